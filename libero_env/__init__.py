@@ -1,0 +1,1 @@
+"""The LIBERO benchmark in headless MuJoCo: tasks, objects, simulation, experts, demonstrations."""

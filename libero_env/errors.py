@@ -1,0 +1,38 @@
+"""Every error this package raises on purpose derives from `LiberoError`."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class LiberoError(Exception):
+    """Root of the package's errors: the message says what is wrong, where, and how to mend it."""
+
+
+class UnknownNameError(LiberoError, LookupError):
+    """A name (suite, task, category, ...) that does not exist; the message lists the valid ones."""
+
+    def __init__(self, kind: str, name: object, valid: Iterable[object]):
+        names = sorted(map(str, valid))
+        close = difflib.get_close_matches(str(name), names, n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names)}")
+
+
+class BDDLError(LiberoError, ValueError):
+    """A task file that cannot be read; the message starts with file:line."""
+
+
+class PlacementError(LiberoError):
+    """No collision-free placement was found for the objects of a scene."""
+
+
+class ActionError(LiberoError, ValueError):
+    """An action of the wrong shape or with values that are not finite; the simulation is untouched."""
+
+
+class RenderError(LiberoError):
+    """No picture can be drawn; the message names the remedy."""
+
+
+class DemoError(LiberoError, ValueError):
+    """A demonstration file that is broken; the message names file, demonstration, key, and what was expected."""

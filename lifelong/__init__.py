@@ -1,0 +1,1 @@
+"""Lifelong robot learning: data, policies, algorithms, training, evaluation and reports."""

@@ -1,0 +1,15 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with the original's task files, measurements and recordings; absent on most machines."""
+    path = Path(os.environ.get("LIBERO_SHARED", Path(__file__).parents[2] / "shared"))
+    if not (path / "official").is_dir():
+        pytest.skip(f"the original's data are not at {path} (set LIBERO_SHARED)")
+    return path
