@@ -1,0 +1,136 @@
+"""What a task is: the values that a task file holds, and what it takes for two of them to mean the same."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Region:
+    """A place on or in a fixture, object or workspace.
+
+    `ranges` are rectangles (x0, y0, x1, y1) in metres in the frame of the target; a region without any is a named
+    site of the target's model (a drawer, the inside of a basket). `yaw` holds (low, high) in radians.
+    """
+
+    name: str
+    target: str
+    ranges: tuple[tuple[float, float, float, float], ...] = ()
+    yaw: tuple[tuple[float, float], ...] = ()
+    rgba: tuple[float, ...] = ()
+
+    @property
+    def address(self) -> str:
+        """What atoms call the region: `floor_bin_region`."""
+        return f"{self.target}_{self.name}"
+
+
+@dataclass(frozen=True)
+class Atom:
+    """A predicate applied to names: `On butter_1 floor_bin_region`. Predicates are capitalised, whatever the file."""
+
+    predicate: str
+    args: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class And:
+    """True where every part is."""
+
+    parts: "tuple[Expression, ...]"
+
+
+@dataclass(frozen=True)
+class Or:
+    """True where any part is."""
+
+    parts: "tuple[Expression, ...]"
+
+
+@dataclass(frozen=True)
+class Not:
+    """True where the part is not."""
+
+    part: "Expression"
+
+
+@dataclass(frozen=True)
+class ForAll:
+    """True where the body holds for each object of the categories; variables are (`?name`, category)."""
+
+    variables: tuple[tuple[str, str], ...]
+    body: "Expression"
+
+
+Expression = Atom | And | Or | Not | ForAll
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a task file says. `fixtures` and `objects` are name -> category in file order: it is the joint order."""
+
+    name: str
+    language: str
+    goal: Expression
+    fixtures: Mapping[str, str] = field(hash=False)
+    objects: Mapping[str, str] = field(hash=False)
+    regions: tuple[Region, ...] = ()
+    init: tuple[Atom, ...] = ()
+    obj_of_interest: tuple[str, ...] = ()
+    scene_properties: Mapping[str, str] = field(default_factory=dict, hash=False)
+    domain: str = "robosuite"
+
+    def region(self, address: str) -> Region | None:
+        """The region with this address (`floor_bin_region`), or None where the file declares none."""
+        return next((region for region in self.regions if region.address == address), None)
+
+
+def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
+    """What two problems say differently, one line each; empty where they mean the same.
+
+    The order of fixtures and objects has a meaning (joint order), the order of regions, init atoms and the parts of
+    a conjunction has none. Case and spacing of the language do not count.
+    """
+    words = lambda p: " ".join(p.language.split()).casefold()  # noqa: E731
+    pairs = {
+        "name": (a.name.casefold(), b.name.casefold()),
+        "language": (words(a), words(b)),
+        "fixtures": (list(a.fixtures.items()), list(b.fixtures.items())),
+        "objects": (list(a.objects.items()), list(b.objects.items())),
+        "obj_of_interest": (set(a.obj_of_interest), set(b.obj_of_interest)),
+        "scene_properties": (dict(a.scene_properties), dict(b.scene_properties)),
+        "init": (set(a.init), set(b.init)),
+        "goal": (_meaning(a.goal), _meaning(b.goal)),
+    }
+    found = [f"{what}: {x} is not {y}" for what, (x, y) in pairs.items() if x != y]
+    regions_a, regions_b = ({region.address: region for region in p.regions} for p in (a, b))
+    for address in sorted(regions_a.keys() | regions_b.keys()):
+        x, y = regions_a.get(address), regions_b.get(address)
+        if x is None or y is None or not _same_region(x, y, tolerance):
+            found.append(f"region {address}: {x} is not {y}")
+    return found
+
+
+def same_meaning(a: Problem, b: Problem) -> bool:
+    """Whether two problems describe the same task; see `differences`."""
+    return not differences(a, b)
+
+
+def _meaning(node: Expression) -> object:
+    match node:
+        case And(parts) | Or(parts):
+            return type(node).__name__, frozenset(map(_meaning, parts))
+        case Not(part):
+            return "Not", _meaning(part)
+        case ForAll(variables, body):
+            return "ForAll", variables, _meaning(body)
+    return node
+
+
+def _same_region(x: Region, y: Region, tolerance: float) -> bool:
+    def close(p, q) -> bool:
+        flat_p, flat_q = ([value for row in rows for value in row] for rows in (p, q))
+        return len(flat_p) == len(flat_q) and all(
+            abs(s - t) <= tolerance for s, t in zip(flat_p, flat_q, strict=True)
+        )
+
+    return close(x.ranges, y.ranges) and close(x.yaw, y.yaw) and close([x.rgba], [y.rgba])

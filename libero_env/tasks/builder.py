@@ -1,0 +1,166 @@
+"""YAML facts -> `Problem`.
+
+A scene says what stands where; a task names its scene, fills in the scene's parameters (`with`) and adds to or replaces
+what the scene says. Keys of both:
+
+    problem          name of the problem class, as in BDDL
+    language         what the task file's `:language` says
+    fixtures         name: category
+    objects          categories in joint order; `plate` is plate_1, `{plate: 2}` is plate_1 and plate_2
+    regions          target: {name: facts}; facts are empty for a site of the target's model, else `at` (x, y) and
+                     `half` (one number or two), or `ranges` [[x0, y0, x1, y1], ...], with `yaw` (one angle or two) and
+                     `rgba`; metres and radians, angles may be arithmetic with pi
+    init             atoms such as `On plate_1 stove_1`
+    obj_of_interest  names
+    scene_properties key: value
+    goal             a list of atoms that must all hold, or one expression in BDDL: `(Or (Open a) (Not (On b c)))`
+
+`$x` stands for the parameter x and `$x_0` for the first of a list; a region that a task sets to `null` is dropped.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from importlib import resources
+from string import Template
+from typing import Any
+
+import yaml
+
+from libero_env import bddl
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.problem import And, Problem, Region
+from libero_env.sexpr import number
+
+KEYS = (
+    "problem",
+    "language",
+    "fixtures",
+    "objects",
+    "regions",
+    "init",
+    "obj_of_interest",
+    "scene_properties",
+    "goal",
+)
+
+
+@lru_cache(maxsize=None)
+def load_data(name: str) -> Any:
+    """The content of one of the package's task files; do not change it.
+
+    Raises:
+        UnknownNameError: there is no such file.
+    """
+    folder = resources.files("libero_env.tasks") / "data"
+    file = folder.joinpath(*name.split("/"))
+    if not file.is_file():
+        raise UnknownNameError("task file", name, (entry.name for entry in folder.iterdir()))
+    return yaml.safe_load(file.read_text(encoding="utf-8"))
+
+
+def load_scene(name: str) -> Mapping[str, Any]:
+    """The facts of a scene of the package."""
+    return load_data(f"scenes/{name}.yaml")
+
+
+def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
+    """The problem that a task in a scene amounts to.
+
+    Args:
+        scene: facts shared by the tasks of the scene.
+        task: `name`, `scene`, `with` (values of the scene's parameters) and the task's own facts.
+
+    Raises:
+        LiberoError: a key or a parameter that is not known, or an atom about a name that nothing declares.
+    """
+    where = f"task {task.get('name', '?')}"
+    own = {key: value for key, value in task.items() if key not in ("name", "scene", "with")}
+    for key in [*scene, *own]:
+        if key not in KEYS:
+            raise UnknownNameError(f"key of {where} or its scene", key, KEYS)
+    facts = {**scene, **own}
+    for key in ("regions", "fixtures", "scene_properties"):
+        facts[key] = _merge(scene.get(key) or {}, own.get(key) or {})
+    facts = _fill(facts, _parameters(task.get("with", {})), where)
+    for key in ("problem", "language", "goal"):
+        if key not in facts:
+            raise LiberoError(f"{where}: neither it nor its scene says {key!r}; add it to the YAML")
+    regions = tuple(_regions(facts["regions"]))
+    objects = dict(_objects(facts.get("objects", [])))
+    known = {*facts["fixtures"], *objects, *(region.address for region in regions)}
+    read = lambda text: bddl.parse_expression(text, known, where)  # noqa: E731
+    goal = facts["goal"]
+    return Problem(
+        name=facts["problem"],
+        language=facts["language"],
+        fixtures=facts["fixtures"],
+        objects=objects,
+        regions=regions,
+        init=tuple(map(read, facts.get("init", []))),
+        obj_of_interest=tuple(facts.get("obj_of_interest", [])),
+        scene_properties=facts["scene_properties"],
+        goal=read(goal) if isinstance(goal, str) else And(tuple(map(read, goal))),
+    )
+
+
+def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with `over` on top, mappings joined at every level; the order is that of `base`, then of `over`."""
+    merged = dict(base)
+    for key, value in over.items():
+        nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = _merge(merged[key], value) if nested else value
+    return merged
+
+
+def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
+    lists = {key: value for key, value in given.items() if isinstance(value, list)}
+    return {**given, **{f"{key}_{i}": item for key, items in lists.items() for i, item in enumerate(items)}}
+
+
+def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
+    """The facts with every `$parameter` replaced; a string that is one parameter takes its value, whatever it is."""
+    if isinstance(node, Mapping):
+        return {_fill(key, values, where): _fill(value, values, where) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_fill(item, values, where) for item in node]
+    if not isinstance(node, str) or "$" not in node:
+        return node
+    if node[1:] in values:
+        return values[node[1:]]
+    try:
+        return Template(node).substitute(values)
+    except (KeyError, ValueError) as error:
+        raise UnknownNameError(f"parameter of {where} in {node!r}", str(error), values) from error
+
+
+def _objects(entries: Sequence[str | Mapping[str, int]]):
+    for entry in entries:
+        for category, count in entry.items() if isinstance(entry, Mapping) else [(entry, 1)]:
+            for i in range(1, count + 1):
+                yield f"{category}_{i}", category
+
+
+def _regions(targets: Mapping[str, Mapping[str, Any]]):
+    for target, regions in targets.items():
+        for name, facts in regions.items():
+            if facts is not None:
+                yield _region(name, target, facts)
+
+
+def _region(name: str, target: str, facts: Mapping[str, Any]) -> Region:
+    for key in facts:
+        if key not in ("at", "half", "ranges", "yaw", "rgba"):
+            raise UnknownNameError(
+                f"key of region {target}_{name}", key, ("at", "half", "ranges", "yaw", "rgba")
+            )
+    ranges = [tuple(map(float, row)) for row in facts.get("ranges", [])]
+    if "at" in facts:
+        (x, y), half = facts["at"], facts["half"]
+        half_x, half_y = half if isinstance(half, list) else (half, half)
+        ranges.append((x - half_x, y - half_y, x + half_x, y + half_y))
+    yaw: tuple[tuple[float, float], ...] = ()
+    if "yaw" in facts:
+        angles = facts["yaw"] if isinstance(facts["yaw"], list) else [facts["yaw"]] * 2
+        low, high = (number(str(angle)) for angle in angles)
+        yaw = ((low, high),)
+    return Region(name, target, tuple(ranges), yaw, tuple(map(float, facts.get("rgba", ()))))

@@ -1,0 +1,107 @@
+"""Suites and tasks by name, with the original's task orders."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+from libero_env import bddl
+from libero_env.errors import UnknownNameError
+from libero_env.problem import Problem
+from libero_env.tasks.builder import build_problem, load_data, load_scene
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task of a suite. `language` is the default instruction, read from the name as the original does;
+    `bddl_language` is what its task file says."""
+
+    suite: str
+    index: int
+    name: str
+    language: str
+    bddl_language: str
+    problem: Problem
+
+    @property
+    def id(self) -> str:
+        """`libero_object/3`."""
+        return f"{self.suite}/{self.index}"
+
+    @property
+    def bddl_text(self) -> str:
+        """The task file, generated."""
+        return bddl.write(self.problem)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """The tasks of a suite in the order of their index."""
+
+    name: str
+    tasks: tuple[Task, ...]
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def order(self, order_index: int = 0) -> tuple[Task, ...]:
+        """The tasks in one of the sequences of the original benchmark.
+
+        Args:
+            order_index: 0 is the order of the indices; the ten-task suites have 21 orders.
+
+        Raises:
+            UnknownNameError: the suite has no such order.
+        """
+        orders = load_data("task_orders.yaml") if len(self) == 10 else [list(range(len(self)))]
+        if order_index not in range(len(orders)):
+            raise UnknownNameError(f"task order of {self.name}", order_index, range(len(orders)))
+        return tuple(self.tasks[i] for i in orders[order_index])
+
+
+def suite_names() -> tuple[str, ...]:
+    """The names that `get_suite` knows."""
+    return tuple(load_data("suites.yaml"))
+
+
+@lru_cache(maxsize=None)
+def get_suite(name: str) -> Suite:
+    """The suite of this name.
+
+    Raises:
+        UnknownNameError: no suite has this name; the message lists them.
+    """
+    if name not in suite_names():
+        raise UnknownNameError("suite", name, suite_names())
+    facts = load_data(f"{name}.yaml")
+    scenes = {scene: load_scene(scene) for scene in {task["scene"] for task in facts["tasks"]}}
+    tasks = []
+    for index, task in enumerate(facts["tasks"]):
+        problem = build_problem(scenes[task["scene"]], task)
+        language = language_from_name(task["name"])
+        tasks.append(Task(name, index, task["name"], language, problem.language, problem))
+    return Suite(name, tuple(tasks))
+
+
+def get_task(key: str) -> Task:
+    """The task called `suite/index`, `suite-index` or by its name alone.
+
+    Raises:
+        UnknownNameError: no such suite, index or task.
+    """
+    for mark in "/-":
+        suite_name, found, index = key.rpartition(mark)
+        if found:
+            suite = get_suite(suite_name)
+            if not index.isdecimal() or int(index) >= len(suite):
+                raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))
+            return suite.tasks[int(index)]
+    named = {task.name: task for name in suite_names() for task in get_suite(name).tasks}
+    if key not in named:
+        raise UnknownNameError("task", key, named)
+    return named[key]
+
+
+def language_from_name(name: str) -> str:
+    """The instruction that a task's name spells: the scene prefix (`KITCHEN_SCENE1_`) dropped, blanks for `_`."""
+    words = name.split("_")
+    prefix = next((i + 1 for i, word in enumerate(words) if word.startswith("SCENE")), 0)
+    return " ".join(words[prefix:])
