@@ -17,3 +17,15 @@ class CheckpointError(LifelongError, ValueError):
 
 class TrainingError(LifelongError, RuntimeError):
     """Training that cannot go on: the loss is not finite, the dataset is empty."""
+
+
+class LanguageError(LifelongError, ValueError):
+    """An instruction that cannot be embedded; the message names the remedy."""
+
+
+class DataError(LifelongError, ValueError):
+    """Demonstrations that do not fit the policy's spec; the message names file, key, and what was expected."""
+
+
+class PolicyError(LifelongError, ValueError):
+    """A policy built or used in a way it cannot work; the message says what would be valid."""
