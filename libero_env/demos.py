@@ -1,0 +1,240 @@
+"""Demonstrations on disk: HDF5 in the original LIBERO's layout, read whole or not at all.
+
+A file holds `data/demo_i` with `actions` (T, 7), `states` (T, 1 + nq + nv), `robot_states` (T, 9: fingers, gripper
+position, gripper quaternion xyzw), `rewards` and `dones` (T,) uint8, and `obs/` with `agentview_rgb`,
+`eye_in_hand_rgb` (T, H, W, 3) uint8 stored upside down (OpenGL rows), `gripper_states` (T, 2), `joint_states` (T, 7),
+`ee_states` (T, 6), `ee_pos` (T, 3), `ee_ori` (T, 3 axis-angle, rad). States are always those before the action.
+
+Pairing. The original stores with each action the observation *after* it. Files of this package say in the attribute
+`pairing` which they hold: "aligned" (the observation the action was chosen on, the default) or "libero".
+
+Labels. Some demonstrations are made with disturbed actions. `actions` is what was executed, so that replaying works;
+`expert_actions`, where present, is what the expert wanted at that moment, which is what there is to learn.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import h5py
+import numpy as np
+
+from libero_env.errors import DemoError
+
+Pairing = Literal["aligned", "libero"]
+
+LOW_DIM_KEYS = {"gripper_states": 2, "joint_states": 7, "ee_states": 6, "ee_pos": 3, "ee_ori": 3}
+IMAGE_KEYS = ("agentview_rgb", "eye_in_hand_rgb")
+DEPTH_KEYS = ("agentview_depth", "eye_in_hand_depth")
+
+
+class BrokenDemoError(DemoError):
+    """What is in the file is not a demonstration, or not a whole one."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """One demonstration. Images are upright; `states`, `rewards` and `dones` are None where the file has none."""
+
+    name: str
+    actions: np.ndarray  # (T, 7) float64 in [-1, 1]
+    obs: Mapping[str, np.ndarray] = field(repr=False)  # name -> (T, ...)
+    states: np.ndarray | None = field(default=None, repr=False)  # (T, 1 + nq + nv)
+    rewards: np.ndarray | None = field(default=None, repr=False)  # (T,) uint8
+    dones: np.ndarray | None = field(default=None, repr=False)  # (T,) uint8
+    success: bool = True
+    pairing: Pairing = "aligned"
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def read_demos(
+    path: str | Path,
+    obs_keys: Sequence[str] | None = None,
+    limit: int | None = None,
+    *,
+    labels: Literal["expert", "executed"] = "expert",
+    pairing: Literal["stored", "aligned"] = "stored",
+) -> list[Demo]:
+    """Read demonstrations, after all of those wanted have been checked.
+
+    Args:
+        path: a demonstration file, ours or the original's, or the folder of parts that an interrupted recording left.
+        obs_keys: observations to load; None for all known ones that the file has.
+        limit: the first so many demonstrations only.
+        labels: "expert" puts `expert_actions` into `Demo.actions` where the file has them, "executed" never does.
+        pairing: "aligned" shifts demonstrations of "libero" pairing by one step, at the cost of their first one.
+
+    Raises:
+        DemoError: a file that is absent, truncated or empty, a key that is missing or of the wrong shape or type; the
+            message names file, demonstration, key and what was expected. Nothing is returned then.
+    """
+    demos: list[Demo] = []
+    for file in demo_files(path):
+        with opened(file) as handle:
+            names = demo_names(handle, file)[: None if limit is None else max(limit - len(demos), 0)]
+            keys = _wanted_keys(handle, file, names, obs_keys)
+            for name in names:
+                check_demo(handle["data"][name], file, name, keys)
+            demos += [_load(handle["data"], file, name, keys, labels) for name in names]
+    if not demos:
+        raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0. Record them again")
+    shapes = {key: value.shape[1:] for key, value in demos[0].obs.items()}
+    for demo in demos:
+        for key, shape in shapes.items():
+            if key not in demo.obs or demo.obs[key].shape[1:] != shape:
+                found = demo.obs[key].shape[1:] if key in demo.obs else "nothing"
+                raise DemoError(
+                    f"{path}: {demo.name}/obs/{key} holds {found}; expected {shape} as in {demos[0].name}"
+                )
+    return [aligned(demo) for demo in demos] if pairing == "aligned" else demos
+
+
+def aligned(demo: Demo) -> Demo:
+    """The demonstration with each action beside the observation before it; a "libero" one loses its first action."""
+    if demo.pairing == "aligned":
+        return demo
+    later = [None if x is None else x[1:] for x in (demo.states, demo.rewards, demo.dones)]
+    obs = {key: value[:-1] for key, value in demo.obs.items()}
+    return Demo(demo.name, demo.actions[1:], obs, *later, success=demo.success, pairing="aligned")
+
+
+def demo_files(path: str | Path) -> list[Path]:
+    """The file itself, or the finished parts in a folder of them.
+
+    Raises:
+        DemoError: there is nothing at the path.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return sorted(path.glob("demo_*.hdf5"))
+    if not path.is_file():
+        raise DemoError(f"{path}: no such file; make it with `libero demos generate`")
+    return [path]
+
+
+def demo_names(handle: h5py.File, file: Path) -> list[str]:
+    """Names of the demonstrations in numerical order.
+
+    Raises:
+        DemoError: no group `data`.
+    """
+    if not isinstance(handle.get("data"), h5py.Group):
+        raise BrokenDemoError(
+            f"{file}: key data is missing; expected a group of demonstrations demo_0, demo_1, ..."
+        )
+    names = [name for name in handle["data"] if name.startswith("demo_") and name[5:].isdigit()]
+    return sorted(names, key=lambda name: int(name[5:]))
+
+
+def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]) -> None:
+    """Check one demonstration's keys, shapes and types without reading its images.
+
+    Raises:
+        BrokenDemoError: naming file, demonstration, key, and what was expected.
+    """
+    if not isinstance(group, h5py.Group):
+        raise BrokenDemoError(f"{file}: {name} is not a group; expected actions, states, obs/ in it")
+    actions = _dataset(group, "actions", file, name)
+    steps = actions.shape[0] if actions.ndim else 0
+    if steps == 0:
+        raise BrokenDemoError(f"{file}: {name}/actions is empty; expected (T, 7) with T > 0")
+    _check_shape(actions, "actions", file, name, (steps, 7), "f")
+    for key, shape, kind in (("states", (steps, None), "f"), ("robot_states", (steps, 9), "f"),
+                             ("expert_actions", (steps, 7), "f"), ("rewards", (steps,), "uif"),
+                             ("dones", (steps,), "uif")):  # fmt: skip
+        if key in group:
+            _check_shape(_dataset(group, key, file, name), key, file, name, shape, kind)
+    for key in obs_keys:
+        dataset = _dataset(group, f"obs/{key}", file, name)
+        if key in IMAGE_KEYS:
+            _check_shape(dataset, f"obs/{key}", file, name, (steps, None, None, 3), "u")
+        elif key in DEPTH_KEYS:
+            _check_shape(dataset, f"obs/{key}", file, name, (steps, None, None, None)[: dataset.ndim], "f")
+        else:
+            _check_shape(dataset, f"obs/{key}", file, name, (steps, LOW_DIM_KEYS.get(key)), "f")
+
+
+def opened(file: Path) -> h5py.File:
+    """The file, open for reading.
+
+    Raises:
+        BrokenDemoError: it was cut short, or is no HDF5 file.
+    """
+    try:
+        return h5py.File(file, "r")
+    except OSError as error:
+        raise BrokenDemoError(
+            f"{file}: not a whole HDF5 file ({error}); it was cut short or is something else"
+        ) from error
+
+
+def _wanted_keys(
+    handle: h5py.File, file: Path, names: list[str], obs_keys: Sequence[str] | None
+) -> list[str]:
+    if obs_keys is not None:
+        return list(obs_keys)
+    for name in names:
+        obs = handle["data"][name].get("obs") if isinstance(handle["data"][name], h5py.Group) else None
+        if not isinstance(obs, h5py.Group):
+            raise BrokenDemoError(
+                f"{file}: {name}/obs is missing; expected a group with {', '.join(IMAGE_KEYS)}, ..."
+            )
+        return [key for key in (*IMAGE_KEYS, *DEPTH_KEYS, *LOW_DIM_KEYS) if key in obs]
+    return []
+
+
+def _dataset(group: h5py.Group, key: str, file: Path, name: str) -> h5py.Dataset:
+    found = group.get(key)
+    if not isinstance(found, h5py.Dataset):
+        parent = group.get("obs") if key.startswith("obs/") else group
+        has = ", ".join(sorted(parent)) if isinstance(parent, h5py.Group) else "nothing"
+        raise BrokenDemoError(
+            f"{file}: {name}/{key} is missing; expected a dataset of that name beside: {has}"
+        )
+    return found
+
+
+def _check_shape(
+    dataset: h5py.Dataset, key: str, file: Path, name: str, shape: tuple[int | None, ...], kinds: str
+) -> None:
+    fits = dataset.ndim == len(shape) and all(
+        b in (None, a) for a, b in zip(dataset.shape, shape, strict=True)
+    )
+    if not fits or dataset.dtype.kind not in kinds:
+        expected = ", ".join("any" if n is None else str(n) for n in shape)
+        types = " or ".join({"f": "float", "u": "unsigned integer", "i": "integer"}[kind] for kind in kinds)
+        raise BrokenDemoError(
+            f"{file}: {name}/{key} is {dataset.shape} {dataset.dtype}; expected ({expected}) {types}"
+        )
+
+
+def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str) -> Demo:
+    group = data[name]
+
+    def read(key: str) -> np.ndarray | None:
+        if key not in group:
+            return None
+        try:
+            return group[key][()]
+        except OSError as error:
+            raise BrokenDemoError(
+                f"{file}: {name}/{key} cannot be read ({error}); the file is damaged"
+            ) from error
+
+    obs = {key: read(f"obs/{key}") for key in keys}
+    for key in (*IMAGE_KEYS, *DEPTH_KEYS):
+        if key in obs:
+            obs[key] = np.ascontiguousarray(obs[key][:, ::-1])  # the file has OpenGL rows
+    wanted = "expert_actions" if labels == "expert" and "expert_actions" in group else "actions"
+    actions = read(wanted).astype(np.float64)
+    if not np.isfinite(actions).all():
+        raise BrokenDemoError(
+            f"{file}: {name}/{wanted} has values that are not finite; expected numbers in [-1, 1]"
+        )
+    states, rewards, dones = read("states"), read("rewards"), read("dones")
+    ends = [x[-1] for x in (rewards, dones) if x is not None]
+    success = bool(group.attrs.get("success", any(end > 0 for end in ends) if ends else True))
+    return Demo(name, actions, obs, states, rewards, dones, success, data.attrs.get("pairing", "libero"))

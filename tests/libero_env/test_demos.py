@@ -1,0 +1,215 @@
+"""Demonstration files: what is written is read back; what is broken is named; what was recorded survives a kill."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from libero_env.demos import aligned, read_demos
+from libero_env.demos_write import DemoWriter, Episode, make_header
+from libero_env.errors import DemoError
+
+
+def header(**more):
+    return make_header(
+        problem_name="LIBERO_Floor_Manipulation",
+        language="pick up the butter and place it in the basket",
+        bddl_name="libero_object/pick_up_the_butter.bddl",
+        bddl_text="(define (problem LIBERO_Floor_Manipulation))",
+        env_kwargs={"robots": ["Panda"]},
+        **({"pairing": "aligned", "seed": 1} | more),
+    )
+
+
+def episode(seed: int, steps: int = 11, size: int = 16) -> Episode:
+    rng = np.random.default_rng(seed)
+    image = lambda: rng.integers(0, 256, (steps, size, size, 3), np.uint8)  # noqa: E731
+    obs = {"agentview_rgb": image(), "eye_in_hand_rgb": image()}
+    obs |= {"joint_states": rng.normal(size=(steps, 7)), "gripper_states": rng.normal(size=(steps, 2))}
+    obs |= {"ee_pos": rng.normal(size=(steps, 3)), "ee_ori": rng.normal(size=(steps, 3))}
+    actions = rng.uniform(-1, 1, (steps, 7))
+    return Episode(actions, rng.normal(size=(steps, 30)), rng.normal(size=(steps, 9)), obs, actions * 0.5)
+
+
+@pytest.fixture
+def path(tmp_path):
+    writer = DemoWriter(tmp_path / "butter_demo.hdf5", header())
+    for i in range(3):
+        writer.write(i, episode(i))
+    return writer.finish()
+
+
+def test_written_is_read_back_upright(path):
+    demos = read_demos(path)
+    assert [demo.name for demo in demos] == ["demo_0", "demo_1", "demo_2"]
+    for i, demo in enumerate(demos):
+        wanted = episode(i)
+        np.testing.assert_array_equal(demo.actions, wanted.expert_actions)
+        np.testing.assert_array_equal(demo.states, wanted.states)
+        for key, values in wanted.obs.items():
+            np.testing.assert_array_equal(demo.obs[key], values)
+        assert demo.success and demo.dones.tolist() == [0] * 10 + [1] and demo.pairing == "aligned"
+    np.testing.assert_array_equal(read_demos(path, labels="executed")[1].actions, episode(1).actions)
+
+
+def test_limit_and_keys_select(path):
+    (demo,) = read_demos(path, obs_keys=["ee_states"], limit=1)
+    assert list(demo.obs) == ["ee_states"]
+    np.testing.assert_array_equal(demo.obs["ee_states"][:, 3:], episode(0).obs["ee_ori"])
+
+
+def test_file_has_the_originals_layout(path):
+    with h5py.File(path) as handle:
+        data = handle["data"]
+        assert {"env_name", "problem_info", "macros_image_convention", "bddl_file_name", "bddl_file_content",
+                "env_args", "num_demos", "total", "tag"} <= set(data.attrs)  # fmt: skip
+        assert data.attrs["num_demos"] == 3 and data.attrs["total"] == 33 and data.attrs["tag"] == "libero-v1"
+        assert data.attrs["env_name"] == "Libero_Floor_Manipulation"
+        info = json.loads(data.attrs["problem_info"])
+        assert info["problem_name"] == "libero_floor_manipulation" and "butter" in info["language_instruction"]
+        demo = data["demo_0"]
+        types = {"actions": "float64", "states": "float64", "robot_states": "float64", "rewards": "uint8",
+                 "dones": "uint8", "obs/agentview_rgb": "uint8", "obs/ee_states": "float64"}  # fmt: skip
+        assert {key: str(demo[key].dtype) for key in types} == types
+        np.testing.assert_array_equal(demo["obs/agentview_rgb"][()], episode(0).obs["agentview_rgb"][:, ::-1])
+        np.testing.assert_array_equal(demo.attrs["init_state"], demo["states"][0])
+        assert demo.attrs["num_samples"] == 11
+
+
+def test_files_of_the_original_are_read(tmp_path):
+    path = tmp_path / "original.hdf5"
+    with h5py.File(path, "w") as handle:
+        for i in (10, 2):
+            demo = handle.create_group(f"data/demo_{i}")
+            demo["actions"] = np.full((5, 7), i / 10)
+            demo["obs/agentview_rgb"] = np.zeros((5, 8, 8, 3), np.uint8)
+            demo["obs/ee_pos"] = np.arange(15.0).reshape(5, 3)
+    demos = read_demos(path)
+    assert [demo.name for demo in demos] == ["demo_2", "demo_10"] and demos[0].states is None
+    assert demos[0].pairing == "libero"
+    shifted = aligned(demos[0])
+    np.testing.assert_array_equal(shifted.obs["ee_pos"], demos[0].obs["ee_pos"][:-1])
+    np.testing.assert_array_equal(shifted.actions, demos[0].actions[1:])
+    assert read_demos(path, pairing="aligned")[0].pairing == "aligned"
+
+
+def _delete(key):
+    def damage(handle):
+        del handle[key]
+
+    return damage
+
+
+def _replace(key, values):
+    def damage(handle):
+        del handle[key]
+        handle[key] = values
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (_delete("data"), ("data", "missing")),
+        (_delete("data/demo_1/actions"), ("demo_1/actions", "missing")),
+        (_delete("data/demo_1/obs/agentview_rgb"), ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb")),
+        (_delete("data/demo_0/obs"), ("demo_0/obs", "missing")),
+        (_replace("data/demo_2/actions", np.zeros((11, 6))), ("demo_2/actions", "(11, 6)", "(11, 7)")),
+        (_replace("data/demo_1/states", np.zeros((10, 30))), ("demo_1/states", "(10, 30)", "(11, any)")),
+        (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 16, 16, 3))), ("eye_in_hand_rgb", "float64", "un")),
+        (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 8, 8, 3), np.uint8)), ("demo_1", "(16, 16, 3)")),
+        (_replace("data/demo_1/expert_actions", np.full((11, 7), np.nan)), ("demo_1", "not finite")),
+        (lambda handle: [handle.__delitem__(f"data/demo_{i}") for i in range(3)], ("no demonstrations",)),
+    ],
+)
+def test_broken_files_are_named(path, damage, words):
+    with h5py.File(path, "r+") as handle:
+        damage(handle)
+    with pytest.raises(DemoError) as caught:
+        read_demos(path)
+    assert all(word in str(caught.value) for word in (path.name, *words)), caught.value
+
+
+def test_truncated_and_absent_files_are_named(path):
+    whole = path.read_bytes()
+    for size in (0, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(DemoError, match=path.name):
+            read_demos(path)
+    path.unlink()
+    with pytest.raises(DemoError, match="no such file"):
+        read_demos(path)
+
+
+def test_recording_goes_on_where_it_was(path):
+    writer = DemoWriter(path, header())
+    assert writer.recorded() == {0, 1, 2}
+    writer.write(3, episode(3))
+    assert writer.recorded() == {0, 1, 2, 3} and len(read_demos(writer.parts)) == 1
+    writer.finish()
+    assert len(read_demos(path)) == 4 and not writer.parts.exists()
+
+
+def test_a_file_made_otherwise_is_refused(path):
+    with pytest.raises(DemoError, match="seed = 1, not 2"):
+        DemoWriter(path, header(seed=2)).recorded()
+
+
+def test_a_broken_part_is_recorded_again(tmp_path):
+    writer = DemoWriter(tmp_path / "x.hdf5", header())
+    writer.write(0, episode(0))
+    part = writer.write(1, episode(1))
+    part.write_bytes(part.read_bytes()[:500])
+    assert writer.recorded() == {0}
+
+
+def test_a_full_disk_leaves_what_was_recorded(tmp_path, monkeypatch):
+    writer = DemoWriter(tmp_path / "x.hdf5", header())
+    writer.write(0, episode(0))
+
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DemoError, match="No space left"):
+        writer.write(1, episode(1))
+    with pytest.raises(DemoError, match="No space left"):
+        writer.finish()
+    monkeypatch.undo()
+    assert len(read_demos(writer.parts)) == 1 and len(list(writer.parts.iterdir())) == 1
+    assert len(read_demos(writer.finish())) == 1
+
+
+def test_a_killed_process_leaves_what_was_recorded(tmp_path):
+    script = """
+        import sys
+        sys.path[:0] = sys.argv[2:]
+        from test_demos import DemoWriter, episode, header
+        writer = DemoWriter(sys.argv[1], header())
+        for i in range(10_000):
+            writer.write(i, episode(i, steps=60, size=64))
+            print(i, flush=True)
+    """
+    path = tmp_path / "x.hdf5"
+    command = [sys.executable, "-c", textwrap.dedent(script), str(path), os.path.dirname(__file__)]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    for _ in range(3):
+        child.stdout.readline()
+    time.sleep(0.05)  # somewhere within the next one
+    child.send_signal(signal.SIGKILL)
+    printed = 3 + len(child.stdout.read().split())
+    child.wait()
+    writer = DemoWriter(path, header())
+    assert len(writer.recorded()) >= printed
+    demos = read_demos(writer.finish())
+    assert len(demos) >= printed
+    for i, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.states, episode(i, 60, 64).states)
