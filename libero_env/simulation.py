@@ -1,0 +1,218 @@
+"""Many closed-loop simulations of one model: physics and controller, no tasks, no pictures.
+
+Two ways to step with the same interface and the same bits: `LoopSimulations`, one MjData after another (one simulation,
+or MuJoCo without `mujoco.batch`), and `BatchSimulations` on a thread pool. A control step is 25 substeps, and each
+substep is one pass: controller on the current kinematics, then the rest of the step, then the next kinematics.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from libero_env.control import (
+    CONTROLLER_STATE_SIZE,
+    REST,
+    SUBSTEPS,
+    ArmIndex,
+    ControllerState,
+    control,
+    set_goals,
+)
+
+try:
+    from mujoco.batch import Batch
+except ImportError:  # before MuJoCo 4
+    Batch = None
+
+# What the controller and the views of the state read, as arrays (n, ...).
+_FIELDS = ("qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat", "M", "qfrc_bias")
+
+
+class Simulations(ABC):
+    """n simulations of one model.
+
+    Attributes:
+        model: shared by all simulations and never written to.
+        num: number of simulations.
+        fields: name of an MjData field -> array (num, ...), for reading. Kinematics are those of the current state.
+        controller: goals and gripper commands.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num: int):
+        self.model, self.num = model, num
+        self.arm = ArmIndex.of(model)
+        self.controller = ControllerState(num)
+        self.fields: dict[str, np.ndarray] = {}
+
+    @abstractmethod
+    def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
+        """Clear these simulations, write positions and velocities, and compute all that follows from them."""
+
+    @abstractmethod
+    def _substeps(self, ids: np.ndarray, actions: np.ndarray) -> None:
+        """Run one control period; the goals are set."""
+
+    @abstractmethod
+    def _remembered(self, i: int) -> list[np.ndarray]:
+        """Live views of what a step leaves behind beside positions: [qacc_warmstart (nv,), ctrl (nu,)]."""
+
+    @abstractmethod
+    def time(self, i: int) -> float:
+        """Simulated seconds since the reset of simulation i."""
+
+    @abstractmethod
+    def data(self, i: int) -> mujoco.MjData:
+        """Simulation i's MjData, for reading what `fields` does not hold, such as contacts."""
+
+    def close(self) -> None:
+        """Let go of the simulations."""
+        self.fields = {}
+
+    def reset(self, ids: Sequence[int], qpos: np.ndarray, qvel: np.ndarray, time: float = 0.0) -> None:
+        """Start simulations afresh from positions (k, nq) and velocities (k, nv); the controller holds the pose."""
+        ids = np.asarray(ids, np.int64)
+        self._start(ids, qpos, qvel, time)
+        pos, mat = self._grip()
+        self.controller.restart(ids, pos[ids], mat[ids])
+
+    def step(self, ids: Sequence[int], actions: np.ndarray) -> None:
+        """Advance the simulations `ids` by one control period; actions (num, 7), rows of other simulations unused."""
+        ids = np.asarray(ids, np.int64)
+        set_goals(ids, actions, *self._grip(), self.controller.goal_pos, self.controller.goal_mat)
+        self._substeps(ids, actions)
+
+    def get_state(self, i: int) -> np.ndarray:
+        """All that the future of simulation i depends on: time, qpos, qvel, warm start, controls, controller."""
+        parts = [[self.time(i)], self.fields["qpos"][i], self.fields["qvel"][i], *self._remembered(i)]
+        return np.concatenate([*parts, self.controller.pack(i)])
+
+    def set_state(self, i: int, state: np.ndarray) -> None:
+        """Restore what `get_state` gave; the simulation goes on to the same bits."""
+        nq, nv, nu = self.model.nq, self.model.nv, self.model.nu
+        time, qpos, qvel, *remembered, goal = np.split(state, np.cumsum([1, nq, nv, nv, nu]))
+        self.reset([i], qpos[None], qvel[None], float(time[0]))
+        for view, value in zip(self._remembered(i), remembered, strict=True):
+            view[:] = value
+        self.controller.unpack(i, goal)
+
+    @property
+    def state_size(self) -> int:
+        """Length of the vector of `get_state`."""
+        return 1 + self.model.nq + 2 * self.model.nv + self.model.nu + CONTROLLER_STATE_SIZE
+
+    def _grip(self) -> tuple[np.ndarray, np.ndarray]:
+        site = self.arm.site
+        return self.fields["site_xpos"][:, site], self.fields["site_xmat"][:, site]
+
+    def _inputs(self, fields: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+        """The kernel's view of MjData."""
+        site = self.arm.site
+        names = ("qpos", "qvel", "xanchor", "xaxis")
+        return (*(fields[n] for n in names), fields["site_xpos"][:, site], fields["site_xmat"][:, site],
+                fields["M"], fields["qfrc_bias"])  # fmt: skip
+
+    def _constants(self) -> tuple[np.ndarray, ...]:
+        return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, REST
+
+
+class LoopSimulations(Simulations):
+    """Simulations stepped one after the other in the calling thread."""
+
+    def __init__(self, model: mujoco.MjModel, num: int = 1):
+        super().__init__(model, num)
+        self._datas = [mujoco.MjData(model) for _ in range(num)]
+        self._views = [self._view(data) for data in self._datas]
+        # One simulation is read in place; several are copied together after each step.
+        self.fields = self._views[0] if num == 1 else {k: np.concatenate([v[k] for v in self._views]) for k in _FIELDS}
+        self._calls = [(self._inputs(v), v["ctrl"]) for v in self._views]
+
+    def _view(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        views = {name: getattr(data, name)[None] for name in _FIELDS}
+        return {**views, "site_xmat": data.site_xmat.reshape(1, self.model.nsite, 9)}
+
+    def _gather(self, ids: np.ndarray) -> None:
+        if self.num > 1:
+            for i in ids:
+                for name, array in self.fields.items():
+                    array[i] = self._views[i][name][0]
+
+    def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
+        for k, i in enumerate(ids):
+            data = self._datas[i]
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:], data.qvel[:], data.time = qpos[k], qvel[k], time
+            mujoco.mj_forward(self.model, data)
+            data.qacc_warmstart[:] = 0.0
+        self._gather(ids)
+
+    def _substeps(self, ids: np.ndarray, actions: np.ndarray) -> None:
+        model, c, constants, first = self.model, self.controller, self._constants(), np.zeros(1, np.int64)
+        for i in ids:
+            data, (inputs, ctrl), own = self._datas[i], self._calls[i], slice(i, i + 1)
+            state = (c.goal_pos[own], c.goal_mat[own], c.gripper[own])
+            for _ in range(SUBSTEPS):
+                control(first, actions[own], *inputs, *state, ctrl, *constants)
+                mujoco.mj_step2(model, data)
+                mujoco.mj_step1(model, data)
+        self._gather(ids)
+
+    def _remembered(self, i: int) -> list[np.ndarray]:
+        return [self._datas[i].qacc_warmstart, self._datas[i].ctrl]
+
+    def time(self, i: int) -> float:
+        return self._datas[i].time
+
+    def data(self, i: int) -> mujoco.MjData:
+        return self._datas[i]
+
+    def close(self) -> None:
+        super().close()
+        self._views, self._calls, self._datas = [], [], []
+
+
+class BatchSimulations(Simulations):
+    """Simulations stepped together on a thread pool; the same bits as the loop, whatever the number of threads."""
+
+    def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0):
+        super().__init__(model, num)
+        self._batch = Batch(model, num, nthread=threads, persistent=True)
+        self.fields = {name: self._batch.bind(name) for name in _FIELDS}
+        self.fields["site_xmat"] = self.fields["site_xmat"].reshape(num, model.nsite, 9)
+        self._time, self._warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
+        self._data = mujoco.MjData(model)  # for reading one simulation at a time
+
+    def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.fields["qpos"][ids], self.fields["qvel"][ids], self._time[ids] = qpos, qvel, time
+        self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._warmstart[ids] = 0.0
+
+    def _substeps(self, ids: np.ndarray, actions: np.ndarray) -> None:
+        c, constants, ctrl = self.controller, self._constants(), self.fields["ctrl"]
+        inputs = self._inputs(self.fields)
+        stage = mujoco.mjtStage.mjSTAGE_VEL
+        for _ in range(SUBSTEPS):
+            control(ids, actions, *inputs, c.goal_pos, c.goal_mat, c.gripper, ctrl, *constants)
+            self._batch.step(ids, nstep=1, stage=stage)
+
+    def _remembered(self, i: int) -> list[np.ndarray]:
+        return [self._warmstart[i], self.fields["ctrl"][i]]
+
+    def time(self, i: int) -> float:
+        return float(np.ravel(self._time[i])[0])
+
+    def data(self, i: int) -> mujoco.MjData:
+        return self._batch.get_data(i, self._data)
+
+    def close(self) -> None:
+        super().close()
+        self._batch = self._time = self._warmstart = None
+
+
+def make_simulations(model: mujoco.MjModel, num: int, threads: int = 0) -> Simulations:
+    """The fastest way to run `num` simulations here: batched where MuJoCo offers it and there are several."""
+    if num > 1 and Batch is not None:
+        return BatchSimulations(model, num, threads)
+    return LoopSimulations(model, num)
