@@ -1,0 +1,158 @@
+"""The measures of eq. 3 against numbers worked out by hand, and properties of the intervals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lifelong.metrics import (
+    METRIC_NAMES,
+    Curve,
+    Scores,
+    area_under_curve,
+    average_success,
+    combine_intervals,
+    forward_transfer,
+    lifelong_metrics,
+    mean_and_standard_error,
+    negative_backward_transfer,
+    wilson_interval,
+)
+
+NAN = float("nan")
+
+
+def curve(*rates: float, episodes: int = 10) -> Curve:
+    n = len(rates)
+    return Curve(np.arange(n) * 5, np.array(rates, dtype=float), np.full(n, episodes))
+
+
+def worked_example() -> Scores:
+    curves = (curve(0.0, 0.8, 0.6), curve(0.2, 0.4, 0.4), curve(0.0, 0.0, 0.6))
+    matrix = np.array([[0.8, NAN, NAN], [0.5, 0.4, NAN], [0.1, 0.3, 0.6]])
+    return Scores(curves, matrix, np.tril(np.full((3, 3), 10)))
+
+
+def random_scores(rng: np.random.Generator, size: int = 6, episodes: int = 20) -> Scores:
+    rates = lambda shape: rng.integers(0, episodes + 1, shape) / episodes  # noqa: E731
+    matrix = np.where(np.tril(np.ones((size, size))) > 0, rates((size, size)), np.nan)
+    curves = tuple(Curve(np.arange(5), rates(5), np.full(5, episodes)) for _ in range(size))
+    return Scores(curves, matrix, np.tril(np.full((size, size), episodes)))
+
+
+def test_worked_example():
+    # Task 1 peaks at its 2nd evaluation, which also stands for the 3rd: (0 + .8 + .8) / 3.
+    # Task 2 peaks first at its 2nd: (.2 + .4 + .4) / 3. Task 3: (0 + 0 + .6) / 3.
+    fwt = [1.6 / 3, 1.0 / 3, 0.2]
+    # Task 1 drops by .3 and .7, task 2 by .1; nothing follows task 3.
+    nbt = [0.5, 0.1, 0.0]
+    auc = [(1.6 / 3 + 0.5 + 0.1) / 3, (1.0 / 3 + 0.3) / 2, 0.2]
+    scores = worked_example()
+    assert forward_transfer(scores.curves) == pytest.approx(fwt)
+    assert negative_backward_transfer(scores.matrix) == pytest.approx(nbt)
+    assert area_under_curve(fwt, scores.matrix) == pytest.approx(auc)
+    found = lifelong_metrics(scores)
+    assert found.fwt.value == pytest.approx(sum(fwt) / 3)
+    assert found.nbt.value == pytest.approx(0.2)  # divided by K = 3, the empty last term included
+    assert found.auc.value == pytest.approx(sum(auc) / 3)
+    assert found.final_success.value == pytest.approx((0.1 + 0.3 + 0.6) / 3)
+    assert found.just_learned.value == pytest.approx((0.8 + 0.4 + 0.6) / 3)
+    assert average_success(scores.matrix) == pytest.approx([0.8, 0.45, 1 / 3])
+
+
+def test_best_epoch_is_the_earliest_of_equals_and_holding_changes_nothing_else():
+    c = curve(0.1, 0.5, 0.2, 0.5)
+    assert c.best == 1
+    assert c.held().tolist() == [0.1, 0.5, 0.5, 0.5]
+    assert c.rates.tolist() == [0.1, 0.5, 0.2, 0.5]
+
+
+def test_interval_weights_agree_with_the_formulas():
+    rng = np.random.default_rng(0)
+    for size in (1, 2, 6):
+        scores = random_scores(rng, size)
+        found = lifelong_metrics(scores)
+        for name in ("fwt", "nbt", "auc"):
+            assert getattr(found, name).value == pytest.approx(getattr(found, f"{name}_by_task").mean())
+        assert found.final_success.value == pytest.approx(scores.matrix[-1].mean())
+        assert found.just_learned.value == pytest.approx(np.diag(scores.matrix).mean())
+
+
+@pytest.mark.parametrize("rate", [0.0, 1.0])
+def test_intervals_have_width_and_hold_the_value_at_the_ends(rate: float):
+    scores = Scores(
+        (curve(rate, rate), curve(rate, rate)),
+        np.array([[rate, NAN], [rate, rate]]),
+        np.tril(np.full((2, 2), 20)),
+    )
+    found = lifelong_metrics(scores)
+    for name in METRIC_NAMES:
+        estimate = getattr(found, name)
+        assert estimate.low <= estimate.value <= estimate.high
+        assert estimate.high - estimate.low > 0.01, name
+
+
+def test_more_episodes_give_narrower_intervals():
+    few, many = (random_scores(np.random.default_rng(1), episodes=20) for _ in range(2))
+    many = dataclasses.replace(
+        many,
+        episodes=many.episodes * 25,
+        curves=tuple(dataclasses.replace(c, episodes=c.episodes * 25) for c in many.curves),
+    )
+    for name in METRIC_NAMES:
+        wide, narrow = getattr(lifelong_metrics(few), name), getattr(lifelong_metrics(many), name)
+        assert narrow.value == pytest.approx(wide.value)
+        assert narrow.high - narrow.low < 0.35 * (wide.high - wide.low)
+
+
+def test_intervals_cover_the_truth():
+    rng = np.random.default_rng(2)
+    size, episodes, truth = 4, 20, 0.7
+    inside = np.zeros(2)
+    for _ in range(400):
+        matrix = np.tril(rng.binomial(episodes, truth, (size, size)) / episodes)
+        scores = Scores((curve(1.0),) * size, matrix, np.tril(np.full((size, size), episodes)))
+        found = lifelong_metrics(scores)
+        inside += [
+            found.nbt.low <= 0 <= found.nbt.high,
+            found.final_success.low <= truth <= found.final_success.high,
+        ]
+    assert (inside / 400 > 0.92).all()
+
+
+def test_wilson_against_a_published_value_and_its_symmetry():
+    low, high = wilson_interval(81, 263)  # Newcombe (1998), method 3: 0.2553 to 0.3662
+    assert (round(float(low), 4), round(float(high), 4)) == (0.2553, 0.3662)
+    s, n = np.arange(21), 20
+    low, high = wilson_interval(s, n)
+    assert low == pytest.approx(1 - high[::-1])
+    assert (low <= s / n).all() and (s / n <= high).all() and (high - low > 0.1).all()
+    assert low[0] == 0 and high[-1] == 1
+    assert [float(x) for x in wilson_interval(0, 0)] == [0, 1]
+
+
+def test_combining_two_rates_is_newcombes_difference():
+    # Newcombe (1998), difference of 56/70 and 48/80, method 10: 0.0524 to 0.3339.
+    low, high = wilson_interval([56, 48], [70, 80])
+    found = combine_intervals([1, -1], [56 / 70, 48 / 80], low, high)
+    assert (found.value, found.low, found.high) == pytest.approx((0.2, 0.0524, 0.3339), abs=5e-5)
+
+
+def test_a_task_without_a_learning_curve_leaves_the_rest_defined():
+    scores = worked_example()
+    scores = dataclasses.replace(scores, curves=(*scores.curves[:2], curve()))
+    found = lifelong_metrics(scores)
+    assert np.isnan(found.fwt.value) and np.isnan(found.auc.value)
+    assert found.nbt.value == pytest.approx(0.2)
+
+
+def test_standard_error_over_seeds():
+    assert mean_and_standard_error([0.2, 0.4, 0.6]) == pytest.approx((0.4, 0.2 / np.sqrt(3)))
+    mean, error = mean_and_standard_error([0.3])
+    assert mean == 0.3 and np.isnan(error)
+    assert np.isnan(mean_and_standard_error([])[0])
+
+
+def test_mismatched_scores_are_refused():
+    with pytest.raises(ValueError, match="scores of 1 tasks"):
+        Scores((curve(0.5),), np.zeros((2, 2)), np.zeros((2, 2), dtype=int))

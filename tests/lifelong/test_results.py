@@ -1,0 +1,233 @@
+"""What is recorded stays readable, whatever happens to the process or the disk."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lifelong.records import (
+    RECORD_TYPES,
+    EvalRecord,
+    LossRecord,
+    PhaseRecord,
+    RunEndRecord,
+    TaskEndRecord,
+    from_line,
+    start_record,
+    to_line,
+)
+from lifelong.results import ResultLog, Results, ResultsError, summarize, write_summary
+
+START = start_record(
+    algo="er",
+    benchmark="libero_object",
+    policy="bc_transformer",
+    seed=1,
+    preset="smoke",
+    tasks=["first_task", "second_task"],
+    instructions=["pick up the first", "pick up the second"],
+    config="seed: 1",
+)
+
+
+def evaluation(phase: str, learned: int, epoch: int, task: int, wins: int, episodes: int = 4) -> EvalRecord:
+    return EvalRecord(
+        phase=phase,
+        learned=learned,
+        epoch=epoch,
+        task=task,
+        successes=tuple(i < wins for i in range(episodes)),
+        lengths=tuple(100 + i for i in range(episodes)),
+        init_states=tuple(range(episodes)),
+        seconds=1.5,
+    )
+
+
+RUN = [
+    START,
+    PhaseRecord(phase="demos", seconds=30.0),
+    evaluation("curve", 0, 0, 0, 0),
+    LossRecord(task=0, epoch=1, loss=-3.25, seconds=2.0),
+    evaluation("curve", 0, 1, 0, 3),
+    evaluation("matrix", 0, 1, 0, 2),
+    TaskEndRecord(task=0, best_epoch=1, seconds=10.0),
+    evaluation("curve", 1, 0, 1, 1),
+    LossRecord(task=1, epoch=1, loss=-4.0, seconds=2.0),
+    evaluation("curve", 1, 1, 1, 4),
+    evaluation("matrix", 1, 1, 0, 1),
+    evaluation("matrix", 1, 1, 1, 4),
+    TaskEndRecord(task=1, best_epoch=1, seconds=10.0),
+    RunEndRecord(seconds=60.0, finished="2026-01-01T00:00:00+00:00"),
+]
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> ResultLog:
+    log = ResultLog(tmp_path / "run" / "results.jsonl")
+    for record in RUN:
+        log.append(record)
+    return log
+
+
+def test_every_kind_of_record_survives_the_round_trip():
+    assert {r.kind for r in RUN} == set(RECORD_TYPES)
+    for record in RUN:
+        line = to_line(record)
+        assert line.count(b"\n") == 1 and from_line(line) == record
+
+
+def test_numbers_that_are_not_finite_stay_strict_json():
+    line = to_line(LossRecord(task=0, epoch=1, loss=float("nan"), seconds=1.0))
+    assert json.loads(line)["loss"] is None
+    assert np.isnan(from_line(line).loss)
+
+
+def test_reading_gives_back_what_was_appended(log: ResultLog):
+    results = log.read()
+    assert list(results.records) == RUN and results.problems == ()
+    assert results.run == START and results.finished
+
+
+def test_no_file_yet_is_an_empty_run(tmp_path: Path):
+    results = ResultLog(tmp_path / "results.jsonl").read()
+    assert results.records == () and not results.has("curve", 0, 0)
+    with pytest.raises(ResultsError, match="stopped before it began"):
+        _ = results.run
+
+
+def test_a_process_killed_at_any_byte_loses_at_most_the_last_record(log: ResultLog):
+    whole = log.path.read_bytes()
+    ends = [i + 1 for i, byte in enumerate(whole) if byte == ord("\n")]
+    for cut in range(0, len(whole), 37):
+        log.path.write_bytes(whole[:cut])
+        complete = sum(end <= cut for end in ends)
+        found = log.read()
+        assert list(found.records[:complete]) == RUN[:complete] and found.problems == ()
+        assert len(found.records) <= complete + 1
+        log.append(RUN[-1])
+        assert log.read() == Results((*found.records, RUN[-1]))
+
+
+def test_only_a_missing_newline_loses_nothing(log: ResultLog):
+    log.path.write_bytes(log.path.read_bytes()[:-1])
+    log.append(RUN[3])
+    assert list(log.read().records) == [*RUN, RUN[3]]
+
+
+def test_reading_never_changes_the_file(log: ResultLog):
+    broken = log.path.read_bytes()[:-7]
+    log.path.write_bytes(broken)
+    log.read()
+    assert log.path.read_bytes() == broken
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("{not json", "not JSON"),
+        ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, eval"),
+        ('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}', "seconds"),
+        (
+            '{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}',
+            "'task' of a 'loss' record",
+        ),
+        ('{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}', "'task' of a 'task_end'"),
+        ("[1, 2]", "unknown kind"),
+    ],
+)
+def test_a_broken_line_is_named_and_the_others_are_read(log: ResultLog, line: str, said: str):
+    lines = log.path.read_text().splitlines()
+    log.path.write_text("\n".join([*lines[:3], line, *lines[3:]]) + "\n")
+    results = log.read()
+    assert list(results.records) == RUN
+    (problem,) = results.problems
+    assert problem.startswith(f"{log.path}:4: ") and said in problem
+
+
+def test_a_full_disk_leaves_whole_lines(log: ResultLog, monkeypatch: pytest.MonkeyPatch):
+    before = log.path.read_bytes()
+
+    def no_space(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(ResultsError, match="No space left.*is intact"):
+        log.append(RUN[3])
+    assert log.path.read_bytes() == before
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
+def test_a_device_that_is_full_is_an_error_with_the_path():
+    with pytest.raises(ResultsError, match="/dev/full"):
+        ResultLog("/dev/full").append(RUN[3])
+
+
+def test_what_is_recorded_need_not_be_done_again(log: ResultLog):
+    results = log.read()
+    assert results.has("matrix", 1, 0) and results.has("matrix", 1, 0, epoch=1)
+    assert not results.has("matrix", 1, 0, epoch=2) and not results.has("curve", 1, 0)
+    assert results.has_loss(0, 1) and not results.has_loss(0, 2)
+    assert results.task_end(1).best_epoch == 1 and results.task_end(2) is None
+
+
+def test_the_last_of_equal_keys_counts(log: ResultLog):
+    log.append(evaluation("matrix", 1, 1, 0, 4))
+    log.append(LossRecord(task=1, epoch=1, loss=-5.0, seconds=2.0))
+    results = log.read()
+    assert results.success_matrix()[0][1, 0] == 1.0
+    assert results.losses()[1][1].tolist() == [-5.0]
+
+
+def test_matrix_and_curves(log: ResultLog):
+    results = log.read()
+    rates, episodes = results.success_matrix()
+    np.testing.assert_array_equal(rates, [[0.5, np.nan], [0.25, 1.0]])
+    np.testing.assert_array_equal(episodes, [[4, 0], [4, 4]])
+    curves = results.curves()
+    assert curves[0].epochs.tolist() == [0, 1] and curves[0].rates.tolist() == [0.0, 0.75]
+    assert results.seconds_by_phase() == {"demos": 30.0, "training": 4.0, "evaluation": 10.5}
+
+
+def test_the_diagonal_can_be_eq_3_to_the_letter(log: ResultLog):
+    rates, _ = log.read().success_matrix(diagonal="curve")
+    np.testing.assert_array_equal(rates, [[0.75, np.nan], [0.25, 1.0]])
+
+
+def test_the_best_of_the_curve_stands_in_for_a_diagonal_that_was_not_evaluated():
+    records = [
+        r for r in RUN if not (isinstance(r, EvalRecord) and r.phase == "matrix" and r.learned == r.task)
+    ]
+    rates, _ = Results(tuple(records)).success_matrix()
+    assert rates[0, 0] == 0.75 and rates[1, 1] == 1.0
+    unfinished = Results(tuple(r for r in records if not isinstance(r, TaskEndRecord)))
+    assert np.isnan(unfinished.success_matrix()[0][0, 0])
+
+
+def test_an_unfinished_run_is_measured_over_the_tasks_it_learned():
+    results = Results(tuple(RUN[:11]))  # the second task's row is half there
+    assert results.learned_tasks() == 1 and not results.finished
+    summary = summarize(results)
+    assert summary["tasks_learned"] == 1
+    assert summary["metrics"]["final_success"]["value"] == 0.5
+    assert summarize(Results((START,)))["metrics"] is None
+
+
+def test_the_summary_is_strict_json_and_complete(log: ResultLog, tmp_path: Path):
+    path = tmp_path / "results.json"
+    written = write_summary(path, log.read(), {"seed": 1, "algo": {"name": "er"}})
+    found = json.loads(path.read_text(), parse_constant=lambda c: pytest.fail(f"{c} is not JSON"))
+    assert found == written
+    assert found["success_matrix"]["rates"] == [[0.5, None], [0.25, 1.0]]
+    assert found["metrics"]["nbt"]["value"] == pytest.approx(0.125)
+    assert found["metrics_diagonal_from_curve"]["nbt"]["value"] == pytest.approx(0.25)
+    assert found["run"]["versions"]["mujoco"] and found["config"]["algo"] == {"name": "er"}
+    assert [p.name for p in tmp_path.glob("*.part")] == []
+
+
+def test_evaluations_without_episodes_are_refused():
+    with pytest.raises(ValueError, match="at least one"):
+        evaluation("curve", 0, 0, 0, 0, episodes=0)
+    with pytest.raises(ValueError, match="'curve' or 'matrix'"):
+        evaluation("test", 0, 0, 0, 0)
