@@ -1,0 +1,23 @@
+"""Network parts that policies are made of: vision, tokens, transformer over time, action heads, augmentation."""
+
+from lifelong.nn.augmentation import Augmentation, ColorJitter, Compose, RandomShift
+from lifelong.nn.heads import ActionHead, DeterministicHead, GMMHead
+from lifelong.nn.tokens import LanguageToken, ProprioTokens
+from lifelong.nn.transformer import TemporalTransformer
+from lifelong.nn.vision import FiLM, ResNetFiLMEncoder, SpatialSoftmax
+
+__all__ = [
+    "ActionHead",
+    "Augmentation",
+    "ColorJitter",
+    "Compose",
+    "DeterministicHead",
+    "FiLM",
+    "GMMHead",
+    "LanguageToken",
+    "ProprioTokens",
+    "RandomShift",
+    "ResNetFiLMEncoder",
+    "SpatialSoftmax",
+    "TemporalTransformer",
+]

@@ -1,0 +1,117 @@
+"""Image augmentation of whole batches: the same change for every frame of a window, drawn anew per window and view.
+
+Shape legend: B batch, T time, V views, H W C image. Images are (B, T, V, H, W, C), uint8 in 0..255.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from lifelong.types import Batch
+
+
+class Augmentation(ABC):
+    """A random change of a batch's images; the batch given is left as it was."""
+
+    @abstractmethod
+    def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Changed images, of the same shape and dtype.
+
+        Args:
+            images: (B, T, V, H, W, C) uint8.
+            generator: a CPU generator; None draws from torch's default one, as dropout does.
+        """
+
+    def __call__(self, batch: Batch, generator: torch.Generator | None = None) -> Batch:
+        """The batch with changed images."""
+        images = self.images(batch.observation.images, generator)
+        return replace(batch, observation=replace(batch.observation, images=images))
+
+
+class Compose(Augmentation):
+    """Several augmentations in order."""
+
+    def __init__(self, augmentations: Sequence[Augmentation]) -> None:
+        self.augmentations = tuple(augmentations)
+
+    def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """See `Augmentation`."""
+        for augmentation in self.augmentations:
+            images = augmentation.images(images, generator)
+        return images
+
+
+class RandomShift(Augmentation):
+    """Shifts by up to `pixels` in each direction, repeating the border (Kostrikov et al., DrQ, ICLR 2021)."""
+
+    def __init__(self, pixels: int = 4) -> None:
+        self.pixels = pixels
+
+    def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """See `Augmentation`."""
+        b, _, v, h, w, _ = images.shape
+        low, high = -self.pixels, self.pixels + 1
+        shifts = torch.randint(low, high, (b, v, 2), generator=generator)
+        rows = (torch.arange(h) + shifts[..., :1]).clamp(0, h - 1).to(images.device)  # (B, V, H)
+        cols = (torch.arange(w) + shifts[..., 1:]).clamp(0, w - 1).to(images.device)  # (B, V, W)
+        batch = torch.arange(b, device=images.device)[:, None, None, None]
+        view = torch.arange(v, device=images.device)[None, :, None, None]
+        moved = images.transpose(1, 2)  # (B, V, T, H, W, C)
+        moved = moved.permute(0, 1, 3, 4, 2, 5)[batch, view, rows[..., None], cols[..., None, :]]
+        return moved.permute(0, 4, 1, 2, 3, 5).contiguous()
+
+
+class ColorJitter(Augmentation):
+    """Brightness, contrast, saturation and hue, each drawn uniformly around no change.
+
+    All four are affine in RGB (hue as a rotation of the chroma plane of YIQ), so one 3x3 matrix and offset
+    per window does it. Applied in the order hue, saturation, contrast, brightness.
+
+    Args:
+        brightness, contrast, saturation: largest relative change.
+        hue: largest turn, as a fraction of the colour circle.
+        keep: chance that a window is left as it is.
+    """
+
+    def __init__(
+        self,
+        brightness: float = 0.3,
+        contrast: float = 0.3,
+        saturation: float = 0.3,
+        hue: float = 0.3,
+        keep: float = 0.1,
+    ) -> None:
+        self.brightness, self.contrast, self.saturation = brightness, contrast, saturation
+        self.hue, self.keep = hue, keep
+
+    def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """See `Augmentation`."""
+        b, t, v, h, w, c = images.shape
+        matrix, contrast, brightness = self._draw(b * v, generator)
+        x = images.to(torch.float32).transpose(1, 2).reshape(b * v, t * h * w, c)
+        matrix, contrast, brightness = (a.to(x.device) for a in (matrix, contrast, brightness))
+        gray = (x.mean(1) @ x.new_tensor(_GRAY))[:, None, None]  # one level per window
+        changed = torch.baddbmm(gray * (1 - contrast) * brightness, x, matrix * (contrast * brightness))
+        changed = changed.round_().clamp_(0, 255).to(images.dtype)
+        return changed.view(b, v, t, h, w, c).transpose(1, 2).contiguous()
+
+    def _draw(self, n: int, generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Colour matrices (n, 3, 3) to multiply from the right, contrast and brightness factors (n, 1, 1)."""
+        uniform = torch.rand(5, n, 1, 1, generator=generator)
+        drawn = torch.where(uniform[4] < self.keep, torch.zeros(4, n, 1, 1), 2 * uniform[:4] - 1)
+        limits = torch.tensor([self.brightness, self.contrast, self.saturation, 2 * math.pi * self.hue])
+        brightness, contrast, saturation, angle = drawn * limits[:, None, None, None]
+        cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        turn = torch.cat([zero + 1, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1).view(n, 3, 3)
+        hue = torch.linalg.inv(_YIQ) @ turn @ _YIQ
+        to_gray = torch.tensor(_GRAY).expand(3, 3)
+        colour = (to_gray * -saturation + torch.eye(3) * (1 + saturation)) @ hue
+        return colour.transpose(1, 2), 1 + contrast, 1 + brightness
+
+
+_GRAY = (0.299, 0.587, 0.114)
+_YIQ = torch.tensor([[0.299, 0.587, 0.114], [0.596, -0.274, -0.322], [0.211, -0.523, 0.312]])

@@ -1,0 +1,147 @@
+"""Latents to actions.
+
+Shape legend: B batch, T time, E latent, K modes, A action.
+"""
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class ActionHead(nn.Module, ABC):
+    """From latents (..., E) to actions in [-1, 1]^A.
+
+    `forward` gives the parameters of a distribution; the other methods read them.
+    """
+
+    @abstractmethod
+    def forward(self, latent: Tensor) -> dict[str, Tensor]:
+        """(..., E) -> the parameters, float32."""
+
+    @abstractmethod
+    def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """Loss of each action (..., A) -> (...)."""
+
+    @abstractmethod
+    def mode(self, params: dict[str, Tensor]) -> Tensor:
+        """The most likely action (..., A)."""
+
+    @abstractmethod
+    def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
+        """A random action (..., A)."""
+
+
+def _trunk(in_dim: int, hidden: int, layers: int) -> nn.Sequential:
+    """`layers` hidden layers with ReLU and one linear layer, as the original's heads have."""
+    modules: list[nn.Module] = []
+    for index in range(layers):
+        modules += [nn.Linear(in_dim if index == 0 else hidden, hidden), nn.ReLU()]
+    return nn.Sequential(*modules, nn.Linear(hidden if layers else in_dim, hidden))
+
+
+class GMMHead(ActionHead):
+    """Mixture of K diagonal Gaussians over actions, means squashed by tanh.
+
+    Mandlekar et al., What matters in learning from offline human demonstrations (CoRL 2021); the sizes are
+    LIBERO's.
+
+    Args:
+        in_dim: E.
+        action_dim: A.
+        modes: K.
+        hidden, layers: sizes of the shared trunk.
+        min_std: smallest standard deviation. The original's 1e-4 lets likelihoods of saturated dimensions
+            grow without bound; 0.02 or so balances dimensions when data and time are short.
+        low_eval_noise: sample with `min_std` instead of the learned deviation in eval mode.
+    """
+
+    def __init__(
+        self,
+        *,
+        in_dim: int,
+        action_dim: int,
+        modes: int = 5,
+        hidden: int = 1024,
+        layers: int = 2,
+        min_std: float = 1e-4,
+        low_eval_noise: bool = False,
+    ) -> None:
+        super().__init__()
+        self.modes, self.action_dim = modes, action_dim
+        self.min_std, self.low_eval_noise = min_std, low_eval_noise
+        self.trunk = _trunk(in_dim, hidden, layers)
+        self.means = nn.Linear(hidden, modes * action_dim)
+        self.stds = nn.Linear(hidden, modes * action_dim)
+        self.logits = nn.Linear(hidden, modes)
+
+    def forward(self, latent: Tensor) -> dict[str, Tensor]:
+        """(..., E) -> `means` (..., K, A) in (-1, 1), `stds` (..., K, A), `logits` (..., K); float32."""
+        h = self.trunk(latent)
+        shape = (*latent.shape[:-1], self.modes, self.action_dim)
+        raw_stds = self.stds(h).float().view(shape)
+        return {
+            "means": self.means(h).float().view(shape).tanh(),
+            "stds": functional.softplus(raw_stds) + self.min_std,
+            "logits": self.logits(h).float(),
+        }
+
+    def log_prob(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """log sum_k w_k prod_a N(action_a; mean_ka, std_ka) of actions (..., A) -> (...)."""
+        with torch.autocast(actions.device.type, enabled=False):
+            z = (actions.float().unsqueeze(-2) - params["means"]) / params["stds"]
+            per_mode = (-0.5 * z.square() - params["stds"].log()).sum(-1)  # (..., K)
+            per_mode = per_mode - 0.5 * self.action_dim * math.log(2.0 * math.pi)
+            return torch.logsumexp(params["logits"].log_softmax(-1) + per_mode, dim=-1)
+
+    def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """Negative log-likelihood of each action, (..., A) -> (...)."""
+        return -self.log_prob(params, actions)
+
+    def mode(self, params: dict[str, Tensor]) -> Tensor:
+        """Mean of the heaviest component, (..., A)."""
+        return _take_mode(params["means"], params["logits"].argmax(-1))
+
+    def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
+        """A draw from the mixture, (..., A)."""
+        weights = params["logits"].softmax(-1)
+        flat = weights.reshape(-1, self.modes)
+        choice = torch.multinomial(flat, 1, generator=generator).view(weights.shape[:-1])
+        mean, std = (_take_mode(params[name], choice) for name in ("means", "stds"))
+        if self.low_eval_noise and not self.training:
+            std = torch.full_like(std, self.min_std)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        return mean + std * noise
+
+
+def _take_mode(values: Tensor, index: Tensor) -> Tensor:
+    """Picks `values` (..., K, A) at `index` (...) -> (..., A)."""
+    index = index[..., None, None].expand(*index.shape, 1, values.shape[-1])
+    return values.gather(-2, index).squeeze(-2)
+
+
+class DeterministicHead(ActionHead):
+    """One action, squashed by tanh, trained by squared error."""
+
+    def __init__(self, *, in_dim: int, action_dim: int, hidden: int = 1024, layers: int = 2) -> None:
+        super().__init__()
+        self.trunk = _trunk(in_dim, hidden, layers)
+        self.means = nn.Linear(hidden, action_dim)
+
+    def forward(self, latent: Tensor) -> dict[str, Tensor]:
+        """(..., E) -> `means` (..., A), float32."""
+        return {"means": self.means(self.trunk(latent)).float().tanh()}
+
+    def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """Squared error, mean over the action's dimensions, (..., A) -> (...)."""
+        return (actions.float() - params["means"]).square().mean(-1)
+
+    def mode(self, params: dict[str, Tensor]) -> Tensor:
+        """The action itself."""
+        return params["means"]
+
+    def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
+        """The action itself: this head is not random."""
+        return params["means"]

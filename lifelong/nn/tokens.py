@@ -1,0 +1,75 @@
+"""Language and proprioception to tokens.
+
+Shape legend: B batch, T time, L language embedding, D one modality's dimension, E token.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+# Fixed centre and scale per modality, so that inputs are of order one from the first task on and no statistic
+# drifts from task to task: rest pose of the arm [rad], half the finger travel [m], the workspace [m].
+_CENTRE_AND_SCALE: dict[str, tuple[tuple[float, ...], float]] = {
+    "joint_states": ((0.0, -0.161, 0.0, -2.4446, 0.0, 2.2268, 0.7854), 0.5),
+    "gripper_states": ((0.02, -0.02), 0.02),
+    "ee_pos": ((0.0, 0.0, 0.3), 0.25),
+}
+
+
+class ProprioTokens(nn.Module):
+    """One token per modality: a linear map of the (scaled) reading.
+
+    Args:
+        proprio: name -> D, in order.
+        dim: E.
+        normalise: bring known modalities to order one first (the original feeds raw radians and metres, in
+            which the gripper's 0.04 m all but vanish).
+        dropout: chance, in training, that a whole modality of a whole window is zeroed, so that the policy
+            does not learn to read the action off the arm's pose alone.
+    """
+
+    def __init__(
+        self, *, proprio: Mapping[str, int], dim: int, normalise: bool = True, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        self.dropout = dropout
+        self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
+        for name, size in proprio.items():
+            centre, scale = _CENTRE_AND_SCALE.get(name, ((0.0,) * size, 1.0))
+            if not normalise or len(centre) != size:
+                centre, scale = (0.0,) * size, 1.0
+            self.register_buffer(f"centre_{name}", torch.tensor(centre), persistent=False)
+            self.register_buffer(f"scale_{name}", torch.tensor(scale), persistent=False)
+
+    def forward(self, proprio: Mapping[str, Tensor]) -> Tensor:
+        """name -> (B, T, D) to (B, T, number of modalities, E)."""
+        tokens = []
+        for name, linear in self.linears.items():
+            x = (proprio[name] - getattr(self, f"centre_{name}")) / getattr(self, f"scale_{name}")
+            if self.training and self.dropout > 0:
+                x = x * (torch.rand(x.shape[0], 1, 1, device=x.device) >= self.dropout)
+            tokens.append(linear(x))
+        return torch.stack(tokens, dim=2)
+
+
+class LanguageToken(nn.Module):
+    """One token for the instruction: a linear map of its embedding."""
+
+    def __init__(self, *, language_dim: int, dim: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(language_dim, dim)
+
+    def forward(self, language: Tensor) -> Tensor:
+        """(B, L) -> (B, E)."""
+        return self.linear(language)
+
+
+def standardise(language: Tensor) -> Tensor:
+    """(B, L) embeddings with mean 0 and variance 1 over L.
+
+    Sentence encoders give unit vectors, whose 384 entries are of order 0.05; BERT's are of order one. This
+    makes a learning rate mean the same for all of them.
+    """
+    return functional.layer_norm(language, language.shape[-1:])

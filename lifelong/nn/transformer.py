@@ -1,0 +1,89 @@
+"""The transformer over time.
+
+Shape legend: B batch, T time, M tokens per time step, E token.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
+    """(length, dim) sine and cosine codes (Vaswani et al., 2017, section 3.5).
+
+    `factor` stands where the paper has 10000: windows are of ten steps, not of a thousand words.
+    """
+    position = torch.arange(length, dtype=torch.float32)[:, None]
+    rate = torch.exp(torch.arange(0, dim, 2, dtype=torch.float32) * (-math.log(factor) / dim))
+    codes = torch.zeros(length, dim)
+    codes[:, 0::2] = torch.sin(position * rate)
+    codes[:, 1::2] = torch.cos(position * rate)[:, : dim // 2]
+    return codes
+
+
+def block_causal_mask(length: int, tokens: int) -> Tensor:
+    """(T M, T M) bool, True where a token may look: at its own time step and earlier ones."""
+    step = torch.arange(length).repeat_interleave(tokens)
+    return step[None, :] <= step[:, None]
+
+
+class TransformerLayer(nn.Module):
+    """Pre-norm self-attention and feed-forward; torch's own layer ties the head size to E / heads, this does not."""
+
+    def __init__(self, *, dim: int, heads: int, head_dim: int, mlp_dim: int, dropout: float) -> None:
+        super().__init__()
+        self.heads, self.head_dim, self.dropout = heads, head_dim, dropout
+        self.attention_norm, self.mlp_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.qkv = nn.Linear(dim, 3 * heads * head_dim, bias=False)
+        self.out = nn.Linear(heads * head_dim, dim)
+        self.drop = nn.Dropout(dropout)
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, mlp_dim), nn.GELU(), nn.Dropout(dropout), nn.Linear(mlp_dim, dim), nn.Dropout(dropout)
+        )
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, S, E), mask (S, S) -> (B, S, E)."""
+        b, s, _ = x.shape
+        qkv = self.qkv(self.attention_norm(x)).view(b, s, 3, self.heads, self.head_dim)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, S, head_dim)
+        dropout = self.dropout if self.training else 0.0
+        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=dropout)
+        x = x + self.drop(self.out(mixed.transpose(1, 2).reshape(b, s, -1)))
+        return x + self.mlp(self.mlp_norm(x))
+
+
+class TemporalTransformer(nn.Module):
+    """Decoder-only transformer in which all tokens of a time step see each other and everything before.
+
+    Args:
+        dim: E.
+        layers, heads, head_dim, mlp_dim, dropout: sizes; the defaults are LIBERO's.
+        max_length: longest window, T.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: int = 64,
+        layers: int = 4,
+        heads: int = 6,
+        head_dim: int = 64,
+        mlp_dim: int = 256,
+        dropout: float = 0.1,
+        max_length: int = 10,
+    ) -> None:
+        super().__init__()
+        sizes = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim, "dropout": dropout}
+        self.layers = nn.ModuleList(TransformerLayer(**sizes) for _ in range(layers))
+        self.register_buffer("positions", sinusoidal_positions(max_length, dim), persistent=False)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, T, M, E) -> (B, T, M, E); every token of a time step carries that step's position code."""
+        b, t, m, e = tokens.shape
+        mask = block_causal_mask(t, m).to(tokens.device)
+        x = (tokens + self.positions[:t, None]).reshape(b, t * m, e)
+        for layer in self.layers:
+            x = layer(x, mask)
+        return x.view(b, t, m, e)

@@ -1,0 +1,188 @@
+"""Images to latents: a ResNet of basic blocks, each modulated by the instruction, read out as keypoints.
+
+Shape legend: N images, C channels, H W image, K keypoints, L language embedding, E latent.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lifelong.errors import PolicyError
+
+
+def make_norm(kind: str, channels: int) -> nn.Module:
+    """Normalisation after a convolution.
+
+    Args:
+        kind: `group` (8 channels a group; no state, so it neither depends on the batch nor drifts from
+            task to task), `batch` (the original's; keeps running statistics) or `none`.
+        channels: C.
+
+    Raises:
+        PolicyError: for another kind.
+    """
+    if kind == "group":
+        return nn.GroupNorm(max(1, channels // 8), channels)
+    if kind == "batch":
+        return nn.BatchNorm2d(channels)
+    if kind == "none":
+        return nn.Identity()
+    raise PolicyError(f"unknown norm {kind!r}. Valid: batch, group, none")
+
+
+class FiLM(nn.Module):
+    """Feature-wise linear modulation: h <- (1 + gamma(language)) h + beta(language).
+
+    Perez et al., FiLM (AAAI 2018), eq. 1-2. Starts as the identity, so an untrained instruction changes
+    nothing.
+    """
+
+    def __init__(self, *, language_dim: int, channels: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(language_dim, 2 * channels)
+        nn.init.zeros_(self.project.weight)
+        nn.init.zeros_(self.project.bias)
+
+    def forward(self, h: Tensor, language: Tensor) -> Tensor:
+        """Modulates `h` (N, C, H, W) by `language` (M, L); N is a multiple of M, frames of a window adjacent."""
+        gamma, beta = self.project(language).to(h.dtype).chunk(2, dim=-1)
+        n, c, height, width = h.shape
+        frames = n // language.shape[0]
+        grouped = h.view(-1, frames, c, height, width)
+        gamma, beta = gamma[:, None, :, None, None], beta[:, None, :, None, None]
+        return torch.addcmul(beta + grouped, grouped, gamma).view(n, c, height, width)
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions and a shortcut (He et al., CVPR 2016, fig. 2 and option B)."""
+
+    def __init__(self, *, in_channels: int, channels: int, stride: int = 1, norm: str = "group") -> None:
+        super().__init__()
+        bias = norm == "none"
+        self.conv1 = nn.Conv2d(in_channels, channels, 3, stride=stride, padding=1, bias=bias)
+        self.norm1 = make_norm(norm, channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=bias)
+        self.norm2 = make_norm(norm, channels)
+        self.shortcut = nn.Identity()
+        if stride != 1 or in_channels != channels:
+            conv = nn.Conv2d(in_channels, channels, 1, stride=stride, bias=bias)
+            self.shortcut = nn.Sequential(conv, make_norm(norm, channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C_in, H, W) -> (N, C, H / stride, W / stride)."""
+        h = functional.relu(self.norm1(self.conv1(x)))
+        h = self.norm2(self.conv2(h))
+        return functional.relu(h + self.shortcut(x))
+
+
+class SpatialSoftmax(nn.Module):
+    """Expected image position of each of K learned heat maps.
+
+    Finn et al., Deep spatial autoencoders (ICRA 2016). Computed in float32: bfloat16 positions would be
+    coarser than a pixel.
+    """
+
+    def __init__(self, *, channels: int, size: tuple[int, int], keypoints: int) -> None:
+        super().__init__()
+        self.heat = nn.Conv2d(channels, keypoints, 1)
+        rows, cols = (torch.linspace(-1.0, 1.0, n) for n in size)
+        grid = torch.stack(torch.meshgrid(cols, rows, indexing="xy"), dim=-1)  # (H, W, 2): x, y
+        self.register_buffer("grid", grid.reshape(-1, 2), persistent=False)
+
+    def forward(self, h: Tensor) -> Tensor:
+        """(N, C, H, W) -> (N, 2 K) positions x, y in [-1, 1], x rightwards and y downwards."""
+        heat = self.heat(h).flatten(2)  # (N, K, H W)
+        with torch.autocast(h.device.type, enabled=False):
+            return (heat.float().softmax(dim=-1) @ self.grid).flatten(1)
+
+
+class ResNetFiLMEncoder(nn.Module):
+    """The image encoder of ResNet-T: ResNet-18's first stages, FiLM after every block, keypoints, one linear map.
+
+    The defaults are LIBERO's (Liu et al., NeurIPS 2023, appendix A): stem and first two stages of ResNet-18,
+    64-d latent from 32 keypoints. Every size is an argument, so that a small one runs on a laptop.
+
+    Args:
+        image_size: H, W in pixels.
+        language_dim: L.
+        latent_dim: E.
+        width: channels of the stem and the first stage; each further stage doubles them.
+        stage_blocks: basic blocks per stage; every stage but the first halves the resolution.
+        stem_kernel, stem_stride, stem_pool: first convolution, and whether a 3x3 stride 2 max pool follows.
+        keypoints: K; None: E / 2.
+        norm: see `make_norm`.
+
+    Raises:
+        PolicyError: when the image is too small for the number of stages.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: tuple[int, int],
+        language_dim: int,
+        latent_dim: int = 64,
+        width: int = 64,
+        stage_blocks: Sequence[int] = (2, 2),
+        stem_kernel: int = 7,
+        stem_stride: int = 2,
+        stem_pool: bool = True,
+        keypoints: int | None = None,
+        norm: str = "group",
+    ) -> None:
+        super().__init__()
+        stem = [
+            nn.Conv2d(3, width, stem_kernel, stem_stride, padding=stem_kernel // 2, bias=norm == "none"),
+            make_norm(norm, width),
+            nn.ReLU(),
+        ]
+        self.stem = nn.Sequential(*stem, *([nn.MaxPool2d(3, 2, padding=1)] if stem_pool else []))
+        self.blocks, self.films = nn.ModuleList(), nn.ModuleList()
+        channels = width
+        for stage, count in enumerate(stage_blocks):
+            for index in range(count):
+                out, stride = width * 2**stage, 2 if stage > 0 and index == 0 else 1
+                self.blocks.append(BasicBlock(in_channels=channels, channels=out, stride=stride, norm=norm))
+                self.films.append(FiLM(language_dim=language_dim, channels=out))
+                channels = out
+        size = self._map_size(image_size)
+        keypoints = keypoints or latent_dim // 2
+        self.keypoints = SpatialSoftmax(channels=channels, size=size, keypoints=keypoints)
+        self.project = nn.Linear(2 * keypoints, latent_dim)
+        self.to(memory_format=torch.channels_last)
+
+    def _map_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Height and width of the feature map the keypoints are read from."""
+        conv, pools = self.stem[0], sum(isinstance(m, nn.MaxPool2d) for m in self.stem)
+        size = []
+        for n in image_size:
+            n = (n + 2 * conv.padding[0] - conv.kernel_size[0]) // conv.stride[0] + 1
+            halvings = pools + sum(block.conv1.stride[0] == 2 for block in self.blocks)
+            for _ in range(halvings):
+                n = (n - 1) // 2 + 1
+            size.append(n)
+        if min(size) < 4:
+            raise PolicyError(
+                f"images of {image_size} leave a feature map of {tuple(size)}, too small to localise anything; "
+                "use larger images, fewer stages, a smaller stem_stride, or stem_pool=false"
+            )
+        return size[0], size[1]
+
+    def forward(self, images: Tensor, language: Tensor) -> Tensor:
+        """Encodes images.
+
+        Args:
+            images: (N, H, W, 3) uint8, or float in [0, 255] (after augmentation).
+            language: (M, L); N = M T with the T frames of a window adjacent.
+
+        Returns:
+            (N, E) latents.
+        """
+        h = images.movedim(-1, 1)  # a view; already channels-last in memory
+        h = h.to(torch.float32).mul(2.0 / 255.0).sub(1.0)
+        h = self.stem(h)
+        for block, film in zip(self.blocks, self.films, strict=True):
+            h = film(block(h), language)
+        return self.project(self.keypoints(h))

@@ -1,0 +1,164 @@
+"""ResNet-T: ResNet with FiLM per camera, a transformer over time, a mixture of Gaussians over actions.
+
+Shape legend: B batch, T time, V views, M tokens per step, E token, A action, L language embedding.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lifelong.errors import PolicyError
+from lifelong.nn.heads import DeterministicHead, GMMHead
+from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
+from lifelong.nn.transformer import TemporalTransformer
+from lifelong.nn.vision import ResNetFiLMEncoder
+from lifelong.policies.base import Policy
+from lifelong.types import Batch, Observation, PolicySpec
+
+
+class BCTransformer(Policy):
+    """Behaviour cloning with LIBERO's ResNet-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
+
+    Each time step becomes M tokens: the instruction, one per proprioceptive modality, one per camera. All
+    tokens of a step see each other and everything earlier; the action is read from the instruction's token.
+    The defaults are the paper's sizes: with a 768-d embedding, two cameras and two modalities it has
+    5 383 307 parameters, as the original.
+
+    Args:
+        spec: what the policy sees and does; `spec.seq_len` is the longest history.
+        embed_dim: E, also the size of an image's latent.
+        image_width, stage_blocks, stem_kernel, stem_stride, stem_pool, keypoints, norm: image encoder, see
+            `ResNetFiLMEncoder`. Each camera has its own.
+        layers, heads, head_dim, mlp_dim, dropout: transformer, see `TemporalTransformer`.
+        head: `gmm` or `deterministic`.
+        head_hidden, head_layers, modes, min_std, low_eval_noise: see `GMMHead`.
+        stochastic: sample actions instead of taking the most likely one; needs generators to act.
+        normalise_proprio, proprio_dropout: see `ProprioTokens`.
+        standardise_language: bring embeddings to mean 0 and variance 1, so that unit vectors of sentence
+            encoders weigh as much as BERT's outputs.
+
+    Raises:
+        PolicyError: an unknown head or norm, or sizes that cannot work.
+    """
+
+    def __init__(
+        self,
+        *,
+        spec: PolicySpec,
+        embed_dim: int = 64,
+        image_width: int = 64,
+        stage_blocks: Sequence[int] = (2, 2),
+        stem_kernel: int = 7,
+        stem_stride: int = 2,
+        stem_pool: bool = True,
+        keypoints: int | None = None,
+        norm: str = "group",
+        layers: int = 4,
+        heads: int = 6,
+        head_dim: int = 64,
+        mlp_dim: int = 256,
+        dropout: float = 0.1,
+        head: str = "gmm",
+        head_hidden: int = 1024,
+        head_layers: int = 2,
+        modes: int = 5,
+        min_std: float = 1e-4,
+        low_eval_noise: bool = False,
+        stochastic: bool = False,
+        normalise_proprio: bool = True,
+        proprio_dropout: float = 0.0,
+        standardise_language: bool = True,
+    ) -> None:
+        super().__init__(spec)
+        self.stochastic, self.standardise_language = stochastic, standardise_language
+        self.encoders = nn.ModuleDict(
+            {
+                view: ResNetFiLMEncoder(
+                    image_size=spec.image_size,
+                    language_dim=spec.language_dim,
+                    latent_dim=embed_dim,
+                    width=image_width,
+                    stage_blocks=stage_blocks,
+                    stem_kernel=stem_kernel,
+                    stem_stride=stem_stride,
+                    stem_pool=stem_pool,
+                    keypoints=keypoints,
+                    norm=norm,
+                )
+                for view in spec.views
+            }
+        )
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
+        self.proprio = ProprioTokens(
+            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
+        )
+        self.transformer = TemporalTransformer(
+            dim=embed_dim,
+            layers=layers,
+            heads=heads,
+            head_dim=head_dim,
+            mlp_dim=mlp_dim,
+            dropout=dropout,
+            max_length=spec.seq_len,
+        )
+        sizes = {"in_dim": embed_dim, "action_dim": spec.action_dim, "hidden": head_hidden, "layers": head_layers}
+        if head == "gmm":
+            self.head = GMMHead(**sizes, modes=modes, min_std=min_std, low_eval_noise=low_eval_noise)
+        elif head == "deterministic":
+            self.head = DeterministicHead(**sizes)
+        else:
+            raise PolicyError(f"unknown head {head!r}. Valid: deterministic, gmm")
+        self._history: Tensor | None = None  # (B, <= seq_len, M, E)
+        self._num_envs: int | None = None
+
+    def encode(self, observation: Observation) -> Tensor:
+        """The tokens of every time step, (B, T, M, E); each step by itself."""
+        images, language = observation.images, observation.language
+        b, t = images.shape[:2]
+        if self.standardise_language:
+            language = standardise(language)
+        tokens = [self.language(language)[:, None, None].expand(b, t, 1, -1)]
+        if self.spec.proprio:
+            tokens.append(self.proprio(observation.proprio))
+        for view, encoder in enumerate(self.encoders.values()):
+            latent = encoder(images[:, :, view].flatten(0, 1), language)
+            tokens.append(latent.view(b, t, 1, -1))
+        return torch.cat(tokens, dim=2)
+
+    def distribution(self, observation: Observation) -> dict[str, Tensor]:
+        """Parameters of the action distribution at every step of a window; see the head."""
+        return self.head(self.transformer(self.encode(observation))[:, :, 0])
+
+    def window_losses(self, batch: Batch) -> Tensor:
+        """See `Policy`."""
+        return self.head.losses(self.distribution(batch.observation), batch.actions).mean(-1)
+
+    def reset(self, num_envs: int) -> None:
+        """See `Policy`."""
+        self._history, self._num_envs = None, num_envs
+
+    def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
+        params = self._step(observation)
+        if not self.stochastic:
+            return self.head.mode(params)
+        if generators is None or len(generators) != self._num_envs:
+            raise PolicyError("a stochastic policy needs one generator per environment to act: act(..., generators=[...])")
+        draws = [
+            self.head.sample({k: v[i : i + 1].cpu() for k, v in params.items()}, generator)
+            for i, generator in enumerate(generators)
+        ]
+        return torch.cat(draws).to(observation.images.device)
+
+    def _step(self, observation: Observation) -> dict[str, Tensor]:
+        """Appends a step to the history; the parameters of the distribution of the next action."""
+        if self._num_envs != len(observation.images):
+            raise PolicyError(
+                f"reset announced {self._num_envs} environments, the observation has {len(observation.images)}; "
+                "call reset(num_envs) at the start of an episode"
+            )
+        tokens = self.encode(observation)
+        if self._history is not None:
+            tokens = torch.cat([self._history[:, 1 - self.spec.seq_len :], tokens], dim=1)
+        self._history = tokens[:, -self.spec.seq_len :]
+        return self.head(self.transformer(self._history)[:, -1, 0])
