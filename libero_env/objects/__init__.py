@@ -1,0 +1,9 @@
+"""Catalog of objects: a category name gives a MuJoCo model with the figures that placement needs.
+
+The builtin pack is generated in code; users add their own with `register_object`.
+"""
+
+from libero_env.objects.catalog import get_object, object_names, register_object
+from libero_env.objects.model import ObjectModel
+
+__all__ = ["ObjectModel", "get_object", "object_names", "register_object"]

@@ -1,0 +1,10 @@
+"""The builtin pack: objects generated in code; `BUILDERS` maps category to builder."""
+
+from libero_env.objects.builtin.assemble import builders_of
+from libero_env.objects.builtin.basket import LOOKS as _BASKET
+from libero_env.objects.builtin.bottles import LOOKS as _BOTTLES
+from libero_env.objects.builtin.boxes import LOOKS as _BOXES
+from libero_env.objects.builtin.cans import LOOKS as _CANS
+from libero_env.objects.builtin.cartons import LOOKS as _CARTONS
+
+BUILDERS = builders_of({**_BASKET, **_BOTTLES, **_BOXES, **_CANS, **_CARTONS})

@@ -1,0 +1,144 @@
+"""Small textured triangle meshes: lofts along a vertical axis, and boxes.
+
+All shapes stand in the rest frame: z up, the front towards +x, metres. Texture coordinates are (u, v)
+with v = 0 at the lower edge of the picture; around a loft, u runs from the back (0) over the left of a
+viewer in front (-y), the front (0.5) and the right (+y) to the back again (1).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles with one texture coordinate per vertex.
+
+    Attributes:
+        vertices: (n, 3) metres.
+        faces: (m, 3) vertex indices, counter-clockwise seen from outside.
+        texcoords: (n, 2).
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    texcoords: np.ndarray
+
+    def rotated(self, quat: np.ndarray) -> "Mesh":
+        """The mesh turned by a quaternion wxyz (4,)."""
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
+        return Mesh(self.vertices @ matrix.reshape(3, 3).T, self.faces, self.texcoords)
+
+
+@dataclass(frozen=True)
+class Ring:
+    """One section of a loft: a superellipse in a horizontal plane.
+
+    Attributes:
+        z: height, metres.
+        depth: half extent along x, metres.
+        width: half extent along y, metres.
+        v: texture height of the section.
+        round: exponent: 2 is an ellipse, larger is boxier.
+        crease: the surface has an edge here, shaded sharp.
+    """
+
+    z: float
+    depth: float
+    width: float
+    v: float
+    round: float = 2.0
+    crease: bool = False
+
+
+def loft(rings: Sequence[Ring], segments: int, center: tuple[float, float] = (0.0, 0.0)) -> Mesh:
+    """Skin over sections from bottom to top (or inside to outside); ends of size 0 close it.
+
+    Args:
+        rings: sections in order; the outside is to the right of the path when the axis is on the left.
+        segments: vertices around.
+        center: (x, y) of the axis, metres.
+    """
+    rows, coords, quads = [], [], []
+    for index, ring in enumerate(rings):
+        if index:
+            quads.append((len(rows) - 1, len(rows)))
+        for _ in range(2 if ring.crease and 0 < index < len(rings) - 1 else 1):
+            points, texcoords = _section(ring, segments, center)
+            rows.append(points)
+            coords.append(texcoords)
+    faces = np.concatenate([_band(low, high, segments) for low, high in quads])
+    vertices = np.concatenate(rows)
+    return Mesh(vertices, _without_degenerate(vertices, faces), np.concatenate(coords))
+
+
+def box(half: Sequence[float], center: Sequence[float], cells: dict[str, tuple[float, ...]]) -> Mesh:
+    """Box whose faces show rectangles of the picture.
+
+    Args:
+        half: half extents (x, y, z), metres.
+        center: (x, y, z), metres.
+        cells: face name (front, back, left, right, top, bottom) -> (u0, v0, u1, v1); faces are seen from
+            outside with z up, top and bottom with the front edge below; right is +y.
+    """
+    frames = {  # face -> (normal, to the right, upwards)
+        "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        "back": ((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
+        "right": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+        "left": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+        "top": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+        "bottom": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    }
+    quads = []
+    for face, (normal, right, up) in frames.items():
+        corners = [np.add(normal, np.add(np.multiply(s, right), np.multiply(t, up))) for s, t in _CORNERS]
+        quads.append(quad([np.add(center, np.multiply(half, corner)) for corner in corners], cells[face]))
+    return merge(quads)
+
+
+def quad(corners: Sequence[Sequence[float]], cell: tuple[float, ...]) -> Mesh:
+    """Four corners, counter-clockwise from the lower left, showing (u0, v0, u1, v1) of the picture."""
+    u0, v0, u1, v1 = cell
+    texcoords = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1)], float)
+    return Mesh(np.array(corners, float), np.array([(0, 1, 2), (0, 2, 3)]), texcoords)
+
+
+def merge(meshes: Sequence[Mesh]) -> Mesh:
+    """All triangles in one mesh."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+        np.concatenate([mesh.texcoords for mesh in meshes]),
+    )
+
+
+_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+
+
+def _section(ring: Ring, segments: int, center: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    # The seam's column stands twice: u = 0 and u = 1.
+    u = np.linspace(0.0, 1.0, segments + 1)
+    angle = 2.0 * np.pi * (u - 0.5)
+    bend = 2.0 / ring.round
+    x = np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** bend * ring.depth + center[0]
+    y = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** bend * ring.width + center[1]
+    return (
+        np.column_stack([x, y, np.full_like(u, ring.z)]),
+        np.column_stack([u, np.full_like(u, ring.v)]),
+    )
+
+
+def _band(low: int, high: int, segments: int) -> np.ndarray:
+    start, column = segments + 1, np.arange(segments)
+    a, b = low * start + column, high * start + column
+    return np.concatenate([np.column_stack([a, a + 1, b + 1]), np.column_stack([a, b + 1, b])])
+
+
+def _without_degenerate(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return faces[np.linalg.norm(normal, axis=1) > 1e-12]

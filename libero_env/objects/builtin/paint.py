@@ -1,0 +1,65 @@
+"""Labels: small pictures drawn with (u, v) coordinates, v upwards, as the meshes use them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+Color = tuple[int, int, int]
+
+_OVERSAMPLE = 4
+
+
+class Canvas:
+    """A picture to paint on; edges are smoothed by drawing large and shrinking.
+
+    Args:
+        color: background, RGB 0..255.
+        size: width and height in pixels.
+    """
+
+    def __init__(self, color: Color, size: tuple[int, int] = (128, 128)):
+        self._size = size
+        self._image = Image.new("RGB", (size[0] * _OVERSAMPLE, size[1] * _OVERSAMPLE), color)
+        self._draw = ImageDraw.Draw(self._image)
+
+    def rect(self, u0: float, v0: float, u1: float, v1: float, color: Color) -> None:
+        """Fills a rectangle."""
+        (x0, y1), (x1, y0) = self._at(u0, v0), self._at(u1, v1)
+        self._draw.rectangle((x0, y0, x1 - 1, y1 - 1), fill=color)
+
+    def band(self, v0: float, v1: float, color: Color) -> None:
+        """Fills a band over the whole width."""
+        self.rect(0.0, v0, 1.0, v1, color)
+
+    def disc(self, u: float, v: float, ru: float, rv: float, color: Color) -> None:
+        """Fills an ellipse with half axes (ru, rv)."""
+        (x0, y1), (x1, y0) = self._at(u - ru, v - rv), self._at(u + ru, v + rv)
+        self._draw.ellipse((x0, y0, x1, y1), fill=color)
+
+    def polygon(self, points: Sequence[tuple[float, float]], color: Color) -> None:
+        """Fills a polygon of (u, v) points."""
+        self._draw.polygon([self._at(u, v) for u, v in points], fill=color)
+
+    def line(self, points: Sequence[tuple[float, float]], width: float, color: Color) -> None:
+        """Draws a line; `width` is a share of the picture's width."""
+        pixels = max(1, round(width * self._image.width))
+        self._draw.line([self._at(u, v) for u, v in points], fill=color, width=pixels, joint="curve")
+
+    def text(self, text: str, cell: tuple[float, float, float, float], color: Color, turn: int = 0) -> None:
+        """Writes text stretched to fill (u0, v0, u1, v1); `turn` rotates it left by 0, 90, 180 or 270 deg."""
+        font = ImageFont.load_default(64)
+        box = font.getbbox(text, stroke_width=2)
+        mask = Image.new("L", (round(box[2] - box[0]), round(box[3] - box[1])), 0)
+        ImageDraw.Draw(mask).text((-box[0], -box[1]), text, fill=255, font=font, stroke_width=2)
+        (x0, y1), (x1, y0) = self._at(*cell[:2]), self._at(*cell[2:])
+        mask = mask.rotate(turn, expand=True)
+        mask = mask.resize((max(1, round(x1 - x0)), max(1, round(y1 - y0))), Image.Resampling.BILINEAR)
+        self._image.paste(color, (round(x0), round(y0)), mask)
+
+    def pixels(self) -> np.ndarray:
+        """The picture (H, W, 3) uint8."""
+        return np.asarray(self._image.resize(self._size, Image.Resampling.BOX)).copy()
+
+    def _at(self, u: float, v: float) -> tuple[float, float]:
+        return u * self._image.width, (1.0 - v) * self._image.height
