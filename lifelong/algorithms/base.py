@@ -1,0 +1,104 @@
+"""The hooks through which an algorithm acts on training; the defaults are plain fine-tuning.
+
+The order in which they are called, for every task:
+
+    begin_task
+      for each of phases():  begin_phase
+                             per step: mix -> (policy loss) + penalty -> after_backward -> after_step
+                             end_phase          with the phase's best weights loaded
+    end_task
+    policy_for                                  around every rollout
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from lifelong.policies.base import Policy
+from lifelong.types import Batch
+
+
+class WindowDataset(Protocol):
+    """The windows of one task's demonstrations."""
+
+    def __len__(self) -> int: ...
+
+    def batch(self, indices: Tensor) -> Batch:
+        """The windows of these indices ((B,) int64), as one batch."""
+        ...
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One stretch of training on a task.
+
+    Attributes:
+        name: Stands in the records and in checkpoint file names.
+        share: Epochs of this phase as a share of the configured epochs.
+        measures_transfer: Whether success during this phase is the learning curve of forward transfer.
+    """
+
+    name: str = "train"
+    share: float = 1.0
+    measures_transfer: bool = True
+
+
+class Algorithm:
+    """Sequential fine-tuning; a base for algorithms, which override the hooks they need."""
+
+    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+        """Before the first step on a task (position `task_index` in the sequence)."""
+
+    def phases(self) -> tuple[Phase, ...]:
+        """The stretches of training every task goes through, in order."""
+        return (Phase(),)
+
+    def begin_phase(self, phase: Phase, policy: Policy) -> None:
+        """Before the first step of a phase; not called again when a killed run goes on inside it."""
+
+    def mode_train(self, policy: Policy) -> None:
+        """Put the policy in training mode; an algorithm may keep some layers in evaluation mode."""
+        policy.train()
+
+    def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """The batch the loss is taken on: what came from the task's data, plus what the algorithm adds."""
+        return batch
+
+    def penalty(self, policy: Policy) -> Tensor | None:
+        """A scalar added to the loss, or None."""
+        return None
+
+    def after_backward(self, policy: Policy) -> None:
+        """With gradients in place, before they are clipped."""
+
+    def after_step(self, policy: Policy) -> None:
+        """After the optimiser moved the weights."""
+
+    def end_phase(self, phase: Phase, policy: Policy) -> None:
+        """After the last step of a phase, with the weights that are kept."""
+
+    def end_task(
+        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """After training on a task, with the final weights."""
+
+    @contextmanager
+    def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
+        """Within the context, the policy that acts on a task; afterwards the policy is as before."""
+        yield policy
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+        """Take up what `state_dict` gave.
+
+        Args:
+            state: From `state_dict`.
+            datasets: The windows of the tasks learned so far, by position; each is read when asked for.
+        """

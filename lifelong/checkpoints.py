@@ -1,0 +1,118 @@
+"""Checkpoints: nested dictionaries of tensors and plain values, in one safetensors file.
+
+The tensors are stored under their path in the tree; everything else is JSON in the file's header. Nothing is
+executed on load, and a file is either complete or not there at all.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from lifelong.errors import CheckpointError
+
+_FORMAT = "lifelong-1"
+
+
+def save(path: Path, tree: dict[str, Any]) -> None:
+    """Write a tree to a file, replacing an older one in a single step.
+
+    Args:
+        path: Where to; the folder is made if need be.
+        tree: Dictionaries (keys str or int), lists and tuples with tensors, str, int, float, bool or None as
+            leaves.
+
+    Raises:
+        CheckpointError: A leaf of another kind, or the disk is full.
+    """
+    tensors: dict[str, Tensor] = {}
+    plain = _encode(tree, "", tensors)
+    tensors.setdefault("", torch.zeros(0))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        save_file(tensors, partial, metadata={"format": _FORMAT, "tree": json.dumps(plain)})
+        os.replace(partial, path)
+    except (OSError, SafetensorError) as error:
+        message = f"cannot write {path}: {error}. Free some space; the older file is intact"
+        raise CheckpointError(message) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The tree a file holds.
+
+    Raises:
+        CheckpointError: The file is missing, truncated, or not one of ours.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}")
+    try:
+        with safe_open(path, framework="pt", device=str(device)) as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != _FORMAT:
+                raise CheckpointError(
+                    f"{path} is a safetensors file of another program (format {metadata.get('format')!r}, "
+                    f"expected {_FORMAT!r})"
+                )
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        return _decode(json.loads(metadata["tree"]), tensors)
+    except (OSError, SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise CheckpointError(
+            f"{path} is broken ({error}). Delete it: the run goes on from what was saved before"
+        ) from error
+
+
+def load_weights(module: torch.nn.Module, state: dict[str, Tensor], source: Path | str) -> None:
+    """Put weights into a module.
+
+    Raises:
+        CheckpointError: Names or shapes differ; the message names the first of them. The module is untouched.
+    """
+    own = module.state_dict()
+    for name, tensor in own.items():
+        if name not in state:
+            raise CheckpointError(f"{source} has no {name}: it was made with another policy configuration")
+        if state[name].shape != tensor.shape:
+            raise CheckpointError(
+                f"{source}: {name} has shape {tuple(state[name].shape)}, the policy's {tuple(tensor.shape)}"
+            )
+    extra = sorted(set(state) - set(own))
+    if extra:
+        raise CheckpointError(f"{source} has {extra[0]}, which the policy has not")
+    module.load_state_dict(state)
+
+
+def _encode(node: Any, path: str, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(node, Tensor):
+        tensors[path] = node.detach().cpu().clone(memory_format=torch.contiguous_format)
+        return {"tensor": path}
+    if isinstance(node, dict):
+        items = [[k, _encode(v, f"{path}/{k}", tensors)] for k, v in node.items()]
+        if not all(isinstance(k, str | int) for k, _ in items):
+            raise CheckpointError(f"keys at {path or '/'} are not all str or int: {list(node)[:3]}")
+        return {"dict": items}
+    if isinstance(node, list | tuple):
+        return {type(node).__name__: [_encode(v, f"{path}/{i}", tensors) for i, v in enumerate(node)]}
+    if node is None or isinstance(node, str | int | float | bool):
+        return {"value": node}
+    raise CheckpointError(f"cannot store a {type(node).__name__} at {path}")
+
+
+def _decode(node: dict[str, Any], tensors: dict[str, Tensor]) -> Any:
+    ((kind, content),) = node.items()
+    if kind == "tensor":
+        return tensors[content]
+    if kind == "dict":
+        return {k: _decode(v, tensors) for k, v in content}
+    if kind in ("list", "tuple"):
+        values: Iterator[Any] = (_decode(v, tensors) for v in content)
+        return list(values) if kind == "list" else tuple(values)
+    return content

@@ -1,0 +1,264 @@
+"""The training loop: there is no other."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.checkpoints import load_weights
+from lifelong.errors import ConfigError, TrainingError
+from lifelong.policies.base import Policy
+from lifelong.types import Batch
+
+ImageAugmentation = Callable[[Tensor, torch.Generator], Tensor]
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a task is trained; the defaults are those of the paper (appendix B) and its code.
+
+    Attributes:
+        epochs: Passes over the task's windows.
+        batch_size: Windows per step.
+        steps_per_epoch: Steps that count as one epoch; None: every window once (the last batch is
+            topped up).
+        lr: Learning rate of AdamW at the start.
+        lr_min: Where the cosine schedule ends, at the last step of the task.
+        warmup_steps: Steps over which the rate rises linearly from zero.
+        betas: AdamW's decay rates.
+        weight_decay: AdamW's decoupled weight decay.
+        grad_clip: Largest norm of the gradient; 0 switches clipping off.
+        precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor has it.
+    """
+
+    epochs: int = 50
+    batch_size: int = 32
+    steps_per_epoch: int | None = None
+    lr: float = 1e-4
+    lr_min: float = 1e-5
+    warmup_steps: int = 0
+    betas: Sequence[float] = (0.9, 0.999)
+    weight_decay: float = 1e-4
+    grad_clip: float = 100.0
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+
+    def __post_init__(self) -> None:
+        if self.precision not in ("auto", "bf16", "fp32"):
+            raise ConfigError(f"train.precision is {self.precision!r}; valid: auto, bf16, fp32")
+        for name in ("epochs", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"train.{name} is {getattr(self, name)}; it must be at least 1")
+
+
+@dataclass(frozen=True)
+class EpochEnd:
+    """What a caller learns at the end of an epoch.
+
+    Attributes:
+        epoch: Epochs done; 0 is before the first step.
+        loss: Mean of the policy's loss over the epoch; nan at epoch 0.
+        penalty: Mean of the algorithm's penalty.
+        seconds: Wall-clock time of the epoch.
+        state: Gives what `fit(resume=...)` needs to go on from here.
+    """
+
+    epoch: int
+    loss: float
+    penalty: float
+    seconds: float
+    state: Callable[[], dict[str, Any]]
+
+
+def fit(
+    policy: Policy,
+    dataset: WindowDataset,
+    algorithm: Algorithm,
+    *,
+    settings: FitSettings,
+    seed: Sequence[int],
+    device: torch.device | str = "cpu",
+    augment: ImageAugmentation | None = None,
+    on_epoch: Callable[[EpochEnd], None] | None = None,
+    resume: dict[str, Any] | None = None,
+    label: str = "",
+    progress: bool = False,
+) -> None:
+    """Train a policy on one task's windows, with what the algorithm adds.
+
+    On one machine the result depends on the arguments alone: each epoch's randomness is derived from `seed`
+    and the epoch, and the global generators are as before afterwards. A call that takes up a state goes on to
+    the same bits as one that never stopped.
+
+    Args:
+        policy: Trained in place; has `loss(batch) -> scalar`.
+        dataset: The task's windows.
+        algorithm: Its hooks are called at each step; the caller has called `begin_phase` (or loaded
+            its state).
+        settings: Epochs, batch size, optimiser.
+        seed: Whole numbers that name this stretch of training.
+        device: Where the policy is.
+        augment: Applied to the images of each mixed batch, with the epoch's generator.
+        on_epoch: Called at the end of each epoch, at epoch 0 too, and once more for the epoch taken up.
+        resume: A state from `EpochEnd.state`.
+        label: Stands before the progress bar.
+        progress: Show a progress bar with the time left.
+
+    Raises:
+        TrainingError: The dataset is empty, or the loss is not finite.
+    """
+    if not len(dataset):
+        raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
+    device = torch.device(device)
+    steps = settings.steps_per_epoch or math.ceil(len(dataset) / settings.batch_size)
+    optimizer = _optimizer(policy, settings)
+    first, loss, penalty = 0, math.nan, 0.0
+    if resume is not None:
+        first, loss, penalty = _take_up(resume, policy, optimizer)
+    total = settings.epochs * steps
+    bar = tqdm(total=total, initial=first * steps, desc=label, disable=not progress, unit="step", leave=False)
+
+    def end(epoch: int, seconds: float) -> None:
+        if on_epoch is not None:
+            state = lambda: _state(epoch, loss, penalty, policy, optimizer)  # noqa: E731
+            on_epoch(EpochEnd(epoch, loss, penalty, seconds, state))
+
+    with bar:
+        end(first, 0.0)
+        for epoch in range(first, settings.epochs):
+            started = time.perf_counter()
+            rate = lambda k, e=epoch: learning_rate(e * steps + k, total, settings)  # noqa: E731
+            step = _Step(policy, algorithm, optimizer, settings, device, augment)
+            loss, penalty = _epoch(step, dataset, steps, (*seed, epoch), rate, bar)
+            end(epoch + 1, time.perf_counter() - started)
+
+
+def learning_rate(step: int, total: int, settings: FitSettings) -> float:
+    """Linear warm-up, then half a cosine from `lr` to `lr_min` over the steps of the task."""
+    if step < settings.warmup_steps:
+        return settings.lr * (step + 1) / settings.warmup_steps
+    share = (step - settings.warmup_steps) / max(1, total - settings.warmup_steps)
+    return settings.lr_min + (settings.lr - settings.lr_min) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+def autocast(device: torch.device, precision: str) -> torch.autocast:
+    """The autocast context of a precision; `auto` takes bf16 where the processor computes in it."""
+    if precision == "auto":
+        if device.type == "cuda":
+            fast = torch.cuda.is_bf16_supported()
+        else:
+            fast = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        precision = "bf16" if fast else "fp32"
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+
+
+def generator(*seed: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A torch generator for a list of whole numbers."""
+    return torch.Generator(device).manual_seed(_word(seed))
+
+
+def _word(seed: Sequence[int]) -> int:
+    return int(np.random.SeedSequence(list(seed)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One step of the optimiser."""
+
+    policy: Policy
+    algorithm: Algorithm
+    optimizer: torch.optim.Optimizer
+    settings: FitSettings
+    device: torch.device
+    augment: ImageAugmentation | None
+
+    def __call__(self, batch: Batch, generator: torch.Generator, lr: float) -> tuple[Tensor, Tensor]:
+        batch = self.algorithm.mix(batch, generator)
+        if self.augment is not None:
+            images = self.augment(batch.observation.images, generator)
+            batch = replace(batch, observation=replace(batch.observation, images=images))
+        batch = batch.to(self.device)
+        with autocast(self.device, self.settings.precision):
+            loss = self.policy.loss(batch)
+        penalty = self.algorithm.penalty(self.policy)
+        self.optimizer.zero_grad(set_to_none=True)
+        (loss if penalty is None else loss + penalty).backward()
+        self.algorithm.after_backward(self.policy)
+        if self.settings.grad_clip:
+            nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.grad_clip)
+        for group in self.optimizer.param_groups:
+            group["lr"] = lr
+        self.optimizer.step()
+        self.algorithm.after_step(self.policy)
+        return loss.detach(), torch.zeros_like(loss) if penalty is None else penalty.detach()
+
+
+def _epoch(
+    step: _Step,
+    dataset: WindowDataset,
+    steps: int,
+    seed: Sequence[int],
+    rate: Callable[[int], float],
+    bar: tqdm,
+) -> tuple[float, float]:
+    """Mean loss and mean penalty of an epoch."""
+    draws = generator(*seed, 0)
+    order = _order(len(dataset), steps * step.settings.batch_size, draws)
+    losses, penalties = [], []
+    cuda = [step.device] if step.device.type == "cuda" else []
+    step.algorithm.mode_train(step.policy)
+    with torch.random.fork_rng(devices=cuda):
+        torch.manual_seed(_word((*seed, 1)))  # dropout draws from the global generator, put back afterwards
+        for k, indices in enumerate(order.split(step.settings.batch_size)):
+            loss, penalty = step(dataset.batch(indices), draws, rate(k))
+            losses.append(loss)
+            penalties.append(penalty)
+            bar.update()
+    loss = torch.stack(losses).float().mean().item()
+    if not math.isfinite(loss):
+        raise TrainingError(
+            f"the loss is {loss}: lower train.lr or algo.strength, or set "
+            "train.precision=fp32"
+        )
+    bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
+    return loss, torch.stack(penalties).float().mean().item()
+
+
+def _order(windows: int, wanted: int, draws: torch.Generator) -> Tensor:
+    """Indices of an epoch: permutations one after the other, cut to the number wanted."""
+    rounds = math.ceil(wanted / windows)
+    order = torch.cat([torch.randperm(windows, generator=draws) for _ in range(rounds)])
+    return order[:wanted]
+
+
+def _optimizer(policy: Policy, settings: FitSettings) -> torch.optim.AdamW:
+    trained = [p for p in policy.parameters() if p.requires_grad]
+    return torch.optim.AdamW(
+        trained, lr=settings.lr, betas=tuple(settings.betas), weight_decay=settings.weight_decay
+    )
+
+
+def _state(
+    epoch: int, loss: float, penalty: float, policy: Policy, optimizer: torch.optim.Optimizer
+) -> dict[str, Any]:
+    return {
+        "epoch": epoch,
+        "loss": loss,
+        "penalty": penalty,
+        "policy": policy.state_dict(),
+        "optimizer": optimizer.state_dict(),
+    }
+
+
+def _take_up(
+    state: dict[str, Any], policy: Policy, optimizer: torch.optim.Optimizer
+) -> tuple[int, float, float]:
+    load_weights(policy, state["policy"], "the training state")
+    optimizer.load_state_dict(state["optimizer"])
+    return state["epoch"], state["loss"], state["penalty"]

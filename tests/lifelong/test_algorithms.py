@@ -1,0 +1,181 @@
+"""What each algorithm promises, as properties."""
+
+import copy
+
+import pytest
+import torch
+
+from lifelong import checkpoints
+from lifelong.algorithms import ER, EWC, Algorithm, PackNet, Sequential
+from lifelong.errors import ConfigError
+from lifelong.training import FitSettings, fit, generator
+from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
+
+SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precision="fp32")
+
+
+def learn(algorithm: Algorithm, policy, task: int) -> None:
+    """A task from its beginning to its end, as the experiment walks through it."""
+    dataset = Windows(task)
+    algorithm.begin_task(task, dataset, policy)
+    for number, phase in enumerate(algorithm.phases()):
+        algorithm.begin_phase(phase, policy)
+        fit(policy, dataset, algorithm, settings=SETTINGS, seed=(task, number))
+        algorithm.end_phase(phase, policy)
+    algorithm.end_task(task, dataset, policy, generator(task))
+
+
+def outputs(algorithm: Algorithm, policy, task: int) -> torch.Tensor:
+    with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
+        acting.eval()
+        return acting(Windows(task).features[:, None])
+
+
+# --- ER
+
+
+def test_er_is_never_over_budget_and_replays_earlier_tasks_only():
+    policy, algorithm, draws = LinearPolicy(), ER(budget=25), generator(0)
+    for task in range(4):
+        batch = Windows(task).batch(torch.arange(8))
+        mixed = algorithm.mix(batch, draws)
+        assert len(mixed) == (16 if task else 8)
+        assert torch.equal(mixed.actions[:8], batch.actions)
+        assert set(mixed.task_ids[8:].tolist()) <= set(range(task))
+        learn(algorithm, policy, task)
+        assert len(algorithm.memory) <= 25
+    assert set(algorithm.memory.shares) == set(range(4))
+
+
+# --- EWC
+
+
+def test_ewc_has_no_penalty_before_the_first_task_ends():
+    assert EWC().penalty(LinearPolicy()) is None
+
+
+@pytest.mark.parametrize("fisher", ["per_sample", "batch"])
+def test_ewc_penalty_is_zero_at_the_anchor_and_only_there(fisher):
+    policy, algorithm = LinearPolicy(), EWC(fisher=fisher)
+    learn(algorithm, policy, 0)
+    assert algorithm.penalty(policy).item() == 0
+    with torch.no_grad():
+        policy.linear.weight[0, 0] += 0.1
+    assert algorithm.penalty(policy).item() > 0
+
+
+def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
+    """Gradient of each window's squared error with respect to the weight: 2 (Wx + b - y) x^T."""
+    error = data.features @ policy.linear.weight.T + policy.linear.bias - data.targets
+    return 2 * error[:, :, None] * data.features[:, None, :]  # (N, A, D)
+
+
+def test_fisher_per_sample_is_the_mean_squared_gradient_of_single_windows():
+    policy, data = LinearPolicy(), Windows(size=7)
+    fisher = EWC(fisher="per_sample", fisher_windows=0).estimate(data, policy, generator(0))
+    torch.testing.assert_close(fisher["linear.weight"], by_hand(policy, data).square().mean(0))
+
+
+def test_fisher_of_one_batch_is_the_squared_mean_gradient():
+    policy, data = LinearPolicy(), Windows(size=8)
+    algorithm = EWC(fisher="batch", fisher_windows=0, fisher_batch_size=8)
+    fisher = algorithm.estimate(data, policy, generator(0))
+    torch.testing.assert_close(fisher["linear.weight"], by_hand(policy, data).mean(0).square())
+
+
+def test_fisher_per_sample_ignores_dropout_and_leaves_no_trace():
+    policy, data = DeepPolicy(), Windows()
+    policy.train()
+    before = copy.deepcopy(policy.state_dict())
+    first, second = (EWC().estimate(data, policy, generator(s)) for s in (0, 0))
+    assert all(torch.equal(first[n], second[n]) for n in first)
+    assert policy.training and all(p.grad is None for p in policy.parameters())
+    assert all(torch.equal(v, before[n]) for n, v in policy.state_dict().items())
+
+
+def test_ewc_old_importance_fades_by_gamma():
+    policy, algorithm = LinearPolicy(), EWC(gamma=0.5, fisher_windows=0)
+    data = Windows(size=6)
+    algorithm.end_task(0, data, policy, generator(0))
+    algorithm.end_task(1, data, policy, generator(0))
+    expected = 1.5 * by_hand(policy, data).square().mean(0)
+    torch.testing.assert_close(algorithm.state_dict()["importance"]["linear.weight"], expected)
+
+
+def test_ewc_names_the_valid_estimates():
+    with pytest.raises(ConfigError, match="per_sample, batch"):
+        EWC(fisher="diagonal")
+
+
+# --- PackNet
+
+
+def test_packnet_old_outputs_stay_bit_identical(tmp_path):
+    torch.manual_seed(0)
+    policy, algorithm = DeepPolicy(), PackNet(prune_perc=0.5)
+    kept = {}
+    for task in range(4):
+        learn(algorithm, policy, task)
+        for old, value in kept.items():
+            assert torch.equal(outputs(algorithm, policy, old), value), f"task {old} moved with task {task}"
+        kept[task] = outputs(algorithm, policy, task)
+
+    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
+    state = checkpoints.load(tmp_path / "s")
+    later_policy, later = DeepPolicy(), PackNet(prune_perc=0.5)
+    later_policy.load_state_dict(state["policy"])
+    later.load_state_dict(state["algorithm"], {})
+    learn(later, later_policy, 4)
+    for old, value in kept.items():
+        assert torch.equal(outputs(later, later_policy, old), value)
+
+
+def test_packnet_owns_a_quarter_of_what_is_free_and_covers_all_weights():
+    policy, algorithm = DeepPolicy(width=32), PackNet(prune_perc=0.75)
+    for task in range(3):
+        learn(algorithm, policy, task)
+        assert algorithm.owned_share()[task] == pytest.approx(0.25 * 0.75**task, rel=0.05)
+    assert set(algorithm.state_dict()["owner"]) == {n for n, p in policy.named_parameters() if p.dim() > 1}
+
+
+def test_packnet_moves_norms_and_biases_with_the_first_task_only():
+    policy, algorithm = DeepPolicy(), PackNet()
+    fresh = copy.deepcopy(policy.state_dict())
+    learn(algorithm, policy, 0)
+    first = copy.deepcopy(policy.state_dict())
+    learn(algorithm, policy, 1)
+    second = policy.state_dict()
+    for name in ("norm.running_mean", "norm.weight", "head.bias", "memory.bias_hh_l0"):
+        assert not torch.equal(first[name], fresh[name])
+        assert torch.equal(first[name], second[name])
+    assert not torch.equal(first["head.weight"], second["head.weight"])
+
+
+def test_packnet_policy_for_leaves_the_policy_as_it_was():
+    policy, algorithm = DeepPolicy(), PackNet()
+    learn(algorithm, policy, 0)
+    learn(algorithm, policy, 1)
+    before = copy.deepcopy(policy.state_dict())
+    with algorithm.policy_for(0, policy):
+        assert not torch.equal(policy.head.weight, before["head.weight"])
+    assert all(torch.equal(v, before[n]) for n, v in policy.state_dict().items())
+
+
+# --- all of them
+
+
+@pytest.mark.parametrize("make", [Sequential, lambda: ER(budget=25), EWC, PackNet])
+def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+    torch.manual_seed(1)
+    policy, algorithm = DeepPolicy(), make()
+    learn(algorithm, policy, 0)
+    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
+    learn(algorithm, policy, 1)
+
+    state = checkpoints.load(tmp_path / "s")
+    other_policy, other = DeepPolicy(), make()
+    other_policy.load_state_dict(state["policy"])
+    other.load_state_dict(state["algorithm"], {0: Windows(0)})
+    learn(other, other_policy, 1)
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, other_policy.state_dict()[name]), name
