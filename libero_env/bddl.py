@@ -1,9 +1,9 @@
 """Task files: BDDL text <-> frozen `Problem`.
 
 The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:language ...) (:regions ...)
-(:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with `;`
-comments. `:requirements` is read and dropped. Goals may nest and, or, not and forall. Numbers may be arithmetic
-with `pi`; nothing in a file is ever executed.
+(:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with
+`;` comments. `:requirements` is read and dropped. Goals may nest and, or, not and forall. Numbers may be
+arithmetic with `pi`; nothing in a file is ever executed.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -59,8 +59,8 @@ def parse(text: str, file: str = "<string>") -> Problem:
     """Read a task from BDDL text; `file` is only for messages.
 
     Raises:
-        BDDLError: "file:line: what; expected ..." for anything that is not the dialect, a name declared twice, or an
-            atom about a name that the file does not declare.
+        BDDLError: "file:line: what; expected ..." for anything that is not the dialect, a name declared
+            twice, or an atom about a name that the file does not declare.
     """
     return _Reader(file).problem(text)
 

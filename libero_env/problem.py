@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 class Region:
     """A place on or in a fixture, object or workspace.
 
-    `ranges` are rectangles (x0, y0, x1, y1) in metres in the frame of the target; a region without any is a named
-    site of the target's model (a drawer, the inside of a basket). `yaw` holds (low, high) in radians.
+    `ranges` are rectangles (x0, y0, x1, y1) in metres in the frame of the target; a region without any is a
+    named site of the target's model (a drawer, the inside of a basket). `yaw` holds (low, high) in radians.
     """
 
     name: str
@@ -26,7 +26,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Atom:
-    """A predicate applied to names: `On butter_1 floor_bin_region`. Predicates are capitalised, whatever the file."""
+    """A predicate applied to names: `On butter_1 floor_bin_region`. Predicates are always capitalised."""
 
     predicate: str
     args: tuple[str, ...]
@@ -66,7 +66,7 @@ Expression = Atom | And | Or | Not | ForAll
 
 @dataclass(frozen=True)
 class Problem:
-    """What a task file says. `fixtures` and `objects` are name -> category in file order: it is the joint order."""
+    """What a task file says. `fixtures` and `objects` are name -> category in file order, the joint order."""
 
     name: str
     language: str
@@ -87,8 +87,8 @@ class Problem:
 def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
     """What two problems say differently, one line each; empty where they mean the same.
 
-    The order of fixtures and objects has a meaning (joint order), the order of regions, init atoms and the parts of
-    a conjunction has none. Case and spacing of the language do not count.
+    The order of fixtures and objects has a meaning (joint order), the order of regions, init atoms and the
+    parts of a conjunction has none. Case and spacing of the language do not count.
     """
     words = lambda p: " ".join(p.language.split()).casefold()  # noqa: E731
     pairs = {

@@ -1,4 +1,4 @@
-"""S-expressions: text -> nested lists of words that remember their line, and numbers written as arithmetic."""
+"""S-expressions: text -> nested lists of words that remember their line, and numbers as arithmetic."""
 
 import ast
 import math
@@ -86,6 +86,8 @@ def number(text: str) -> float:
     Raises:
         ValueError: the text is anything else, or not finite.
     """
+    if len(text) > 64:  # the parser itself fails on very deep nesting
+        raise ValueError(text)
     try:
         value = _value(ast.parse(text, mode="eval").body)
     except (SyntaxError, ZeroDivisionError, RecursionError) as error:
@@ -97,7 +99,7 @@ def number(text: str) -> float:
 
 def _value(node: ast.expr) -> float:
     match node:
-        case ast.Constant(value=int() | float() as value):
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
         case ast.Name(id="pi") | ast.Attribute(value=ast.Name(id="np" | "math"), attr="pi"):
             return math.pi

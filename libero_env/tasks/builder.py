@@ -1,25 +1,25 @@
 """YAML facts -> `Problem`.
 
-A scene says what stands where; a task names its scene, fills in the scene's parameters (`with`) and adds to or replaces
-what the scene says. Keys of both:
+A scene says what stands where; a task names its scene, fills in the scene's parameters (`with`) and adds
+to or replaces what the scene says. Keys of both:
 
     problem          name of the problem class, as in BDDL
     language         what the task file's `:language` says
     fixtures         name: category
     objects          categories in joint order; `plate` is plate_1, `{plate: 2}` is plate_1 and plate_2
-    regions          target: {name: facts}; facts are empty for a site of the target's model, else `at` (x, y) and
-                     `half` (one number or two), or `ranges` [[x0, y0, x1, y1], ...], with `yaw` (one angle or two) and
-                     `rgba`; metres and radians, angles may be arithmetic with pi
+    regions          target: {name: facts}; facts are empty for a site of the target's model, else `at` (x, y)
+                     and `half` (one number or two), or `ranges` [[x0, y0, x1, y1], ...], with `yaw` (one
+                     angle or two) and `rgba`; metres and radians, angles may be arithmetic with pi
     init             atoms such as `On plate_1 stove_1`
     obj_of_interest  names
     scene_properties key: value
-    goal             a list of atoms that must all hold, or one expression in BDDL: `(Or (Open a) (Not (On b c)))`
+    goal             a list of atoms that must all hold, or one expression: `(Or (Open a) (Not (On b c)))`
 
-`$x` stands for the parameter x and `$x_0` for the first of a list; a region that a task sets to `null` is dropped.
+`$x` stands for the parameter x and `$x_0` for the first of a list; a region that a task sets to `null` goes.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cache
 from importlib import resources
 from string import Template
 from typing import Any
@@ -44,7 +44,7 @@ KEYS = (
 )
 
 
-@lru_cache(maxsize=None)
+@cache
 def load_data(name: str) -> Any:
     """The content of one of the package's task files; do not change it.
 
@@ -104,7 +104,7 @@ def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with `over` on top, mappings joined at every level; the order is that of `base`, then of `over`."""
+    """`base` with `over` on top, mappings joined at every level; the order is that of `base` first."""
     merged = dict(base)
     for key, value in over.items():
         nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
@@ -118,7 +118,7 @@ def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
-    """The facts with every `$parameter` replaced; a string that is one parameter takes its value, whatever it is."""
+    """The facts with every `$parameter` replaced; a string that is only a parameter becomes its value."""
     if isinstance(node, Mapping):
         return {_fill(key, values, where): _fill(value, values, where) for key, value in node.items()}
     if isinstance(node, list):

@@ -1,7 +1,7 @@
 """Suites and tasks by name, with the original's task orders."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 from libero_env import bddl
 from libero_env.errors import UnknownNameError
@@ -62,7 +62,7 @@ def suite_names() -> tuple[str, ...]:
     return tuple(load_data("suites.yaml"))
 
 
-@lru_cache(maxsize=None)
+@cache
 def get_suite(name: str) -> Suite:
     """The suite of this name.
 
@@ -101,7 +101,7 @@ def get_task(key: str) -> Task:
 
 
 def language_from_name(name: str) -> str:
-    """The instruction that a task's name spells: the scene prefix (`KITCHEN_SCENE1_`) dropped, blanks for `_`."""
+    """The instruction that a task's name spells: without the scene prefix (`KITCHEN_SCENE1_`)."""
     words = name.split("_")
     prefix = next((i + 1 for i, word in enumerate(words) if word.startswith("SCENE")), 0)
     return " ".join(words[prefix:])

@@ -1,0 +1,94 @@
+"""The `libero` command. Each subcommand is a small function that imports what it needs when it runs."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+
+from libero_env.errors import LiberoError
+from lifelong.errors import LifelongError
+
+Subparsers = argparse._SubParsersAction  # argparse has no public name for it
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand.
+
+    Args:
+        argv: the words after `libero`; those of the process by default.
+
+    Returns:
+        Exit status: 0, 1 where the command found something broken, 2 for an error (told in one line).
+    """
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    try:
+        return args.run(args) or 0
+    except (LiberoError, LifelongError, OSError) as error:
+        print(f"libero: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("libero: interrupted", file=sys.stderr)
+        return 130
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser with every subcommand; each stores its function as `run`."""
+    parser = argparse.ArgumentParser(prog="libero", description="Lifelong robot learning on LIBERO.")
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    for register in COMMANDS:
+        register(subparsers)
+    return parser
+
+
+def register_doctor(subparsers: Subparsers) -> None:
+    """`libero doctor`"""
+    parser = subparsers.add_parser("doctor", help="what this machine has and lacks, and how to mend it")
+    parser.add_argument("--gl", action="store_true", help="only draw a frame")
+    parser.set_defaults(run=run_doctor)
+
+
+def run_doctor(args: argparse.Namespace) -> int:
+    """Print the findings; 1 where something essential is broken."""
+    import libero_env.doctor as environment
+    import lifelong.doctor as learning
+
+    findings = environment.examine(gl_only=args.gl)
+    if not args.gl:
+        findings += learning.examine()
+    print(environment.render_findings(findings))
+    return int(environment.is_broken(findings))
+
+
+def register_tasks(subparsers: Subparsers) -> None:
+    """`libero tasks list|show`"""
+    parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    listing = commands.add_parser("list", help="the tasks of one suite, or of all")
+    listing.add_argument("suite", nargs="?", help="such as libero_object")
+    listing.add_argument("--order", type=int, default=0, help="one of the published sequences (0 to 20)")
+    listing.set_defaults(run=run_tasks_list)
+    show = commands.add_parser("show", help="the BDDL of a task")
+    show.add_argument("task", help="such as libero_object/3, or the task's name")
+    show.set_defaults(run=run_tasks_show)
+
+
+def run_tasks_list(args: argparse.Namespace) -> None:
+    """One line per task."""
+    from libero_env.tasks import get_suite, suite_names
+
+    for name in [args.suite] if args.suite else suite_names():
+        for task in get_suite(name).order(args.order):
+            print(f"{task.id:18} {task.language}")
+
+
+def run_tasks_show(args: argparse.Namespace) -> None:
+    """The task file, as generated."""
+    from libero_env.tasks import get_task
+
+    print(get_task(args.task).bddl_text, end="")
+
+
+COMMANDS: tuple[Callable[[Subparsers], None], ...] = (register_doctor, register_tasks)
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""Task files survive the way through `Problem`, and broken ones say where they are broken."""
+
+import dataclasses
+import math
+import pickle
+
+import pytest
+
+from libero_env import bddl
+from libero_env.bddl import And, Atom, ForAll, Not, Or, Problem, Region
+from libero_env.errors import BDDLError
+from libero_env.sexpr import number
+
+pytestmark = pytest.mark.unit
+
+TEXT = """
+(define (problem LIBERO_Kitchen_Tabletop_Manipulation)  ; a comment
+  (:domain robosuite)
+  (:requirements :typing)
+  (:language put both Moka pots on the stove, it's time)
+  (:regions
+    (pot_region (:target table) (:ranges ((-0.01 .34 1e-2 0.36) (0 0 1 1))) (:yaw_rotation ((-pi/2 (0.0)))))
+    (cook_region (:target stove_1) (:rgba (0 0 1 0.5)))
+  )
+  (:fixtures table - kitchen_table stove_1 - flat_stove)
+  (:objects pot_1 pot_2 - moka_pot
+     plate_1 - plate
+     pot_3 - moka_pot)
+  (:obj_of_interest pot_1)
+  (:scene_properties (:floor wooden) (:wall red brick))
+  (:init (On pot_1 table_pot_region) (turnon stove_1))
+  (:goal (And (On pot_1 stove_1_cook_region)
+              (Or (Not (Turnon stove_1)) (forall (?x ?y - moka_pot) (On ?x ?y)))))
+)
+"""
+GOOD = TEXT.replace("(0.0)", "0.0")
+
+
+def test_every_construct_is_read():
+    problem = bddl.parse(GOOD)
+    pot = problem.region("table_pot_region")
+    assert pot.ranges == ((-0.01, 0.34, 0.01, 0.36), (0.0, 0.0, 1.0, 1.0))
+    assert pot.yaw == ((-math.pi / 2, 0.0),)
+    assert problem.region("stove_1_cook_region") == Region("cook_region", "stove_1", rgba=(0, 0, 1, 0.5))
+    assert problem.language == "put both Moka pots on the stove, it's time"
+    assert list(problem.objects) == ["pot_1", "pot_2", "plate_1", "pot_3"]
+    assert problem.scene_properties == {"floor": "wooden", "wall": "red brick"}
+    assert problem.init[1] == Atom("Turnon", ("stove_1",))
+    everything = ForAll((("?x", "moka_pot"), ("?y", "moka_pot")), Atom("On", ("?x", "?y")))
+    lit = Atom("On", ("pot_1", "stove_1_cook_region"))
+    assert problem.goal == And((lit, Or((Not(Atom("Turnon", ("stove_1",))), everything))))
+
+
+def assert_round_trip(problem: Problem):
+    text = bddl.write(problem)
+    again = bddl.parse(text)
+    assert again == problem
+    assert list(again.objects.items()) == list(problem.objects.items())
+    assert bddl.write(again) == text
+    assert bddl.differences(problem, again) == []
+
+
+def test_round_trip():
+    assert_round_trip(bddl.parse(GOOD))
+
+
+def test_round_trip_of_all_originals(shared):
+    files = sorted((shared / "official" / "bddl_files").glob("*/*.bddl"))
+    assert len(files) == 130
+    for file in files:
+        assert_round_trip(bddl.read(file))
+
+
+def test_a_problem_travels_between_processes():
+    problem = bddl.parse(GOOD)
+    assert pickle.loads(pickle.dumps(problem)) == problem  # noqa: S301
+    assert hash(problem) == hash(bddl.parse(GOOD))
+
+
+@pytest.mark.parametrize(
+    ("change", "line", "message"),
+    [
+        (("(0 0 1 1)", "(0 0 1)"), 7, "(0 0 1) in :ranges; expected a list of 4 numbers"),
+        (("-pi/2", "__import__('os')"), 7, "expected"),
+        (("-pi/2", "exit"), 7, "exit is no number; expected a finite number such as 0.25 or -pi/4"),
+        (("-pi/2", "1e999"), 7, "1e999 is no number"),
+        (("-pi/2", "1/0"), 7, "1/0 is no number"),
+        (("(:target stove_1)", ""), 8, "region cook_region has no target; expected (:target NAME)"),
+        (("plate_1 - plate", "pot_1 - plate"), 12, "pot_1 is declared twice"),
+        (("pot_3 - moka_pot", "pot_3"), 13, "pot_3 has no category; expected NAME NAME - CATEGORY"),
+        (("plate_1 - plate", "table - plate"), 11, "table is a fixture too"),
+        (("On pot_1 table_pot_region", "On pot_1 floor"), 16, "floor is not declared; expected one of "),
+        (("(turnon stove_1)", "turnon"), 16, "not an atom: turnon; expected (PREDICATE NAME ...)"),
+        (("(:language", "(:languish"), 5, "unknown section ':languish'; expected one of :domain, "),
+        (("(:domain robosuite)", "(:goal)"), 17, "a second :goal; expected one (the first is on line 3)"),
+        (("(:init", "(:obj_of_interest"), 16, "a second :obj_of_interest"),
+        (("(Not (Turnon stove_1))", "(Not)"), 18, "(Not); expected (Not EXPRESSION)"),
+        (("(define", "(defined"), 2, "not a problem; expected (define (problem NAME) ...)"),
+        (("(define", ") (define"), 2, "a ) closes nothing; expected as many ( as )"),
+        (("(:domain robosuite)", "(:domain robosuite"), 2, "this ( is never closed; expected as many ( as )"),
+    ],
+)
+def test_errors_name_file_line_and_remedy(change, line, message):
+    assert change[0] in GOOD
+    with pytest.raises(BDDLError) as caught:
+        bddl.parse(GOOD.replace(*change, 1), "kitchen.bddl")
+    assert str(caught.value).startswith(f"kitchen.bddl:{line}: ")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "words", "(define (problem x))", "(define)", "()", "((("])
+def test_what_is_no_task_is_refused(text):
+    with pytest.raises(BDDLError, match=r"empty.bddl:1: .*; expected "):
+        bddl.parse(text, "empty.bddl")
+
+
+def test_numbers_are_arithmetic_and_nothing_else():
+    assert number("-pi/4") == -math.pi / 4
+    assert number("2*np.pi+.5") == 2 * math.pi + 0.5
+    for text in ("open", "pi()", "[1]", "'a'", "1j", "True", "a.b", "2**9", "9" * 5000, "-" * 100_000 + "1"):
+        with pytest.raises(ValueError):
+            number(text)
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"language": "other words"}, "language"),
+        ({"objects": dict(sorted(bddl.parse(GOOD).objects.items()))}, "objects"),
+        ({"init": ()}, "init"),
+        ({"goal": Atom("On", ("pot_2", "stove_1_cook_region"))}, "goal"),
+        ({"regions": ()}, "region stove_1_cook_region"),
+    ],
+)
+def test_differences_are_found(change, where):
+    problem = bddl.parse(GOOD)
+    found = bddl.differences(problem, dataclasses.replace(problem, **change))
+    assert any(line.startswith(where) for line in found)
+    assert not bddl.same_meaning(problem, dataclasses.replace(problem, **change))
+
+
+def test_order_without_meaning_does_not_count():
+    problem = bddl.parse(GOOD)
+    parts = problem.goal.parts
+    turned = dataclasses.replace(
+        problem, init=problem.init[::-1], regions=problem.regions[::-1], goal=And(parts[::-1])
+    )
+    assert bddl.same_meaning(problem, turned)
