@@ -1,0 +1,53 @@
+# make train   set everything up, then train and evaluate (ARGS="algo=er seed=2" are Hydra overrides)
+# make test    set everything up, then the checks that CI runs
+PYTHON ?= python3
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+GL_STAMP := $(VENV)/.gl
+EXTRAS := train,language,dev
+# test processes, each on one thread: as many as cores, at most 8
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
+
+.DEFAULT_GOAL := help
+.PHONY: help setup gl train test lint clean
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+setup: $(STAMP) $(GL_STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 1; }
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
+	  { echo "No virtual environment could be made; on Debian: apt-get install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet --no-deps --constraint constraints.txt robosuite
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	@touch $@
+
+gl: $(GL_STAMP)
+
+# a frame is drawn; where that fails, the libraries are installed and it is tried again
+$(GL_STAMP): $(STAMP)
+	@if $(BIN)/libero doctor --gl >/dev/null 2>&1; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	  apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
+	    apt-get install -y -qq --no-install-recommends libegl1 libosmesa6; \
+	fi
+	@$(BIN)/libero doctor --gl
+	@touch $@
+
+train: setup
+	$(BIN)/python train.py algo=ewc benchmark=libero_object $(ARGS)
+
+test: setup lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist=worksteal $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache
