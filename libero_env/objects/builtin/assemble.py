@@ -91,9 +91,8 @@ def _add_visual(
         width=width,
         height=height,
         nchannel=channels,
-        colorspace=mujoco.mjtColorSpace.mjCOLORSPACE_SRGB,
     )
-    texture.data = np.ascontiguousarray(look.image).tobytes()
+    texture.data = np.ascontiguousarray(look.image[::-1]).tobytes()  # MuJoCo: first row is v = 0
     material = spec.add_material(
         name=f"{category}_material", specular=look.specular, shininess=look.shininess, reflectance=0.0
     )

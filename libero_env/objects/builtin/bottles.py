@@ -99,9 +99,9 @@ def _skin(body: Profile, cap: Profile, center: tuple[float, float]) -> Mesh:
         v = (CAP - 0.01) * (height - bottom) / (shoulder - bottom)
         rings.append(Ring(height, depth, width, v, round=2.4))
     for height, depth, width in cap:
-        v = CAP + 0.01 + 0.17 * (height - shoulder) / (top - shoulder)
+        v = CAP + 0.01 + 0.13 * (height - shoulder) / (top - shoulder)
         rings.append(Ring(height, depth, width, v, crease=True))
-    rings.append(Ring(top, 0.0, 0.0, 0.995))
+    rings.append(Ring(top, 0.0, 0.0, 0.96))
     return loft(rings, segments=16, center=center)
 
 

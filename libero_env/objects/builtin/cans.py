@@ -27,8 +27,8 @@ def tomato_sauce() -> Look:
     canvas.band(0.10, 0.36, (245, 240, 228))
     canvas.band(0.40, 0.60, (30, 130, 56))
     for u in (0.0, 0.5, 1.0):
-        canvas.text("TOMATO", (u - 0.19, 0.43, u + 0.19, 0.57), (255, 255, 255))
-        canvas.text("SAUCE", (u - 0.12, 0.64, u + 0.12, 0.75), (255, 226, 120))
+        canvas.text("SAUCE", (u - 0.13, 0.43, u + 0.13, 0.57), (255, 255, 255))
+        canvas.text("TOMATO", (u - 0.16, 0.63, u + 0.16, 0.77), (255, 232, 150))
         for shift in (-0.12, 0.0, 0.12):
             _tomato(canvas, u + shift, 0.22, 0.055, 0.095)
     return Look(_can(), canvas.pixels(), specular=0.5, shininess=0.6)
@@ -48,7 +48,7 @@ def _can():
         (top - 0.001, radius + 0.0010, 0.84, False),
         (top, radius, 0.88, True),
         (top - 0.0025, radius - 0.0030, 0.91, True),
-        (top - 0.0020, 0.0, 1.00, False),
+        (top - 0.0020, 0.0, 0.98, False),
     ]
     return loft([Ring(z, r, r, v, crease=crease) for z, r, v, crease in profile], segments=18)
 
