@@ -1,0 +1,318 @@
+"""One self-contained page about one run, or about several side by side."""
+
+import base64
+import os
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from lifelong.errors import LifelongError
+from lifelong.figures import (
+    Line,
+    Panel,
+    as_svg,
+    cell_colours,
+    forgetting_figure,
+    heatmap_figure,
+    learning_figure,
+    save,
+)
+from lifelong.metrics import (
+    METRIC_NAMES,
+    average_success,
+    mean_and_standard_error,
+    wilson_interval,
+)
+from lifelong.records import RunRecord
+from lifelong.results import Results
+from lifelong.runs import Group, Run, group_runs, load_run, short_labels
+
+METRIC_TEXTS = {
+    "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
+    "nbt": ("NBT", "forgetting: success lost on a task, averaged over the later ones", "down"),
+    "auc": ("AUC", "success on a task averaged over learning it and all later tasks", "up"),
+    "final_success": ("Final", "success over all tasks at the end of the sequence", "up"),
+    "just_learned": ("Just learned", "success on each task right after learning it", "up"),
+}
+MEDIA_TYPES = {
+    ".gif": "image/gif",
+    ".webp": "image/webp",
+    ".png": "image/png",
+    ".mp4": "video/mp4",
+    ".webm": "video/webm",
+}
+MEDIA_LIMIT = 48 * 2**20  # bytes of rollout pictures in one page
+
+
+def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
+    """Writes report.html, heatmap.png and heatmap.pdf (for several runs also forgetting.png and .pdf).
+
+    Args:
+        run_dirs: One run to describe, or several to compare. Unfinished runs count as far as they are.
+        out: The page, or an existing folder for it. Default: in the run directory; for several runs,
+            in the current folder.
+
+    Returns:
+        The page's path. It needs no other file and no network.
+
+    Raises:
+        LifelongError: No run is given, a run directory lacks its results, or `out` cannot be written.
+    """
+    if not run_dirs:
+        raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
+    runs = [load_run(Path(d)) for d in run_dirs]
+    out = Path(out) if out is not None else (runs[0].path if len(runs) == 1 else Path.cwd())
+    if out.is_dir() or out.suffix == "":
+        out = out / "report.html"
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        context = _single(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
+        page = _template().render(**context, metric_texts=METRIC_TEXTS)
+        part = out.with_name(out.name + ".part")
+        part.write_text(page, encoding="utf-8")
+        os.replace(part, out)
+    except OSError as error:
+        raise LifelongError(f"{out}: the report cannot be written ({error})") from error
+    return out
+
+
+def _single(run: Run, folder: Path) -> dict[str, Any]:
+    """What the template shows of one run; writes the heatmap beside the page."""
+    record, labels = run.record, short_labels(run.record.instructions)
+    rates, _ = run.results.success_matrix()
+    save(heatmap_figure([Panel(f"{record.algo}, {record.benchmark}", rates, labels)]), folder / "heatmap")
+    curves, losses = run.results.curves(), run.results.losses()
+    average = np.full((1, len(record.tasks)), np.nan)
+    average[0, : run.learned] = average_success(rates[: run.learned, : run.learned])
+    times = {k: v for k, v in run.results.seconds_by_phase().items() if v > 0}
+    return {
+        "title": f"{record.algo} on {record.benchmark}",
+        "facts": _facts(record),
+        "notes": run.notes,
+        "metrics": _metric_rows(run),
+        "heatmaps": [_heatmap(run.results, labels)],
+        "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
+        "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
+        "tasks": _task_rows(run, rates),
+        "times": [(name, _duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
+        "total_time": _duration(sum(times.values())),
+        "media": _media(run.path / "videos"),
+        "config_text": run.config_text,
+        "versions": dict(record.versions),
+        "run_dir": run.path.resolve().name,
+    }
+
+
+def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
+    """What the template shows of several runs; writes heatmaps and forgetting curves beside the page."""
+    groups = group_runs(runs)
+    panels, heatmaps, lines = [], [], []
+    for group in groups:
+        labels = short_labels(group.runs[0].record.instructions)
+        matrices = np.stack([r.results.success_matrix()[0] for r in group.runs])
+        present = ~np.isnan(matrices)
+        mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
+        panels.append(Panel(group.label, mean, labels))
+        single = len(group.runs) == 1
+        heatmap = _heatmap(group.runs[0].results, labels) if single else _mean_heatmap(matrices, mean, labels)
+        heatmaps.append(heatmap | {"title": group.label, "seeds": [r.record.seed for r in group.runs]})
+        values = np.full((len(group.runs), matrices.shape[1]), np.nan)
+        for row, run in zip(values, group.runs, strict=True):
+            row[: run.learned] = average_success(
+                run.results.success_matrix()[0][: run.learned, : run.learned]
+            )
+        lines.append(Line(group.label, values))
+    save(heatmap_figure(panels), folder / "heatmap")
+    save(forgetting_figure(lines), folder / "forgetting")
+    benchmarks = sorted({r.record.benchmark for r in runs})
+    return {
+        "title": f"{len(groups)} methods on {', '.join(benchmarks)}" if len(groups) > 1 else groups[0].label,
+        "facts": [("runs", len(runs)), ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs}))))],
+        "notes": [f"{r.path}: {note}" for r in runs for note in r.notes],
+        "groups": _group_rows(groups),
+        "heatmaps": heatmaps,
+        "forgetting": as_svg(forgetting_figure(lines)),
+        "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
+    }
+
+
+def _facts(record: RunRecord) -> list[tuple[str, Any]]:
+    facts = [("policy", record.policy), ("preset", record.preset), ("seed", record.seed)]
+    facts += [
+        ("tasks", len(record.tasks)),
+        ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),
+    ]
+    return facts + [("CPUs", record.cpu_count)] + ([("commit", record.commit[:10])] if record.commit else [])
+
+
+def _metric_rows(run: Run) -> list[dict[str, Any]]:
+    if run.metrics is None:
+        return []
+    return [{"name": n, "estimate": getattr(run.metrics, n)} for n in METRIC_NAMES]
+
+
+def _group_rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
+    """Mean and standard error of each metric over a group's runs, the best of each column marked."""
+    rows = []
+    for group in groups:
+        measured = [r.metrics for r in group.runs if r.metrics is not None]
+        cells = {n: mean_and_standard_error([getattr(m, n).value for m in measured]) for n in METRIC_NAMES}
+        only = {n: getattr(measured[0], n) for n in METRIC_NAMES} if len(measured) == 1 else None
+        rows.append(
+            {"label": group.label, "count": len(measured), "cells": cells, "single": only, "best": set()}
+        )
+    for name in METRIC_NAMES:
+        means = np.array([row["cells"][name][0] for row in rows])
+        if len(rows) > 1 and not np.isnan(means).all():
+            best = np.nanmax(means) if METRIC_TEXTS[name][2] == "up" else np.nanmin(means)
+            for row, mean in zip(rows, means, strict=True):
+                if np.isclose(mean, best):
+                    row["best"].add(name)
+    return rows
+
+
+def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
+    page = run.path / "report.html"
+    return {
+        "label": label,
+        "seed": run.record.seed,
+        "metrics": run.metrics,
+        "learned": f"{run.learned} of {len(run.record.tasks)}",
+        "time": _duration(sum(run.results.seconds_by_phase().values())),
+        "path": str(run.path),
+        "link": os.path.relpath(page, folder) if page.is_file() else None,
+    }
+
+
+def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
+    rows = []
+    for task, (name, text) in enumerate(zip(run.record.tasks, run.record.instructions, strict=True)):
+        end, done = run.results.task_end(task), task < run.learned
+        last = task == run.learned - 1
+        rows.append(
+            {
+                "name": name,
+                "instruction": text,
+                "best_epoch": end.best_epoch if end else None,
+                "learned": rates[task, task] if done else np.nan,
+                "final": rates[run.learned - 1, task] if done else np.nan,
+                "fwt": run.metrics.fwt_by_task[task] if done and run.metrics else np.nan,
+                "nbt": run.metrics.nbt_by_task[task] if done and run.metrics and not last else np.nan,
+                "seconds": _duration(end.seconds) if end else None,
+            }
+        )
+    return rows
+
+
+def _heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
+    """Cells of one run's matrix: percent, colours, and Wilson's interval as the text on hover."""
+    rates, episodes = results.success_matrix()
+    low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
+    spread = "{} of {} episodes; 95 % interval {} to {} %"
+
+    def hint(i: int, j: int) -> str:
+        ends = (f"{100 * end[i, j]:.0f}" for end in (low, high))
+        return spread.format(round(rates[i, j] * episodes[i, j]), episodes[i, j], *ends)
+
+    def detail(i: int, j: int) -> str:
+        return f"{100 * low[i, j]:.0f}–{100 * high[i, j]:.0f}"
+
+    return _grid(rates, labels, hint, detail)
+
+
+def _mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
+    """Cells of the mean over seeds, its standard error as the text on hover."""
+
+    def spread(i: int, j: int) -> tuple[float, int]:
+        values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
+        return 100 * mean_and_standard_error(values)[1], len(values)
+
+    def hint(i: int, j: int) -> str:
+        error, count = spread(i, j)
+        return f"mean of {count} seeds, standard error {error:.1f}" if count > 1 else "one seed"
+
+    return _grid(mean, labels, hint, lambda i, j: "")
+
+
+def _grid(
+    rates: np.ndarray,
+    labels: Sequence[str],
+    hint: Callable[[int, int], str],
+    detail: Callable[[int, int], str],
+) -> dict[str, Any]:
+    size = len(rates)
+    rows = []
+    for i in range(size):
+        cells = []
+        for j in range(size):
+            if np.isnan(rates[i, j]):
+                cells.append(None)
+                continue
+            back, ink = cell_colours(float(rates[i, j]))
+            where = (
+                f"after task {i + 1} ({labels[i]}), on task {j + 1} ({labels[j]}): {100 * rates[i, j]:.0f} %"
+            )
+            text = f"{100 * rates[i, j]:.0f}"
+            cells.append(
+                {
+                    "text": text,
+                    "detail": detail(i, j),
+                    "hint": f"{where}\n{hint(i, j)}",
+                    "back": back,
+                    "ink": ink,
+                }
+            )
+        known = rates[i, : i + 1]
+        average = f"{100 * known.mean():.0f}" if not np.isnan(known).any() else ""
+        rows.append({"label": labels[i], "cells": cells, "average": average})
+    return {"rows": rows, "size": size, "title": ""}
+
+
+def _media(folder: Path) -> dict[str, Any]:
+    """Rollout pictures as data URLs; a text file of the same stem is the caption."""
+    items, left_out, used = [], [], 0
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        kind = MEDIA_TYPES.get(path.suffix.lower())
+        if kind is None:
+            continue
+        used += path.stat().st_size
+        if used > MEDIA_LIMIT:
+            left_out.append(path.name)
+            continue
+        note = path.with_suffix(".txt")
+        caption = note.read_text(encoding="utf-8").strip() if note.is_file() else path.stem.replace("_", " ")
+        data = base64.b64encode(path.read_bytes()).decode()
+        items.append(
+            {"url": f"data:{kind};base64,{data}", "video": kind.startswith("video"), "caption": caption}
+        )
+    return {"items": items, "left_out": left_out}
+
+
+def _duration(seconds: float) -> str:
+    """Seconds for people: 42 s, 3 min 20 s, 2 h 05 min."""
+    seconds = round(seconds)
+    if seconds < 60:
+        return f"{seconds} s"
+    if seconds < 3600:
+        return f"{seconds // 60} min {seconds % 60:02d} s"
+    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
+
+
+def _percent(value: float | None, digits: int = 1) -> str:
+    """A share as percent with a true minus sign; a dash where it is undefined."""
+    if value is None or np.isnan(value):
+        return "–"
+    return f"{100 * value:.{digits}f}".replace("-", "−")
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["percent"] = _percent
+    text = resources.files("lifelong").joinpath("report_template.html").read_text(encoding="utf-8")
+    return environment.from_string(text)

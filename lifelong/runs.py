@@ -1,0 +1,125 @@
+"""Run directories read back: one run as far as it went, or groups of runs that differ in their seed."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lifelong.errors import LifelongError
+from lifelong.metrics import Metrics, lifelong_metrics
+from lifelong.records import RunRecord
+from lifelong.results import ResultLog, Results, ResultsError
+
+_BASICS = ("algo", "benchmark", "policy", "preset")
+_COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark")  # sections of the config
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run directory as far as it could be read."""
+
+    path: Path
+    results: Results
+    record: RunRecord
+    config: dict[str, Any]
+    config_text: str
+    notes: tuple[str, ...]
+    learned: int
+    metrics: Metrics | None  # None before the first task is learned
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but their seed."""
+
+    label: str
+    runs: tuple[Run, ...]
+
+
+def load_run(path: Path) -> Run:
+    """Reads a run directory. Raises: LifelongError naming what is missing."""
+    if not path.is_dir():
+        raise LifelongError(f"{path}: no such run directory")
+    log = path / "results.jsonl"
+    if not log.is_file():
+        present = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
+        raise LifelongError(
+            f"{path}: results.jsonl is missing, so this is no run directory (it has: {present})"
+        )
+    results = ResultLog(log).read()
+    try:
+        record = results.run
+    except ResultsError as error:
+        raise LifelongError(f"{log}: {error}") from error
+    config, text, notes = _load_config(path / "config.yaml")
+    learned = results.learned_tasks()
+    metrics = lifelong_metrics(results.scores()) if learned else None
+    if not results.finished:
+        notes.insert(0, f"This run is not finished: {learned} of {len(record.tasks)} tasks are learned.")
+    return Run(path, results, record, config, text, (*notes, *results.problems), learned, metrics)
+
+
+def short_labels(instructions: Sequence[str]) -> list[str]:
+    """Instructions without the words that all of them begin and end with; whole if nothing would be left."""
+    words = [text.split() for text in instructions]
+    start = len(os.path.commonprefix(words)) if len(words) > 1 else 0
+    end = len(os.path.commonprefix([w[::-1] for w in words])) if len(words) > 1 else 0
+    cut = [w[start : len(w) - end] for w in words]
+    fits = all(cut) and all(len(w) >= start + end for w in words)
+    return [" ".join(w) for w in (cut if fits else words)]
+
+
+def group_runs(runs: Sequence[Run]) -> list[Group]:
+    """Runs that differ only in their seed together, in the order given; labels name what differs."""
+    groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(_identity(run), []).append(run)
+    identities = [dict(key) for key in groups]
+    return [
+        Group(_label(identity, identities), tuple(members))
+        for identity, members in zip(identities, groups.values(), strict=True)
+    ]
+
+
+def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
+    """The algorithm's name and what else tells it apart; settings count among runs of one algorithm."""
+    rivals = [o for o in others if o["algo"] == identity["algo"]]
+    differs = {
+        k: v
+        for k, v in identity.items()
+        if k != "algo" and any(o.get(k) != v for o in (others if k in _BASICS else rivals))
+    }
+    words = [str(v) if k in _BASICS else f"{k.rpartition('.')[2]} {v}" for k, v in differs.items()]
+    if len(words) > 3:
+        words = [*words[:3], "…"]
+    return f"{identity['algo']} ({', '.join(words)})" if words else str(identity["algo"])
+
+
+def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
+    record = run.record
+    basic = {n: getattr(record, n) for n in _BASICS}
+    flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
+    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(("seed", "_target_", "dir", "path"))}
+    return tuple((basic | dict(sorted(flat.items()))).items())
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(value, dict):
+        parts = (_flatten(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
+        return {k: v for part in parts for k, v in part.items()}
+    return {prefix: value if isinstance(value, str | int | float | bool | None) else str(value)}
+
+
+def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return {}, "", [f"{path.name} is missing; the configuration is not shown."]
+    try:
+        config = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        return {}, text, [f"{path.name} is not valid YAML ({' '.join(str(error).split())})."]
+    return (config if isinstance(config, dict) else {}), text, []

@@ -1,0 +1,296 @@
+"""Reports of made-up runs: everything on one page, nothing fetched, unfinished and broken runs included."""
+
+import base64
+import os
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from lifelong.errors import LifelongError
+from lifelong.records import EvalRecord, LossRecord, PhaseRecord, RunEndRecord, TaskEndRecord, start_record
+from lifelong.report import write_report
+from lifelong.results import ResultLog
+from lifelong.runs import group_runs, load_run, short_labels
+
+GROCERIES = [
+    "alphabet soup",
+    "cream cheese",
+    "salad dressing",
+    "bbq sauce",
+    "ketchup",
+    "tomato sauce",
+    "butter",
+    "milk",
+    "chocolate pudding",
+    "orange juice",
+]
+# Algorithm -> success just after learning, and the share of it kept from one task to the next.
+CHARACTERS = {"sequential": (0.82, 0.35), "er": (0.74, 0.86), "ewc": (0.5, 0.6), "packnet": (0.68, 1.0)}
+
+
+def make_run(
+    folder: Path,
+    algo: str = "er",
+    seed: int = 1,
+    tasks: int = 10,
+    done: int | None = None,
+    epochs: tuple[int, ...] = (0, 2, 4, 6, 8, 10),
+    **settings: object,
+) -> Path:
+    """A run directory as an experiment leaves it, with made-up but likely numbers."""
+    rng = np.random.default_rng([seed, *algo.encode()])
+    names = GROCERIES[:tasks] if tasks <= 10 else [f"thing {i}" for i in range(tasks)]
+    config = yaml.safe_dump(
+        {"algo": {"name": algo, **settings}, "seed": seed, "train": {"epochs": epochs[-1]}}
+    )
+    log = ResultLog(folder / "results.jsonl")
+    log.append(
+        start_record(
+            algo=algo,
+            benchmark="libero_object",
+            policy="bc_transformer",
+            seed=seed,
+            preset="laptop",
+            tasks=[f"pick_up_the_{n.replace(' ', '_')}_and_place_it_in_the_basket" for n in names],
+            instructions=[f"pick up the {n} and place it in the basket" for n in names],
+            config=config,
+        )
+    )
+    (folder / "config.yaml").write_text(config)
+    log.append(PhaseRecord(phase="demos", seconds=310.0))
+    top, kept = CHARACTERS[algo]
+    level = np.clip(rng.normal(top, 0.12, tasks), 0.1, 1.0)
+    for i in range(tasks if done is None else done):
+        _learn(log, rng, i, level[i], epochs)
+        for j in range(i + 1):
+            log.append(_evaluation(rng, "matrix", i, epochs[-1], j, level[j] * kept ** (i - j)))
+        log.append(TaskEndRecord(task=i, best_epoch=epochs[-1], seconds=float(rng.uniform(200, 260))))
+    if done is None:
+        log.append(RunEndRecord(seconds=2600.0, finished="2026-01-01T12:00:00+00:00"))
+    return folder
+
+
+def _learn(
+    log: ResultLog, rng: np.random.Generator, task: int, level: float, epochs: tuple[int, ...]
+) -> None:
+    for epoch in range(epochs[-1] + 1):
+        if epoch:
+            loss = -28 + 30 * np.exp(-0.35 * epoch) + rng.normal(0, 0.4)
+            log.append(LossRecord(task=task, epoch=epoch, loss=float(loss), seconds=14.0))
+        if epoch in epochs:
+            log.append(_evaluation(rng, "curve", task, epoch, task, level * (1 - np.exp(-0.4 * epoch))))
+
+
+def _evaluation(
+    rng: np.random.Generator, phase: str, learned: int, epoch: int, task: int, rate: float
+) -> EvalRecord:
+    wins = rng.random(20) < rate
+    return EvalRecord(
+        phase=phase,
+        learned=learned,
+        epoch=epoch,
+        task=task,
+        successes=tuple(bool(w) for w in wins),
+        lengths=tuple(int(x) for x in rng.integers(90, 280, 20)),
+        init_states=tuple(range(20)),
+        seconds=4.0,
+    )
+
+
+def add_video(folder: Path, name: str = "task_01_success") -> None:
+    (folder / "videos").mkdir(exist_ok=True)
+    frames = [Image.new("RGB", (16, 16), (40 * i, 90, 160)) for i in range(4)]
+    path = folder / "videos" / f"{name}.gif"
+    frames[0].save(path, save_all=True, append_images=frames[1:])
+
+
+class Page(HTMLParser):
+    """What a test asks of a page: its text, what it loads, and that every element is closed."""
+
+    VOID = ("meta", "img", "br", "link", "input", "line")
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.loads: list[str] = []
+        self.words: list[str] = []
+        self.titles: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.loads += [v for k in ("src", "xlink:href", "data") if (v := values.get(k))]
+        self.loads += [v] if tag == "link" and (v := values.get("href")) else []
+        self.titles += [v] if (v := values.get("title")) else []
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open.pop() == tag, f"</{tag}> closes nothing"
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = make_run(tmp_path_factory.mktemp("er"), tasks=4)
+    add_video(folder)
+    write_report([folder])
+    return folder
+
+
+def test_one_page_that_loads_nothing(finished: Path):
+    page = Page((finished / "report.html").read_text())
+    assert page.open == []
+    assert page.loads and all(v.startswith(("data:", "#")) for v in page.loads)
+    assert "@import" not in (finished / "report.html").read_text()
+
+
+def test_the_page_tells_the_whole_run(finished: Path):
+    text = Page((finished / "report.html").read_text()).text
+    for said in ("er on libero_object", "FWT", "NBT", "AUC", "Just learned", "demos 5 min 10 s", "mujoco"):
+        assert said in text
+    assert "pick up the cream cheese and place it in the basket" in text
+    assert "task 01 success" in text and "epochs: 10" in text
+    assert "not finished" not in text
+
+
+def test_the_heatmap_shows_the_matrix(finished: Path):
+    run = load_run(finished)
+    page = Page((finished / "report.html").read_text())
+    hints = [t for t in page.titles if t.startswith("after task")]
+    assert len(hints) == 10  # the upper triangle is blank
+    rates, _ = run.results.success_matrix()
+    assert f"on task 2 (cream cheese): {100 * rates[3, 1]:.0f} %" in hints[7]
+    assert f"{round(20 * rates[3, 1])} of 20 episodes" in hints[7]
+
+
+def test_pictures_for_papers_lie_beside_the_page(finished: Path):
+    assert (finished / "heatmap.pdf").read_bytes().startswith(b"%PDF")
+    with Image.open(finished / "heatmap.png") as image:
+        assert min(image.size) > 800
+
+
+def test_the_same_results_give_the_same_page(finished: Path, tmp_path: Path):
+    out = write_report([finished], tmp_path / "again.html")
+    assert out.read_bytes() == (finished / "report.html").read_bytes()
+
+
+@pytest.mark.parametrize("done", [0, 1, 2])
+def test_an_unfinished_run_is_reported_as_far_as_it_is(tmp_path: Path, done: int):
+    folder = make_run(tmp_path / "run", tasks=3, done=done)
+    with open(folder / "results.jsonl", "ab") as file:
+        file.write(b'{"kind": "eval", "pha')
+    page = Page(write_report([folder]).read_text())
+    assert f"not finished: {done} of 3 tasks are learned" in page.text and page.open == []
+    assert ("None yet" in page.text) == (done == 0)
+
+
+def test_broken_lines_and_a_missing_config_are_said_on_the_page(tmp_path: Path):
+    folder = make_run(tmp_path / "run", tasks=2)
+    lines = (folder / "results.jsonl").read_text().splitlines()
+    (folder / "results.jsonl").write_text("\n".join([*lines[:4], "<b>oops</b>", *lines[4:]]) + "\n")
+    (folder / "config.yaml").unlink()
+    raw = write_report([folder]).read_text()
+    assert "results.jsonl:5: not JSON" in Page(raw).text and "config.yaml is missing" in Page(raw).text
+
+
+def test_text_of_a_run_is_never_markup(tmp_path: Path):
+    folder = make_run(tmp_path / "run", tasks=2)
+    (folder / "config.yaml").write_text("algo: {note: '<script>alert(1)</script>'}\n")
+    assert "<script" not in write_report([folder]).read_text()
+
+
+def test_several_runs_side_by_side(tmp_path: Path):
+    runs = [make_run(tmp_path / f"{a}{s}", a, s, tasks=3) for a in CHARACTERS for s in (1, 2)]
+    out = write_report(runs, tmp_path / "compared")
+    page = Page(out.read_text())
+    assert page.open == [] and out.name == "report.html"
+    assert "4 methods on libero_object" in page.text
+    assert len(re.findall(r"± \d", page.text)) >= 4 * 5
+    assert {p.name for p in out.parent.iterdir()} == {
+        "report.html",
+        *(f"{stem}.{kind}" for stem in ("heatmap", "forgetting") for kind in ("png", "pdf")),
+    }
+
+
+def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Path):
+    runs = [
+        make_run(tmp_path / "a", "ewc", 1, tasks=2, strength=10),
+        make_run(tmp_path / "b", "ewc", 2, tasks=2, strength=10),
+        make_run(tmp_path / "c", "ewc", 1, tasks=2, strength=500),
+        make_run(tmp_path / "d", "er", 1, tasks=2, budget=7),
+    ]
+    groups = group_runs([load_run(r) for r in runs])
+    assert [(g.label, len(g.runs)) for g in groups] == [
+        ("ewc (strength 10)", 2),
+        ("ewc (strength 500)", 1),
+        ("er", 1),
+    ]
+
+
+def test_runs_of_different_progress_and_length_compare(tmp_path: Path):
+    runs = [make_run(tmp_path / "a", "er", 1, tasks=3), make_run(tmp_path / "b", "er", 2, tasks=3, done=1)]
+    runs.append(make_run(tmp_path / "c", "ewc", 1, tasks=3, done=0))
+    page = Page(write_report(runs, tmp_path / "out.html").read_text())
+    assert "1 of 3" in page.text and "0 of 3" in page.text
+
+
+def test_long_sequences_fit(tmp_path: Path):
+    page = Page(write_report([make_run(tmp_path / "run", tasks=30, epochs=(0, 1))]).read_text())
+    assert page.open == []
+
+
+@pytest.mark.parametrize("name", ["nowhere", "empty", "begun"])
+def test_what_is_no_run_is_named(tmp_path: Path, name: str):
+    folder = tmp_path / name
+    said = {"nowhere": "no such run", "empty": "results.jsonl is missing", "begun": "no 'run' record"}[name]
+    if name != "nowhere":
+        folder.mkdir()
+    if name == "begun":
+        (folder / "results.jsonl").write_text("")
+    with pytest.raises(LifelongError, match=f"{re.escape(str(folder))}.*{said}"):
+        write_report([folder])
+    with pytest.raises(LifelongError, match="no run directory given"):
+        write_report([])
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root writes anywhere")
+def test_a_folder_that_cannot_be_written_is_named(finished: Path, tmp_path: Path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(LifelongError, match="cannot be written"):
+        write_report([finished], tmp_path / "sub" / "report.html")
+
+
+def test_too_many_pictures_are_left_out_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = make_run(tmp_path / "run", tasks=2)
+    for name in ("a", "b"):
+        add_video(folder, name)
+    (folder / "videos" / "a.txt").write_text("the first one")
+    monkeypatch.setattr("lifelong.report.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
+    raw = write_report([folder]).read_text()
+    assert "the first one" in raw and "Left out for their size: b.gif" in raw
+    assert base64.b64encode((folder / "videos" / "a.gif").read_bytes()).decode() in raw
+
+
+def test_labels_leave_out_what_all_instructions_share():
+    texts = [f"pick up the {n} and place it in the basket" for n in GROCERIES]
+    assert short_labels(texts) == list(GROCERIES)
+    assert short_labels(["open the door"]) == ["open the door"]
+    assert short_labels(["push it", "push it"]) == ["push it", "push it"]
+    assert short_labels(["open the door", "close the window"]) == ["open the door", "close the window"]
