@@ -1,0 +1,204 @@
+"""A scripted expert: sees the whole state, acts through the environment's seven numbers."""
+
+from typing import Literal
+
+import numpy as np
+
+from libero_env.expert.geometry import Pose
+from libero_env.expert.grasp import TIP_BELOW, Grasp, GraspError, choose_grasp
+from libero_env.expert.motion import CLOSE, OPEN, action_toward, downward, rotation_between
+from libero_env.expert.plan import PickPlace, Shapes, plan_goal, pose_of
+from libero_env.expert.style import Style
+from libero_env.predicates import StateView, evaluate
+from libero_env.problem import Atom
+from libero_env.tasks import Task
+
+Phase = Literal["reach", "close", "carry", "release", "rest"]
+
+ARRIVED = 0.005  # m
+ARRIVED_TURN = 0.12  # rad
+FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
+AROUND = 0.08  # m, within which bodies count as in the way
+HAND_OVER_RIM = 0.045  # m, of the grip site, so that the palm stays above a container
+
+
+class Expert:
+    """Reaches the goal of a task in one simulation.
+
+    It moves in phases: reach (down a funnel over the grasp), close, carry (up, over and a little down), release. It
+    looks at what it achieved: an object that slipped, tipped or fell beside its place is taken again.
+
+    Args:
+        task: what to do.
+        rng: draws the manner; the same generator state gives the same behaviour.
+        shapes: of the task's scene, to share between experts of the same task; made from the first view otherwise.
+        style: the manner, instead of drawing it.
+
+    Attributes:
+        phase: what it is doing.
+        retries: how often it had to start over.
+        trouble: why it cannot go on, or "".
+    """
+
+    def __init__(
+        self, task: Task, rng: np.random.Generator, *, shapes: Shapes | None = None, style: Style | None = None
+    ):
+        self.task, self.shapes = task, shapes
+        self.style = Style.draw(rng) if style is None else style
+        self.phase: Phase = "reach"
+        self.retries = 0
+        self.trouble = ""
+        self._skill: PickPlace | None = None
+        self._grasp: tuple[Grasp, Pose] | None = None  # and where the object was then
+        self._hold: tuple[np.ndarray, np.ndarray] | None = None  # pose to keep while the fingers move
+        self._offset = np.zeros(3)  # of the object from the grip site when it was taken
+        self._steps, self._opening = 0, 0.0
+
+    @property
+    def steadiness(self) -> float:
+        """How much disturbance the moment bears, in [0, 1]: none while the fingers move."""
+        return {"reach": 1.0, "carry": 0.7}.get(self.phase, 0.0)
+
+    def act(self, view: StateView) -> np.ndarray:
+        """The next action, (7,) in [-1, 1].
+
+        Raises:
+            UnsupportedGoalError: the task's goal needs a skill that there is not.
+        """
+        if self.shapes is None:
+            self.shapes = Shapes(view.scene)
+        skill = self._next_skill(view)
+        if skill is None:
+            self._enter("rest")
+            return np.array([0.0] * 6 + [OPEN])
+        return getattr(self, f"_{self.phase}")(view, skill)
+
+    def _next_skill(self, view: StateView) -> PickPlace | None:
+        skills = plan_goal(self.task.problem.goal, view.scene)
+        if self._skill is None or (self.phase in ("reach", "rest") and self._done(view, self._skill)):
+            self._skill = next((skill for skill in skills if not self._done(view, skill)), None)
+            self._grasp = None
+            if self._skill is not None:
+                self._enter("reach")
+        return self._skill
+
+    def _done(self, view: StateView, skill: PickPlace) -> bool:
+        return evaluate(Atom("In", (skill.thing, skill.site)), view)
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase, self._steps = phase, 0
+
+    def _again(self) -> None:
+        self.retries += 1
+        self._grasp = None
+        self._enter("reach")
+
+    def _reach(self, view: StateView, skill: PickPlace) -> np.ndarray:
+        pos, style = view.eef_pos, self.style
+        try:
+            goal, mat = self._grasp_pose(view, skill)
+        except GraspError as error:
+            self.trouble = str(error)
+            return np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, OPEN])
+        away = float(np.linalg.norm(goal[:2] - pos[:2]))
+        turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
+        self._steps += 1
+        if away < ARRIVED and abs(goal[2] - pos[2]) < ARRIVED and turn < ARRIVED_TURN:
+            self._hold = goal, mat
+            self._enter("close")
+            return self._close(view, skill)
+        lift = np.clip(style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, style.hover)
+        over = goal.copy()
+        over[2] += lift
+        if away > 0.05:
+            way = self._in_the_way(view, goal, skill.thing)
+            over[2] = max(over[2], way + FINGER_CLEARANCE + TIP_BELOW)
+        lateral = np.clip(1.0 - (over[2] - pos[2] - 0.02) / 0.04, 0.0, 1.0)
+        return self._toward(view, over, mat, OPEN, lateral)
+
+    def _close(self, view: StateView, skill: PickPlace) -> np.ndarray:
+        opening = float(np.abs(view.finger_pos).sum())
+        still = abs(opening - self._opening) < 4e-4
+        self._opening = opening
+        self._steps += 1
+        if self._steps > 4 + self.style.pause and still or self._steps > 15:
+            if opening < 0.004:
+                self._again()
+                return self._toward(view, view.eef_pos + [0, 0, 0.05], self._hold[1], OPEN)
+            self._offset = view.body_pos(skill.thing) - view.eef_pos
+            self._enter("carry")
+            return self._carry(view, skill)
+        return self._toward(view, *self._hold, CLOSE)
+
+    def _carry(self, view: StateView, skill: PickPlace) -> np.ndarray:
+        pos, style = view.eef_pos, self.style
+        offset = view.body_pos(skill.thing) - pos
+        if np.linalg.norm(offset - self._offset) > 0.03 + 0.3 * abs(self._offset[2]):
+            self._again()
+            return self._reach(view, skill)
+        hang = max(pos[2] - self.shapes.cloud(view, skill.thing)[:, 2].min(), TIP_BELOW)
+        rim = self.shapes.cloud(view, skill.container)[:, 2].max()
+        goal = view.site_pos(skill.site) - offset
+        goal[:2] += style.place_xy
+        away = float(np.linalg.norm(goal[:2] - pos[:2]))
+        high = rim + hang + style.margin
+        low = max(rim + hang - style.depth, rim + HAND_OVER_RIM)
+        goal[2] = high if away > 0.03 else min(low, high)
+        self._steps += 1
+        if away < 0.02 and pos[2] < goal[2] + 0.015:
+            self._hold = np.array([*goal[:2], min(goal[2], pos[2])]), self._hold[1]
+            self._enter("release")
+            return self._release(view, skill)
+        way = self._in_the_way(view, goal, skill.thing) + hang + 0.7 * style.margin
+        lateral = np.clip(1.0 - (min(way, high) - pos[2]) / 0.05, 0.0, 1.0)
+        return self._toward(view, goal, self._hold[1], CLOSE, lateral)
+
+    def _release(self, view: StateView, skill: PickPlace) -> np.ndarray:
+        self._steps += 1
+        if self._steps <= self.style.pause:
+            return self._toward(view, *self._hold, CLOSE)
+        if self._steps > 14:
+            if self._done(view, skill):
+                self._enter("rest")
+            else:
+                self._again()
+        return self._toward(view, *self._hold, OPEN)
+
+    def _rest(self, view: StateView, skill: PickPlace) -> np.ndarray:
+        return np.array([0.0] * 6 + [OPEN])
+
+    def _toward(
+        self, view: StateView, goal: np.ndarray, mat: np.ndarray, gripper: float, lateral: float = 1.0
+    ) -> np.ndarray:
+        style = self.style
+        return action_toward(
+            view.eef_pos, view.eef_mat, goal, mat, gripper=gripper, gain=style.gain, speed=style.speed, lateral=lateral
+        )
+
+    def _grasp_pose(self, view: StateView, skill: PickPlace) -> tuple[np.ndarray, np.ndarray]:
+        """Where the grip site must be to take the object, following it when it moves; planned anew when it turns."""
+        now = pose_of(view, skill.thing)
+        if self._grasp is not None:
+            then = self._grasp[1]
+            moved = np.linalg.norm(now.pos - then.pos) > 0.01
+            if moved or np.linalg.norm(rotation_between(then.mat, now.mat)) > 0.1:
+                self._grasp = None
+        if self._grasp is None:
+            cloud, others = self.shapes.cloud(view, skill.thing), self.shapes.others(view, skill.thing)
+            support = view.scene.workspace.region_height
+            self._grasp = choose_grasp(cloud, others, support, view.eef_mat[:, 1], skill.thing), now
+        grasp, then = self._grasp
+        yaw = grasp.yaw + self.style.yaw
+        along = np.array([-np.sin(grasp.yaw), np.cos(grasp.yaw), 0.0]) * self.style.grasp_along
+        return grasp.pos_world + now.pos - then.pos + along, downward(yaw, view.eef_mat[:, 1])
+
+    def _in_the_way(self, view: StateView, goal: np.ndarray, thing: str) -> float:
+        """Height of the highest thing near the next decimetre of the way, m."""
+        others = self.shapes.others(view, thing)
+        start = view.eef_pos[:2]
+        way = goal[:2] - start
+        length = float(np.linalg.norm(way))
+        way = way * min(1.0, 0.10 / max(length, 1e-9))
+        along = np.clip((others[:, :2] - start) @ way / max(way @ way, 1e-12), 0.0, 1.0)
+        near = np.linalg.norm(others[:, :2] - start - along[:, None] * way, axis=1) < AROUND
+        return float(others[near, 2].max(initial=view.scene.workspace.region_height))
