@@ -1,0 +1,126 @@
+"""Pictures without a screen: GL backend choice and a renderer that draws upright frames.
+
+OpenGL contexts are opened lazily, by the thread that draws; nothing is shared between processes.
+"""
+
+import importlib
+import os
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+
+from libero_env.errors import RenderError, UnknownNameError
+
+BACKENDS = ("egl", "osmesa", "glfw")
+REMEDY = (
+    "install a GL library (Debian and Ubuntu: apt-get install -y libegl1 libgl1-mesa-dri libosmesa6), or set "
+    "MUJOCO_GL to one of egl, osmesa, glfw; `libero doctor` checks it"
+)
+
+
+def open_context(width: int, height: int) -> tuple[str, object]:
+    """Open an offscreen OpenGL context: (backend name, context with make_current and free).
+
+    `MUJOCO_GL` chooses the backend where it is set; otherwise EGL is tried, then OSMesa.
+
+    Raises:
+        RenderError: none works here; the message says why and what to install.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    if wanted and wanted not in BACKENDS:
+        raise RenderError(f"MUJOCO_GL={wanted} is not a backend; valid: {', '.join(BACKENDS)}. Or unset it")
+    failures = []
+    for name in (wanted,) if wanted else ("egl", "osmesa"):
+        try:
+            return name, importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        except Exception as error:  # noqa: BLE001 - each backend fails in its own way (ImportError, AttributeError, GL)
+            failures.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
+    raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
+
+
+@lru_cache(maxsize=1)
+def choose_backend() -> str:
+    """Name of the backend that works here; opens a small context to find out.
+
+    Raises:
+        RenderError: none does.
+    """
+    name, context = open_context(64, 64)
+    context.free()
+    return name
+
+
+class Renderer:
+    """Draws a model's cameras into (height, width, 3) uint8 frames, first row on top.
+
+    Only visual geoms (group 1) are drawn. Use from one thread; close it, or use it as a context manager.
+    """
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int):
+        largest = min(model.vis.global_.offheight, model.vis.global_.offwidth)
+        if not (0 < height <= largest and 0 < width <= largest):
+            raise RenderError(f"a frame of {height}x{width} pixels is not between 1 and {largest} on each side")
+        self._model, self._height, self._width = model, height, width
+        self._gl: object | None = None
+        self._pixels = np.empty((height, width, 3), np.uint8)
+
+    def camera_id(self, name: str) -> int:
+        """Index of a camera.
+
+        Raises:
+            UnknownNameError: the model has no such camera; the message lists them.
+        """
+        index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+        if index < 0:
+            raise UnknownNameError("camera", name, [self._model.camera(i).name for i in range(self._model.ncam)])
+        return index
+
+    def render(self, data: mujoco.MjData, cameras: list[int], out: list[np.ndarray]) -> None:
+        """Draw the cameras of one state into the arrays of `out`, each (height, width, 3) uint8."""
+        if self._gl is None:
+            self._open()
+        self._gl.make_current()
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        for k, (camera, frame) in enumerate(zip(cameras, out, strict=True)):
+            self._camera.fixedcamid = camera
+            if k == 0:
+                mujoco.mjv_updateScene(
+                    self._model, data, self._options, None, self._camera, everything, self._scene
+                )  # fmt: skip
+            else:
+                mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
+            mujoco.mjr_render(self._viewport, self._scene, self._context)
+            mujoco.mjr_readPixels(self._pixels, None, self._viewport, self._context)
+            frame[:] = self._pixels[::-1]  # OpenGL's first row is the lowest
+
+    def close(self) -> None:
+        """Free the context. Idempotent."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self) -> None:
+        _, self._gl = open_context(self._width, self._height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        mujoco.mjr_resizeOffscreen(self._width, self._height, self._context)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + 100)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._options = mujoco.MjvOption()
+        self._options.geomgroup[:] = 0
+        self._options.geomgroup[1] = 1
+        self._options.sitegroup[:] = 0
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._viewport = mujoco.MjrRect(0, 0, self._width, self._height)
