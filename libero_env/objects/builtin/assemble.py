@@ -24,13 +24,13 @@ class Look:
 
     Attributes:
         mesh: in the rest frame: origin at the root, z up, front towards +x.
-        image: texture (H, W, 3) uint8, first row on top (v = 1).
+        image: texture, PNG bytes; the file's first row is v = 0.
         specular: strength of highlights, 0..1.
         shininess: sharpness of highlights, 0..1.
     """
 
     mesh: Mesh
-    image: np.ndarray
+    image: bytes
     specular: float = 0.25
     shininess: float = 0.4
 
@@ -80,19 +80,12 @@ def _add_collision(body: mujoco.MjsBody, facts: Facts) -> None:
         )
 
 
-def _add_visual(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, category: str, look: Look, facts: Facts
-) -> None:
-    # Textures and materials keep their place in the namespace of the scene: the category goes in front.
-    height, width, channels = look.image.shape
-    texture = spec.add_texture(
-        name=f"{category}_texture",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=width,
-        height=height,
-        nchannel=channels,
-    )
-    texture.data = np.ascontiguousarray(look.image[::-1]).tobytes()  # MuJoCo: first row is v = 0
+def _add_visual(spec: mujoco.MjSpec, body: mujoco.MjsBody, category: str, look: Look, facts: Facts) -> None:
+    # The category goes in front of each name: scenes share one namespace for textures and materials.
+    # A file in `assets`, not a buffer: only so can a scene be written as XML.
+    picture = f"{category}.png"
+    spec.assets[picture] = look.image
+    texture = spec.add_texture(name=f"{category}_texture", type=mujoco.mjtTexture.mjTEXTURE_2D, file=picture)
     material = spec.add_material(
         name=f"{category}_material", specular=look.specular, shininess=look.shininess, reflectance=0.0
     )
@@ -121,9 +114,8 @@ def _add_visual(
 
 def _add_sites(body: mujoco.MjsBody, facts: Facts) -> None:
     hidden = {"rgba": (0.0, 0.0, 0.0, 0.0), "group": HIDDEN_GROUP}
-    body.add_site(
-        name="default_site", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=(0.0, 0.0, 0.0), size=(0.002,) * 3, **hidden
-    )
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    body.add_site(name="default_site", type=sphere, pos=(0.0, 0.0, 0.0), size=(0.002,) * 3, **hidden)
     for site in facts.sites:
         kind = getattr(mujoco.mjtGeom, f"mjGEOM_{site.type.upper()}")
         body.add_site(name=site.name, type=kind, pos=site.pos, size=site.size, quat=site.quat, **hidden)

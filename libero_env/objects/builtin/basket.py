@@ -4,6 +4,7 @@ import numpy as np
 
 from libero_env.objects.builtin.assemble import Look
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft
+from libero_env.objects.builtin.paint import png
 
 COLUMNS, ROWS = 28, 14  # strands of the weave around and over the picture's height
 RIM_V = 0.88  # the braided rim takes the picture above
@@ -11,7 +12,7 @@ RIM_V = 0.88  # the braided rim takes the picture above
 
 def basket() -> Look:
     """Brown basket whose walls are where the collision boxes are."""
-    return Look(_basket_mesh(), _weave(), specular=0.05, shininess=0.1)
+    return Look(_basket_mesh(), png(_weave()), specular=0.05, shininess=0.1)
 
 
 LOOKS = {"basket": basket}
@@ -35,7 +36,9 @@ def _basket_mesh() -> Mesh:
 def _weave() -> np.ndarray:
     """Over and under: each strand is bright in its middle, dark where it dives, (128, 256, 3) uint8."""
     height, width = 128, 256
-    v, u = np.meshgrid((np.arange(height)[::-1] + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    v = (np.arange(height)[::-1, None] + 0.5) / height  # first row on top
+    u = (np.arange(width)[None] + 0.5) / width
+    v, u = np.broadcast_arrays(v, u)
     row, column = v * ROWS, u * COLUMNS
     over = (np.floor(row) + np.floor(column)) % 2 == 0
     across = np.where(over, row, column) % 1.0 - 0.5

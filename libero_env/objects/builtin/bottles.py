@@ -18,7 +18,7 @@ def ketchup() -> Look:
         canvas.text("KETCHUP", (u - 0.15, 0.39, u + 0.15, 0.46), (255, 255, 255))
         canvas.disc(u, 0.25, 0.065, 0.085, (222, 40, 24))
         canvas.polygon([(u - 0.04, 0.345), (u, 0.30), (u + 0.04, 0.345)], (40, 130, 50))
-    return Look(_ketchup_mesh(), canvas.pixels(), specular=0.5, shininess=0.6)
+    return Look(_ketchup_mesh(), canvas.png(), specular=0.5, shininess=0.6)
 
 
 def salad_dressing() -> Look:
@@ -31,7 +31,7 @@ def salad_dressing() -> Look:
         canvas.disc(u - 0.04, 0.25, 0.045, 0.055, (240, 130, 36))
         canvas.disc(u + 0.045, 0.25, 0.05, 0.05, (60, 150, 56))
         canvas.disc(u, 0.50, 0.05, 0.03, (60, 150, 56))
-    return Look(_salad_mesh(), canvas.pixels(), specular=0.4, shininess=0.5)
+    return Look(_salad_mesh(), canvas.png(), specular=0.4, shininess=0.5)
 
 
 def bbq_sauce() -> Look:
@@ -44,7 +44,7 @@ def bbq_sauce() -> Look:
         for shift, height in ((-0.075, 0.10), (0.0, 0.15), (0.075, 0.10)):
             flame = [(u + shift - 0.035, 0.20), (u + shift + 0.035, 0.20), (u + shift, 0.20 + height)]
             canvas.polygon(flame, (250, 140, 30))
-    return Look(_bbq_mesh(), canvas.pixels(), specular=0.5, shininess=0.6)
+    return Look(_bbq_mesh(), canvas.png(), specular=0.5, shininess=0.6)
 
 
 LOOKS = {"bbq_sauce": bbq_sauce, "ketchup": ketchup, "salad_dressing": salad_dressing}

@@ -27,7 +27,7 @@ def butter() -> Look:
     canvas.rect(0.5, 0.5, 1.0, 0.75, (204, 40, 30))
     canvas.text("BUTTER", (0.55, 0.55, 0.95, 0.70), (255, 240, 170))
     canvas.text("BUTTER", (0.58, 0.83, 0.92, 0.97), (196, 34, 26))
-    return Look(box((0.0384, 0.0197, 0.0088), (0, 0, 0), CELLS), canvas.pixels(), specular=0.15)
+    return Look(box((0.0384, 0.0197, 0.0088), (0, 0, 0), CELLS), canvas.png(), specular=0.15)
 
 
 def cream_cheese() -> Look:
@@ -42,7 +42,7 @@ def cream_cheese() -> Look:
     canvas.disc(0.75, 0.625, 0.18, 0.10, (52, 76, 176))
     canvas.text("CREAM", (0.63, 0.585, 0.87, 0.665), (255, 255, 255))
     canvas.text("CREAM CHEESE", (0.54, 0.84, 0.96, 0.96), (52, 76, 176))
-    return Look(box((0.0410, 0.0213, 0.0092), (0, 0, 0), CELLS), canvas.pixels(), specular=0.4)
+    return Look(box((0.0410, 0.0213, 0.0092), (0, 0, 0), CELLS), canvas.png(), specular=0.4)
 
 
 def chocolate_pudding() -> Look:
@@ -57,7 +57,7 @@ def chocolate_pudding() -> Look:
     canvas.rect(0.5, 0.5, 1.0, 0.53, (214, 52, 34))
     canvas.text("PUDDING", (0.55, 0.57, 0.95, 0.71), (252, 224, 168))
     canvas.text("PUDDING", (0.56, 0.83, 0.94, 0.97), (252, 224, 168))
-    return Look(box((0.0412, 0.0238, 0.0141), (0.0, 0, 0.0006), CELLS), canvas.pixels(), specular=0.2)
+    return Look(box((0.0412, 0.0238, 0.0141), (0.0, 0, 0.0006), CELLS), canvas.png(), specular=0.2)
 
 
 LOOKS = {"butter": butter, "chocolate_pudding": chocolate_pudding, "cream_cheese": cream_cheese}

@@ -18,7 +18,7 @@ def alphabet_soup() -> Look:
         canvas.disc(u, 0.36, 0.15, 0.13, (250, 250, 245))
         canvas.disc(u, 0.38, 0.125, 0.095, (240, 120, 30))
         canvas.text("SOUP", (u - 0.10, 0.33, u + 0.10, 0.44), (255, 240, 190))
-    return Look(_can(), canvas.pixels(), specular=0.5, shininess=0.6)
+    return Look(_can(), canvas.png(), specular=0.5, shininess=0.6)
 
 
 def tomato_sauce() -> Look:
@@ -31,7 +31,7 @@ def tomato_sauce() -> Look:
         canvas.text("TOMATO", (u - 0.16, 0.63, u + 0.16, 0.77), (255, 232, 150))
         for shift in (-0.12, 0.0, 0.12):
             _tomato(canvas, u + shift, 0.22, 0.055, 0.095)
-    return Look(_can(), canvas.pixels(), specular=0.5, shininess=0.6)
+    return Look(_can(), canvas.png(), specular=0.5, shininess=0.6)
 
 
 LOOKS = {"alphabet_soup": alphabet_soup, "tomato_sauce": tomato_sauce}

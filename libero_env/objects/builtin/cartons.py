@@ -28,7 +28,7 @@ def milk() -> Look:
         for v in (0.18, 0.23, 0.28):
             canvas.rect(u - 0.07, v, u + 0.07, v + 0.02, (120, 140, 170))
         canvas.text("MILK", (u - 0.07, 0.45, u + 0.07, 0.58), (255, 255, 255))
-    return Look(_carton(), canvas.pixels(), specular=0.2)
+    return Look(_carton(), canvas.png(), specular=0.2)
 
 
 def orange_juice() -> Look:
@@ -45,7 +45,7 @@ def orange_juice() -> Look:
     for u in SIDES:
         _orange_slice(canvas, u, 0.23, 0.070)
         canvas.text("OJ", (u - 0.05, 0.43, u + 0.05, 0.57), (30, 100, 40))
-    return Look(_carton(), canvas.pixels(), specular=0.2)
+    return Look(_carton(), canvas.png(), specular=0.2)
 
 
 LOOKS = {"milk": milk, "orange_juice": orange_juice}

@@ -124,8 +124,10 @@ def _section(ring: Ring, segments: int, center: tuple[float, float]) -> tuple[np
     u = np.linspace(0.0, 1.0, segments + 1)
     angle = 2.0 * np.pi * (u - 0.5)
     bend = 2.0 / ring.round
-    x = np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** bend * ring.depth + center[0]
-    y = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** bend * ring.width + center[1]
+    # Rounded: a fractional power would blow the sine of pi up to something visible.
+    cosine, sine = np.round(np.cos(angle), 12), np.round(np.sin(angle), 12)
+    x = np.sign(cosine) * np.abs(cosine) ** bend * ring.depth + center[0]
+    y = np.sign(sine) * np.abs(sine) ** bend * ring.width + center[1]
     return (
         np.column_stack([x, y, np.full_like(u, ring.z)]),
         np.column_stack([u, np.full_like(u, ring.v)]),

@@ -1,5 +1,6 @@
 """Labels: small pictures drawn with (u, v) coordinates, v upwards, as the meshes use them."""
 
+import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -57,9 +58,16 @@ class Canvas:
         mask = mask.resize((max(1, round(x1 - x0)), max(1, round(y1 - y0))), Image.Resampling.BILINEAR)
         self._image.paste(color, (round(x0), round(y0)), mask)
 
-    def pixels(self) -> np.ndarray:
-        """The picture (H, W, 3) uint8."""
-        return np.asarray(self._image.resize(self._size, Image.Resampling.BOX)).copy()
+    def png(self) -> bytes:
+        """The picture, encoded."""
+        return png(np.asarray(self._image.resize(self._size, Image.Resampling.BOX)))
 
     def _at(self, u: float, v: float) -> tuple[float, float]:
         return u * self._image.width, (1.0 - v) * self._image.height
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """A picture (H, W, 3) uint8, first row on top, encoded for MuJoCo, whose v = 0 is a file's first row."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels[::-1]).save(stream, "png")
+    return stream.getvalue()
