@@ -15,32 +15,41 @@ from pathlib import Path
 from libero_env.paths import cache_dir, demos_dir
 
 ROBOSUITE = "1.4.1"
+GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
 BACKENDS = ("egl", "osmesa", "glfw")
-GL_REMEDY = "install a GL library: apt-get install libegl1 libosmesa6 (as root), or `make gl`"
 PROBE_SECONDS = 60
+PACKAGE_ROOT = str(Path(__file__).parents[1])
 
 # Runs in a process of its own: a broken driver takes the process with it.
 _PROBE = """
-import json, time, warnings
-warnings.simplefilter("ignore")
-import mujoco
+import json, sys, time
+import mujoco, numpy
+from libero_env.errors import RenderError
+from libero_env.render import Renderer, choose_backend
 model = mujoco.MjModel.from_xml_string(
-    "<mujoco><worldbody><light pos='0 0 2'/><geom type='plane' size='1 1 1'/></worldbody></mujoco>")
+    "<mujoco><worldbody><light pos='0 0 2'/><geom type='plane' size='1 1 1' group='1'/>"
+    "<camera name='above' pos='0 0 2'/></worldbody></mujoco>")
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
-renderer = mujoco.Renderer(model, 128, 128)
-renderer.update_scene(data); renderer.render()
-start = time.perf_counter()
-renderer.update_scene(data); picture = renderer.render()
-seconds = time.perf_counter() - start
+picture = numpy.zeros((128, 128, 3), numpy.uint8)
 try:
-    from OpenGL.GL import GL_RENDERER, glGetString
-    name = glGetString(GL_RENDERER).decode()
-except Exception:
-    name = "?"
-found = {"milliseconds": 1e3 * seconds, "renderer": name, "drawn": bool(picture.max() > 0)}
+    found = {"backend": choose_backend()}
+    with Renderer(model, 128, 128) as renderer:
+        camera = [renderer.camera_id("above")]
+        renderer.render(data, camera, [picture])
+        start = time.perf_counter()
+        renderer.render(data, camera, [picture])
+        found["milliseconds"] = 1e3 * (time.perf_counter() - start)
+        try:
+            from OpenGL.GL import GL_RENDERER, glGetString
+            found["device"] = glGetString(GL_RENDERER).decode()
+        except Exception:
+            found["device"] = "unknown device"
+    if not picture.any():
+        found = {"error": found["backend"] + " draws black pictures"}
+except RenderError as error:
+    found = {"error": str(error)}
 print(json.dumps(found), flush=True)
-renderer.close()
 """
 
 
@@ -93,44 +102,32 @@ def check_robot_models() -> Finding:
 
 
 def check_gl() -> Finding:
-    """Draw a frame with `MUJOCO_GL` where it is set, else with each backend until one works."""
-    chosen = os.environ.get("MUJOCO_GL")
-    failures = []
-    for backend in [chosen] if chosen else BACKENDS[:2]:
-        drawn, detail = probe_gl(backend)
-        if drawn:
-            note = f" ({'; '.join(failures)})" if failures else ""
-            return Finding("GL", f"{backend}: {detail}{note}")
-        failures.append(f"{backend}: {detail}")
-    remedy = GL_REMEDY
-    if chosen:
-        remedy = f"unset MUJOCO_GL (it is {chosen!r}; valid: {', '.join(BACKENDS)}), or {GL_REMEDY}"
-    return Finding("GL", "no picture can be drawn. " + "; ".join(failures), False, remedy)
-
-
-def probe_gl(backend: str) -> tuple[bool, str]:
-    """Render two 128 x 128 frames in a process of its own.
-
-    Returns:
-        Whether the frame was drawn, and the time of the second frame or the reason of the failure.
-    """
-    env = {**os.environ, "MUJOCO_GL": backend}
-    if backend in ("egl", "osmesa"):
-        env["PYOPENGL_PLATFORM"] = backend
+    """Draw two 128 x 128 frames with the backend that the environment would take, in a process of its own."""
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if chosen.lower() not in ("", *BACKENDS):
+        remedy = f"unset MUJOCO_GL, or set it to one of {', '.join(BACKENDS)}"
+        return Finding("GL", f"MUJOCO_GL={chosen} is not a backend", False, remedy)
+    env = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH")))),
+    }
+    command = [sys.executable, "-c", _PROBE]
     try:
-        command = [sys.executable, "-c", _PROBE]
         done = subprocess.run(
             command, env=env, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
         )
     except subprocess.TimeoutExpired:
-        return False, f"no frame within {PROBE_SECONDS} s"
+        return Finding("GL", f"no frame within {PROBE_SECONDS} s", False, GL_REMEDY)
     lines = done.stdout.strip().splitlines()
-    if lines and lines[-1].startswith("{"):
-        found = json.loads(lines[-1])
-        return found["drawn"], f"{found['renderer']}, a 128x128 frame takes {found['milliseconds']:.1f} ms"
-    noise = (" ", "Exception ignored")
-    reasons = [line for line in done.stderr.splitlines() if line and not line.startswith(noise)]
-    return False, reasons[-1] if reasons else f"exit status {done.returncode}"
+    if not lines or not lines[-1].startswith("{"):
+        reasons = [line for line in done.stderr.splitlines() if line]
+        detail = reasons[-1] if reasons else f"the process that drew ended with status {done.returncode}"
+        return Finding("GL", detail, False, GL_REMEDY)
+    found = json.loads(lines[-1])
+    if "error" in found:
+        return Finding("GL", found["error"], False, GL_REMEDY)
+    detail = f"{found['backend']} on {found['device']}, a 128x128 frame takes {found['milliseconds']:.1f} ms"
+    return Finding("GL", detail)
 
 
 def check_cache() -> Finding:
