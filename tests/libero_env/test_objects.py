@@ -202,11 +202,9 @@ def test_dropped_at_rest_it_stands(category):
     low = bounds(compiled, collision_geoms(compiled)[1:])[0, 2]  # the floor is the first geom
     data = mujoco.MjData(compiled)
     data.qpos[2] = 0.01 - low
-    for _ in range(750):
-        mujoco.mj_step(compiled, data)
+    advance(compiled, data, 750)
     before = data.qpos[:3].copy()
-    for _ in range(250):
-        mujoco.mj_step(compiled, data)
+    advance(compiled, data, 250)
     assert np.linalg.norm(data.qpos[:3] - before) < 0.005
     up, up_at_rest = np.zeros(3), np.zeros(3)
     inverse = rest * (1, -1, -1, -1)
@@ -261,11 +259,54 @@ def test_basket_is_open_and_holds_what_is_dropped_into_it():
     attach(scene, can, "can_", (0, 0, 0.25), can.rest_quat())
     compiled = scene.compile()
     data = mujoco.MjData(compiled)
-    for _ in range(1000):
-        mujoco.mj_step(compiled, data)
+    advance(compiled, data, 1000)
     region = data.site("basket_contain_region")
     offset = region.xmat.reshape(3, 3).T @ (data.body("can_main").xpos - region.xpos)
     assert (np.abs(offset) < compiled.site("basket_contain_region").size).all()
+
+
+@pytest.mark.parametrize("name", GROCERIES)
+def test_parallel_jaws_lift_it(name):
+    """Two pads of a finger's size close on it across, press with 20 N each, and rise by 0.1 m."""
+    model = get_object(name)
+    scene = scene_spec()
+    attach(scene, model, "a_", (0, 0, 0), model.rest_quat())
+    add_jaws(scene, height=0.012)
+    compiled = scene.compile()
+    data = mujoco.MjData(compiled)
+    boxes = [i for i in range(compiled.ngeom) if compiled.geom(i).name.startswith("a_g")]
+    data.joint("a_joint0").qpos[2] = 0.001 - bounds(compiled, boxes)[0, 2]
+    data.ctrl[:2] = 20.0
+    advance(compiled, data, 300)
+    held = data.body("a_main").xpos.copy()
+    for step in range(500):
+        data.ctrl[2] = 0.1 * (step + 1) / 500
+        mujoco.mj_step(compiled, data)
+    advance(compiled, data, 250)
+    risen = data.body("a_main").xpos - held
+    assert risen[2] == pytest.approx(0.1, abs=0.01) and np.abs(risen[:2]).max() < 0.01
+
+
+def add_jaws(scene: mujoco.MjSpec, height: float) -> None:
+    """Adds a hand whose pads, 8 cm apart, close along y; actuators: grip, grip, rise (a position)."""
+    slide, joint_target = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtTrn.mjTRN_JOINT
+    hand = scene.worldbody.add_body(name="hand", pos=(0, 0, height), gravcomp=1)
+    hand.add_geom(size=(0.01, 0.01, 0.01), mass=0.5, contype=0, conaffinity=0)
+    hand.add_joint(name="lift", type=slide, axis=(0, 0, 1)).damping[:] = 60
+    for side in (-1, 1):
+        finger = hand.add_body(name=f"finger{side}", pos=(0, 0.044 * side, 0), gravcomp=1)
+        finger.add_joint(name=f"close{side}", type=slide, axis=(0, -side, 0)).damping[:] = 60
+        pad = finger.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.0085, 0.004, 0.009), mass=0.05)
+        pad.condim, pad.friction = 4, (2.0, 0.05, 0.0001)
+        scene.add_actuator(name=f"grip{side}", target=f"close{side}", trntype=joint_target).set_to_motor()
+    rise = scene.add_actuator(name="rise", target="lift", trntype=joint_target)
+    rise.set_to_position(kp=2000.0)
+
+
+def advance(model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> None:
+    """Steps with constant controls."""
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
 
 
 def test_labels_tell_the_objects_apart():
