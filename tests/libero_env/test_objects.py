@@ -76,7 +76,12 @@ def attach(scene: mujoco.MjSpec, model: ObjectModel, prefix: str, pos, quat) -> 
     frame = scene.worldbody.add_frame(pos=pos, quat=quat)
     scene.attach(model.spec, prefix=prefix, frame=frame)
     body = scene.body(f"{prefix}main")
-    body.add_freejoint(name=f"{prefix}joint0").damping[:] = model.joint_damping
+    damp(body.add_freejoint(name=f"{prefix}joint0"), model.joint_damping)
+
+
+def damp(joint: mujoco.MjsJoint, damping: float) -> None:
+    """Sets linear damping: a number in MuJoCo 3, the first of three coefficients in 4."""
+    joint.damping = damping if np.isscalar(joint.damping) else (damping, 0.0, 0.0)
 
 
 def test_builtin_pack_covers_libero_object():
@@ -292,15 +297,16 @@ def add_jaws(scene: mujoco.MjSpec, height: float) -> None:
     slide, joint_target = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtTrn.mjTRN_JOINT
     hand = scene.worldbody.add_body(name="hand", pos=(0, 0, height), gravcomp=1)
     hand.add_geom(size=(0.01, 0.01, 0.01), mass=0.5, contype=0, conaffinity=0)
-    hand.add_joint(name="lift", type=slide, axis=(0, 0, 1)).damping[:] = 60
+    damp(hand.add_joint(name="lift", type=slide, axis=(0, 0, 1)), 60)
     for side in (-1, 1):
         finger = hand.add_body(name=f"finger{side}", pos=(0, 0.044 * side, 0), gravcomp=1)
-        finger.add_joint(name=f"close{side}", type=slide, axis=(0, -side, 0)).damping[:] = 60
+        damp(finger.add_joint(name=f"close{side}", type=slide, axis=(0, -side, 0)), 60)
         pad = finger.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.0085, 0.004, 0.009), mass=0.05)
         pad.condim, pad.friction = 4, (2.0, 0.05, 0.0001)
-        scene.add_actuator(name=f"grip{side}", target=f"close{side}", trntype=joint_target).set_to_motor()
+        scene.add_actuator(name=f"grip{side}", target=f"close{side}", trntype=joint_target)
     rise = scene.add_actuator(name="rise", target="lift", trntype=joint_target)
-    rise.set_to_position(kp=2000.0)
+    rise.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+    rise.gainprm[0], rise.biasprm[1] = 2000.0, -2000.0
 
 
 def advance(model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> None:
