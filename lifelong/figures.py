@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from lifelong.metrics import Curve, mean_and_standard_error, wilson_interval
@@ -66,10 +67,11 @@ def success_colours() -> Colormap:
 
 def cell_colours(rate: float) -> tuple[str, str]:
     """Background and text colour of a cell with this success rate, as #rrggbb."""
-    red, green, blue, _ = success_colours()(rate)
-    luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
-    back = "#{:02x}{:02x}{:02x}".format(*(round(255 * c) for c in (red, green, blue)))
-    return back, "#ffffff" if luminance < 0.5 else "#14212b"
+    channels = np.array(success_colours()(rate)[:3])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    luminance = float(linear @ (0.2126, 0.7152, 0.0722))
+    back = "#{:02x}{:02x}{:02x}".format(*(round(255 * c) for c in channels))
+    return back, "#ffffff" if luminance < 0.24 else "#0d1820"
 
 
 def heatmap_figure(panels: Sequence[Panel]) -> Figure:
@@ -78,7 +80,7 @@ def heatmap_figure(panels: Sequence[Panel]) -> Figure:
     rows = math.ceil(len(panels) / columns)
     with matplotlib.rc_context(_STYLE):
         single = len(panels) == 1
-        width, height = (4.6, 3.9) if single else (2.45 * columns + 0.5, 2.6 * rows)
+        width, height = (4.4, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
         figure = Figure(figsize=(width, height), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
         image = None
@@ -91,7 +93,12 @@ def heatmap_figure(panels: Sequence[Panel]) -> Figure:
                 axes.set_ylabel("after learning task")
             if place + columns >= len(panels):
                 axes.set_xlabel("success on task")
-        bar = figure.colorbar(image, ax=grid, shrink=0.85, pad=0.02, aspect=28, label="success (%)")
+        if single and len(panels[0].rates) > 5:  # in the empty triangle
+            place = grid[0, 0].inset_axes((0.56, 0.93, 0.42, 0.035))
+            bar = figure.colorbar(image, cax=place, orientation="horizontal", ticks=(0, 50, 100))
+            bar.set_label("success (%)", labelpad=1)
+        else:
+            bar = figure.colorbar(image, ax=grid, shrink=0.85, pad=0.02, aspect=28, label="success (%)")
         bar.outline.set_visible(False)
     return figure
 
@@ -104,42 +111,45 @@ def learning_figure(
     """For each task, success (with Wilson's 95 % band, best epoch ringed) above training loss."""
     tasks = sorted(curves.keys() | losses.keys())
     columns = min(5, len(tasks))
-    rows = math.ceil(len(tasks) / columns)
+    # Inches. Placed by hand: automatic layout of a hundred panels takes a minute.
+    left, panel, gap, upper, lower, between, row_height = 0.7, 1.93, 0.24, 1.1, 0.68, 0.13, 2.5
+    width, height = left + columns * (panel + gap), math.ceil(len(tasks) / columns) * row_height + 0.2
+    limits = _loss_limits(losses)
+    epochs = [c.epochs for c in curves.values()] + [e for e, _ in losses.values()]
+    last = max(1, *(int(e.max(initial=1)) for e in epochs))
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(max(4.0, 1.95 * columns), 2.35 * rows), layout="constrained")
-        ratios = [1.5, 1] * rows
-        grid = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, height_ratios=ratios)
-        low, high = _loss_limits(losses)
-        for place in range(rows * columns):
+        figure = Figure(figsize=(width, height))
+        for place, task in enumerate(tasks):
             row, column = divmod(place, columns)
-            above, below = grid[2 * row, column], grid[2 * row + 1, column]
-            if place >= len(tasks):
-                above.set_axis_off()
-                below.set_axis_off()
-                continue
-            task = tasks[place]
-            above.set_title(f"{task + 1}  {shorten(labels[task], 22)}", loc="left", fontsize=8)
+            x, top = left + column * (panel + gap), height - 0.25 - row * row_height
+            bottoms = ((top - upper, upper), (top - upper - between - lower, lower))
+            boxes = [(x / width, y / height, panel / width, h / height) for y, h in bottoms]
+            above, below = (figure.add_axes(box) for box in boxes)
+            above.set_title(f"{task + 1}  {shorten(labels[task], 24)}", loc="left", fontsize=8.5)
             _draw_curve(above, curves.get(task))
             if task in losses:
-                below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2)
-            below.set_ylim(low, high)
+                marker = "o" if len(losses[task][0]) < 4 else None
+                below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2, marker=marker, ms=2.6)
+            below.set_ylim(*limits)
+            below.yaxis.set_major_locator(MaxNLocator(3))
             for axes, name in ((above, "success (%)"), (below, "loss")):
                 _clean(axes)
-                axes.tick_params(labelleft=column == 0)
+                axes.set_xlim(-0.03 * last, 1.03 * last)
+                axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+                axes.tick_params(labelleft=column == 0, labelbottom=axes is below)
                 if column == 0:
                     axes.set_ylabel(name)
-            last_of_column = place + columns >= len(tasks)
-            below.tick_params(labelbottom=last_of_column)
-            if last_of_column:
+                    axes.yaxis.set_label_coords(-0.5 / panel, 0.5)
+            if place + columns >= len(tasks):
                 below.set_xlabel("epoch")
-        figure.align_ylabels(grid[:, 0])
     return figure
 
 
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
     """Average success over the tasks learned so far against their number; ± one standard error."""
+    named = any(line.label for line in lines)
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(4.8, 2.9), layout="constrained")
+        figure = Figure(figsize=(5.6, 3.1) if named else (3.5, 2.7), layout="constrained")
         axes = figure.subplots()
         for number, line in enumerate(lines):
             mean, error = zip(*(mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T), strict=True)
@@ -153,10 +163,10 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         axes.set_ylim(0, 100)
         axes.set_xticks(range(1, longest + 1, max(1, longest // 10)))
         axes.set_xlabel("tasks learned")
-        axes.set_ylabel("average success over them (%)")
+        axes.set_ylabel("average success (%)")
         axes.grid(axis="y", lw=0.4, alpha=0.3, color=_INK)
         _clean(axes)
-        if len(lines) > 1 or lines[0].label:
+        if named:
             axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
     return figure
 
@@ -179,7 +189,9 @@ def save(figure: Figure, stem: Path) -> None:
     with matplotlib.rc_context(_STYLE):
         FigureCanvasAgg(figure)
         for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
-            figure.savefig(stem.with_suffix(suffix), facecolor="white", **options)
+            figure.savefig(
+                stem.with_suffix(suffix), facecolor="white", bbox_inches="tight", pad_inches=0.05, **options
+            )
 
 
 def shorten(text: str, length: int) -> str:

@@ -2,7 +2,7 @@
 
 import base64
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,20 +15,18 @@ from lifelong.figures import (
     Line,
     Panel,
     as_svg,
-    cell_colours,
     forgetting_figure,
     heatmap_figure,
     learning_figure,
     save,
 )
+from lifelong.heat_table import mean_heatmap, run_heatmap
 from lifelong.metrics import (
     METRIC_NAMES,
     average_success,
     mean_and_standard_error,
-    wilson_interval,
 )
 from lifelong.records import RunRecord
-from lifelong.results import Results
 from lifelong.runs import Group, Run, group_runs, load_run, short_labels
 
 METRIC_TEXTS = {
@@ -94,7 +92,8 @@ def _single(run: Run, folder: Path) -> dict[str, Any]:
         "facts": _facts(record),
         "notes": run.notes,
         "metrics": _metric_rows(run),
-        "heatmaps": [_heatmap(run.results, labels)],
+        "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run))]),
+        "heatmaps": [run_heatmap(run.results, labels)],
         "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
         "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
         "tasks": _task_rows(run, rates),
@@ -118,7 +117,9 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
         panels.append(Panel(group.label, mean, labels))
         single = len(group.runs) == 1
-        heatmap = _heatmap(group.runs[0].results, labels) if single else _mean_heatmap(matrices, mean, labels)
+        heatmap = (
+            run_heatmap(group.runs[0].results, labels) if single else mean_heatmap(matrices, mean, labels)
+        )
         heatmaps.append(heatmap | {"title": group.label, "seeds": [r.record.seed for r in group.runs]})
         values = np.full((len(group.runs), matrices.shape[1]), np.nan)
         for row, run in zip(values, group.runs, strict=True):
@@ -206,70 +207,6 @@ def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def _heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
-    """Cells of one run's matrix: percent, colours, and Wilson's interval as the text on hover."""
-    rates, episodes = results.success_matrix()
-    low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
-    spread = "{} of {} episodes; 95 % interval {} to {} %"
-
-    def hint(i: int, j: int) -> str:
-        ends = (f"{100 * end[i, j]:.0f}" for end in (low, high))
-        return spread.format(round(rates[i, j] * episodes[i, j]), episodes[i, j], *ends)
-
-    def detail(i: int, j: int) -> str:
-        return f"{100 * low[i, j]:.0f}–{100 * high[i, j]:.0f}"
-
-    return _grid(rates, labels, hint, detail)
-
-
-def _mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
-    """Cells of the mean over seeds, its standard error as the text on hover."""
-
-    def spread(i: int, j: int) -> tuple[float, int]:
-        values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
-        return 100 * mean_and_standard_error(values)[1], len(values)
-
-    def hint(i: int, j: int) -> str:
-        error, count = spread(i, j)
-        return f"mean of {count} seeds, standard error {error:.1f}" if count > 1 else "one seed"
-
-    return _grid(mean, labels, hint, lambda i, j: "")
-
-
-def _grid(
-    rates: np.ndarray,
-    labels: Sequence[str],
-    hint: Callable[[int, int], str],
-    detail: Callable[[int, int], str],
-) -> dict[str, Any]:
-    size = len(rates)
-    rows = []
-    for i in range(size):
-        cells = []
-        for j in range(size):
-            if np.isnan(rates[i, j]):
-                cells.append(None)
-                continue
-            back, ink = cell_colours(float(rates[i, j]))
-            where = (
-                f"after task {i + 1} ({labels[i]}), on task {j + 1} ({labels[j]}): {100 * rates[i, j]:.0f} %"
-            )
-            text = f"{100 * rates[i, j]:.0f}"
-            cells.append(
-                {
-                    "text": text,
-                    "detail": detail(i, j),
-                    "hint": f"{where}\n{hint(i, j)}",
-                    "back": back,
-                    "ink": ink,
-                }
-            )
-        known = rates[i, : i + 1]
-        average = f"{100 * known.mean():.0f}" if not np.isnan(known).any() else ""
-        rows.append({"label": labels[i], "cells": cells, "average": average})
-    return {"rows": rows, "size": size, "title": ""}
 
 
 def _media(folder: Path) -> dict[str, Any]:

@@ -58,7 +58,8 @@ def load_run(path: Path) -> Run:
     learned = results.learned_tasks()
     metrics = lifelong_metrics(results.scores()) if learned else None
     if not results.finished:
-        notes.insert(0, f"This run is not finished: {learned} of {len(record.tasks)} tasks are learned.")
+        so_far = f"{learned} of {len(record.tasks)} tasks are learned"
+        notes.insert(0, f"This run is not finished: {so_far}, and the metrics are over these.")
     return Run(path, results, record, config, text, (*notes, *results.problems), learned, metrics)
 
 
