@@ -1,0 +1,199 @@
+"""The environment's contract, and that one simulation and many are the same."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from libero_env.env import LiberoEnv
+from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.tasks import get_suite
+from libero_env.vector import BatchEnv
+
+pytestmark = pytest.mark.sim
+TASK = "libero_object/2"
+SMALL = {"camera_size": (32, 48)}
+
+
+@pytest.fixture
+def env():
+    env = LiberoEnv(TASK, cameras=())
+    yield env
+    env.close()
+
+
+def same(a, b):
+    assert a.keys() == b.keys()
+    for key in a:
+        np.testing.assert_array_equal(a[key], b[key], err_msg=key)
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN.*:UserWarning")
+def test_gymnasium_accepts_it():
+    env = LiberoEnv(TASK, **SMALL, render_mode="rgb_array")
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_observations_are_in_their_space():
+    env = LiberoEnv(TASK, **SMALL)
+    observation, info = env.reset(options={"init_state": 0})
+    assert env.observation_space.contains(observation)
+    assert observation["agentview_rgb"].shape == (32, 48, 3)
+    assert not info["success"]
+    assert env.observation_space.contains(env.step(np.zeros(7))[0])
+    env.close()
+
+
+def test_a_seed_says_it_all(env):
+    first, _ = env.reset(seed=11)
+    env.step(np.ones(7))
+    same(env.reset(seed=11)[0], first)
+    other, _ = env.reset(seed=12)
+    assert not np.array_equal(env.reset(seed=11)[0]["joint_states"], other["joint_states"])
+
+
+def test_an_init_state_depends_on_nothing_else(env):
+    env.reset(options={"init_state": 7})
+    expected = env.get_state()
+    env.reset(seed=5)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    env.reset(seed=99, options={"init_state": 7})
+    np.testing.assert_array_equal(env.get_state(), expected)
+
+
+def test_set_state_goes_on_to_the_same_bits(env):
+    env.reset(options={"init_state": 3})
+    commands = np.random.default_rng(0).uniform(-1, 1, (20, 7))
+    for command in commands[:10]:
+        env.step(command)
+    state = env.get_state()
+    expected = [env.step(command) for command in commands[10:]]
+    env.set_state(state)
+    for command, (observation, *rest) in zip(commands[10:], expected, strict=True):
+        again, *rest_again = env.step(command)
+        same(again, observation)
+        assert rest_again == rest
+
+
+def test_the_originals_state_layout_is_taken(env, shared):
+    with np.load(shared / "parity" / "libero_object-00-random.npz") as z:
+        state = z["states"][0]
+    env0 = LiberoEnv("libero_object/0", cameras=())
+    env0.set_state(state)
+    np.testing.assert_array_equal(env0.world.physics_state(0), state)
+    with pytest.raises(LiberoError, match="finite numbers"):
+        env0.set_state(state[:-1])
+
+
+def test_the_horizon_truncates():
+    env = LiberoEnv(TASK, cameras=(), horizon=3)
+    env.reset(options={"init_state": 0})
+    outcomes = [env.step(np.zeros(7))[2:4] for _ in range(3)]
+    assert outcomes == [(False, False), (False, False), (False, True)]
+    with pytest.raises(LiberoError, match="reset"):
+        env.step(np.zeros(7))
+    env.close()
+
+
+def test_reaching_the_goal_terminates(env):
+    """Put the target into the basket by hand; the goal holds and the episode ends."""
+    env.reset(options={"init_state": 0})
+    state, scene = env.world.physics_state(0), env.world.scene
+    target = env.task.problem.goal.parts[0].args[0] if hasattr(env.task.problem.goal, "parts") else None
+    target = target or env.task.problem.goal.args[0]
+    address = 1 + scene.model.joint(f"{target}_joint0").qposadr[0]
+    state[address : address + 3] = env.view.site_pos("basket_1_contain_region") + [0, 0, 0.02]
+    env.set_state(state)
+    _, reward, terminated, truncated, info = env.step(np.zeros(7))
+    assert (reward, terminated, truncated, info["success"]) == (1.0, True, False, True)
+    assert all(info["progress"].values())
+
+
+@pytest.mark.parametrize("bad", [np.zeros(6), np.full(7, np.nan)])
+def test_a_bad_action_leaves_the_simulation_untouched(env, bad):
+    env.reset(options={"init_state": 0})
+    before = env.get_state()
+    with pytest.raises(ActionError):
+        env.step(bad)
+    np.testing.assert_array_equal(env.get_state(), before)
+
+
+def test_wrong_names_list_the_valid_ones(env):
+    with pytest.raises(UnknownNameError, match="libero_object"):
+        LiberoEnv("libero_subject/0")
+    with pytest.raises(UnknownNameError, match="agentview"):
+        LiberoEnv(TASK, cameras=("agentveiw",))
+    with pytest.raises(LiberoError, match="init_state"):
+        env.reset(options={"state": 3})
+    with pytest.raises(LiberoError, match="0 to 49"):
+        env.reset(options={"init_state": 50})
+
+
+@pytest.mark.parametrize(("num", "threads"), [(1, 1), (3, 2)])
+def test_the_batch_is_the_single_environment_many_times(num, threads):
+    batch = BatchEnv(TASK, num, num_threads=threads, horizon=8, **SMALL)
+    env = LiberoEnv(TASK, horizon=8, **SMALL)
+    commands = np.random.default_rng(1).uniform(-1, 1, (8, num, 7))
+    for how in ({"options": {"init_state": np.arange(num) + 4}}, {"seed": 21}):
+        seen = [batch.reset(**how)[0]]
+        results = [batch.step(command) for command in commands]
+        seen += [result[0] for result in results]
+        for i in range(num):
+            single = {"seed": 21 + i} if "seed" in how else {"options": {"init_state": i + 4}}
+            same({k: v[i] for k, v in seen[0].items()}, env.reset(**single)[0])
+            for t in range(8):
+                observation, reward, terminated, truncated, _ = env.step(commands[t, i])
+                same({k: v[i] for k, v in seen[t + 1].items()}, observation)
+                assert (reward, terminated, truncated) == tuple(r[i] for r in results[t][1:4])
+            np.testing.assert_array_equal(batch.get_state(i), env.get_state())
+    batch.close()
+    env.close()
+
+
+def test_finished_simulations_stand_still_until_reset():
+    batch = BatchEnv(TASK, 3, cameras=(), horizon=4)
+    batch.reset(options={"init_state": 0})
+    for _ in range(2):
+        batch.step(np.zeros((3, 7)))
+    batch.reset(options={"init_state": 1, "reset_mask": [False, True, False]})
+    for _ in range(2):
+        _, _, _, truncated, _ = batch.step(np.ones((3, 7)))
+    assert truncated.tolist() == [True, False, True]
+    before = batch.get_state(0)
+    _, reward, _, truncated, _ = batch.step(np.ones((3, 7)))
+    np.testing.assert_array_equal(batch.get_state(0), before)
+    assert reward[0] == 0 and not truncated[0]
+    batch.close()
+
+
+def test_it_is_a_gymnasium_vector_environment():
+    batch = BatchEnv(TASK, 2, **SMALL)
+    assert isinstance(batch, gymnasium.vector.VectorEnv)
+    observation, _ = batch.reset(options={"init_state": 0})
+    assert batch.observation_space.contains(observation)
+    with pytest.raises(ActionError):
+        batch.step(np.zeros((3, 7)))
+    batch.close()
+
+
+@pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.id)
+def test_initial_states_are_settled_and_stand_where_they_should(task):
+    env = LiberoEnv(task, cameras=())
+    world, nq = env.world, env.world.scene.model.nq
+    states = world.init_states
+    assert states.shape == (50, 1 + nq + world.scene.model.nv)
+    assert len(np.unique(states[:, 1:], axis=0)) == 50
+    for i in range(0, 50, 7):
+        env.reset(options={"init_state": i})
+        for atom in task.problem.init:
+            (x0, y0, x1, y1), *_ = task.problem.region(atom.args[1]).ranges
+            x, y, _ = env.view.body_pos(atom.args[0])
+            assert x0 - 2e-3 < x < x1 + 2e-3 and y0 - 2e-3 < y < y1 + 2e-3
+        before = world.simulations.fields["qpos"][0].copy()
+        for _ in range(10):
+            assert not env.step(np.zeros(7))[4]["success"]
+        moved = np.abs(world.simulations.fields["qpos"][0] - before)[world.scene.nq_robot :]
+        assert moved.max() < 5e-3
+    env.close()

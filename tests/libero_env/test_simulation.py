@@ -1,0 +1,150 @@
+"""Motion: the original's recordings, and the same bits however the simulations are run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from libero_env.control import ArmIndex, checked_actions
+from libero_env.errors import ActionError
+from libero_env.scene import build_scene
+from libero_env.simulation import Batch, BatchSimulations, LoopSimulations
+from libero_env.tasks import get_task
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return build_scene(get_task("libero_object/0").problem)
+
+
+def start(scene, num):
+    qpos = np.tile(scene.model.qpos0, (num, 1))
+    qpos[:, :7] = [0.0, -0.16, 0.0, -2.44, 0.0, 2.23, 0.785]
+    for i, name in enumerate(scene.objects):
+        address = scene.model.joint(f"{name}_joint0").qposadr[0]
+        qpos[:, address : address + 3] = [0.1 * i - 0.3, 0.3, 0.05 + 0.01 * i]
+    qpos[:, 0] += 0.01 * np.arange(num)
+    return qpos, np.zeros((num, scene.model.nv))
+
+
+def actions(num, steps, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, num, 7))
+
+
+@pytest.mark.parametrize("recording", ["libero_object-00-random", "libero_object-03-grasp"])
+def test_free_motion_is_that_of_the_recordings(shared, recording):
+    with np.load(shared / "parity" / f"{recording}.npz") as z:
+        states, commands, touch = z["states"], z["actions"], z["robot_contact"]
+        task = get_task(f"libero_object/{int(z['task_id'])}")
+        recorded = {k: v for k, v in zip(json.loads(str(z["obs_keys"])), np.split(z["obs"], [7, 14, 17, 21, 23], 1))}
+    scene = build_scene(task.problem)
+    simulations, nq = LoopSimulations(scene.model), scene.model.nq
+    assert states.shape[1] == 1 + nq + scene.model.nv, "states have the original's layout"
+    simulations.reset([0], states[:1, 1 : 1 + nq], states[:1, 1 + nq :])
+    free = int(np.argmax(touch)) - 6 if touch.any() else len(commands)
+    assert free > 10
+    for t in range(free):
+        simulations.step([0], commands[t : t + 1])
+        np.testing.assert_allclose(simulations.fields["qpos"][0, :9], states[t + 1, 1:10], atol=1e-6, rtol=0)
+        # The original observes one substep before the end of the control period.
+        grip = simulations.fields["site_xpos"][0, simulations.arm.site]
+        np.testing.assert_allclose(grip, recorded["robot0_eef_pos"][t], atol=3e-3)
+
+
+@pytest.mark.skipif(Batch is None, reason="MuJoCo older than 4 has no batch")
+@pytest.mark.parametrize(("num", "threads"), [(2, 1), (3, 2), (5, 4)])
+def test_a_batch_gives_the_bits_of_single_simulations(scene, num, threads):
+    qpos, qvel = start(scene, num)
+    batch, loop = BatchSimulations(scene.model, num, threads), LoopSimulations(scene.model, num)
+    singles = [LoopSimulations(scene.model) for _ in range(num)]
+    for simulations in (batch, loop):
+        simulations.reset(range(num), qpos, qvel)
+    for i, single in enumerate(singles):
+        single.reset([0], qpos[i : i + 1], qvel[i : i + 1])
+    for t, command in enumerate(actions(num, 30)):
+        moving = [i for i in range(num) if (t + i) % 5]  # now and then one stands still
+        batch.step(moving, command)
+        loop.step(moving, command)
+        for i in moving:
+            singles[i].step([0], command[i : i + 1])
+    for i, single in enumerate(singles):
+        np.testing.assert_array_equal(batch.get_state(i), single.get_state(0))
+        np.testing.assert_array_equal(loop.get_state(i), single.get_state(0))
+        for name in ("xpos", "site_xpos", "qfrc_bias", "M"):
+            np.testing.assert_array_equal(batch.fields[name][i], single.fields[name][0], err_msg=name)
+
+
+@pytest.mark.parametrize("kind", [LoopSimulations, BatchSimulations])
+def test_a_restored_state_goes_on_to_the_same_bits(scene, kind):
+    simulations = kind(scene.model, 2)
+    simulations.reset(range(2), *start(scene, 2))
+    commands = actions(2, 24)
+    for command in commands[:12]:
+        simulations.step(range(2), command)
+    kept = simulations.get_state(1)
+    assert kept.shape == (simulations.state_size,)
+    for command in commands[12:]:
+        simulations.step(range(2), command)
+    expected = simulations.get_state(1)
+    simulations.set_state(1, kept)
+    np.testing.assert_array_equal(simulations.get_state(1), kept)
+    for command in commands[12:]:
+        simulations.step([1], command)
+    np.testing.assert_array_equal(simulations.get_state(1), expected)
+
+
+def test_a_reset_depends_on_nothing_before_it(scene):
+    simulations, (qpos, qvel) = LoopSimulations(scene.model), start(scene, 1)
+    simulations.reset([0], qpos, qvel)
+    fresh = simulations.get_state(0)
+    for command in actions(1, 10):
+        simulations.step([0], command)
+    simulations.reset([0], qpos, qvel)
+    np.testing.assert_array_equal(simulations.get_state(0), fresh)
+
+
+def test_zero_action_holds_the_pose_and_the_gripper(scene):
+    simulations = LoopSimulations(scene.model)
+    simulations.reset([0], *start(scene, 1))
+    grip = simulations.fields["site_xpos"][0, simulations.arm.site].copy()
+    for _ in range(20):
+        simulations.step([0], np.zeros((1, 7)))
+    now = simulations.fields["site_xpos"][0, simulations.arm.site]
+    assert np.linalg.norm(now - grip) < 2e-3
+    assert (simulations.controller.gripper == 0).all()
+
+
+def test_the_gripper_opens_at_minus_one_and_closes_at_plus_one(scene):
+    simulations = LoopSimulations(scene.model)
+    simulations.reset([0], *start(scene, 1))
+    widths = []
+    for direction in (-1.0, 1.0):
+        for _ in range(30):
+            simulations.step([0], np.array([[0, 0, 0, 0, 0, 0, direction]]))
+        left, right = simulations.fields["qpos"][0, 7:9]
+        widths.append(left - right)
+    assert widths[0] > 0.075
+    assert widths[1] < 0.005
+
+
+def test_the_mass_matrix_block_is_that_of_mujoco(scene):
+    import mujoco
+
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = start(scene, 1)[0][0]
+    mujoco.mj_forward(scene.model, data)
+    full = np.zeros((scene.model.nv, scene.model.nv))
+    for k in range(scene.model.nv):
+        unit = np.eye(scene.model.nv)[k]
+        mujoco.mj_mulM(scene.model, data, full[k], unit)
+    np.testing.assert_allclose(data.M[ArmIndex.of(scene.model).mass_address], full[:7, :7], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "bad", [np.zeros(6), np.zeros((1, 7)), [0, 0, 0, np.nan, 0, 0, 0], [0, 0, 0, 0, 0, 0, np.inf], "up", None]
+)
+def test_bad_actions_are_named(bad):
+    with pytest.raises(ActionError):
+        checked_actions(bad)
