@@ -1,0 +1,138 @@
+"""The `libero` command: what it prints, and one clear line where it cannot do what it is told."""
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from libero_env import bddl, doctor, paths
+from libero_env.doctor import Finding
+from libero_env.tasks import get_suite, get_task
+from lifelong import cli
+from lifelong.doctor import check_torch
+
+pytestmark = pytest.mark.unit
+
+ROOT = Path(__file__).parents[1]
+
+
+def subcommands() -> list[str]:
+    actions = cli.build_parser()._actions
+    return list(next(action for action in actions if isinstance(action, argparse._SubParsersAction)).choices)
+
+
+@pytest.mark.parametrize("command", subcommands())
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([command, "--help"])
+    assert ended.value.code == 0
+    assert f"libero {command}" in capsys.readouterr().out
+
+
+def test_tasks_are_listed_in_the_asked_order(capsys):
+    assert cli.main(["tasks", "list", "libero_object", "--order", "3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == [task.id for task in get_suite("libero_object").order(3)]
+
+
+def test_a_task_is_shown_as_bddl(capsys):
+    assert cli.main(["tasks", "show", "libero_object/7"]) == 0
+    assert bddl.parse(capsys.readouterr().out) == get_task("libero_object/7").problem
+
+
+@pytest.mark.parametrize(
+    ("argv", "hint"),
+    [
+        (["tasks", "list", "libero_objet"], "Did you mean 'libero_object'?"),
+        (["tasks", "show", "libero_object/12"], "Valid: 0, 1, "),
+        (["tasks", "list", "libero_object", "--order", "99"], "task order of libero_object 99"),
+    ],
+)
+def test_errors_are_one_line_and_a_status(argv, hint, capsys):
+    assert cli.main(argv) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("libero: error: ") and hint in err and err.count("\n") == 1
+
+
+def test_unknown_command_lists_the_valid_ones(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["tsaks"])
+    assert ended.value.code == 2
+    assert "'tasks'" in capsys.readouterr().err
+
+
+def test_runs_as_a_process():
+    command = [sys.executable, "-m", "lifelong.cli", "tasks", "show", "nope"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("libero: error: unknown task 'nope'") and "Traceback" not in done.stderr
+
+
+def test_doctor_says_what_is_broken_and_how_to_mend_it(monkeypatch, capsys):
+    broken = Finding("GL", "no picture", False, "install one")
+    minor = Finding("demonstrations", "none", False, "make some", essential=False)
+    monkeypatch.setattr(doctor, "examine", lambda gl_only: [minor])
+    assert cli.main(["doctor", "--gl"]) == 0
+    assert "note  demonstrations:" in capsys.readouterr().out
+    monkeypatch.setattr(doctor, "examine", lambda gl_only: [minor, broken])
+    assert cli.main(["doctor", "--gl"]) == 1
+    out = capsys.readouterr().out
+    assert "FAIL  GL:" in out and "-> install one" in out
+
+
+@pytest.mark.sim
+def test_doctor_draws_a_frame(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    finding = doctor.check_gl()
+    assert finding.ok, finding
+    assert " ms" in finding.detail
+
+
+def test_doctor_survives_a_machine_without_gl(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    finding = doctor.check_gl()
+    assert not finding.ok and "egl, osmesa, glfw" in finding.remedy
+    monkeypatch.delenv("MUJOCO_GL")
+    for probe in ("import os; os.abort()", "raise SystemExit(3)", "raise OSError('no libGL')"):
+        monkeypatch.setattr(doctor, "_PROBE", probe)
+        finding = doctor.check_gl()
+        assert not finding.ok and finding.detail and "libegl1" in finding.remedy
+
+
+def test_doctor_finds_what_is_not_installed(tmp_path, monkeypatch):
+    finding = doctor.check_package("no-such-package-at-all")
+    assert not finding.ok and finding.remedy == "make setup"
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    finding = doctor.check_robot_models()
+    assert not finding.ok and "--no-deps robosuite==1.4.1" in finding.remedy
+
+
+def test_doctor_looks_at_folders(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache" / "deep"))
+    assert doctor.check_cache().detail.startswith(f"{tmp_path / 'cache' / 'deep'}, 0 B used")
+    assert not doctor.check_demos().ok and not doctor.check_demos().essential
+    suite = paths.demos_dir() / "libero_object"
+    suite.mkdir(parents=True)
+    (suite / "a_demo.hdf5").write_bytes(b"x" * 1500)
+    assert doctor.check_demos().detail.startswith("1 files") and "1.5 kB" in doctor.check_demos().detail
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "file" / "cache"))
+    assert not doctor.check_cache().ok
+
+
+def test_folders_follow_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    monkeypatch.delenv("LIBERO_DEMOS", raising=False)
+    assert paths.demos_dir() == tmp_path / "demos"
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "elsewhere"))
+    assert paths.demos_dir() == tmp_path / "elsewhere"
+    monkeypatch.delenv("LIBERO_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert paths.cache_dir() == tmp_path / "xdg" / "libero"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_doctor_knows_the_device():
+    assert check_torch().ok and "threads" in check_torch().detail

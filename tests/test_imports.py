@@ -1,0 +1,92 @@
+"""Importing does nothing, and imports point one way."""
+
+import json
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import libero_env
+import lifelong
+
+pytestmark = pytest.mark.unit
+
+ROOT = Path(__file__).parents[1]
+ENV_SIDE = sorted(module.name for module in pkgutil.walk_packages(libero_env.__path__, "libero_env."))
+LEARNING_SIDE = sorted(module.name for module in pkgutil.walk_packages(lifelong.__path__, "lifelong."))
+
+# What other packages do when they are imported: numba tries whether its cache can be written, matplotlib lists the
+# fonts once per machine, gymnasium silences pygame.
+THEIRS = re.compile(r"/__pycache__|/matplotlib|/\.(config|cache)$")
+THEIR_VARIABLES = ("PYGAME_HIDE_SUPPORT_PROMPT",)
+
+# Imports the modules it is given and tells what that changed. The audit hook sees every file opened for writing and
+# every socket, whoever asks for it.
+_PROBE = """
+import importlib, json, os, random, sys
+names = json.loads(sys.argv[1])
+before = dict(os.environ)
+deeds = []
+
+def watch(event, args):
+    if event == "open" and isinstance(args[0], str) and args[0] != os.devnull:
+        flags = args[2] if isinstance(args[2], int) else 0
+        if set(str(args[1] or "")) & set("wax+") or flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            deeds.append(f"wrote {args[0]}")
+    elif event in ("os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.symlink", "os.truncate"):
+        deeds.append(f"{event} {args[0]}")
+    elif event in ("socket.connect", "builtins.input"):
+        deeds.append(f"{event} {args[:1]}")
+
+sys.addaudithook(watch)
+import numpy
+state = (numpy.random.get_state()[1].tolist(), random.getstate())
+for name in names:
+    importlib.import_module(name)
+deeds += [f"set {name}" for name in os.environ.keys() | before if os.environ.get(name) != before.get(name)]
+if state != (numpy.random.get_state()[1].tolist(), random.getstate()):
+    deeds.append("touched the global random state")
+print(json.dumps({"deeds": deeds, "loaded": sorted(sys.modules)}))
+"""
+
+
+def import_in_fresh_process(names: list[str], home: Path) -> dict:
+    """What importing the modules did in a process that knew nothing."""
+    env = {
+        "PATH": os.environ["PATH"],
+        "HOME": str(home),
+        "PYTHONPATH": str(ROOT),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    command = [sys.executable, "-W", "error", "-c", _PROBE, json.dumps(names)]
+    done = subprocess.run(
+        command, env=env, cwd=home, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1, f"importing printed: {done.stdout}"
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("names", [ENV_SIDE, LEARNING_SIDE], ids=["libero_env", "lifelong"])
+def test_importing_does_nothing(names, tmp_path):
+    done = import_in_fresh_process(names, tmp_path)
+    theirs = {f"set {name}" for name in THEIR_VARIABLES}
+    ours = [deed for deed in done["deeds"] if deed not in theirs and not THEIRS.search(deed)]
+    assert ours == []
+    assert "robosuite" not in done["loaded"]
+
+
+def test_the_environment_loads_nothing_of_learning(tmp_path):
+    loaded = import_in_fresh_process(ENV_SIDE, tmp_path)["loaded"]
+    assert not {"lifelong", "torch", "hydra", "omegaconf", "robosuite", "matplotlib"} & set(loaded)
+
+
+def test_the_command_line_starts_light(tmp_path):
+    """`libero --help` must not wait for PyTorch or MuJoCo."""
+    loaded = import_in_fresh_process(["lifelong.cli"], tmp_path)["loaded"]
+    assert not {"torch", "mujoco", "hydra", "transformers", "matplotlib", "numba"} & set(loaded)
