@@ -9,7 +9,7 @@ from libero_env.scene import Scene, initial_qpos
 
 ARM_NOISE = 0.02  # rad, standard deviation of the arm's start around its rest pose, as in the original
 _CLEARANCE = 0.001  # m, above the surface
-_MAX_TRIES = 2000
+_MAX_TRIES = 500
 
 
 def sample_qpos(scene: Scene, rng: np.random.Generator) -> np.ndarray:
@@ -18,7 +18,7 @@ def sample_qpos(scene: Scene, rng: np.random.Generator) -> np.ndarray:
     Objects may hover by a millimetre: settle them before use (`init_states.settle`).
 
     Raises:
-        PlacementError: no free placement in 2000 tries, or an init atom that cannot be placed.
+        PlacementError: no free placement in 500 tries, or an init atom that cannot be placed.
     """
     regions = {atom.args[0]: _region(scene, atom) for atom in scene.problem.init if atom.args[0] in scene.objects}
     if missing := set(scene.objects) - set(regions):

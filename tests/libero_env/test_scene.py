@@ -1,0 +1,214 @@
+"""Scene, placement, predicates and pictures."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from libero_env import bddl
+from libero_env.env import LiberoEnv
+from libero_env.errors import PlacementError, RenderError, UnknownNameError
+from libero_env.placement import lowest_point, sample_qpos
+from libero_env.predicates import StateView, evaluate
+from libero_env.problem import And, Atom, ForAll, Not, Or
+from libero_env.render import Renderer, open_context
+from libero_env.scene import build_scene
+from libero_env.simulation import LoopSimulations
+from libero_env.tasks import get_suite, get_task
+from libero_env.world import axis_angle
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def task():
+    return get_task("libero_object/0")
+
+
+@pytest.fixture(scope="module")
+def scene(task):
+    return build_scene(task.problem)
+
+
+@pytest.fixture
+def view(scene):
+    simulations = LoopSimulations(scene.model)
+    simulations.reset([0], sample_qpos(scene, np.random.default_rng(0))[None], np.zeros((1, scene.model.nv)))
+    return StateView(scene, simulations)
+
+
+@pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.id)
+def test_joints_are_robot_gripper_objects_in_file_order(task):
+    model = build_scene(task.problem).model
+    names = [model.joint(j).name for j in range(model.njnt)]
+    assert names[:7] == [f"robot0_joint{i}" for i in range(1, 8)]
+    assert names[9:] == [f"{name}_joint0" for name in task.problem.objects]
+
+
+def test_the_workspace_has_the_measured_figures(scene, shared):
+    figures = json.loads((shared / "official/workspaces.json").read_text())["libero_floor_manipulation"]
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:9] = figures["arm_qpos"]
+    mujoco.mj_forward(model, data)
+    assert model.opt.timestep == figures["timestep"]
+    assert (model.opt.impratio, model.opt.cone, model.opt.integrator) == (20.0, figures["cone"], figures["integrator"])
+    assert (model.opt.density, model.opt.viscosity) == (figures["density"], figures["viscosity"])
+    np.testing.assert_allclose(data.site("gripper0_grip_site").xpos, figures["grip_site_world"], atol=1e-5)
+    for name, camera in figures["cameras"].items():
+        mine = model.camera(name)
+        assert model.body(int(mine.bodyid[0])).name == camera["body"]
+        assert mine.fovy[0] == pytest.approx(camera["fovy"])
+        np.testing.assert_allclose(mine.pos, camera["pos"], atol=1e-5)
+        assert abs(mine.quat @ camera["quat_wxyz"]) == pytest.approx(1, abs=2e-3)
+    for joint in figures["arm_joints"]:
+        dof = model.joint(joint["name"]).dofadr[0]
+        np.testing.assert_allclose(model.joint(joint["name"]).range, joint["range"])
+        got = (model.dof_damping[dof], model.dof_armature[dof], model.dof_frictionloss[dof])
+        np.testing.assert_allclose(got, (joint["damping"], joint["armature"], joint["frictionloss"]))
+    for i, actuator in enumerate(figures["actuators"]):
+        assert model.actuator(i).name == actuator["name"]
+        np.testing.assert_allclose(model.actuator_ctrlrange[i], actuator["ctrlrange"])
+
+
+def test_the_scene_is_light(scene):
+    drawn = scene.model.geom_dataid[(scene.model.geom_group == 1) & (scene.model.geom_dataid >= 0)]
+    assert scene.model.mesh_facenum[drawn].sum() < 10_000
+
+
+def test_placement_fills_the_regions_and_nothing_touches(scene, task):
+    data = mujoco.MjData(scene.model)
+    for seed in range(20):
+        data.qpos[:] = sample_qpos(scene, np.random.default_rng(seed))
+        mujoco.mj_forward(scene.model, data)
+        for atom in task.problem.init:
+            (x0, y0, x1, y1), *_ = task.problem.region(atom.args[1]).ranges
+            x, y, z = data.body(f"{atom.args[0]}_main").xpos
+            assert x0 <= x <= x1 and y0 <= y <= y1
+            quat = data.body(f"{atom.args[0]}_main").xquat
+            assert z + lowest_point(scene, atom.args[0], quat) == pytest.approx(0.001, abs=1e-9)
+        assert data.ncon == 0 or data.contact.dist[: data.ncon].min() > -1e-3
+
+
+def test_a_full_region_is_an_error_with_remedies(task):
+    text = task.bddl_text
+    crowded = bddl.parse(text)
+    region = crowded.region("floor_bin_region").ranges[0]
+    for other in crowded.regions:
+        if other.ranges:
+            numbers = " ".join(repr(v) for v in other.ranges[0])
+            text = text.replace(f"({numbers})", f"({' '.join(repr(v) for v in region)})")
+    with pytest.raises(PlacementError, match="make their regions larger"):
+        sample_qpos(build_scene(bddl.parse(text)), np.random.default_rng(0))
+
+
+def test_an_object_without_a_place_is_an_error(task):
+    text = task.bddl_text.replace("(On milk_1 floor_other_object_region_2)", "")
+    with pytest.raises(PlacementError, match="milk_1"):
+        sample_qpos(build_scene(bddl.parse(text)), np.random.default_rng(0))
+
+
+def test_unknown_names_in_a_task_list_the_valid_ones(task, view):
+    with pytest.raises(UnknownNameError, match="alphabet_soup"):
+        build_scene(bddl.parse(task.bddl_text.replace("- milk\n", "- mlik\n")))
+    with pytest.raises(UnknownNameError, match="In, On"):
+        evaluate(Atom("Under", ("milk_1", "basket_1")), view)
+    with pytest.raises(UnknownNameError, match="basket_1_contain_region"):
+        evaluate(Atom("In", ("milk_1", "basket_1_contian_region")), view)
+
+
+def test_predicates_are_those_of_the_recordings(scene, shared):
+    """Regions agree exactly; objects on objects need contact, and builtin shapes touch a little differently."""
+    with np.load(shared / "parity/libero_object-00-predicates.npz") as z:
+        qpos, truth, atoms = z["qpos"], z["truth"], json.loads(str(z["atoms"]))
+    simulations = LoopSimulations(scene.model)
+    view = StateView(scene, simulations)
+    wrong = {"region": 0, "contact": 0}
+    checked = 0
+    for q, row in zip(qpos, truth, strict=True):
+        simulations.reset([0], q[None], np.zeros((1, scene.model.nv)))
+        for (name, *args), expected in zip(atoms, row, strict=True):
+            if name in ("on", "in"):
+                checked += 1
+                needs_contact = name == "on" and not args[1].startswith("floor")
+                got = evaluate(Atom(name.capitalize(), tuple(args)), view)
+                wrong["contact" if needs_contact else "region"] += got != expected
+    assert checked > 20_000
+    assert wrong["region"] == 0
+    assert wrong["contact"] <= 0.001 * checked
+
+
+def test_predicates_do_not_touch_the_state(view, task):
+    before = view.simulations.get_state(0)
+    evaluate(task.problem.goal, view)
+    view.body_pos("milk_1")[:] = 9.0
+    view.eef_pos[:] = 9.0
+    np.testing.assert_array_equal(view.simulations.get_state(0), before)
+
+
+def test_goals_combine(view):
+    yes, no = Atom("In", ("milk_1", "floor_other_object_region_2")), Atom("In", ("milk_1", "basket_1_contain_region"))
+    assert not evaluate(no, view)
+    yes = Not(no)
+    assert evaluate(And((yes, Not(no))), view) and not evaluate(And((yes, no)), view)
+    assert evaluate(Or((no, yes)), view) and not evaluate(Or((no, no)), view)
+    body = Atom("In", ("?x", "basket_1_contain_region"))
+    assert evaluate(ForAll((("?x", "milk"),), Not(body)), view)
+    assert not evaluate(ForAll((("?x", "milk"),), body), view)
+
+
+def test_pictures_are_upright_and_repeat():
+    env = LiberoEnv("libero_object/0", camera_size=(64, 64))
+    frame = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
+    again = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
+    np.testing.assert_array_equal(frame, again)
+    brown = lambda image: ((image[..., 0] > image[..., 2] * 1.6) & (image[..., 0] > 60)).sum()  # noqa: E731
+    assert brown(frame[24:48, 40:]) > 5 * max(brown(frame[:16, :32]), 1), "the basket stands on the right, below middle"
+    env.close()
+    env.close()
+
+
+def test_contexts_are_freed():
+    """Opening and closing again and again keeps memory where it is."""
+    import resource
+
+    def cycle(times):
+        for _ in range(times):
+            env = LiberoEnv("libero_object/0", camera_size=(64, 64))
+            env.reset(options={"init_state": 0})
+            env.close()
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    cycle(4)
+    before = cycle(4)
+    assert cycle(12) - before < 60_000  # kB
+
+
+def test_frames_too_large_and_backends_unknown_are_named(scene, monkeypatch):
+    with pytest.raises(RenderError, match="1024"):
+        Renderer(scene.model, 2000, 64)
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    with pytest.raises(RenderError, match="egl, osmesa, glfw"):
+        open_context(8, 8)
+
+
+def test_no_gl_says_what_to_install(monkeypatch):
+    import importlib
+
+    def fail(name):
+        raise ImportError("no library")
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(importlib, "import_module", fail)
+    with pytest.raises(RenderError, match="apt-get install"):
+        open_context(8, 8)
+
+
+def test_axis_angle_turns_back_into_the_rotation():
+    quats = np.random.default_rng(0).normal(size=(50, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    quats[0] = [1, 0, 0, 0]
+    for quat, vector in zip(quats, axis_angle(quats), strict=True):
+        angle, back = np.linalg.norm(vector), np.zeros(4)
+        mujoco.mju_axisAngle2Quat(back, vector / max(angle, 1e-12), angle)
+        assert abs(back @ quat) == pytest.approx(1)
