@@ -13,7 +13,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-VERSIONED_PACKAGES = ("mujoco", "torch", "numpy", "robosuite", "gymnasium", "h5py", "transformers")
+VERSIONED_PACKAGES = (
+    "libero-lifelong",
+    "mujoco",
+    "torch",
+    "numpy",
+    "robosuite",
+    "gymnasium",
+    "h5py",
+    "transformers",
+)
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,10 @@ class RunRecord:
     commit: str | None
     cpu_count: int
     started: str  # ISO 8601, UTC
+
+    def __post_init__(self) -> None:
+        if len(self.tasks) != len(self.instructions):
+            raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.instructions)} instructions")
 
 
 @dataclass(frozen=True)
@@ -155,8 +168,7 @@ def utc_now() -> str:
 def installed_versions() -> dict[str, str]:
     """Versions of Python, this package, and what a result depends on."""
     versions = {"python": ".".join(map(str, sys.version_info[:3]))}
-    own = {d.metadata["Name"] for d in metadata.distributions(path=[str(_SOURCE)])}
-    for name in sorted(own - set(VERSIONED_PACKAGES)) + list(VERSIONED_PACKAGES):
+    for name in VERSIONED_PACKAGES:
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

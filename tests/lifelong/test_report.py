@@ -256,7 +256,7 @@ def test_runs_of_different_progress_and_length_compare(tmp_path: Path):
 
 
 def test_long_sequences_fit(tmp_path: Path):
-    page = Page(write_report([make_run(tmp_path / "run", tasks=21, epochs=(0, 1))]).read_text())
+    page = Page(write_report([make_run(tmp_path / "run", tasks=21, done=4, epochs=(0, 1))]).read_text())
     assert page.open == []
 
 
