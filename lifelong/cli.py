@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from libero_env.errors import LiberoError
 from lifelong.errors import LifelongError
@@ -88,7 +89,22 @@ def run_tasks_show(args: argparse.Namespace) -> None:
     print(get_task(args.task).bddl_text, end="")
 
 
-COMMANDS: tuple[Callable[[Subparsers], None], ...] = (register_doctor, register_tasks)
+def register_report(subparsers: Subparsers) -> None:
+    """`libero report RUN_DIR...`"""
+    parser = subparsers.add_parser("report", help="a page about one run, or about several side by side")
+    parser.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN_DIR", help="such as runs/libero_object/ewc/...")
+    parser.add_argument("--out", type=Path, help="the page to write (default: report.html in the run directory)")
+    parser.set_defaults(run=run_report)
+
+
+def run_report(args: argparse.Namespace) -> None:
+    """Write the page and say where it is."""
+    from lifelong.report import write_report
+
+    print(write_report(args.run_dirs, args.out))
+
+
+COMMANDS: tuple[Callable[[Subparsers], None], ...] = (register_doctor, register_tasks, register_report)
 
 if __name__ == "__main__":
     sys.exit(main())
