@@ -2,7 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -163,6 +164,15 @@ def generator(*seed: int, device: torch.device | str = "cpu") -> torch.Generator
     return torch.Generator(device).manual_seed(_word(seed))
 
 
+@contextmanager
+def seeded(*seed: int, device: torch.device | str = "cpu") -> Iterator[None]:
+    """Within the context, torch's global generators start from a seed; afterwards they are as before."""
+    device = torch.device(device)
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(_word(seed))
+        yield
+
+
 def _word(seed: Sequence[int]) -> int:
     return int(np.random.SeedSequence(list(seed)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
@@ -211,10 +221,8 @@ def _epoch(
     draws = generator(*seed, 0)
     order = _order(len(dataset), steps * step.settings.batch_size, draws)
     losses, penalties = [], []
-    cuda = [step.device] if step.device.type == "cuda" else []
     step.algorithm.mode_train(step.policy)
-    with torch.random.fork_rng(devices=cuda):
-        torch.manual_seed(_word((*seed, 1)))  # dropout draws from the global generator, put back afterwards
+    with seeded(*seed, 1, device=step.device):  # for dropout
         for k, indices in enumerate(order.split(step.settings.batch_size)):
             loss, penalty = step(dataset.batch(indices), draws, rate(k))
             losses.append(loss)

@@ -1,0 +1,206 @@
+"""A run: everything built from its configuration, the task sequence walked, the results summed up."""
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from weakref import WeakValueDictionary
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from libero_env.tasks import Task
+from libero_env.vector import BatchEnv
+from lifelong.data import SequenceVLDataset
+from lifelong.errors import ConfigError
+from lifelong.evaluation import EnvPool, EvalSettings
+from lifelong.policies import Policy
+from lifelong.records import PhaseRecord, RunEndRecord, TaskEndRecord, start_record, utc_now
+from lifelong.report import write_report
+from lifelong.results import write_summary
+from lifelong.rundir import RunDirectory
+from lifelong.sequence import Parts, TaskSequence
+from lifelong.settings import CAMERAS, BenchmarkSettings, DataSettings, RunSettings
+from lifelong.tracking import Tracker
+from lifelong.training import seeded
+from lifelong.types import PolicySpec
+
+GROUPS = ("algo", "benchmark", "policy", "data", "augmentation", "train", "eval", "language", "wandb")
+INIT = 0  # first word of the seed of the policy's initial weights, see lifelong.sequence
+
+
+def run(config: DictConfig, names: Mapping[str, str]) -> Path:
+    """Run a configuration to its end, or go on with a run that was interrupted.
+
+    Args:
+        config: What configs/config.yaml composes.
+        names: The file chosen in each group, such as algo -> ewc; they name the run.
+
+    Returns:
+        The run's directory, with results.json and report.html in it.
+
+    Raises:
+        LiberoError: Something in the configuration, the data or the directory does not work.
+    """
+    settings = RunSettings(**{k: v for k, v in config.items() if k not in GROUPS})
+    benchmark: BenchmarkSettings = _build(config.benchmark)
+    tasks = benchmark.sequence()
+    label = "_".join([names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])])
+    name = f"{names['benchmark']}/{names['algo']}/{label}"
+    directory = RunDirectory(Path(settings.runs_dir) / name)
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    plain = OmegaConf.to_container(config, resolve=True)
+    with directory.opened(plain, settings.resume):
+        if directory.log.read().finished:
+            print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
+        else:
+            tracker: Tracker = _build(config.wandb)
+            tracker.start(name, str(directory.path), plain)
+            _record_start(directory, names, settings.seed, tasks, plain)
+            _walk(config, settings, tasks, directory, tracker)
+            tracker.finish()
+        return _sum_up(directory, plain)
+
+
+def _build(node: DictConfig, **more: Any) -> Any:
+    """The object a node of the configuration describes, with plain lists and dictionaries inside."""
+    return instantiate(node, _convert_="all", _partial_=True)(**more)
+
+
+def _record_start(
+    directory: RunDirectory, names: Mapping[str, str], seed: int, tasks: tuple[Task, ...], config: Any
+) -> None:
+    directory.log.append(
+        start_record(
+            algo=names["algo"],
+            benchmark=names["benchmark"],
+            policy=names["policy"],
+            seed=seed,
+            preset=names.get("preset", ""),
+            tasks=[t.name for t in tasks],
+            instructions=[t.language for t in tasks],
+            config=OmegaConf.to_yaml(OmegaConf.create(config)),
+        )
+    )
+
+
+def _walk(
+    config: DictConfig,
+    settings: RunSettings,
+    tasks: tuple[Task, ...],
+    directory: RunDirectory,
+    tracker: Tracker,
+) -> None:
+    """Build all parts and learn the sequence."""
+    began, device = time.perf_counter(), _device(settings.device)
+    progress = sys.stderr.isatty() if settings.progress is None else settings.progress
+    data: DataSettings = _build(config.data)
+    evaluation: EvalSettings = _build(config.eval)
+    instructions = tuple(t.language for t in tasks)
+    languages = _build(config.language).embed(instructions)
+    spec = data.spec(languages.shape[1])
+    datasets = DemoDatasets(_demos(tasks, data, directory, progress), spec, languages, data, device)
+    with seeded(settings.seed, INIT):
+        policy: Policy = _build(config.policy, spec=spec).to(device)
+    with EnvPool(lambda key: _env(tasks, key, spec, evaluation), evaluation.open_environments) as envs:
+        parts = Parts(
+            instructions=instructions,
+            languages=languages,
+            datasets=datasets,
+            policy=policy,
+            algorithm=_build(config.algo),
+            envs=envs,
+            fit=_build(config.train),
+            eval=evaluation,
+            augment=_build(config.augmentation),
+            directory=directory,
+            tracker=tracker,
+            seed=settings.seed,
+            device=device,
+            progress=progress,
+        )
+        TaskSequence(parts).run()
+    directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
+
+
+def _env(tasks: tuple[Task, ...], key: tuple[int, int], spec: PolicySpec, evaluation: EvalSettings) -> BatchEnv:
+    task, simulations = key
+    return BatchEnv(
+        tasks[task],
+        simulations,
+        num_threads=evaluation.sim_threads,
+        cameras=tuple(CAMERAS[view] for view in spec.views),
+        camera_size=spec.image_size,
+        horizon=evaluation.horizon + evaluation.settle_steps,
+    )
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"device={name}, but torch finds no GPU; use device=auto or device=cpu")
+    return device
+
+
+def _demos(
+    tasks: tuple[Task, ...], data: DataSettings, directory: RunDirectory, progress: bool
+) -> dict[int, Path]:
+    """The demonstration file of each task; recorded now where there is none."""
+    began = time.perf_counter()
+    paths = ensure_demos(tasks, data.demos)
+    directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
+    return dict(enumerate(paths))
+
+
+@dataclass(frozen=True)
+class DemoDatasets(Mapping[int, SequenceVLDataset]):
+    """The tasks' windows by position; read when asked for, and kept for as long as somebody holds them."""
+
+    paths: Mapping[int, Path]
+    spec: PolicySpec
+    languages: torch.Tensor  # (K, L)
+    data: DataSettings
+    device: torch.device
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_held", WeakValueDictionary())
+
+    def __getitem__(self, task: int) -> SequenceVLDataset:
+        dataset = self._held.get(task)
+        if dataset is None:
+            dataset = SequenceVLDataset.from_file(
+                self.paths[task],
+                spec=self.spec,
+                language=self.languages[task],
+                task_id=task,
+                limit=self.data.demos,
+                pairing=self.data.pairing,
+                labels=self.data.labels,
+            ).to(self.device)
+            self._held[task] = dataset
+        return dataset
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.paths)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+
+def _sum_up(directory: RunDirectory, config: Mapping[str, Any]) -> Path:
+    """Write results.json and the report; the run's directory."""
+    results = directory.log.read()
+    write_summary(directory.path / "results.json", results, config)
+    page = write_report([directory.path])
+    ends = len(results.of(TaskEndRecord))
+    print(f"{ends} tasks learned. Report: {page}")
+    return directory.path

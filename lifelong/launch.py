@@ -1,0 +1,92 @@
+"""From the command line to a run: composing the configuration, errors in one line, reports of sweeps."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from libero_env.errors import LiberoError, UnknownNameError
+from lifelong import experiment
+from lifelong.report import write_report
+
+
+class CombinedReport(Callback):
+    """After `-m`, one report that compares all runs of the sweep."""
+
+    def __init__(self) -> None:
+        self._runs: list[Path] = []
+
+    def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
+        """Note the directory of a run that ended well."""
+        if isinstance(job_return._return_value, Path):
+            self._runs.append(job_return._return_value)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Compare what ended well."""
+        if len(self._runs) > 1:
+            page = write_report(self._runs, Path(config.runs_dir) / "sweep" / "report.html")
+            print(f"{len(self._runs)} runs compared: {page}")
+
+
+def main(config_dir: str) -> int:
+    """Run what the command line asks for.
+
+    Args:
+        config_dir: Folder of the configuration, absolute or relative to the working directory of the script.
+
+    Returns:
+        Exit status: 0, or 1 where something went wrong (told in one line).
+    """
+    failed = False
+
+    def job(config: DictConfig) -> Path | None:
+        nonlocal failed
+        try:
+            return experiment.run(config, HydraConfig.get().runtime.choices)
+        except (LiberoError, HydraException, OmegaConfBaseException, OSError) as error:
+            failed = True
+            print(f"error: {_one_line(error)}", file=sys.stderr)
+            return None
+
+    path = Path(sys.argv[0]).resolve().parent / config_dir
+    try:
+        check_choices(sys.argv[1:], path)
+        hydra.main(version_base="1.3", config_path=str(path), config_name="config")(job)()
+    except LiberoError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    return int(failed)
+
+
+def check_choices(overrides: Sequence[str], config_dir: Path) -> None:
+    """Look at the overrides that choose a group's file, before Hydra does.
+
+    Raises:
+        UnknownNameError: No such file; the message lists those there are.
+    """
+    for override in overrides:
+        group, _, names = override.partition("=")
+        if not (group and names and (config_dir / group).is_dir()):
+            continue
+        valid = sorted(file.stem for file in (config_dir / group).glob("*.yaml"))
+        for name in names.split(","):
+            if name not in valid:
+                raise UnknownNameError(group, name, valid)
+
+
+def _one_line(error: Exception) -> str:
+    """The message, with the message of what caused it where Hydra wraps one of ours."""
+    cause = error
+    while cause is not None and not isinstance(cause, LiberoError):
+        cause = cause.__cause__
+    return " ".join(str(cause or error).split())

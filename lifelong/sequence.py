@@ -1,0 +1,267 @@
+"""The walk through the task sequence: learn a task, keep its best weights, evaluate all tasks so far.
+
+It can be killed anywhere. What is done is found again in the records and checkpoints; the rest comes out with
+the same bits, because all randomness is derived from the seed and the place in the sequence.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from lifelong import checkpoints
+from lifelong.algorithms.base import Algorithm, Phase, WindowDataset
+from lifelong.evaluation import EnvPool, EvalSettings, rollout, save_animation
+from lifelong.policies.base import Policy
+from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.rundir import RunDirectory
+from lifelong.tracking import Tracker
+from lifelong.training import EpochEnd, FitSettings, ImageAugmentation, fit, generator
+
+# First words of the seeds derived from the run's seed, one for each use.
+FIT, END_TASK, ROLLOUT = 1, 2, 3
+CONTROL_PERIOD = 0.05  # s
+SAVE_EVERY = 60.0  # s between two saves while learning, but for those at points of the learning curve
+
+
+@dataclass(frozen=True)
+class Parts:
+    """All that a walk needs, ready made."""
+
+    instructions: tuple[str, ...]
+    languages: Tensor  # (K, L)
+    datasets: Mapping[int, WindowDataset]  # by position; each is read when asked for
+    policy: Policy
+    algorithm: Algorithm
+    envs: EnvPool  # keys: (position, number of simulations)
+    fit: FitSettings
+    eval: EvalSettings
+    augment: ImageAugmentation | None
+    directory: RunDirectory
+    tracker: Tracker
+    seed: int
+    device: torch.device
+    progress: bool
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Where in the sequence training stands: a phase of a task."""
+
+    task: int
+    number: int
+    phase: Phase
+    epochs: int
+    offset: int  # epochs of the task's earlier phases
+
+
+class TaskSequence:
+    """Learns the tasks in turn; `run` starts, or goes on where an earlier process stopped."""
+
+    def __init__(self, parts: Parts):
+        self.parts = parts
+        self.log = parts.directory.log
+        self._saved = time.monotonic()
+
+    def run(self) -> None:
+        """Learn and evaluate whatever is not done yet."""
+        first = self._restore()
+        if first:
+            self._finish(first - 1)
+        for task in range(first, len(self.parts.instructions)):
+            self._learn(task)
+            self._finish(task)
+
+    def _restore(self) -> int:
+        """Take up the state after the last task that was learned; the position of the next."""
+        p, last = self.parts, self.parts.directory.last_task()
+        if last >= 0:
+            path = p.directory.task_path(last)
+            self._take_up(checkpoints.load(path, p.device), str(path))
+        return last + 1
+
+    def _take_up(self, state: Mapping[str, Any], source: str) -> None:
+        if state.get("policy") is not None:
+            checkpoints.load_weights(self.parts.policy, state["policy"], source)
+        self.parts.algorithm.load_state_dict(state["algorithm"], self.parts.datasets)
+
+    def _learn(self, task: int) -> None:
+        """Train on a task, from its beginning or from what is saved of it, and write its checkpoint."""
+        p = self.parts
+        dataset, saved = p.datasets[task], p.directory.progress(task, p.device)
+        self._say(f"Task {task + 1}/{len(p.instructions)}: {p.instructions[task]} ({len(dataset)} windows)")
+        if saved is None:
+            p.algorithm.begin_task(task, dataset, p.policy)
+        else:
+            self._take_up(saved, str(p.directory.progress_path))
+        stretches = self._stretches(task)
+        for stretch in stretches:
+            if saved is not None and stretch.number < saved["phase"]:
+                continue
+            here = saved is not None and stretch.number == saved["phase"]
+            self._train(stretch, dataset, saved["fit"] if here else None)
+            self._save(task, stretch.number + 1)
+        draws = generator(p.seed, END_TASK, task)
+        p.algorithm.end_task(task, dataset, p.policy, draws)
+        state = {"task": task, "policy": p.policy.state_dict(), "algorithm": p.algorithm.state_dict()}
+        checkpoints.save(p.directory.task_path(task), state)
+
+    def _stretches(self, task: int) -> list[Stretch]:
+        stretches, offset = [], 0
+        for number, phase in enumerate(self.parts.algorithm.phases()):
+            epochs = max(1, round(self.parts.fit.epochs * phase.share))
+            stretches.append(Stretch(task, number, phase, epochs, offset))
+            offset += epochs
+        return stretches
+
+    def _train(self, stretch: Stretch, dataset: WindowDataset, resume: dict[str, Any] | None) -> None:
+        """One phase, from its first step or a saved epoch to the weights that are kept of it."""
+        p = self.parts
+        if resume is None:
+            p.algorithm.begin_phase(stretch.phase, p.policy)
+        fit(
+            p.policy,
+            dataset,
+            p.algorithm,
+            settings=replace(p.fit, epochs=stretch.epochs),
+            seed=(p.seed, FIT, stretch.task, stretch.number),
+            device=p.device,
+            augment=p.augment,
+            on_epoch=lambda end: self._after_epoch(stretch, end),
+            resume=resume,
+            label=f"task {stretch.task + 1} {stretch.phase.name}",
+            progress=p.progress,
+        )
+        if self._selects(stretch):
+            best = self._best_epoch(stretch, stretch.epochs)
+            state = checkpoints.load(p.directory.best_path, p.device)
+            if (state["task"], state["epoch"]) != (stretch.task, best):
+                raise checkpoints.CheckpointError(
+                    f"{p.directory.best_path} is of task {state['task']}, epoch {state['epoch']}; expected "
+                    f"task {stretch.task}, epoch {best}. Start afresh with resume=false"
+                )
+            checkpoints.load_weights(p.policy, state["policy"], str(p.directory.best_path))
+        p.algorithm.end_phase(stretch.phase, p.policy)
+
+    def _after_epoch(self, stretch: Stretch, end: EpochEnd) -> None:
+        """Record the loss, save, and draw a point of the learning curve if one is due."""
+        p, task, epoch = self.parts, stretch.task, stretch.offset + end.epoch
+        if end.epoch and not self.log.read().has_loss(task, epoch):
+            self.log.append(LossRecord(task=task, epoch=epoch, loss=end.loss, seconds=end.seconds))
+            p.tracker.log({"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty})
+        due = end.epoch in p.eval.curve_epochs(stretch.epochs)
+        if due or time.monotonic() - self._saved > SAVE_EVERY:
+            self._save(task, stretch.number, end.state())
+        if not (due and stretch.phase.measures_transfer):
+            return
+        record = self._evaluate("curve", task, task, epoch)
+        loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
+        self._say(f"  epoch {epoch:3d}: {loss}success {record.rate:4.0%}")
+        if self._selects(stretch) and self._best_epoch(stretch, end.epoch) == end.epoch:
+            best = {"task": task, "epoch": end.epoch, "policy": p.policy.state_dict()}
+            checkpoints.save(p.directory.best_path, best)
+
+    def _selects(self, stretch: Stretch) -> bool:
+        return self.parts.eval.select == "best" and stretch.phase.measures_transfer
+
+    def _best_epoch(self, stretch: Stretch, until: int) -> int:
+        """The earliest epoch of the phase with the highest success on the curve so far."""
+        results = self.log.read()
+        rates = {}
+        for epoch in self.parts.eval.curve_epochs(stretch.epochs):
+            key = ("curve", stretch.task, stretch.task, stretch.offset + epoch)
+            if epoch <= until and (record := results.evaluation(*key)) is not None:
+                rates[epoch] = record.rate
+        return max(rates, key=lambda e: (rates[e], -e))
+
+    def _save(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
+        """Save where learning a task stands: inside a phase, or before it."""
+        p = self.parts
+        state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": p.algorithm.state_dict()}
+        state["policy"] = None if fit_state is not None else p.policy.state_dict()
+        checkpoints.save(p.directory.progress_path, state)
+        self._saved = time.monotonic()
+
+    def _finish(self, task: int) -> None:
+        """Evaluate all tasks so far, unless that is done."""
+        p, results = self.parts, self.log.read()
+        first = self._stretches(task)[0]
+        best = self._best_epoch(first, first.epochs) if self._selects(first) else first.epochs
+        row = [self._evaluate("matrix", task, other, best) for other in range(task + 1)]
+        if results.task_end(task) is None:
+            spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
+            spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in row)
+            spent += sum(r.seconds for r in row)
+            self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
+        mean = sum(r.rate for r in row) / len(row)
+        p.tracker.log({"success/just_learned": row[-1].rate, "success/mean": mean, "tasks": task + 1})
+        text = f"  learned: success {row[-1].rate:.0%} on it, {mean:.0%} over {task + 1} so far"
+        self._say(text + self._left(task))
+
+    def _evaluate(
+        self, phase: Literal["curve", "matrix"], learned: int, task: int, epoch: int
+    ) -> EvalRecord:
+        """Rollouts on a task, or their record if they were done before."""
+        p = self.parts
+        found = self.log.read().evaluation(phase, learned, task, epoch if phase == "curve" else None)
+        if found is not None:
+            return found
+        states = p.eval.init_states(phase)
+        shown = phase == "matrix" and (task == learned or learned == len(p.instructions) - 1)
+        with p.algorithm.policy_for(task, p.policy) as acting:
+            rollouts = rollout(
+                acting,
+                p.envs.get((task, len(states))),
+                states,
+                language=p.languages[task],
+                horizon=p.eval.horizon,
+                settle_steps=p.eval.settle_steps,
+                seed=(p.seed, ROLLOUT, learned, epoch, task),
+                device=p.device,
+                precision=p.eval.precision,
+                record_every=p.eval.record_every if shown else 0,
+                label=f"rollouts on task {task + 1}",
+                progress=p.progress,
+            )
+        if rollouts.frames:
+            self._save_video(learned, task, rollouts.frames, rollouts.episodes[0].success)
+        record = EvalRecord(
+            phase=phase,
+            learned=learned,
+            epoch=epoch,
+            task=task,
+            successes=tuple(e.success for e in rollouts.episodes),
+            lengths=tuple(e.length for e in rollouts.episodes),
+            init_states=tuple(e.init_state for e in rollouts.episodes),
+            seconds=rollouts.seconds,
+        )
+        self.log.append(record)
+        return record
+
+    def _save_video(self, learned: int, task: int, frames: tuple, success: bool) -> None:
+        p = self.parts
+        path = p.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"
+        save_animation(frames, path, seconds_per_frame=CONTROL_PERIOD * p.eval.record_every)
+        outcome = "success" if success else "failure"
+        caption = f"{p.instructions[task]}: {outcome}, after learning {learned + 1} tasks"
+        path.with_suffix(".txt").write_text(caption + "\n", encoding="utf-8")
+
+    def _left(self, task: int) -> str:
+        """An estimate of the time left, from what training a task and filling a cell took so far."""
+        results, size = self.log.read(), len(self.parts.instructions)
+        learned, left = task + 1, size - task - 1
+        if not left:
+            return ""
+        evals = results.of(EvalRecord)
+        cells = [r.seconds for r in evals if r.phase == "matrix"]
+        once = sum(r.seconds for r in results.of(LossRecord))
+        once += sum(r.seconds for r in evals if r.phase == "curve")
+        todo = size * (size + 1) // 2 - learned * (learned + 1) // 2
+        seconds = left * once / learned + todo * sum(cells) / len(cells)
+        return f"; about {max(1, round(seconds / 60))} min left"
+
+    def _say(self, text: str) -> None:
+        print(text, flush=True)

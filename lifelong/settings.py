@@ -1,0 +1,98 @@
+"""Settings that belong to no single part: of the run, the task sequence, and the data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from libero_env.demos import LOW_DIM_KEYS
+from libero_env.errors import UnknownNameError
+from libero_env.tasks import Task, get_suite
+from lifelong.errors import ConfigError
+from lifelong.types import PolicySpec
+
+CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """The keys at the top of the configuration; see configs/config.yaml."""
+
+    seed: int
+    device: str
+    threads: int
+    runs_dir: str
+    run_id: str | None
+    resume: bool
+    progress: bool | None
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """Which tasks, in which order.
+
+    Attributes:
+        suite: Name of a suite.
+        order: One of its published sequences.
+        tasks: The first so many of the sequence, or a list of names or indices, in the order to be learned.
+    """
+
+    suite: str
+    order: int = 0
+    tasks: int | Sequence[int | str] | None = None
+
+    def sequence(self) -> tuple[Task, ...]:
+        """The tasks in learning order.
+
+        Raises:
+            UnknownNameError: No such suite, order or task.
+        """
+        suite = get_suite(self.suite)
+        tasks = suite.order(self.order)
+        if self.tasks is None:
+            return tasks
+        if isinstance(self.tasks, int):
+            if not 1 <= self.tasks <= len(tasks):
+                raise ConfigError(f"benchmark.tasks is {self.tasks}; {self.suite} has {len(tasks)} tasks")
+            return tasks[: self.tasks]
+        known = {t.name: t for t in suite.tasks} | {str(t.index): t for t in suite.tasks}
+        for name in self.tasks:
+            if str(name) not in known:
+                raise UnknownNameError(f"task of {self.suite}", name, [t.name for t in suite.tasks])
+        return tuple(known[str(name)] for name in self.tasks)
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """What the policy sees and learns from; see configs/data."""
+
+    demos: int
+    image_size: int
+    seq_len: int
+    views: Sequence[str]
+    proprio: Sequence[str]
+    pairing: Literal["aligned", "stored"] = "aligned"
+    labels: Literal["expert", "executed"] = "expert"
+    folder: str | None = None
+
+    def __post_init__(self) -> None:
+        valid = {
+            "pairing": ("aligned", "stored"),
+            "labels": ("expert", "executed"),
+            "views": CAMERAS,
+            "proprio": LOW_DIM_KEYS,
+        }
+        for key, names in valid.items():
+            value = getattr(self, key)
+            for name in [value] if isinstance(value, str) else value:
+                if name not in names:
+                    raise UnknownNameError(f"data.{key}", name, names)
+
+    def spec(self, language_dim: int) -> PolicySpec:
+        """What the policy is built for."""
+        return PolicySpec(
+            views=tuple(self.views),
+            image_size=(self.image_size, self.image_size),
+            proprio={name: LOW_DIM_KEYS[name] for name in self.proprio},
+            language_dim=language_dim,
+            seq_len=self.seq_len,
+        )

@@ -1,0 +1,8 @@
+"""Learn a sequence of tasks: `python train.py algo=ewc benchmark=libero_object`."""
+
+import sys
+
+from lifelong.launch import main
+
+if __name__ == "__main__":
+    sys.exit(main("configs"))
