@@ -4,17 +4,20 @@ from typing import Literal
 
 import numpy as np
 
+from libero_env.control import SUBSTEPS
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import TIP_BELOW, Grasp, GraspError, choose_grasp
-from libero_env.expert.motion import CLOSE, OPEN, action_toward, downward, rotation_between
+from libero_env.expert.motion import CLOSE, OPEN, action_toward, downward, finger_axis, rotation_between
 from libero_env.expert.plan import PickPlace, Shapes, plan_goal, pose_of
 from libero_env.expert.style import Style
 from libero_env.predicates import StateView, evaluate
 from libero_env.problem import Atom
+from libero_env.scene import TIMESTEP
 from libero_env.tasks import Task
 
 Phase = Literal["reach", "close", "carry", "release", "rest"]
 
+CONTROL_HZ = 1.0 / (SUBSTEPS * TIMESTEP)
 ARRIVED = 0.005  # m
 ARRIVED_TURN = 0.12  # rad
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
@@ -53,6 +56,8 @@ class Expert:
         self._hold: tuple[np.ndarray, np.ndarray] | None = None  # pose to keep while the fingers move
         self._offset = np.zeros(3)  # of the object from the grip site when it was taken
         self._steps, self._opening = 0, 0.0
+        self._before: np.ndarray | None = None  # where the grip site was one step ago
+        self._velocity = np.zeros(3)
 
     @property
     def steadiness(self) -> float:
@@ -67,6 +72,9 @@ class Expert:
         """
         if self.shapes is None:
             self.shapes = Shapes(view.scene)
+        pos = view.eef_pos.copy()
+        self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
+        self._before = pos
         skill = self._next_skill(view)
         if skill is None:
             self._enter("rest")
@@ -172,8 +180,9 @@ class Expert:
     ) -> np.ndarray:
         style = self.style
         return action_toward(
-            view.eef_pos, view.eef_mat, goal, mat, gripper=gripper, gain=style.gain, speed=style.speed, lateral=lateral
-        )
+            view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
+            speed=style.speed, lateral=lateral,
+        )  # fmt: skip
 
     def _grasp_pose(self, view: StateView, skill: PickPlace) -> tuple[np.ndarray, np.ndarray]:
         """Where the grip site must be to take the object, following it when it moves; planned anew when it turns."""
@@ -186,11 +195,11 @@ class Expert:
         if self._grasp is None:
             cloud, others = self.shapes.cloud(view, skill.thing), self.shapes.others(view, skill.thing)
             support = view.scene.workspace.region_height
-            self._grasp = choose_grasp(cloud, others, support, view.eef_mat[:, 1], skill.thing), now
+            self._grasp = choose_grasp(cloud, others, support, finger_axis(view.eef_mat), skill.thing), now
         grasp, then = self._grasp
         yaw = grasp.yaw + self.style.yaw
         along = np.array([-np.sin(grasp.yaw), np.cos(grasp.yaw), 0.0]) * self.style.grasp_along
-        return grasp.pos_world + now.pos - then.pos + along, downward(yaw, view.eef_mat[:, 1])
+        return grasp.pos_world + now.pos - then.pos + along, downward(yaw, finger_axis(view.eef_mat))
 
     def _in_the_way(self, view: StateView, goal: np.ndarray, thing: str) -> float:
         """Height of the highest thing near the next decimetre of the way, m."""

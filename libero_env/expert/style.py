@@ -9,7 +9,7 @@ import numpy as np
 class Style:
     """The manner of one demonstration. Small and continuous on purpose: what to do stays a function of the state."""
 
-    gain: float = 1.5  # action per full-scale error; 1.5 is a little short of critical damping
+    gain: float = 1.6  # action per full-scale error
     speed: float = 1.0  # largest action
     hover: float = 0.08  # m, height of the approach over the grasp
     slope: float = 2.5  # of the funnel that the approach descends in
@@ -24,7 +24,7 @@ class Style:
     def draw(cls, rng: np.random.Generator) -> "Style":
         """A manner at random."""
         return cls(
-            gain=rng.uniform(1.35, 1.65),
+            gain=rng.uniform(1.45, 1.75),
             speed=rng.uniform(0.85, 1.0),
             hover=rng.uniform(0.065, 0.10),
             slope=rng.uniform(2.0, 3.0),
