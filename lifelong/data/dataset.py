@@ -17,7 +17,7 @@ from lifelong.errors import DataError
 from lifelong.types import Batch, Observation, PolicySpec
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SequenceVLDataset:
     """All windows of `seq_len` steps of one task, with the task's language embedding.
 
@@ -133,12 +133,16 @@ class SequenceVLDataset:
             DataError: an index out of range.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64, device=self.last.device)
-        if len(indices) and not (0 <= int(indices.min()) and int(indices.max()) < len(self)):
-            raise DataError(f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}")
+        if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
+            raise DataError(
+                f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
+            )
         frames = self.frames(indices)
         gather = lambda x: x.index_select(0, frames.flatten()).view(*frames.shape, *x.shape[1:])  # noqa: E731
         language = self.language.expand(len(indices), -1)
-        observation = Observation(gather(self.images), {k: gather(v) for k, v in self.proprio.items()}, language)
+        observation = Observation(
+            gather(self.images), {k: gather(v) for k, v in self.proprio.items()}, language
+        )
         return Batch(observation, gather(self.actions), torch.full_like(indices, self.task_id), indices)
 
     def to(self, device: torch.device | str) -> "SequenceVLDataset":
@@ -153,7 +157,10 @@ class SequenceVLDataset:
 
 
 def batches(
-    dataset: SequenceVLDataset, batch_size: int, generator: torch.Generator | None = None, drop_last: bool = False
+    dataset: SequenceVLDataset,
+    batch_size: int,
+    generator: torch.Generator | None = None,
+    drop_last: bool = False,
 ) -> Iterator[Batch]:
     """One pass over all windows.
 
@@ -163,7 +170,9 @@ def batches(
         generator: shuffles; drawn from once, when iteration starts. None: in order.
         drop_last: leave a smaller last batch out.
     """
-    order = torch.arange(len(dataset)) if generator is None else torch.randperm(len(dataset), generator=generator)
+    order = (
+        torch.arange(len(dataset)) if generator is None else torch.randperm(len(dataset), generator=generator)
+    )
     for indices in order.split(batch_size):
         if len(indices) == batch_size or not drop_last:
             yield dataset.batch(indices)
@@ -171,7 +180,7 @@ def batches(
 
 def _check(demo: Demo, spec: PolicySpec, source: str) -> None:
     """Raises DataError when a demonstration does not fit the spec."""
-    expected: dict[str, tuple[int, ...]] = {view: (*spec.image_size, 3) for view in spec.views}
+    expected: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
     expected |= {name: (size,) for name, size in spec.proprio.items()}
     where = f"{source}: {demo.name}"
     if demo.actions.ndim != 2 or demo.actions.shape[1] != spec.action_dim:
@@ -184,6 +193,8 @@ def _check(demo: Demo, spec: PolicySpec, source: str) -> None:
             hint = ""
             if key in spec.views and len(found) == 4:
                 hint = f". Set the policy's image_size to {list(found[1:3])}, or record at {list(shape[:2])}"
-            raise DataError(f"{where}/obs/{key} is {found}; the policy expects {(len(demo.actions), *shape)}{hint}")
+            raise DataError(
+                f"{where}/obs/{key} is {found}; the policy expects {(len(demo.actions), *shape)}{hint}"
+            )
         if key in spec.views and demo.obs[key].dtype != np.uint8:
             raise DataError(f"{where}/obs/{key} is {demo.obs[key].dtype}; expected uint8 in 0..255")

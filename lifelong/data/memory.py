@@ -98,14 +98,16 @@ class ReplayMemory:
             DataError: a dataset is absent or has fewer windows than the state refers to; nothing is changed then.
         """
         indices = {int(task): i.clone() for task, i in state["indices"].items()}
+        absent = sorted(set(indices) - set(datasets))
+        if absent:
+            raise DataError(
+                f"the memory holds windows of tasks {absent}; there are datasets of {sorted(datasets)} only"
+            )
+        held = {task: datasets[task] for task in indices}
         for task, kept in indices.items():
-            if task not in datasets:
-                raise DataError(f"the memory holds windows of task {task}, whose dataset is not among {sorted(datasets)}")
-            if len(kept) and int(kept.max()) >= len(datasets[task]):
+            if len(kept) and int(kept.max()) >= len(held[task]):
                 raise DataError(
                     f"the memory holds window {int(kept.max())} of task {task}, whose dataset has "
-                    f"{len(datasets[task])}: its demonstrations are not those of the interrupted run"
+                    f"{len(held[task])}: its demonstrations are not those of the interrupted run"
                 )
-        self.budget = int(state["budget"])
-        self._indices = indices
-        self._datasets = {task: datasets[task] for task in indices}
+        self.budget, self._indices, self._datasets = int(state["budget"]), indices, held

@@ -54,15 +54,28 @@ class RandomShift(Augmentation):
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """See `Augmentation`."""
         b, _, v, h, w, _ = images.shape
-        low, high = -self.pixels, self.pixels + 1
-        shifts = torch.randint(low, high, (b, v, 2), generator=generator)
-        rows = (torch.arange(h) + shifts[..., :1]).clamp(0, h - 1).to(images.device)  # (B, V, H)
-        cols = (torch.arange(w) + shifts[..., 1:]).clamp(0, w - 1).to(images.device)  # (B, V, W)
-        batch = torch.arange(b, device=images.device)[:, None, None, None]
-        view = torch.arange(v, device=images.device)[None, :, None, None]
-        moved = images.transpose(1, 2)  # (B, V, T, H, W, C)
-        moved = moved.permute(0, 1, 3, 4, 2, 5)[batch, view, rows[..., None], cols[..., None, :]]
-        return moved.permute(0, 4, 1, 2, 3, 5).contiguous()
+        shifts = torch.randint(0, 2 * self.pixels + 1, (b, v, 2), generator=generator).tolist()
+        padded = _repeat_border(images, self.pixels)
+        moved = torch.empty_like(images)
+        for row, per_view in enumerate(shifts):
+            for view, (y, x) in enumerate(per_view):
+                moved[row, :, view] = padded[row, :, view, y : y + h, x : x + w]
+        return moved
+
+
+def _repeat_border(images: Tensor, pixels: int) -> Tensor:
+    """(..., H, W, C) -> (..., H + 2 pixels, W + 2 pixels, C)."""
+    if not pixels:
+        return images
+    *lead, h, w, c = images.shape
+    padded = images.new_empty(*lead, h + 2 * pixels, w + 2 * pixels, c)
+    rows = slice(pixels, pixels + h)
+    padded[..., rows, pixels : pixels + w, :] = images
+    padded[..., rows, :pixels, :] = images[..., :1, :]
+    padded[..., rows, pixels + w :, :] = images[..., -1:, :]
+    padded[..., :pixels, :, :] = padded[..., pixels : pixels + 1, :, :]
+    padded[..., pixels + h :, :, :] = padded[..., pixels + h - 1 : pixels + h, :, :]
+    return padded
 
 
 class ColorJitter(Augmentation):

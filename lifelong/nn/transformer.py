@@ -40,7 +40,11 @@ class TransformerLayer(nn.Module):
         self.out = nn.Linear(heads * head_dim, dim)
         self.drop = nn.Dropout(dropout)
         self.mlp = nn.Sequential(
-            nn.Linear(dim, mlp_dim), nn.GELU(), nn.Dropout(dropout), nn.Linear(mlp_dim, dim), nn.Dropout(dropout)
+            nn.Linear(dim, mlp_dim),
+            nn.GELU(),
+            nn.Dropout(dropout),
+            nn.Linear(mlp_dim, dim),
+            nn.Dropout(dropout),
         )
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:

@@ -174,15 +174,14 @@ class ResNetFiLMEncoder(nn.Module):
         """Encodes images.
 
         Args:
-            images: (N, H, W, 3) uint8, or float in [0, 255] (after augmentation).
+            images: (N, H, W, 3) uint8.
             language: (M, L); N = M T with the T frames of a window adjacent.
 
         Returns:
             (N, E) latents.
         """
         h = images.movedim(-1, 1)  # a view; already channels-last in memory
-        h = h.to(torch.float32).mul(2.0 / 255.0).sub(1.0)
-        h = self.stem(h)
+        h = self.stem(h.to(torch.float32).mul_(2.0 / 255.0).sub_(1.0))
         for block, film in zip(self.blocks, self.films, strict=True):
             h = film(block(h), language)
         return self.project(self.keypoints(h))

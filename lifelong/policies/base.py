@@ -40,9 +40,7 @@ class Policy(nn.Module, ABC):
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
         """See `act`; called without gradients, in eval mode, with a checked observation."""
 
-    def act(
-        self, observation: Observation, generators: Sequence[torch.Generator] | None = None
-    ) -> Tensor:
+    def act(self, observation: Observation, generators: Sequence[torch.Generator] | None = None) -> Tensor:
         """The next action of every environment; advances the history.
 
         Args:

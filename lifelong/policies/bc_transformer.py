@@ -102,7 +102,12 @@ class BCTransformer(Policy):
             dropout=dropout,
             max_length=spec.seq_len,
         )
-        sizes = {"in_dim": embed_dim, "action_dim": spec.action_dim, "hidden": head_hidden, "layers": head_layers}
+        sizes = {
+            "in_dim": embed_dim,
+            "action_dim": spec.action_dim,
+            "hidden": head_hidden,
+            "layers": head_layers,
+        }
         if head == "gmm":
             self.head = GMMHead(**sizes, modes=modes, min_std=min_std, low_eval_noise=low_eval_noise)
         elif head == "deterministic":
@@ -143,7 +148,9 @@ class BCTransformer(Policy):
         if not self.stochastic:
             return self.head.mode(params)
         if generators is None or len(generators) != self._num_envs:
-            raise PolicyError("a stochastic policy needs one generator per environment to act: act(..., generators=[...])")
+            raise PolicyError(
+                "a stochastic policy needs one generator per environment to act: act(..., generators=[...])"
+            )
         draws = [
             self.head.sample({k: v[i : i + 1].cpu() for k, v in params.items()}, generator)
             for i, generator in enumerate(generators)
