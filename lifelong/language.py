@@ -85,13 +85,10 @@ def embed(
 @cache
 def shipped() -> dict[str, Tensor]:
     """The embeddings that come with the package, by `normal_form` of the text; each (384,) float32."""
-    with resources.as_file(resources.files("lifelong") / "embeddings" / "minilm.npz") as path:
-        with np.load(path, allow_pickle=False) as file:
-            vectors = torch.from_numpy(file["embeddings"].astype(np.float32))
-            return {
-                normal_form(text): vector
-                for text, vector in zip(file["texts"].tolist(), vectors, strict=True)
-            }
+    packed = resources.files("lifelong") / "embeddings" / "minilm.npz"
+    with packed.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        vectors = torch.from_numpy(file["embeddings"].astype(np.float32))
+        return {normal_form(text): v for text, v in zip(file["texts"].tolist(), vectors, strict=True)}
 
 
 def normal_form(text: str) -> str:

@@ -101,7 +101,7 @@ class ReplayMemory:
         absent = sorted(set(indices) - set(datasets))
         if absent:
             raise DataError(
-                f"the memory holds windows of tasks {absent}; there are datasets of {sorted(datasets)} only"
+                f"the memory holds windows of tasks {absent}; there are datasets of {sorted(datasets)}"
             )
         held = {task: datasets[task] for task in indices}
         for task, kept in indices.items():

@@ -63,8 +63,9 @@ class Policy(nn.Module, ABC):
     def _check(self, observation: Observation) -> None:
         expected = (1, len(self.spec.views), *self.spec.image_size, 3)
         if tuple(observation.images.shape[1:]) != expected:
+            sizes = ", ".join(map(str, expected))
             raise PolicyError(
-                f"images are {tuple(observation.images.shape)}; this policy acts on (B, {', '.join(map(str, expected))})"
+                f"images are {tuple(observation.images.shape)}; this policy acts on (B, {sizes})"
             )
         missing = [name for name in self.spec.proprio if name not in observation.proprio]
         if missing:

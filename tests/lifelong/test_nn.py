@@ -1,0 +1,209 @@
+"""Network parts have the properties their names promise."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from lifelong.data import fake_batch
+from lifelong.errors import PolicyError
+from lifelong.nn import (
+    ColorJitter,
+    Compose,
+    DeterministicHead,
+    FiLM,
+    GMMHead,
+    ProprioTokens,
+    RandomShift,
+    ResNetFiLMEncoder,
+    SpatialSoftmax,
+    TemporalTransformer,
+)
+from lifelong.nn.precision import bf16_runs_on_cpu
+from lifelong.nn.tokens import standardise
+from lifelong.nn.transformer import block_causal_mask
+from lifelong.types import PolicySpec
+
+pytestmark = pytest.mark.unit
+SPEC = PolicySpec(image_size=(16, 20), language_dim=6, seq_len=4)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def randn(*shape: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=generator())
+
+
+def small_encoder(**changes) -> ResNetFiLMEncoder:
+    sizes = {"image_size": (32, 32), "language_dim": 6, "latent_dim": 8, "width": 8, "stem_pool": False}
+    return ResNetFiLMEncoder(**(sizes | changes))
+
+
+def test_film_starts_as_the_identity_and_is_linear_in_its_parameters() -> None:
+    film, h, language = FiLM(language_dim=6, channels=8), randn(6, 8, 3, 3), randn(2, 6)
+    assert torch.equal(film(h, language), h)
+    nn.init.normal_(film.project.weight, generator=generator())
+    gamma, beta = film.project(language).repeat_interleave(3, dim=0)[:, :, None, None].chunk(2, dim=1)
+    torch.testing.assert_close(film(h, language), (1 + gamma) * h + beta)
+
+
+def test_spatial_softmax_finds_a_peak_in_the_image() -> None:
+    layer = SpatialSoftmax(channels=2, size=(5, 9), keypoints=2)
+    with torch.no_grad():
+        layer.heat.weight.copy_(torch.eye(2)[..., None, None] * 50)
+    h = torch.zeros(1, 2, 5, 9)
+    h[0, 0, 0, 8] = 1.0  # top right
+    h[0, 1, 4, 4] = 1.0  # bottom middle
+    torch.testing.assert_close(layer(h), torch.tensor([[1.0, -1.0, 0.0, 1.0]]), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("norm", ["group", "batch", "none"])
+def test_encoder_frames_of_a_window_share_its_language(norm: str) -> None:
+    encoder = small_encoder(norm=norm).eval()
+    for film in encoder.films:
+        nn.init.normal_(film.project.weight, generator=generator())
+    images = torch.randint(0, 256, (6, 32, 32, 3), generator=generator(), dtype=torch.uint8)
+    language = randn(2, 6)
+    together = encoder(images, language)
+    each = torch.cat([encoder(images[i : i + 1], language[i // 3 : i // 3 + 1]) for i in range(6)])
+    torch.testing.assert_close(together, each, atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(encoder(images, language.flip(0)), together)
+
+
+def test_encoder_refuses_what_cannot_work() -> None:
+    with pytest.raises(PolicyError, match="too small to localise"):
+        small_encoder(stage_blocks=(1, 1, 1, 1), stem_pool=True)
+    with pytest.raises(PolicyError, match="Valid: batch, group, none"):
+        small_encoder(norm="layer")
+
+
+def test_mask_lets_a_step_see_itself_and_the_past() -> None:
+    expected = np.kron(np.tril(np.ones((3, 3))), np.ones((2, 2))).astype(bool)
+    np.testing.assert_array_equal(block_causal_mask(3, 2).numpy(), expected)
+
+
+def test_transformer_output_does_not_depend_on_the_future() -> None:
+    transformer = TemporalTransformer(dim=8, layers=2, heads=2, head_dim=4, mlp_dim=16, max_length=5).eval()
+    tokens = randn(2, 5, 3, 8)
+    changed = tokens.clone()
+    changed[:, 3:] = 0
+    torch.testing.assert_close(transformer(tokens)[:, :3], transformer(changed)[:, :3])
+    torch.testing.assert_close(transformer(tokens[:, :3]), transformer(tokens)[:, :3])
+
+
+def test_gmm_log_probability_against_the_formula() -> None:
+    head = GMMHead(in_dim=4, action_dim=3, modes=2, hidden=8, layers=1, min_std=1e-4)
+    params = {k: v.detach() for k, v in head(randn(5, 4)).items()}
+    actions = 2 * torch.rand(5, 3, generator=generator()) - 1
+    means, stds, logits = (params[k].double().numpy() for k in ("means", "stds", "logits"))
+    for i, action in enumerate(actions.double().numpy()):
+        weights = np.exp(logits[i]) / np.exp(logits[i]).sum()
+        density = sum(
+            weights[k]
+            * np.prod(
+                np.exp(-0.5 * ((action - means[i, k]) / stds[i, k]) ** 2)
+                / (stds[i, k] * math.sqrt(2 * math.pi))
+            )
+            for k in range(2)
+        )
+        one = {k: v[i : i + 1] for k, v in params.items()}
+        assert head.log_prob(one, actions[i : i + 1]).item() == pytest.approx(math.log(density), abs=1e-4)
+
+
+def test_gmm_loss_is_float32_under_autocast() -> None:
+    if not bf16_runs_on_cpu():
+        pytest.skip("bfloat16 does not run on this CPU")
+    head = GMMHead(in_dim=4, action_dim=3, hidden=8)
+    with torch.autocast("cpu", torch.bfloat16):
+        params = head(randn(5, 4))
+        losses = head.losses(params, randn(5, 3))
+    assert losses.dtype == torch.float32
+    assert all(v.dtype == torch.float32 for v in params.values())
+
+
+def test_gmm_mode_is_the_heaviest_mean_and_samples_follow_the_mixture() -> None:
+    head = GMMHead(in_dim=4, action_dim=1, modes=2, hidden=8, low_eval_noise=True)
+    params = {
+        "means": torch.tensor([[-0.5], [0.5]]).expand(20_000, 2, 1),
+        "stds": torch.tensor([[0.05], [0.1]]).expand(20_000, 2, 1),
+        "logits": torch.tensor([0.25, 0.75]).log().expand(20_000, 2),
+    }
+    assert (head.mode(params) == 0.5).all()
+    drawn = head.sample(params, generator())[:, 0]
+    right = drawn[drawn > 0]
+    assert len(right) / len(drawn) == pytest.approx(0.75, abs=0.02)
+    assert right.std().item() == pytest.approx(0.1, rel=0.05)
+    assert head.eval().sample(params, generator())[:, 0].abs().std() < 1e-3  # low_eval_noise
+    assert torch.equal(head.sample(params, generator(3)), head.sample(params, generator(3)))
+
+
+def test_deterministic_head_loss_is_squared_error() -> None:
+    head = DeterministicHead(in_dim=4, action_dim=3, hidden=8)
+    params, actions = head(randn(5, 4)), randn(5, 3)
+    torch.testing.assert_close(head.losses(params, actions), (params["means"] - actions).pow(2).mean(-1))
+    assert torch.equal(head.mode(params), head.sample(params, None))
+
+
+def test_proprio_is_of_order_one_and_dropout_takes_whole_windows() -> None:
+    tokens = ProprioTokens(proprio={"gripper_states": 2}, dim=2, dropout=0.5)
+    nn.init.eye_(tokens.linears["gripper_states"].weight)
+    nn.init.zeros_(tokens.linears["gripper_states"].bias)
+    opened = torch.tensor([0.04, -0.04]).expand(64, 3, 2)
+    torch.testing.assert_close(tokens.eval()({"gripper_states": opened})[0, 0, 0], torch.tensor([1.0, -1.0]))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        kept = tokens.train()({"gripper_states": opened}).abs().sum(-1).flatten(1) > 0
+    assert (kept.all(1) | ~kept.any(1)).all()
+    assert kept.any() and not kept.all()
+
+
+def test_standardised_language_has_unit_variance() -> None:
+    out = standardise(0.05 * randn(3, 100) + 1)
+    torch.testing.assert_close(out.var(-1, unbiased=False), torch.ones(3), atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("augmentation", [RandomShift(3), ColorJitter(keep=0.0), Compose([RandomShift(2)])])
+def test_augmentation_is_the_same_for_all_frames_of_a_window_and_spares_its_input(augmentation) -> None:
+    batch = fake_batch(SPEC, 8, generator())
+    batch.observation.images.copy_(batch.observation.images[:, :1].clone())  # all frames alike
+    before = batch.observation.images.clone()
+    global_state = torch.random.get_rng_state()
+    changed = augmentation(batch, generator(1)).observation.images
+    assert torch.equal(batch.observation.images, before)
+    assert torch.equal(global_state, torch.random.get_rng_state())
+    assert torch.equal(changed, changed[:, :1].expand_as(changed))
+    assert torch.equal(changed, augmentation(batch, generator(1)).observation.images)
+    assert changed.dtype == torch.uint8
+    same = [torch.equal(a, b) for a, b in zip(changed, before, strict=True)]
+    assert not all(same)
+
+
+def test_shift_equals_a_naive_reference() -> None:
+    images = fake_batch(SPEC, 5, generator()).observation.images
+    moved = RandomShift(3).images(images, generator(7))
+    shifts = torch.randint(0, 7, (5, 2, 2), generator=generator(7))
+    padded = np.pad(images.numpy(), [(0, 0)] * 3 + [(3, 3), (3, 3), (0, 0)], mode="edge")
+    for b in range(5):
+        for v in range(2):
+            y, x = shifts[b, v].tolist()
+            np.testing.assert_array_equal(moved[b, :, v], padded[b, :, v, y : y + 16, x : x + 20])
+
+
+def test_jitter_of_nothing_changes_nothing_and_gray_stays_gray() -> None:
+    images = fake_batch(SPEC, 4, generator()).observation.images
+    assert torch.equal(ColorJitter(0, 0, 0, 0, keep=0.0).images(images, generator()), images)
+    assert torch.equal(ColorJitter(keep=1.0).images(images, generator()), images)
+    gray = images[..., :1].expand_as(images)
+    turned = ColorJitter(0, 0, 0.3, 0.3, keep=0.0).images(gray, generator()).int()
+    assert (turned - gray.int()).abs().max() <= 1
+
+
+def test_brightness_scales() -> None:
+    images = torch.full((3, 1, 2, 4, 4, 3), 100, dtype=torch.uint8)
+    changed = ColorJitter(0.3, 0, 0, 0, keep=0.0).images(images, generator()).float()
+    assert ((changed >= 70) & (changed <= 130)).all()
+    assert len(changed.unique()) > 3  # each window its own
