@@ -1,7 +1,7 @@
 """What a task is: the values that a task file holds, and what it takes for two of them to mean the same."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,14 @@ class Problem:
     obj_of_interest: tuple[str, ...] = ()
     scene_properties: Mapping[str, str] = field(default_factory=dict, hash=False)
     domain: str = "robosuite"
+
+    def __eq__(self, other: object) -> bool:
+        """All the same, the order of fixtures and objects included."""
+        return isinstance(other, Problem) and self._key() == other._key()
+
+    def _key(self) -> tuple[object, ...]:
+        values = (getattr(self, field.name) for field in fields(self))
+        return tuple(tuple(value.items()) if isinstance(value, Mapping) else value for value in values)
 
     def region(self, address: str) -> Region | None:
         """The region with this address (`floor_bin_region`), or None where the file declares none."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 from libero_env import bddl
 from libero_env.errors import UnknownNameError
@@ -98,6 +99,16 @@ def get_task(key: str) -> Task:
     if key not in named:
         raise UnknownNameError("task", key, named)
     return named[key]
+
+
+def read_task(path: str | Path) -> Task:
+    """A task of your own from a BDDL file; its suite is `file`, its name the file's.
+
+    Raises:
+        BDDLError: the file is not a task; the message starts with file:line.
+    """
+    problem, name = bddl.read(path), Path(path).stem
+    return Task("file", 0, name, language_from_name(name), problem.language, problem)
 
 
 def language_from_name(name: str) -> str:
