@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from libero_env.errors import LiberoError
+from lifelong import cli_demos
 from lifelong.errors import LifelongError
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
@@ -92,8 +93,12 @@ def run_tasks_show(args: argparse.Namespace) -> None:
 def register_report(subparsers: Subparsers) -> None:
     """`libero report RUN_DIR...`"""
     parser = subparsers.add_parser("report", help="a page about one run, or about several side by side")
-    parser.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN_DIR", help="such as runs/libero_object/ewc/...")
-    parser.add_argument("--out", type=Path, help="the page to write (default: report.html in the run directory)")
+    parser.add_argument(
+        "run_dirs", nargs="+", type=Path, metavar="RUN_DIR", help="such as runs/libero_object/ewc/..."
+    )
+    parser.add_argument(
+        "--out", type=Path, help="the page to write (default: report.html in the run directory)"
+    )
     parser.set_defaults(run=run_report)
 
 
@@ -104,7 +109,12 @@ def run_report(args: argparse.Namespace) -> None:
     print(write_report(args.run_dirs, args.out))
 
 
-COMMANDS: tuple[Callable[[Subparsers], None], ...] = (register_doctor, register_tasks, register_report)
+COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
+    register_doctor,
+    register_tasks,
+    cli_demos.register,
+    register_report,
+)
 
 if __name__ == "__main__":
     sys.exit(main())

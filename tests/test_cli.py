@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from libero_env import bddl, doctor, paths
@@ -54,6 +55,46 @@ def test_errors_are_one_line_and_a_status(argv, hint, capsys):
     assert cli.main(argv) == 2
     err = capsys.readouterr().err
     assert err.startswith("libero: error: ") and hint in err and err.count("\n") == 1
+
+
+@pytest.fixture
+def demo_file(tmp_path) -> Path:
+    from libero_env.demos_write import DemoWriter, Episode, make_header
+
+    frames = np.zeros((4, 8, 8, 3), np.uint8)
+    obs = {"agentview_rgb": frames, "ee_pos": np.zeros((4, 3)), "ee_ori": np.zeros((4, 3))}
+    episode = Episode(
+        np.zeros((4, 7)), np.zeros((4, 30)), np.zeros((4, 9)), obs, attrs={"failed_attempts": 2}
+    )
+    header = make_header(problem_name="P", language="l", bddl_name="a/b.bddl", bddl_text="", env_kwargs={})
+    writer = DemoWriter(tmp_path / "suite" / "a_demo.hdf5", header)
+    writer.write(0, episode)
+    writer.write(1, episode)
+    return writer.finish()
+
+
+def test_demonstrations_are_described_and_checked(demo_file, tmp_path, capsys):
+    assert cli.main(["demos", "info", str(tmp_path)]) == 0
+    assert (
+        f"{demo_file}: 2 demonstrations, 8 steps, 8x8 pixels, failed attempts: 4, " in capsys.readouterr().out
+    )
+    assert cli.main(["demos", "check", str(demo_file)]) == 0
+    assert capsys.readouterr().out == f"ok    {demo_file}: 2 demonstrations\n"
+
+
+def test_broken_demonstrations_are_told_apart(demo_file, tmp_path, capsys):
+    cut = demo_file.with_name("cut_demo.hdf5")
+    cut.write_bytes(demo_file.read_bytes()[:2000])
+    assert cli.main(["demos", "check", str(tmp_path)]) == 1
+    out = capsys.readouterr().out
+    assert f"ok    {demo_file}" in out and f"FAIL  {cut}: not a whole HDF5 file" in out
+
+
+@pytest.mark.parametrize("command", ["info", "check"])
+def test_absent_demonstrations_are_an_error(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "none"))
+    assert cli.main(["demos", command]) == 2
+    assert "no demonstrations in" in capsys.readouterr().err
 
 
 def test_unknown_command_lists_the_valid_ones(capsys):
