@@ -70,17 +70,25 @@ def build_scene(problem: Problem) -> Scene:
     Raises:
         UnknownNameError: a fixture or object category that has no model.
     """
-    workspace = load_workspace(workspace_of(problem))
     objects = {name: get_object(category) for name, category in problem.objects.items()}
+    return Scene(problem, load_workspace(workspace_of(problem)), scene_spec(problem, objects).compile(), objects)
+
+
+def scene_spec(problem: Problem, objects: Mapping[str, ObjectModel] | None = None) -> mujoco.MjSpec:
+    """A fresh, editable model of a problem's scene, with these objects or with those of the catalog.
+
+    Raises:
+        UnknownNameError: a fixture or object category that has no model.
+    """
+    workspace = load_workspace(workspace_of(problem))
     spec = mujoco.MjSpec()
     spec.modelname = "libero"
     _set_options(spec)
     _add_arena(spec, workspace)
     add_panda(spec, workspace.figures["robot"]["base_pos_world"])
-    for name, item in objects.items():
-        _add_object(spec, name, item)
-    model = spec.compile()
-    return Scene(problem, workspace, model, objects)
+    for name, category in problem.objects.items():
+        _add_object(spec, name, get_object(category) if objects is None else objects[name])
+    return spec
 
 
 def workspace_of(problem: Problem) -> str:
