@@ -17,7 +17,7 @@ class Attempt:
     """What happened in one simulation."""
 
     success: bool
-    states: np.ndarray  # (T, 1 + nq + nv) before each action
+    states: np.ndarray  # (T + 1, 1 + nq + nv) [time, qpos, qvel] before each action, and at the end
     actions: np.ndarray  # (T, 7) executed
     expert_actions: np.ndarray  # (T, 7) wanted
     retries: int
@@ -62,11 +62,12 @@ def run_experts(
             states[i].append(world.physics_state(i))
             executed[i].append(actions[i].copy())
             wanted[i].append(label)
-        infos = env.step(actions)[-1]
-        success = infos["success"][: len(experts)]
+        success = env.step(actions)[-1]["success"][: len(experts)]
+    for i, rows in enumerate(states):
+        rows.append(world.physics_state(i))
     return [
         Attempt(bool(success[i]), np.array(states[i]), np.array(executed[i]), np.array(wanted[i]), expert.retries,
-                "" if success[i] else _reason(expert, len(states[i])))
+                "" if success[i] else _reason(expert, len(executed[i])))
         for i, expert in enumerate(experts)
     ]  # fmt: skip
 

@@ -53,6 +53,7 @@ class Expert:
         self.trouble = ""
         self._skill: PickPlace | None = None
         self._grasp: tuple[Grasp, Pose] | None = None  # and where the object was then
+        self._rise = 0.0  # m, over the grasp, at which the fingertips pass over the object
         self._hold: tuple[np.ndarray, np.ndarray] | None = None  # pose to keep while the fingers move
         self._offset = np.zeros(3)  # of the object from the grip site when it was taken
         self._steps, self._opening = 0, 0.0
@@ -115,7 +116,7 @@ class Expert:
             self._hold = goal, mat
             self._enter("close")
             return self._close(view, skill)
-        lift = np.clip(style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, style.hover)
+        lift = np.clip(style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, self._rise + style.hover)
         over = goal.copy()
         over[2] += lift
         if away > 0.05:
@@ -144,8 +145,8 @@ class Expert:
         if np.linalg.norm(offset - self._offset) > 0.03 + 0.3 * abs(self._offset[2]):
             self._again()
             return self._reach(view, skill)
-        hang = max(pos[2] - self.shapes.cloud(view, skill.thing)[:, 2].min(), TIP_BELOW)
-        rim = self.shapes.cloud(view, skill.container)[:, 2].max()
+        hang = max(pos[2] - self.shapes.span(view, skill.thing)[0], TIP_BELOW)
+        rim = self.shapes.span(view, skill.container)[1]
         goal = view.site_pos(skill.site) - offset
         goal[:2] += style.place_xy
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
@@ -195,7 +196,8 @@ class Expert:
         if self._grasp is None:
             cloud, others = self.shapes.cloud(view, skill.thing), self.shapes.others(view, skill.thing)
             support = view.scene.workspace.region_height
-            self._grasp = choose_grasp(cloud, others, support, finger_axis(view.eef_mat), skill.thing), now
+            grasp = choose_grasp(cloud, others, support, finger_axis(view.eef_mat), skill.thing)
+            self._grasp, self._rise = (grasp, now), cloud[:, 2].max() - grasp.pos_world[2] + TIP_BELOW
         grasp, then = self._grasp
         yaw = grasp.yaw + self.style.yaw
         along = np.array([-np.sin(grasp.yaw), np.cos(grasp.yaw), 0.0]) * self.style.grasp_along

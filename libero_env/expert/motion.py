@@ -28,7 +28,7 @@ def action_toward(
         velocity: of the grip site now, (3,), m/s.
         gripper: 7th entry of the action.
         gain: action per error, in units of the largest step.
-        speed: largest action of the translation; horizontally it limits the length, so that paths are straight.
+        speed: largest action of the translation; the horizontal part is scaled as one, so that paths are straight.
         lateral: factor on the horizontal part, in [0, 1].
 
     Returns:
@@ -36,8 +36,7 @@ def action_toward(
     """
     action = np.zeros(7)
     move = gain * (goal_pos - pos - DAMPING * velocity) / POSITION_SCALE
-    length = np.hypot(move[0], move[1])
-    action[:2] = lateral * move[:2] * min(1.0, speed / max(length, 1e-9))
+    action[:2] = lateral * move[:2] * min(1.0, speed / max(np.abs(move[:2]).max(), 1e-9))
     action[2] = np.clip(move[2], -speed, speed)
     turn = TURN_GAIN * rotation_between(mat, goal_mat) / ROTATION_SCALE
     action[3:6] = turn * min(1.0, 0.6 / max(np.linalg.norm(turn), 1e-9))

@@ -67,6 +67,12 @@ class Shapes:
         """Points on an object, world frame, (N, 3)."""
         return pose_of(view, name).apply(self.fine[name])
 
+    def span(self, view: StateView, name: str) -> tuple[float, float]:
+        """Lowest and highest point of an object, m."""
+        pose = pose_of(view, name)
+        heights = self.coarse[name] @ pose.mat[2] + pose.pos[2]
+        return float(heights.min()), float(heights.max())
+
     def others(self, view: StateView, *names: str) -> np.ndarray:
         """Points on all objects but these, world frame, (M, 3)."""
         clouds = [pose_of(view, name).apply(points) for name, points in self.coarse.items() if name not in names]

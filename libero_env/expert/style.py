@@ -11,13 +11,13 @@ class Style:
 
     gain: float = 1.6  # action per full-scale error
     speed: float = 1.0  # largest action
-    hover: float = 0.08  # m, height of the approach over the grasp
-    slope: float = 2.5  # of the funnel that the approach descends in
+    hover: float = 0.02  # m, of the fingertips over the body on the way in
+    slope: float = 3.0  # of the funnel that the approach descends in
     grasp_along: float = 0.0  # m, shift of the grasp along the jaws, where the body is long enough
     yaw: float = 0.0  # rad, error of the grasp's yaw
-    margin: float = 0.025  # m, between what is carried and what it is carried over
+    margin: float = 0.02  # m, between what is carried and what it is carried over
     place_xy: tuple[float, float] = (0.0, 0.0)  # m, shift of the place
-    depth: float = 0.03  # m, how far below the rim the body is let go
+    depth: float = 0.01  # m, how far below the rim the body is let go
     pause: int = 0  # steps of waiting before lifting and before letting go
 
     @classmethod
@@ -25,14 +25,14 @@ class Style:
         """A manner at random."""
         return cls(
             gain=rng.uniform(1.45, 1.75),
-            speed=rng.uniform(0.85, 1.0),
-            hover=rng.uniform(0.065, 0.10),
-            slope=rng.uniform(2.0, 3.0),
+            speed=rng.uniform(0.9, 1.0),
+            hover=rng.uniform(0.01, 0.03),
+            slope=rng.uniform(2.5, 3.5),
             grasp_along=rng.uniform(-0.004, 0.004),
             yaw=rng.normal(0.0, 0.02),
-            margin=rng.uniform(0.02, 0.035),
+            margin=rng.uniform(0.015, 0.025),
             place_xy=tuple(rng.uniform(-0.01, 0.01, 2)),
-            depth=rng.uniform(0.02, 0.04),
+            depth=rng.uniform(0.0, 0.015),
             pause=int(rng.integers(0, 2)),
         )
 

@@ -1,0 +1,185 @@
+"""Making demonstrations: the scripted expert in batched simulations, on all cores, resumable.
+
+Demonstration k of a task depends on the seed and k alone (and on what the file says it was made with): not on the
+number of workers, on what was recorded before, or on how often the recording was interrupted.
+"""
+
+import multiprocessing
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+from tqdm import tqdm
+
+from libero_env.demos import Pairing
+from libero_env.demos_studio import BATCH, GENERATOR, Recipe, record_chunk
+from libero_env.demos_write import DemoWriter
+from libero_env.errors import DemoError
+from libero_env.paths import demos_dir
+from libero_env.tasks import Task, get_suite, get_task
+
+
+def generate(
+    task: Task | str,
+    n: int,
+    *,
+    path: str | Path,
+    seed: int = 0,
+    camera_size: tuple[int, int] = (128, 128),
+    workers: int = 0,
+    pairing: Pairing = "aligned",
+    disturb: bool = True,
+    progress: bool | None = None,
+) -> Path:
+    """Record the first `n` demonstrations of a task into one file; those that are there already stay.
+
+    Args:
+        task: a `Task`, or what `get_task` takes.
+        n: number of successful demonstrations; failed attempts are left out and counted in the file.
+        path: the file. An interrupted recording leaves `<path>.parts`, and goes on when called again.
+        seed: of placements, manners and disturbances. The 50 stored initial states are never used.
+        camera_size: (height, width), pixels.
+        workers: processes; 0 is one for each core, 1 records in this process.
+        pairing: see `libero_env.demos`.
+        disturb: disturb the executed actions; the file then also holds what the expert wanted.
+        progress: show a bar; None where stderr is a terminal.
+
+    Raises:
+        DemoError: the file there was made otherwise, cannot be written, or the expert fails again and again.
+    """
+    task = get_task(task) if isinstance(task, str) else task
+    recipe = Recipe(task.id, tuple(camera_size), seed, pairing, disturb)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _locked(path.parent):
+        record([(recipe, path)], n, workers=workers, progress=progress)
+    return path
+
+
+def ensure_demos(
+    tasks: str | Iterable[Task],
+    n: int,
+    *,
+    camera_size: tuple[int, int] = (128, 128),
+    seed: int = 0,
+    root: str | Path | None = None,
+    workers: int = 0,
+    progress: bool | None = None,
+) -> list[Path]:
+    """Demonstration files with at least `n` demonstrations for each task: found where they are, else recorded.
+
+    Files are named by all that matters (suite, camera size, seed, generator), so that each is made once; one that was
+    recorded with another version of the scene is recorded anew. Several processes may call this at once.
+
+    Args:
+        tasks: name of a suite, or tasks.
+        n: demonstrations of each; the first `n` are the same however many there are.
+        camera_size, seed, workers, progress: as for `generate`.
+        root: folder of demonstrations; `libero_env.paths.demos_dir()` by default.
+
+    Returns:
+        One path for each task, in order.
+    """
+    tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
+    root = demos_dir() if root is None else Path(root)
+    jobs = [(r, demo_path(root, r)) for r in (Recipe(t.id, tuple(camera_size), seed) for t in tasks)]
+    missing = [job for job in jobs if not _complete(*job, n)]
+    if missing:
+        with _locked(root):
+            missing = [job for job in missing if not _complete(*job, n)]
+            for recipe, path in missing:
+                _make_way(DemoWriter(path, recipe.header()))
+            record(missing, n, workers=workers, progress=progress)
+    return [path for _, path in jobs]
+
+
+def demo_path(root: Path, recipe: Recipe) -> Path:
+    """Where `ensure_demos` keeps the demonstrations of a recipe."""
+    height, width = recipe.camera_size
+    folder = f"{height}x{width}-seed{recipe.seed}-{GENERATOR}"
+    return root / recipe.task.suite / folder / f"{recipe.task.name}_demo.hdf5"
+
+
+def record(
+    jobs: Sequence[tuple[Recipe, Path]], n: int, *, workers: int = 0, progress: bool | None = None
+) -> None:
+    """Record what is missing of the first `n` demonstrations of each job, all jobs on one pool of processes."""
+    writers = [DemoWriter(path, recipe.header()) for recipe, path in jobs]
+    missing = [sorted(set(range(n)) - writer.recorded()) for writer in writers]
+    chunks = [(j, numbers[i : i + BATCH]) for j, numbers in enumerate(missing) for i in range(0, len(numbers), BATCH)]
+    left = {j: len(numbers) for j, numbers in enumerate(missing)}
+    total = n * len(jobs)
+    bar = tqdm(
+        total=total, initial=total - sum(left.values()), desc="demonstrations", unit="demo", smoothing=0.1,
+        disable=None if progress is None else not progress,
+    )  # fmt: skip
+    with bar:
+        for j, count in _run([(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cores()):
+            bar.update(count)
+            left[j] -= count
+            if left[j] == 0:
+                writers[j].finish()
+
+
+def _run(chunks: list[tuple[Recipe, Path, list[int]]], owners: list[int], workers: int) -> Iterator[tuple[int, int]]:
+    """Record chunks in processes; yields (owner, demonstrations) as each is done."""
+    workers = min(workers, len(chunks))
+    if workers <= 1:
+        for owner, chunk in zip(owners, chunks, strict=True):
+            yield owner, record_chunk(*chunk)
+        return
+    # spawn: an OpenGL context that a fork inherits hangs.
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    futures: dict[Future[int], int] = {}
+    try:
+        for owner, chunk in zip(owners, chunks, strict=True):
+            futures[pool.submit(record_chunk, *chunk)] = owner
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _complete(recipe: Recipe, path: Path, n: int) -> bool:
+    """Whether the file has the first `n` demonstrations of the recipe."""
+    writer = DemoWriter(path, recipe.header())
+    try:
+        return path.is_file() and not writer.parts.exists() and set(range(n)) <= writer.recorded()
+    except DemoError:
+        return False
+
+
+def _make_way(writer: DemoWriter) -> None:
+    """Remove what an older version of the scene or the expert left under the name of the file to be, or a broken one.
+    Only for files that this package named itself."""
+    try:
+        writer.recorded()
+    except DemoError as error:
+        tqdm.write(f"recording again: {error}")
+        writer.path.unlink(missing_ok=True)
+        shutil.rmtree(writer.parts, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """One recording at a time in a folder; the lock of a process that was killed is free."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".recording.lock")
+    try:
+        lock.acquire(timeout=0.1)
+    except Timeout:
+        tqdm.write(f"another process records demonstrations in {folder}; waiting for it")
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
