@@ -110,7 +110,11 @@ def record(
     """Record what is missing of the first `n` demonstrations of each job, all jobs on one pool of processes."""
     writers = [DemoWriter(path, recipe.header()) for recipe, path in jobs]
     missing = [sorted(set(range(n)) - writer.recorded()) for writer in writers]
-    chunks = [(j, numbers[i : i + BATCH]) for j, numbers in enumerate(missing) for i in range(0, len(numbers), BATCH)]
+    chunks = [
+        (j, numbers[i : i + BATCH])
+        for j, numbers in enumerate(missing)
+        for i in range(0, len(numbers), BATCH)
+    ]
     left = {j: len(numbers) for j, numbers in enumerate(missing)}
     total = n * len(jobs)
     bar = tqdm(
@@ -118,14 +122,18 @@ def record(
         disable=None if progress is None else not progress,
     )  # fmt: skip
     with bar:
-        for j, count in _run([(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cores()):
+        for j, count in _run(
+            [(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cores()
+        ):
             bar.update(count)
             left[j] -= count
             if left[j] == 0:
                 writers[j].finish()
 
 
-def _run(chunks: list[tuple[Recipe, Path, list[int]]], owners: list[int], workers: int) -> Iterator[tuple[int, int]]:
+def _run(
+    chunks: list[tuple[Recipe, Path, list[int]]], owners: list[int], workers: int
+) -> Iterator[tuple[int, int]]:
     """Record chunks in processes; yields (owner, demonstrations) as each is done."""
     workers = min(workers, len(chunks))
     if workers <= 1:

@@ -76,7 +76,9 @@ def record_chunk(recipe: Recipe, path: Path, numbers: list[int]) -> int:
     while failures:
         for k, attempt in studio.attempt(list(failures.items())):
             if attempt.success:
-                writer.write(k, studio.film(attempt, {"seed": recipe.seed, "failed_attempts": failures.pop(k)}))
+                writer.write(
+                    k, studio.film(attempt, {"seed": recipe.seed, "failed_attempts": failures.pop(k)})
+                )
                 continue
             failures[k] += 1
             if failures[k] == MAX_ATTEMPTS:
@@ -115,7 +117,9 @@ class Studio:
             placed.append(k)
             experts.append(Expert(self.task, np.random.default_rng(manner), shapes=self.shapes))
             noise.append(Disturbance(np.random.default_rng(pushes)) if self.recipe.disturb else None)
-        return failed + list(zip(placed, run_experts(self.stage, experts, noise, max_steps=MAX_STEPS), strict=True))
+        return failed + list(
+            zip(placed, run_experts(self.stage, experts, noise, max_steps=MAX_STEPS), strict=True)
+        )
 
     def film(self, attempt: Attempt, attrs: dict) -> Episode:
         """The attempt with its observations."""

@@ -144,8 +144,18 @@ class DemoWriter:
                 yield file, name
 
     def _check_header(self, file: Path, found: Mapping[str, Any]) -> None:
-        for key in ("bddl_file_name", "seed", "camera_size", "pairing", "generator"):
-            here = found[key].tolist() if isinstance(found.get(key), np.generic | np.ndarray) else found.get(key)
+        for key in (
+            "bddl_file_name",
+            "seed",
+            "camera_size",
+            "pairing",
+            "generator",
+            "disturbed",
+            "model_digest",
+        ):
+            here = (
+                found[key].tolist() if isinstance(found.get(key), np.generic | np.ndarray) else found.get(key)
+            )
             if key in self.header and here != self.header[key]:
                 raise DemoError(
                     f"{file}: was recorded with {key} = {here!r}, not {self.header[key]!r}; "

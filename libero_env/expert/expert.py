@@ -44,7 +44,12 @@ class Expert:
     """
 
     def __init__(
-        self, task: Task, rng: np.random.Generator, *, shapes: Shapes | None = None, style: Style | None = None
+        self,
+        task: Task,
+        rng: np.random.Generator,
+        *,
+        shapes: Shapes | None = None,
+        style: Style | None = None,
     ):
         self.task, self.shapes = task, shapes
         self.style = Style.draw(rng) if style is None else style
@@ -116,7 +121,9 @@ class Expert:
             self._hold = goal, mat
             self._enter("close")
             return self._close(view, skill)
-        lift = np.clip(style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, self._rise + style.hover)
+        lift = np.clip(
+            style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, self._rise + style.hover
+        )
         over = goal.copy()
         over[2] += lift
         if away > 0.05:

@@ -41,7 +41,9 @@ def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -
         pos, mat = poses[b]
         for g in np.flatnonzero(model.geom_bodyid == b):
             if model.geom_contype[g] or model.geom_conaffinity[g]:
-                points = _geom_points(model, int(g), spacing) @ _matrix(model.geom_quat[g]).T + model.geom_pos[g]
+                points = (
+                    _geom_points(model, int(g), spacing) @ _matrix(model.geom_quat[g]).T + model.geom_pos[g]
+                )
                 clouds.append(points @ mat.T + pos)
     return np.concatenate(clouds)
 

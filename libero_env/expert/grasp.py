@@ -89,7 +89,9 @@ def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[f
         for yaw in aligned + [now + np.pi * k / _YAWS for k in range(_YAWS)]:
             askew = min((_turn(yaw, other) for other in aligned), default=0.0)
             for center, width, shift in _holds(slab, yaw):
-                cost = 0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                cost = (
+                    0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                )
                 yield cost, Grasp(np.array([*center, height]), float(yaw), width)
 
 

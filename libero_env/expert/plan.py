@@ -37,14 +37,18 @@ def plan_goal(goal: Expression, scene: Scene) -> tuple[PickPlace, ...]:
         container = _container(atom.args[-1], scene) if len(atom.args) == 2 else None
         if atom.predicate != "In" or container is None or atom.args[0] not in scene.objects:
             text = f"({atom.predicate} {' '.join(atom.args)})"
-            raise UnsupportedGoalError(f"no skill reaches {text}; there is one for (In OBJECT SITE_OF_A_CONTAINER)")
+            raise UnsupportedGoalError(
+                f"no skill reaches {text}; there is one for (In OBJECT SITE_OF_A_CONTAINER)"
+            )
         skills.append(PickPlace(atom.args[0], atom.args[1], container))
     return tuple(skills)
 
 
 def _container(address: str, scene: Scene) -> str | None:
     region = scene.problem.region(address)
-    return region.target if region is not None and not region.ranges and region.target in scene.objects else None
+    return (
+        region.target if region is not None and not region.ranges and region.target in scene.objects else None
+    )
 
 
 class Shapes:
@@ -75,7 +79,9 @@ class Shapes:
 
     def others(self, view: StateView, *names: str) -> np.ndarray:
         """Points on all objects but these, world frame, (M, 3)."""
-        clouds = [pose_of(view, name).apply(points) for name, points in self.coarse.items() if name not in names]
+        clouds = [
+            pose_of(view, name).apply(points) for name, points in self.coarse.items() if name not in names
+        ]
         return np.concatenate(clouds) if clouds else np.zeros((0, 3))
 
     def _points(self, name: str, spacing: float) -> np.ndarray:

@@ -73,7 +73,9 @@ def test_file_has_the_originals_layout(path):
         assert data.attrs["num_demos"] == 3 and data.attrs["total"] == 33 and data.attrs["tag"] == "libero-v1"
         assert data.attrs["env_name"] == "Libero_Floor_Manipulation"
         info = json.loads(data.attrs["problem_info"])
-        assert info["problem_name"] == "libero_floor_manipulation" and "butter" in info["language_instruction"]
+        assert (
+            info["problem_name"] == "libero_floor_manipulation" and "butter" in info["language_instruction"]
+        )
         demo = data["demo_0"]
         types = {"actions": "float64", "states": "float64", "robot_states": "float64", "rewards": "uint8",
                  "dones": "uint8", "obs/agentview_rgb": "uint8", "obs/ee_states": "float64"}  # fmt: skip
@@ -120,12 +122,21 @@ def _replace(key, values):
     [
         (_delete("data"), ("data", "missing")),
         (_delete("data/demo_1/actions"), ("demo_1/actions", "missing")),
-        (_delete("data/demo_1/obs/agentview_rgb"), ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb")),
+        (
+            _delete("data/demo_1/obs/agentview_rgb"),
+            ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb"),
+        ),
         (_delete("data/demo_0/obs"), ("demo_0/obs", "missing")),
         (_replace("data/demo_2/actions", np.zeros((11, 6))), ("demo_2/actions", "(11, 6)", "(11, 7)")),
         (_replace("data/demo_1/states", np.zeros((10, 30))), ("demo_1/states", "(10, 30)", "(11, any)")),
-        (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 16, 16, 3))), ("eye_in_hand_rgb", "float64", "un")),
-        (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 8, 8, 3), np.uint8)), ("demo_1", "(16, 16, 3)")),
+        (
+            _replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 16, 16, 3))),
+            ("eye_in_hand_rgb", "float64", "un"),
+        ),
+        (
+            _replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 8, 8, 3), np.uint8)),
+            ("demo_1", "(16, 16, 3)"),
+        ),
         (_replace("data/demo_1/expert_actions", np.full((11, 7), np.nan)), ("demo_1", "not finite")),
         (lambda handle: [handle.__delitem__(f"data/demo_{i}") for i in range(3)], ("no demonstrations",)),
     ],
@@ -200,13 +211,12 @@ def test_a_killed_process_leaves_what_was_recorded(tmp_path):
     """
     path = tmp_path / "x.hdf5"
     command = [sys.executable, "-c", textwrap.dedent(script), str(path), os.path.dirname(__file__)]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    for _ in range(3):
-        child.stdout.readline()
-    time.sleep(0.05)  # somewhere within the next one
-    child.send_signal(signal.SIGKILL)
-    printed = 3 + len(child.stdout.read().split())
-    child.wait()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        for _ in range(3):
+            child.stdout.readline()
+        time.sleep(0.05)  # somewhere within the next one
+        child.send_signal(signal.SIGKILL)
+        printed = 3 + len(child.stdout.read().split())
     writer = DemoWriter(path, header())
     assert len(writer.recorded()) >= printed
     demos = read_demos(writer.finish())

@@ -1,0 +1,167 @@
+"""Recording with the expert: what a demonstration depends on, interruption, and files that are found again."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from libero_env.demos import read_demos
+from libero_env.demos_generate import demo_path, ensure_demos, generate
+from libero_env.demos_studio import Recipe, Studio
+from libero_env.demos_write import DemoWriter
+from libero_env.env import LiberoEnv
+from libero_env.errors import DemoError
+from libero_env.expert.driver import run_experts
+from libero_env.tasks import get_task
+
+pytestmark = pytest.mark.sim
+TASK = "libero_object/9"  # the shortest
+SIZE = (16, 16)
+KINDS = {"camera_size": SIZE, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Three demonstrations recorded without interruption."""
+    return generate(TASK, 3, path=tmp_path_factory.mktemp("demos") / "whole.hdf5", workers=1, **KINDS)
+
+
+def same(a, b):
+    """Whether two files hold the same demonstrations."""
+    for x, y in zip(read_demos(a), read_demos(b), strict=True):
+        assert x.name == y.name
+        np.testing.assert_array_equal(x.states, y.states)
+        np.testing.assert_array_equal(x.actions, y.actions)
+        for key in x.obs:
+            np.testing.assert_array_equal(x.obs[key], y.obs[key])
+
+
+def test_observations_are_those_of_the_environment(whole):
+    """Each is what was seen before its action, and replaying the executed actions leads through the same states."""
+    demo = read_demos(whole, limit=1, labels="executed")[0]
+    env = LiberoEnv(TASK, camera_size=SIZE)
+    obs = env.set_state(demo.states[0])
+    for t, action in enumerate(demo.actions):
+        np.testing.assert_allclose(env.world.physics_state(0)[1:], demo.states[t][1:], atol=1e-6)
+        for key in ("joint_states", "gripper_states", "ee_pos", "ee_ori"):
+            np.testing.assert_allclose(obs[key], demo.obs[key][t], atol=1e-6)
+        for key in ("agentview_rgb", "eye_in_hand_rgb"):
+            assert np.abs(obs[key].astype(int) - demo.obs[key][t]).mean() < 0.5
+        obs, _, terminated, _, _ = env.step(action)
+    env.close()
+    assert terminated and demo.success
+
+
+def test_the_file_says_how_it_was_made(whole):
+    with h5py.File(whole) as handle:
+        attrs, demo = handle["data"].attrs, handle["data/demo_0"]
+        assert (
+            attrs["seed"] == 0 and attrs["camera_size"].tolist() == [16, 16] and attrs["pairing"] == "aligned"
+        )
+        assert "define (problem" in attrs["bddl_file_content"] and attrs["num_failed_attempts"] >= 0
+        assert (
+            demo.attrs["model_file"].startswith("<mujoco")
+            and "orange_juice_1_main" in demo.attrs["model_file"]
+        )
+        assert demo["robot_states"].shape[1] == 9
+        quat = demo["robot_states"][:, 5:]
+        np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-6)
+
+
+def test_demonstrations_differ_and_are_disturbed(whole):
+    demos = read_demos(whole)
+    executed = read_demos(whole, labels="executed")
+    assert not np.array_equal(demos[0].states[0], demos[1].states[0])
+    assert all(np.abs(a.actions - b.actions).max() > 0.05 for a, b in zip(demos, executed, strict=True))
+
+
+def test_the_libero_pairing_shows_what_came_after():
+    """The same attempt filmed both ways differs by one step."""
+    studio = Studio(Recipe(TASK, SIZE, pairing="libero"))
+    ((_, attempt),) = studio.attempt([(0, 0)])
+    after = studio.film(attempt, {})
+    studio.close()
+    np.testing.assert_array_equal(after.states, attempt.states[:-1])
+    arm = slice(1, 8)
+    np.testing.assert_allclose(after.obs["joint_states"], attempt.states[1:, arm], atol=1e-12)
+
+
+def test_more_demonstrations_are_added_to_those_there_are(whole, tmp_path):
+    path = generate(TASK, 1, path=tmp_path / "grown.hdf5", workers=1, **KINDS)
+    assert len(read_demos(path)) == 1
+    same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
+
+
+def test_a_killed_recording_goes_on_to_the_same_file(whole, tmp_path):
+    script = f"""
+        import sys
+        from libero_env.demos_generate import generate
+        generate({TASK!r}, 30, path=sys.argv[1], workers=1, camera_size={SIZE}, progress=False)
+    """
+    path = tmp_path / "killed.hdf5"
+    child = subprocess.Popen([sys.executable, "-c", textwrap.dedent(script), str(path)])
+    parts = DemoWriter(path, {}).parts
+    deadline = time.monotonic() + 120
+    while not (parts / "demo_00000.hdf5").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    assert not path.exists() and len(read_demos(parts)) >= 1
+    for part in sorted(parts.glob("demo_*.hdf5"))[3:]:
+        part.unlink()
+    same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
+
+
+def test_a_file_made_otherwise_is_refused(whole):
+    with pytest.raises(DemoError, match="seed = 0, not 1"):
+        generate(TASK, 3, path=whole, seed=1, workers=1, **KINDS)
+
+
+def test_files_are_made_once_and_found_again(whole, tmp_path):
+    recipe = Recipe(TASK, SIZE)
+    kept = demo_path(tmp_path, recipe)
+    kept.parent.mkdir(parents=True)
+    os.link(whole, kept)
+    before = kept.stat().st_mtime_ns
+    assert ensure_demos([get_task(TASK)], 2, root=tmp_path, workers=1, **KINDS) == [kept]
+    assert kept.stat().st_mtime_ns == before
+    assert (
+        demo_path(tmp_path, Recipe(TASK, SIZE, seed=1)) != kept != demo_path(tmp_path, Recipe(TASK, (32, 32)))
+    )
+
+
+def test_what_an_older_scene_left_is_recorded_anew(whole, tmp_path):
+    kept = demo_path(tmp_path, Recipe(TASK, SIZE))
+    kept.parent.mkdir(parents=True)
+    kept.write_bytes(whole.read_bytes())
+    with h5py.File(kept, "r+") as handle:
+        handle["data"].attrs["model_digest"] = "another"
+    ensure_demos([get_task(TASK)], 1, root=tmp_path, workers=1, **KINDS)
+    assert len(read_demos(kept)) == 1
+
+
+@pytest.mark.slow
+def test_the_number_of_processes_does_not_matter(whole, tmp_path):
+    path = generate(TASK, 7, path=tmp_path / "two.hdf5", workers=2, **KINDS)
+    assert path.exists()
+    same(generate(TASK, 7, path=tmp_path / "one.hdf5", workers=1, **KINDS), path)
+
+
+def test_failed_attempts_are_counted_and_left_out(tmp_path, monkeypatch):
+    calls = []
+
+    def sometimes(stage, experts, noise, max_steps):
+        calls.append(len(experts))
+        first = len(calls) == 1
+        return run_experts(stage, experts, noise, max_steps=5 if first else max_steps)
+
+    monkeypatch.setattr("libero_env.demos_studio.run_experts", sometimes)
+    path = generate(TASK, 1, path=tmp_path / "x.hdf5", seed=3, workers=1, **KINDS)
+    with h5py.File(path) as handle:
+        assert handle["data"].attrs["num_failed_attempts"] == 1 and handle["data"].attrs["num_demos"] == 1

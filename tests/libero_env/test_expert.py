@@ -1,0 +1,192 @@
+"""The expert: shapes, grasps and motion by their properties; every task reached; slips mended."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from libero_env.env import LiberoEnv
+from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoalError, plan_goal
+from libero_env.expert.driver import run_experts
+from libero_env.expert.geometry import surface_points
+from libero_env.expert.grasp import MAX_OPENING, WIDEST, GraspError, choose_grasp
+from libero_env.expert.motion import action_toward, downward, rotation_between
+from libero_env.problem import And, Atom
+from libero_env.scene import build_scene
+from libero_env.tasks import get_suite, get_task
+from libero_env.vector import BatchEnv
+
+X_AXIS = np.array([1.0, 0.0, 0.0])
+NOTHING = np.zeros((0, 3))
+
+
+def box(half, spacing=0.003):
+    """Points on a box that stands on the floor."""
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><body><geom type='box' size='{' '.join(map(str, half))}'/></body></worldbody></mujoco>"
+    )
+    return surface_points(model, 1, spacing) + [0, 0, half[2]]
+
+
+def turned(points, angle, shift=(0.0, 0.0)):
+    c, s = np.cos(angle), np.sin(angle)
+    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [*shift, 0]
+
+
+def between(yaw, other):
+    return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
+
+
+@pytest.mark.parametrize("geom", ["box", "cylinder", "capsule", "ellipsoid", "sphere", "mesh"])
+def test_surface_points_span_the_geom(geom):
+    asset = "<asset><mesh name='m' vertex='-.02 0 0 .02 0 0 0 .03 0 0 0 .05'/></asset>"
+    shape = "mesh='m'" if geom == "mesh" else "size='.02 .03 .04'"
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco>{asset}<worldbody><body><geom type='{geom}' {shape} pos='.1 0 0' euler='20 30 40'/>"
+        "<geom type='box' size='1 1 1' contype='0' conaffinity='0'/></body></worldbody></mujoco>"
+    )
+    points = surface_points(model, 1)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    local = (points - data.geom_xpos[0]) @ data.geom_xmat[0].reshape(3, 3)
+    center, half = model.geom_aabb[0, :3], model.geom_aabb[0, 3:]
+    assert (np.abs(local - center) <= half + 1e-4).all()  # mesh points are rounded
+    np.testing.assert_allclose(np.abs(local - center).max(axis=0), half, atol=0.004)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, -0.7, 1.5])
+def test_a_box_is_taken_across_its_narrow_side(angle):
+    cloud = turned(box((0.04, 0.02, 0.015)), angle, (0.2, -0.1))
+    grasp = choose_grasp(cloud, NOTHING, 0.0, X_AXIS)
+    assert between(grasp.yaw, angle + np.pi / 2) < 0.06
+    assert grasp.width == pytest.approx(0.04, abs=0.004) and grasp.width <= WIDEST
+    np.testing.assert_allclose(grasp.pos_world[:2], [0.2, -0.1], atol=0.004)
+    assert 0.012 < grasp.pos_world[2] < 0.03
+
+
+def test_the_hand_turns_as_little_as_it_can():
+    cube = box((0.02, 0.02, 0.02))
+    for yaw in (0.1, -0.4, 1.2):
+        axis = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        assert between(choose_grasp(cube, NOTHING, 0.0, axis).yaw, yaw) <= np.pi / 4 + 0.06
+
+
+def test_the_same_input_gives_the_same_grasp():
+    cloud = box((0.03, 0.02, 0.06))
+    grasps = [choose_grasp(cloud, NOTHING, 0.0, X_AXIS) for _ in range(2)]
+    np.testing.assert_array_equal(grasps[0].pos_world, grasps[1].pos_world)
+    assert grasps[0].yaw == grasps[1].yaw
+
+
+def test_the_palm_stays_above_what_is_tall():
+    cloud = box((0.02, 0.02, 0.09))
+    assert choose_grasp(cloud, NOTHING, 0.0, X_AXIS).pos_world[2] > 0.18 - 0.031
+
+
+def test_fingers_keep_out_of_neighbours():
+    cloud = box((0.02, 0.02, 0.03))
+    neighbour = box((0.02, 0.05, 0.05), 0.01) + [0.07, 0.0, 0.0]  # where a finger would be
+    assert between(choose_grasp(cloud, NOTHING, 0.0, X_AXIS).yaw, 0.0) < 0.06
+    assert between(choose_grasp(cloud, neighbour, 0.0, X_AXIS).yaw, np.pi / 2) < 0.4
+
+
+def test_what_is_too_wide_is_refused_with_its_width():
+    with pytest.raises(GraspError, match=r"crate cannot be grasped.*1[0-9]\.[0-9] cm wide") as caught:
+        choose_grasp(box((0.06, 0.07, 0.03), 0.005), NOTHING, 0.0, X_AXIS, "crate")
+    assert f"{100 * MAX_OPENING:.0f} cm" in str(caught.value)
+
+
+def test_actions_point_at_the_goal_and_stay_in_range():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        pos, goal = rng.uniform(-1, 1, (2, 3))
+        mat, goal_mat = (downward(yaw, X_AXIS) for yaw in rng.uniform(-3, 3, 2))
+        action = action_toward(pos, mat, goal, goal_mat, velocity=np.zeros(3), gripper=1.0)
+        assert (np.abs(action) <= 1.0).all() and action[6] == 1.0
+        assert action[:3] @ (goal - pos) > 0
+        cross = action[0] * (goal - pos)[1] - action[1] * (goal - pos)[0]
+        assert abs(cross) < 1e-9  # a straight line over the ground
+    still = action_toward(goal, mat, goal, mat, velocity=np.zeros(3), gripper=-1.0)
+    np.testing.assert_allclose(still, [0, 0, 0, 0, 0, 0, -1], atol=1e-7)
+
+
+def test_rotations():
+    for yaw in (-2.0, 0.4, 1.3):
+        mat = downward(yaw, X_AXIS)
+        np.testing.assert_allclose(mat @ mat.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(mat) == pytest.approx(1.0) and mat[2, 2] == -1.0
+        assert mat[:, 0] @ X_AXIS >= 0  # the nearer of the two ways round
+    turn = rotation_between(downward(0.0, X_AXIS), downward(0.5, X_AXIS))
+    np.testing.assert_allclose(turn, [0, 0, 0.5], atol=1e-9)
+
+
+def test_manners_are_drawn_from_the_generator_alone():
+    first, second, other = (Style.draw(np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert first == second != other
+
+
+def test_a_disturbance_leaves_the_gripper_alone_and_can_be_switched_off():
+    noise = Disturbance(np.random.default_rng(0))
+    action = np.array([0.5, 0, 0, 0, 0, 0, 1.0])
+    assert all(noise.apply(action)[6] == 1.0 for _ in range(50))
+    np.testing.assert_array_equal(noise.apply(action, 0.0), action)
+    assert not np.array_equal(noise.apply(action), action)
+
+
+@pytest.mark.sim
+def test_a_goal_without_a_skill_is_refused():
+    scene = build_scene(get_task("libero_object/0").problem)
+    with pytest.raises(UnsupportedGoalError, match=r"\(On butter_1 basket_1\).*In OBJECT"):
+        plan_goal(And((Atom("On", ("butter_1", "basket_1")),)), scene)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.name)
+def test_every_task_is_reached_and_stays_reached(task):
+    env = BatchEnv(task, 1, cameras=())
+    env.reset(options={"init_state": 31})
+    expert, noise = Expert(task, np.random.default_rng(0)), Disturbance(np.random.default_rng(5))
+    (attempt,) = run_experts(env, [expert], [noise], max_steps=200)
+    assert attempt.reason == "" and attempt.success
+    assert np.abs(attempt.actions).max() <= 1.0 and len(attempt) < 160
+    hold = np.array([[0.0] * 6 + [-1.0]])
+    for _ in range(12):  # let go of, it comes to rest in the basket
+        env.world.step([0], hold)
+    assert env.world.goal_reached([0]).all()
+    env.close()
+
+
+@pytest.mark.sim
+def test_what_one_simulation_does_depends_on_no_other():
+    task = get_task("libero_object/6")
+
+    def run(starts, slot):
+        env = BatchEnv(task, len(starts), num_threads=2, cameras=())
+        env.reset(seed=starts)
+        shapes = Shapes(env.world.scene)
+        experts = [Expert(task, np.random.default_rng(s), shapes=shapes) for s in starts]
+        noise = [Disturbance(np.random.default_rng(s)) for s in starts]
+        attempt = run_experts(env, experts, noise, max_steps=60)[slot]
+        env.close()
+        return attempt
+
+    alone, among = run([11], 0), run([5, 11, 8], 1)
+    np.testing.assert_array_equal(alone.actions, among.actions)
+    np.testing.assert_array_equal(alone.states, among.states)
+
+
+@pytest.mark.sim
+def test_a_slip_is_mended():
+    task = get_task("libero_object/7")
+    env = LiberoEnv(task, cameras=())
+    env.reset(options={"init_state": 3})
+    expert = Expert(task, np.random.default_rng(0), style=Style())
+    dropped, success = 0, False
+    for _ in range(250):
+        action = expert.act(env.view)
+        if expert.phase == "carry" and dropped < 8 and env.view.eef_pos[2] > 0.17:
+            action, dropped = np.array([0.0] * 6 + [-1.0]), dropped + 1
+        _, _, success, _, _ = env.step(action)
+        if success:
+            break
+    env.close()
+    assert dropped == 8 and expert.retries >= 1 and success
