@@ -50,9 +50,9 @@ class FiLM(nn.Module):
         gamma, beta = self.project(language).to(h.dtype).chunk(2, dim=-1)
         n, c, height, width = h.shape
         frames = n // language.shape[0]
-        grouped = h.view(-1, frames, c, height, width)
-        gamma, beta = gamma[:, None, :, None, None], beta[:, None, :, None, None]
-        return torch.addcmul(beta + grouped, grouped, gamma).view(n, c, height, width)
+        windows = h.view(-1, frames, c, height, width)
+        scale, shift = (1 + gamma)[:, None, :, None, None], beta[:, None, :, None, None]
+        return torch.addcmul(shift, windows, scale).view(n, c, height, width)
 
 
 class BasicBlock(nn.Module):
@@ -72,9 +72,9 @@ class BasicBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C_in, H, W) -> (N, C, H / stride, W / stride)."""
-        h = functional.relu(self.norm1(self.conv1(x)))
+        h = functional.relu(self.norm1(self.conv1(x)), inplace=True)
         h = self.norm2(self.conv2(h))
-        return functional.relu(h + self.shortcut(x))
+        return functional.relu(h + self.shortcut(x), inplace=True)
 
 
 class SpatialSoftmax(nn.Module):
@@ -86,16 +86,17 @@ class SpatialSoftmax(nn.Module):
 
     def __init__(self, *, channels: int, size: tuple[int, int], keypoints: int) -> None:
         super().__init__()
-        self.heat = nn.Conv2d(channels, keypoints, 1)
+        self.heat = nn.Linear(channels, keypoints)
         rows, cols = (torch.linspace(-1.0, 1.0, n) for n in size)
         grid = torch.stack(torch.meshgrid(cols, rows, indexing="xy"), dim=-1)  # (H, W, 2): x, y
-        self.register_buffer("grid", grid.reshape(-1, 2), persistent=False)
+        self.register_buffer("grid", grid.reshape(-1, 2).T.contiguous(), persistent=False)
 
     def forward(self, h: Tensor) -> Tensor:
         """(N, C, H, W) -> (N, 2 K) positions x, y in [-1, 1], x rightwards and y downwards."""
-        heat = self.heat(h).flatten(2)  # (N, K, H W)
+        heat = self.heat(h.permute(0, 2, 3, 1)).flatten(1, 2)  # (N, H W, K), as it lies in memory
         with torch.autocast(h.device.type, enabled=False):
-            return (heat.float().softmax(dim=-1) @ self.grid).flatten(1)
+            positions = self.grid @ heat.float().softmax(dim=1)  # (N, 2, K)
+        return positions.transpose(1, 2).flatten(1)
 
 
 class ResNetFiLMEncoder(nn.Module):
@@ -136,7 +137,7 @@ class ResNetFiLMEncoder(nn.Module):
         stem = [
             nn.Conv2d(3, width, stem_kernel, stem_stride, padding=stem_kernel // 2, bias=norm == "none"),
             make_norm(norm, width),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
         ]
         self.stem = nn.Sequential(*stem, *([nn.MaxPool2d(3, 2, padding=1)] if stem_pool else []))
         self.blocks, self.films = nn.ModuleList(), nn.ModuleList()

@@ -54,7 +54,7 @@ def test_film_starts_as_the_identity_and_is_linear_in_its_parameters() -> None:
 def test_spatial_softmax_finds_a_peak_in_the_image() -> None:
     layer = SpatialSoftmax(channels=2, size=(5, 9), keypoints=2)
     with torch.no_grad():
-        layer.heat.weight.copy_(torch.eye(2)[..., None, None] * 50)
+        layer.heat.weight.copy_(torch.eye(2) * 50)
     h = torch.zeros(1, 2, 5, 9)
     h[0, 0, 0, 8] = 1.0  # top right
     h[0, 1, 4, 4] = 1.0  # bottom middle
