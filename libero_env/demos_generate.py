@@ -7,9 +7,11 @@ number of workers, on what was recorded before, or on how often the recording wa
 import multiprocessing
 import os
 import shutil
+import threading
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from multiprocessing import connection
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -141,7 +143,8 @@ def _run(
             yield owner, record_chunk(*chunk)
         return
     # spawn: an OpenGL context that a fork inherits hangs.
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_die_with_parent)
     futures: dict[Future[int], int] = {}
     try:
         for owner, chunk in zip(owners, chunks, strict=True):
@@ -150,6 +153,18 @@ def _run(
             yield futures[future], future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _die_with_parent() -> None:
+    """End this process when its parent is gone: the workers of a killed recording would wait for ever."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    if parent is not None:
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def cores() -> int:
