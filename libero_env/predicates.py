@@ -164,7 +164,11 @@ def _boxes(view: StateView, address: str) -> list[Box]:
     workspace = view.scene.workspace
     surface = np.array([0.0, 0.0, workspace.region_height + _ZONE_HEIGHT]) + workspace.offset
     return [
-        (surface + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.eye(3), np.array([x1 - x0, y1 - y0, 2 * _ZONE_HALF_HEIGHT]) / 2)
+        (
+            surface + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0),
+            np.eye(3),
+            np.array([x1 - x0, y1 - y0, 2 * _ZONE_HALF_HEIGHT]) / 2,
+        )
         for x0, y0, x1, y1 in region.ranges
     ]
 

@@ -123,7 +123,10 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         self.world.close()
 
     def _seed(self, ids: np.ndarray, seed: int | Sequence[int | None] | None) -> None:
-        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if np.isscalar(seed) or seed is None else seed
+        if seed is None or np.isscalar(seed):
+            seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
+        else:
+            seeds = seed
         if len(seeds) != self.num_envs:
             raise LiberoError(f"seed: expected one or {self.num_envs} seeds, got {len(seeds)}")
         for i in ids:

@@ -104,7 +104,7 @@ class World:
         self.simulations.reset([i], state[None, 1 : 1 + nq], state[None, 1 + nq :], float(state[0]))
 
     def proprioception(self) -> dict[str, np.ndarray]:
-        """Joint positions (num, 7), fingers (num, 2), grip site (num, 3) and hand orientation as axis-angle (num, 3)."""
+        """Joints (num, 7), fingers (num, 2), grip site (num, 3) and hand orientation as axis-angle (num, 3)."""
         f, nq = self.simulations.fields, self.scene.nq_robot
         return {
             "joint_states": f["qpos"][:, :7].copy(),
@@ -119,7 +119,8 @@ class World:
             return
         for i in ids:
             self._pose_picture(i)
-            self.renderer.render(self._picture, list(self._camera_ids.values()), [frames[k][i] for k in self._camera_ids])
+            out = [frames[key][i] for key in self._camera_ids]
+            self.renderer.render(self._picture, list(self._camera_ids.values()), out)
 
     def frame(self, i: int, camera: str) -> np.ndarray:
         """One picture of any camera, (height, width, 3) uint8."""

@@ -74,7 +74,8 @@ def camera_rate(size: int, repeats: int) -> dict[str, float]:
         rates.append(25 / (time.perf_counter() - start))
     drawing = best(lambda: env.world.draw([0], env.world.empty_frames()), 5 * repeats)
     env.close()
-    return {"steps_per_s_best": max(rates), "steps_per_s_median": float(np.median(rates)), "draw_both_ms": 1e3 * drawing}
+    median = float(np.median(rates))
+    return {"steps_per_s_best": max(rates), "steps_per_s_median": median, "draw_both_ms": 1e3 * drawing}
 
 
 def batch_rate(num: int, repeats: int) -> float:

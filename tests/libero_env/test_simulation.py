@@ -38,7 +38,8 @@ def test_free_motion_is_that_of_the_recordings(shared, recording):
     with np.load(shared / "parity" / f"{recording}.npz") as z:
         states, commands, touch = z["states"], z["actions"], z["robot_contact"]
         task = get_task(f"libero_object/{int(z['task_id'])}")
-        recorded = {k: v for k, v in zip(json.loads(str(z["obs_keys"])), np.split(z["obs"], [7, 14, 17, 21, 23], 1))}
+        parts = np.split(z["obs"], [7, 14, 17, 21, 23], 1)
+        recorded = dict(zip(json.loads(str(z["obs_keys"])), parts, strict=True))
     scene = build_scene(task.problem)
     simulations, nq = LoopSimulations(scene.model), scene.model.nq
     assert states.shape[1] == 1 + nq + scene.model.nv, "states have the original's layout"
