@@ -12,6 +12,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from libero_env.demos_generate import ensure_demos
 from libero_env.tasks import Task
 from libero_env.vector import BatchEnv
 from lifelong.data import SequenceVLDataset
@@ -156,7 +157,13 @@ def _demos(
 ) -> dict[int, Path]:
     """The demonstration file of each task; recorded now where there is none."""
     began = time.perf_counter()
-    paths = ensure_demos(tasks, data.demos)
+    paths = ensure_demos(
+        tasks,
+        data.demos,
+        camera_size=(data.image_size, data.image_size),
+        root=data.folder,
+        progress=progress,
+    )
     directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
     return dict(enumerate(paths))
 

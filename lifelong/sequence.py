@@ -19,7 +19,7 @@ from lifelong.policies.base import Policy
 from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.rundir import RunDirectory
 from lifelong.tracking import Tracker
-from lifelong.training import EpochEnd, FitSettings, ImageAugmentation, fit, generator
+from lifelong.training import BatchAugmentation, EpochEnd, FitSettings, fit, generator
 
 # First words of the seeds derived from the run's seed, one for each use.
 FIT, END_TASK, ROLLOUT = 1, 2, 3
@@ -39,7 +39,7 @@ class Parts:
     envs: EnvPool  # keys: (position, number of simulations)
     fit: FitSettings
     eval: EvalSettings
-    augment: ImageAugmentation | None
+    augment: BatchAugmentation | None
     directory: RunDirectory
     tracker: Tracker
     seed: int

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,10 +15,11 @@ from tqdm import tqdm
 from lifelong.algorithms.base import Algorithm, WindowDataset
 from lifelong.checkpoints import load_weights
 from lifelong.errors import ConfigError, TrainingError
+from lifelong.nn.precision import bf16_runs_on_cpu
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
-ImageAugmentation = Callable[[Tensor, torch.Generator], Tensor]
+BatchAugmentation = Callable[[Batch, torch.Generator], Batch]
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def fit(
     settings: FitSettings,
     seed: Sequence[int],
     device: torch.device | str = "cpu",
-    augment: ImageAugmentation | None = None,
+    augment: BatchAugmentation | None = None,
     on_epoch: Callable[[EpochEnd], None] | None = None,
     resume: dict[str, Any] | None = None,
     label: str = "",
@@ -105,7 +106,7 @@ def fit(
         settings: Epochs, batch size, optimiser.
         seed: Whole numbers that name this stretch of training.
         device: Where the policy is.
-        augment: Applied to the images of each mixed batch, with the epoch's generator.
+        augment: Applied to each mixed batch, with the epoch's generator.
         on_epoch: Called at the end of each epoch, at epoch 0 too, and once more for the epoch taken up.
         resume: A state from `EpochEnd.state`.
         label: Stands before the progress bar.
@@ -154,7 +155,7 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
         if device.type == "cuda":
             fast = torch.cuda.is_bf16_supported()
         else:
-            fast = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+            fast = device.type == "cpu" and bf16_runs_on_cpu()
         precision = "bf16" if fast else "fp32"
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
 
@@ -186,13 +187,12 @@ class _Step:
     optimizer: torch.optim.Optimizer
     settings: FitSettings
     device: torch.device
-    augment: ImageAugmentation | None
+    augment: BatchAugmentation | None
 
     def __call__(self, batch: Batch, generator: torch.Generator, lr: float) -> tuple[Tensor, Tensor]:
         batch = self.algorithm.mix(batch, generator)
         if self.augment is not None:
-            images = self.augment(batch.observation.images, generator)
-            batch = replace(batch, observation=replace(batch.observation, images=images))
+            batch = self.augment(batch, generator)
         batch = batch.to(self.device)
         with autocast(self.device, self.settings.precision):
             loss = self.policy.loss(batch)
