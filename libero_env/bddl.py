@@ -8,7 +8,7 @@ arithmetic with `pi`; nothing in a file is ever executed.
 
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from libero_env.problem import (
     And,
@@ -35,6 +35,7 @@ __all__ = [
     "Region",
     "differences",
     "parse",
+    "parse_atom",
     "parse_expression",
     "read",
     "same_meaning",
@@ -79,8 +80,16 @@ def parse_expression(text: str, known: Collection[str], file: str = "<string>") 
     Raises:
         BDDLError: as in `parse`.
     """
-    tree = parse_tree(text if text.lstrip().startswith("(") else f"({text})", file)
-    return _Reader(file).expression(tree, set(known))
+    return _Reader(file).expression(_one_list(text, file), set(known))
+
+
+def parse_atom(text: str, known: Collection[str], file: str = "<string>") -> Atom:
+    """Read one atom, such as `On plate_1 stove_1`; see `parse_expression`."""
+    return _Reader(file).atom(_one_list(text, file), set(known))
+
+
+def _one_list(text: str, file: str) -> List:
+    return parse_tree(text if text.lstrip().startswith("(") else f"({text})", file)
 
 
 def write(problem: Problem) -> str:
@@ -166,14 +175,13 @@ class _Reader:
             self.fail(title.line, "no problem name", "(problem NAME)")
         sections: dict[str, List] = {}
         for part in rest:
-            head = part.head if isinstance(part, List) else ""
+            section = part if isinstance(part, List) else List((), part.line)
+            head, line = section.head, section.line
             if head not in SECTIONS:
-                self.fail(
-                    part.line, f"unknown section {head or show(part)!r}", f"one of {', '.join(SECTIONS)}"
-                )
+                self.fail(line, f"unknown section {head or show(part)!r}", f"one of {', '.join(SECTIONS)}")
             if head in sections:
-                self.fail(part.line, f"a second {head}", f"one (the first is on line {sections[head].line})")
-            sections[head] = part
+                self.fail(line, f"a second {head}", f"one (the first is on line {sections[head].line})")
+            sections[head] = section
         return self.assemble(self.word(title.items[1]), root.line, sections)
 
     def assemble(self, name: str, line: int, sections: dict[str, List]) -> Problem:
@@ -213,48 +221,46 @@ class _Reader:
     def names(self, section: List) -> dict[str, str]:
         """`a_1 a_2 - a  b_1 - b` -> {a_1: a, a_2: a, b_1: b}."""
         found: dict[str, str] = {}
-        waiting: list[Word] = []
+        waiting: list[tuple[str, int]] = []
         items = iter(section.items[1:])
         for item in items:
-            if self.word(item) != "-":
-                waiting.append(item)
+            if (word := self.word(item)) != "-":
+                waiting.append((word, item.line))
                 continue
             category = next(items, None)
             if not waiting or category is None:
                 self.fail(
                     item.line, "a - without names before it or a category after it", "NAME NAME - CATEGORY"
                 )
-            for name in waiting:
-                if name.text in found:
-                    self.fail(name.line, f"{name.text} is declared twice", "each name declared once")
-                found[name.text] = self.word(category)
+            for name, line in waiting:
+                if name in found:
+                    self.fail(line, f"{name} is declared twice", "each name declared once")
+                found[name] = self.word(category)
             waiting = []
         if waiting:
-            self.fail(waiting[0].line, f"{waiting[0].text} has no category", "NAME NAME - CATEGORY")
+            name, line = waiting[0]
+            self.fail(line, f"{name} has no category", "NAME NAME - CATEGORY")
         return found
 
     def region(self, node: Word | List) -> Region:
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not a region: {show(node)}", "(NAME (:target NAME) ...)")
-        found: dict[str, object] = {}
+        found: dict[str, Any] = {}
         for part in node.items[1:]:
-            head = part.head if isinstance(part, List) else ""
-            if head == ":target" and len(part.items) == 2:
-                found["target"] = self.word(part.items[1])
-            elif head in (":ranges", ":yaw_rotation") and len(part.items) == 2:
+            head = part.head if isinstance(part, List) and len(part.items) == 2 else ""
+            value = part.items[1] if isinstance(part, List) and head else part
+            if head == ":target":
+                found["target"] = self.word(value)
+            elif head in (":ranges", ":yaw_rotation"):
                 width, key = (4, "ranges") if head == ":ranges" else (2, "yaw")
-                rows = part.items[1]
-                if not isinstance(rows, List):
-                    self.fail(rows.line, f"{head} {rows.text}", "a list of lists of numbers")
-                found[key] = tuple(self.numbers(row, width, head) for row in rows.items)
-            elif head == ":rgba" and len(part.items) == 2:
-                found["rgba"] = self.numbers(part.items[1], 4, head)
+                if not isinstance(value, List):
+                    self.fail(value.line, f"{head} {value.text}", "a list of lists of numbers")
+                found[key] = tuple(self.numbers(row, width, head) for row in value.items)
+            elif head == ":rgba":
+                found["rgba"] = self.numbers(value, 4, head)
             else:
-                self.fail(
-                    part.line,
-                    f"{show(part)} in a region",
-                    "(:target X), (:ranges (...)), (:yaw_rotation (...)) or (:rgba (...))",
-                )
+                valid = "(:target X), (:ranges (...)), (:yaw_rotation (...)) or (:rgba (...))"
+                self.fail(part.line, f"{show(part)} in a region", valid)
         if "target" not in found:
             self.fail(node.line, f"region {show(node.items[0])} has no target", "(:target NAME)")
         return Region(name=self.word(node.items[0]), **found)
@@ -279,10 +285,10 @@ class _Reader:
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not an atom: {show(node)}", "(PREDICATE NAME ...)")
         predicate, *args = map(self.word, node.items)
-        for item in node.items[1:]:
-            if self.word(item) not in known:
-                near = ", ".join(sorted(known)) or "nothing: none is declared"
-                self.fail(item.line, f"{item.text} is not declared", f"one of {near}")
+        for name, item in zip(args, node.items[1:], strict=True):
+            if name not in known:
+                valid = ", ".join(sorted(known)) or "a name, but none is declared"
+                self.fail(item.line, f"{name} is not declared", f"one of {valid}")
         return Atom(predicate.capitalize(), tuple(args))
 
     def expression(self, node: Word | List, known: set[str]) -> Expression:

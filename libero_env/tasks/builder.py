@@ -88,7 +88,7 @@ def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
     regions = tuple(_regions(facts["regions"]))
     objects = dict(_objects(facts.get("objects", [])))
     known = {*facts["fixtures"], *objects, *(region.address for region in regions)}
-    read = lambda text: bddl.parse_expression(text, known, where)  # noqa: E731
+    atom = lambda text: bddl.parse_atom(text, known, where)  # noqa: E731
     goal = facts["goal"]
     return Problem(
         name=facts["problem"],
@@ -96,10 +96,12 @@ def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
         fixtures=facts["fixtures"],
         objects=objects,
         regions=regions,
-        init=tuple(map(read, facts.get("init", []))),
+        init=tuple(map(atom, facts.get("init", []))),
         obj_of_interest=tuple(facts.get("obj_of_interest", [])),
         scene_properties=facts["scene_properties"],
-        goal=read(goal) if isinstance(goal, str) else And(tuple(map(read, goal))),
+        goal=bddl.parse_expression(goal, known, where)
+        if isinstance(goal, str)
+        else And(tuple(map(atom, goal))),
     )
 
 
@@ -153,7 +155,7 @@ def _region(name: str, target: str, facts: Mapping[str, Any]) -> Region:
             raise UnknownNameError(
                 f"key of region {target}_{name}", key, ("at", "half", "ranges", "yaw", "rgba")
             )
-    ranges = [tuple(map(float, row)) for row in facts.get("ranges", [])]
+    ranges = [(float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in facts.get("ranges", [])]
     if "at" in facts:
         (x, y), half = facts["at"], facts["half"]
         half_x, half_y = half if isinstance(half, list) else (half, half)
