@@ -1,0 +1,138 @@
+"""The real thing: train.py from its command line to a report, and killed on the way."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from lifelong import checkpoints
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+TINY = (
+    "preset=smoke", "algo=packnet", "threads=1", "data.demos=2", "train.epochs=2", "train.steps_per_epoch=2",
+    "train.batch_size=4", "eval.every=1", "eval.horizon=12", "eval.episodes=2", "eval.curve_episodes=1",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("home")
+
+
+def start(home: Path, runs: Path, *overrides: str) -> subprocess.Popen:
+    env = os.environ | {"LIBERO_DEMOS": str(home / "demos")}
+    command = [sys.executable, str(ROOT / "train.py"), f"runs_dir={runs}", *overrides]
+    return subprocess.Popen(
+        command, env=env, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def finish(process: subprocess.Popen) -> str:
+    output, _ = process.communicate(timeout=900)
+    assert process.returncode == 0, output
+    return output
+
+
+def run_dir(runs: Path) -> Path:
+    (log,) = runs.rglob("results.jsonl")
+    return log.parent
+
+
+def records(path: Path) -> list[dict]:
+    lines = (path / "results.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
+    output = finish(start(home, tmp_path, "preset=smoke", "algo=er"))
+    path = run_dir(tmp_path)
+    assert path == tmp_path / "libero_object" / "er" / "bc_transformer_small_seed1"
+    assert "2 tasks learned" in output
+    summary = json.loads((path / "results.json").read_text())
+    assert summary["finished"] and summary["tasks_learned"] == 2
+    assert summary["metrics"].keys() >= {"fwt", "nbt", "auc"}
+    page = (path / "report.html").read_text()
+    assert "<svg" in page and "data:image/webp" in page
+    kept = {p.name for p in (path / "checkpoints").iterdir()}
+    assert {"task_0.safetensors", "task_1.safetensors"} <= kept
+    assert sorted(p.name for p in home.iterdir()) == ["demos"]  # nothing else is left where it was started
+    again = finish(start(home, tmp_path, "preset=smoke", "algo=er"))
+    assert "is finished" in again
+
+
+def wait_for_lines(process: subprocess.Popen, runs: Path, count: int) -> None:
+    deadline = time.monotonic() + 600
+    while time.monotonic() < deadline and process.poll() is None:
+        logs = list(runs.rglob("results.jsonl"))
+        if logs and logs[0].read_bytes().count(b"\n") >= count:
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"never wrote {count} records: {process.stdout.read()}")
+
+
+def test_killed_twice_and_resumed_gives_the_same_results(home, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    finish(start(home, whole, *TINY))
+    for count in (5, 15):
+        process = start(home, killed, *TINY)
+        wait_for_lines(process, killed, count)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    finish(start(home, killed, *TINY))
+
+    def outcome(path):
+        """Records by what they are about, without times; one made twice must be the same both times."""
+        found = {}
+        for record in records(path):
+            if record["kind"] in ("loss", "eval", "task_end"):
+                record.pop("seconds")
+                key = tuple(record.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
+                assert found.setdefault(key, record) == record
+        return found
+
+    assert outcome(run_dir(killed)) == outcome(run_dir(whole))
+    last = [checkpoints.load(run_dir(p) / "checkpoints" / "task_1.safetensors") for p in (whole, killed)]
+    assert last[0]["policy"].keys() == last[1]["policy"].keys()
+    for name, value in last[0]["policy"].items():
+        assert torch.equal(value, last[1]["policy"][name]), name
+
+
+def test_another_configuration_in_the_same_place_is_refused(home, tmp_path):
+    finish(start(home, tmp_path, *TINY, "benchmark.tasks=1"))
+    process = start(home, tmp_path, *TINY, "benchmark.tasks=1", "train.lr=0.5")
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 1
+    assert "train.lr 0.001 -> 0.5" in output and "run_id=" in output and "Traceback" not in output
+
+
+def test_a_sweep_ends_with_a_report_that_compares(home, tmp_path):
+    tiny = (*(t for t in TINY if not t.startswith("algo")), "benchmark.tasks=1")
+    output = finish(start(home, tmp_path, "-m", "algo=sequential,ewc", "wandb.mode=disabled", *tiny))
+    assert "2 runs compared" in output
+    assert (tmp_path / "sweep" / "report.html").is_file()
+    assert len(list(tmp_path.rglob("results.json"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: er, ewc, packnet, sequential"),
+        ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
+        ("eval.select=first", "valid: best, last"),
+        ("device=tpu", "valid: auto, cpu, cuda"),
+    ],
+)
+def test_what_cannot_run_is_told_in_one_line(home, tmp_path, override, message):
+    process = start(home, tmp_path, "preset=smoke", override)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 1
+    assert message in output and "Traceback" not in output
+    assert len(output.strip().splitlines()) == 1, output

@@ -1,0 +1,147 @@
+"""Every configuration file composes, binds to what it builds, and has no key that nothing reads."""
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_object
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+import lifelong
+from lifelong.errors import ConfigError
+from lifelong.evaluation import EvalSettings
+from lifelong.experiment import GROUPS
+from lifelong.launch import check_choices
+from lifelong.settings import RunSettings
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = ROOT / "configs"
+FILES = sorted(f.relative_to(CONFIGS) for f in CONFIGS.glob("*/*.yaml"))
+GIVEN = {"policy": {"spec"}}  # what the experiment adds
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose("config", [*overrides])
+
+
+def nodes(config, path=""):
+    """Every node with a `_target_`, with its path."""
+    if isinstance(config, DictConfig):
+        if "_target_" in config:
+            yield path, config
+        for key in config:
+            yield from nodes(config[key], f"{path}.{key}" if path else str(key))
+    elif isinstance(config, ListConfig):
+        for i, value in enumerate(config):
+            yield from nodes(value, f"{path}[{i}]")
+
+
+def names_in(tree: ast.AST) -> set[str]:
+    return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
+
+
+@cache
+def attributes_read() -> set[str]:
+    """Names of all attributes that the package reads, `self.x` in `__post_init__` left out."""
+    found = set()
+    for file in Path(lifelong.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.FunctionDef) and node.name == "__post_init__":
+                node.body.clear()
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                found.add(node.attr)
+    return found
+
+
+def unread(target: type) -> set[str]:
+    """Parameters of a target that nothing reads."""
+    if dataclasses.is_dataclass(target):
+        return {f.name for f in dataclasses.fields(target)} - attributes_read()
+    if target.__init__ is object.__init__:
+        return set()
+    source = ast.parse(textwrap.dedent(inspect.getsource(target.__init__)))
+    return set(inspect.signature(target).parameters) - names_in(source)
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_every_file_binds_to_its_target(file):
+    config = composed(f"{file.parent}={file.stem}")
+    assert set(config) == set(GROUPS) | {f.name for f in dataclasses.fields(RunSettings)}
+    for path, node in nodes(config):
+        target = get_object(node["_target_"])
+        arguments = {k for k in node if k != "_target_"} | GIVEN.get(path, set())
+        inspect.signature(target).bind(**dict.fromkeys(arguments))
+        assert not unread(target), f"{path}: {target.__name__} never reads {unread(target)}"
+
+
+def test_every_group_has_a_target():
+    config = composed()
+    assert {path for path, _ in nodes(config)} >= set(GROUPS)
+
+
+def test_settings_at_the_top_are_read():
+    assert not unread(RunSettings)
+
+
+@pytest.mark.parametrize("file", [f for f in FILES if str(f.parent) == "algo"], ids=str)
+def test_an_algorithm_is_named_like_its_file(file):
+    target = composed(f"algo={file.stem}").algo["_target_"]
+    assert target.startswith(f"lifelong.algorithms.{file.stem}.")
+    assert target.rpartition(".")[2].lower() == file.stem
+
+
+@pytest.mark.parametrize("preset", ["laptop", "smoke", "paper"])
+def test_values_on_the_command_line_win_over_the_preset(preset):
+    config = composed(f"preset={preset}", "train.epochs=3", "policy=bc_transformer", "data.demos=7")
+    assert (config.train.epochs, config.data.demos, config.policy.image_width) == (3, 7, 64)
+
+
+def test_the_paper_preset_is_the_published_protocol():
+    config = composed("preset=paper")
+    assert OmegaConf.to_container(config.train) == {
+        "_target_": "lifelong.training.FitSettings", "epochs": 50, "batch_size": 32, "steps_per_epoch": None,
+        "lr": 1e-4, "lr_min": 1e-5, "warmup_steps": 0, "betas": [0.9, 0.999], "weight_decay": 1e-4,
+        "grad_clip": 100.0, "precision": "auto",
+    }  # fmt: skip
+    assert (config.data.demos, config.data.image_size, config.data.seq_len) == (50, 128, 10)
+    e = config.eval
+    assert (e.episodes, e.curve_episodes, e.every, e.horizon, e.settle_steps) == (20, 20, 5, 600, 5)
+
+
+@pytest.mark.parametrize(
+    "override", ["algo=ewx", "algo=er,ewx", "benchmark=libero", "policy=rnn", "preset=big", "language=x"]
+)
+def test_an_unknown_choice_lists_the_valid_ones(override):
+    group = override.partition("=")[0]
+    valid = sorted(f.stem for f in FILES if str(f.parent) == group)
+    with pytest.raises(LookupError, match="Valid: " + ", ".join(valid)):
+        check_choices([override, "train.epochs=3"], CONFIGS)
+
+
+def test_known_choices_and_other_overrides_pass():
+    check_choices(["algo=er,ewc", "seed=1,2", "train.lr=1e-3", "-m", "hydra.verbose=true"], CONFIGS)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"select": "worst"}, "valid: best, last"),
+        ({"selection": "apart", "episodes": 40, "curve_episodes": 20}, "need 60 initial states"),
+        ({"episodes": 0}, "at least 1"),
+    ],
+)
+def test_evaluation_that_cannot_work_is_named(change, message):
+    with pytest.raises(ConfigError, match=message):
+        EvalSettings(**change)
+
+
+def test_selection_and_reporting_states_are_apart_by_default():
+    settings = EvalSettings()
+    assert not set(settings.init_states("curve")) & set(settings.init_states("matrix"))
+    assert settings.curve_epochs(12) == (0, 5, 10, 12)
