@@ -97,7 +97,9 @@ def register_report(subparsers: Subparsers) -> None:
         "run_dirs", nargs="+", type=Path, metavar="RUN_DIR", help="such as runs/libero_object/ewc/..."
     )
     parser.add_argument(
-        "--out", type=Path, help="the page to write (default: report.html in the run directory)"
+        "--out",
+        type=Path,
+        help="the page, or a folder for it (default: report.html in the run directory, or here for several)",
     )
     parser.set_defaults(run=run_report)
 
