@@ -18,7 +18,9 @@ from libero_env.tasks import Task
 Phase = Literal["reach", "close", "carry", "release", "rest"]
 
 CONTROL_HZ = 1.0 / (SUBSTEPS * TIMESTEP)
-ARRIVED = 0.005  # m
+ARRIVED = (
+    0.012  # m; wide, so that the moment to close is passed in motion and not approached for ever by a clone
+)
 ARRIVED_TURN = 0.12  # rad
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 AROUND = 0.08  # m, within which bodies count as in the way
@@ -161,7 +163,7 @@ class Expert:
         low = max(rim + hang - style.depth, rim + HAND_OVER_RIM)
         goal[2] = high if away > 0.03 else min(low, high)
         self._steps += 1
-        if away < 0.02 and pos[2] < goal[2] + 0.015:
+        if away < 0.025 and pos[2] < goal[2] + 0.02:
             self._hold = np.array([*goal[:2], min(goal[2], pos[2])]), self._hold[1]
             self._enter("release")
             return self._release(view, skill)
