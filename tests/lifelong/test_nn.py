@@ -61,6 +61,15 @@ def test_spatial_softmax_finds_a_peak_in_the_image() -> None:
     torch.testing.assert_close(layer(h), torch.tensor([[1.0, -1.0, 0.0, 1.0]]), atol=1e-4, rtol=0)
 
 
+def test_a_low_temperature_lets_untrained_keypoints_follow_the_image() -> None:
+    h, spread = randn(20, 8, 6, 6), {}
+    for temperature in (1.0, 0.1):
+        layer = SpatialSoftmax(channels=8, size=(6, 6), keypoints=16, temperature=temperature)
+        nn.init.normal_(layer.heat.weight, std=0.1, generator=generator())
+        spread[temperature] = layer(h).std(0).mean()
+    assert spread[0.1] > 4 * spread[1.0]
+
+
 @pytest.mark.parametrize("norm", ["group", "batch", "none"])
 def test_encoder_frames_of_a_window_share_its_language(norm: str) -> None:
     encoder = small_encoder(norm=norm).eval()

@@ -1,0 +1,117 @@
+"""How fast windows are gathered, images augmented, and policies trained.
+
+    python experiments/benchmarks/data_and_policy_speed.py [--threads 2] [--steps 5] [--only paper|small|data]
+
+Wall time is what counts on an idle machine; CPU time, beside it, hardly changes when others use the machine too.
+bfloat16 is left out where it does not run (see lifelong.nn.precision).
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import yaml
+
+from lifelong.data import SequenceVLDataset, fake_batch
+from lifelong.nn import ColorJitter, RandomShift
+from lifelong.nn.precision import bf16_runs_on_cpu
+from lifelong.policies import BCTransformer
+from lifelong.types import PolicySpec
+
+PAPER = PolicySpec(language_dim=768)
+SMALL = PolicySpec(image_size=(64, 64), seq_len=5)
+CONFIG = Path(__file__).parents[2] / "configs" / "policy" / "bc_transformer_small.yaml"
+SMALL_SIZES = {k: v for k, v in yaml.safe_load(CONFIG.read_text()).items() if k != "_target_"}
+
+
+def timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Wall and CPU seconds of one call, after one to warm up."""
+    work()
+    wall, cpu = time.perf_counter(), time.process_time()
+    for _ in range(repeats):
+        work()
+    return (time.perf_counter() - wall) / repeats, (time.process_time() - cpu) / repeats
+
+
+def show(name: str, windows: int, seconds: tuple[float, float]) -> None:
+    """One line of the table."""
+    wall, cpu = seconds
+    print(
+        f"{name:52} {1000 * wall:9.1f} ms {1000 * cpu:9.1f} ms CPU {windows / wall:9.0f} windows/s",
+        flush=True,
+    )
+
+
+def training_step(policy: BCTransformer, batch_size: int, bf16: bool) -> Callable[[], None]:
+    """Forward, backward and one step of AdamW on a fixed batch."""
+    batch = fake_batch(policy.spec, batch_size, torch.Generator().manual_seed(0))
+    optimizer = torch.optim.AdamW(policy.parameters())
+
+    def step() -> None:
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            loss = policy.loss(batch)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+
+    return step
+
+
+def measure_data(repeats: int) -> None:
+    """Gathering and augmenting a batch of 32 windows."""
+    for name, spec in (("128x128, T=10", PAPER), ("64x64, T=5", SMALL)):
+        frames, draws = 3000, torch.Generator().manual_seed(0)
+        images = torch.zeros(frames, len(spec.views), *spec.image_size, 3, dtype=torch.uint8)
+        proprio = {key: torch.zeros(frames, size) for key, size in spec.proprio.items()}
+        last = torch.full((frames,), frames - 1)
+        language = torch.zeros(spec.language_dim)
+        dataset = SequenceVLDataset(images, proprio, torch.zeros(frames, 7), last, language, 0, spec.seq_len)
+        gather = lambda d=dataset, g=draws: d.batch(torch.randint(len(d), (32,), generator=g))  # noqa: E731
+        show(f"gather 32 windows, {name}", 32, timed(gather, repeats))
+        batch = gather()
+        for augmentation in (RandomShift(4), ColorJitter()):
+            work = lambda a=augmentation, b=batch, g=draws: a(b, g)  # noqa: E731
+            show(f"{type(augmentation).__name__} of 32 windows, {name}", 32, timed(work, repeats))
+
+
+def measure_policy(name: str, spec: PolicySpec, sizes: dict, batch_size: int, repeats: int) -> None:
+    """A training step in each precision, and a step of acting in ten environments."""
+    policy = BCTransformer(spec=spec, **sizes)
+    count = sum(p.numel() for p in policy.parameters())
+    print(f"{name}: {count} parameters")
+    for bf16 in (False, True):
+        label = f"train {name}, batch {batch_size}, {'bf16' if bf16 else 'fp32'}"
+        if bf16 and not bf16_runs_on_cpu():
+            print(f"{label:52} does not run here; try ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16")
+            continue
+        show(label, batch_size, timed(training_step(policy.train(), batch_size, bf16), repeats))
+    observation = fake_batch(spec, 10, torch.Generator().manual_seed(0), steps=1).observation
+    policy.eval().reset(10)
+    act = lambda: policy.act(observation, [torch.Generator() for _ in range(10)])  # noqa: E731
+    show(f"act {name}, 10 environments, fp32", 10, timed(act, 2 * spec.seq_len))
+
+
+def main() -> None:
+    """Measures what the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--steps", type=int, default=5, help="repetitions of each measurement")
+    parser.add_argument("--only", choices=("paper", "small", "data"))
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    print(f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, {args.threads} threads")
+    if args.only in (None, "data"):
+        measure_data(args.steps)
+    if args.only in (None, "small"):
+        for batch_size in (32, 64):
+            measure_policy("small, 64x64, T=5", SMALL, SMALL_SIZES, batch_size, args.steps)
+    if args.only in (None, "paper"):
+        measure_policy("paper, 128x128, T=10", PAPER, {}, 32, max(1, args.steps // 5))
+
+
+if __name__ == "__main__":
+    main()
