@@ -1,0 +1,110 @@
+"""The rollout loop and its environments, with an environment whose outcomes are known."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import nn
+
+from lifelong.errors import ConfigError
+from lifelong.evaluation import EnvPool, rollout, save_animation
+from lifelong.types import PolicySpec
+
+SPEC = PolicySpec(views=("agentview_rgb",), image_size=(4, 4), proprio={"x": 1}, language_dim=2)
+
+
+class Countdown:
+    """Simulation i succeeds after `init_state` steps of the policy's unit action, or never for state 0."""
+
+    def __init__(self, num_envs: int):
+        self.num_envs, self.closed = num_envs, False
+
+    def _obs(self):
+        frames = np.zeros((self.num_envs, 4, 4, 3), np.uint8)
+        return {"agentview_rgb": frames, "x": self.done[:, None].astype(float)}
+
+    def reset(self, *, seed=None, options=None):
+        self.goal = np.asarray(options["init_state"])
+        self.done = np.zeros(self.num_envs)
+        self.running = np.ones(self.num_envs, bool)
+        return self._obs(), {}
+
+    def step(self, actions):
+        assert actions.shape == (self.num_envs, 7) and actions.dtype == np.float64
+        self.done += self.running * actions[:, 0]
+        reached = self.running & (self.goal > 0) & (self.done >= self.goal)
+        self.running &= ~reached
+        truncated = np.zeros(self.num_envs, bool)
+        return self._obs(), reached * 1.0, reached, truncated, {"success": ~self.running}
+
+    def close(self):
+        self.closed = True
+
+
+class Forward(nn.Module):
+    """Always the same action; remembers how it was called."""
+
+    spec = SPEC
+
+    def __init__(self):
+        super().__init__()
+        self.calls, self.draws = 0, []
+
+    def reset(self, num_envs):
+        self.calls = 0
+
+    def act(self, observation, generators=None):
+        assert not self.training
+        assert observation.images.shape == (len(generators), 1, 1, 4, 4, 3)
+        assert observation.proprio["x"].shape == (len(generators), 1, 1)
+        self.calls += 1
+        self.draws.append([torch.rand(1, generator=g).item() for g in generators])
+        return torch.ones(len(generators), 7)
+
+
+def run(states, **kwargs):
+    policy = Forward().train()
+    arguments = {"language": torch.zeros(2), "horizon": 6, "settle_steps": 2, "precision": "fp32"} | kwargs
+    return policy, rollout(policy, Countdown(len(states)), states, **arguments)
+
+
+def test_success_and_length_of_each_episode():
+    policy, rollouts = run([3, 0, 6, 7])
+    assert [e.success for e in rollouts.episodes] == [True, False, True, False]
+    assert [e.length for e in rollouts.episodes] == [3, 6, 6, 6]
+    assert [e.init_state for e in rollouts.episodes] == [3, 0, 6, 7]
+    assert rollouts.rate == 0.5
+    assert policy.training, "the policy is left in the mode it was in"
+
+
+def test_it_ends_when_all_have_succeeded():
+    policy, rollouts = run([1, 2])
+    assert policy.calls == 2
+
+
+def test_an_episode_draws_the_same_whatever_runs_beside_it():
+    alone, _ = run([5])
+    beside, _ = run([2, 5, 3])
+    assert [d[0] for d in alone.draws] == [d[1] for d in beside.draws]
+
+
+def test_pictures_of_the_first_episode_until_it_ends(tmp_path):
+    _, rollouts = run([3, 0], record_every=1)
+    assert len(rollouts.frames) == 3 and rollouts.frames[0].shape == (4, 4, 3)
+    save_animation(rollouts.frames, tmp_path / "videos" / "a.webp", seconds_per_frame=0.1)
+    with Image.open(tmp_path / "videos" / "a.webp") as picture:
+        assert picture.size == (4, 4)
+
+
+def test_as_many_simulations_as_initial_states():
+    with pytest.raises(ConfigError, match="3 initial states, but the environment has 2"):
+        rollout(Forward(), Countdown(2), [1, 2, 3], language=torch.zeros(2), horizon=3)
+
+
+def test_the_pool_closes_what_was_not_used_for_longest_and_all_at_the_end():
+    with EnvPool(Countdown, capacity=2) as pool:
+        first, second = pool.get(1), pool.get(2)
+        assert pool.get(1) is first
+        third = pool.get(3)
+        assert (first.closed, second.closed, third.closed) == (False, True, False)
+    assert first.closed and third.closed

@@ -1,0 +1,59 @@
+"""A run's directory: one configuration, one writer at a time, nothing thrown away."""
+
+import pytest
+
+from lifelong.errors import ConfigError, LifelongError
+from lifelong.rundir import RunDirectory
+from lifelong.tracking import Tracker
+
+CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
+
+
+def test_the_same_configuration_is_found_again(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    for _ in range(2):
+        with directory.opened(CONFIG, resume=True):
+            assert (directory.path / "config.yaml").exists()
+
+
+def test_what_changes_no_result_may_change(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    with directory.opened(CONFIG, resume=True):
+        pass
+    with directory.opened(CONFIG | {"device": "cuda", "runs_dir": "b"}, resume=True):
+        pass
+
+
+def test_another_configuration_is_refused_with_the_difference_and_the_remedy(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    with directory.opened(CONFIG, resume=True):
+        pass
+    other = CONFIG | {"train": {"lr": 0.2, "epochs": 3}}
+    message = r"train\.lr 0\.1 -> 0\.2.*run_id=NAME"
+    with pytest.raises(ConfigError, match=message), directory.opened(other, resume=True):
+        pass
+
+
+def test_starting_afresh_keeps_the_old_run(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    for lr in (0.1, 0.2, 0.3):
+        with directory.opened(CONFIG | {"train": {"lr": lr}}, resume=False):
+            pass
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["run", "run.old1", "run.old2"]
+
+
+def test_a_second_writer_is_refused(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    second = RunDirectory(tmp_path / "run")
+    with directory.opened(CONFIG, resume=True):  # noqa: SIM117
+        with pytest.raises(LifelongError, match="another process is"), second.opened(CONFIG, resume=True):
+            pass
+
+
+def test_the_tracker_is_silent_by_default_and_names_its_modes():
+    tracker = Tracker()
+    tracker.start("run", ".", {})
+    tracker.log({"loss": 1.0})
+    tracker.finish()
+    with pytest.raises(ConfigError, match="disabled, offline, online"):
+        Tracker(mode="on")
