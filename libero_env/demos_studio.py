@@ -23,7 +23,7 @@ from libero_env.scene import build_scene, scene_spec
 from libero_env.tasks import Task, get_task
 from libero_env.vector import BatchEnv
 
-GENERATOR = "scripted-expert-2"  # change it when the same seed gives other demonstrations
+GENERATOR = "scripted-expert-3"  # change it when the same seed gives other demonstrations
 MAX_ATTEMPTS = 10  # of one demonstration
 MAX_STEPS = 250  # of one attempt
 BATCH = 5  # demonstrations simulated together, and recorded before the next

@@ -22,6 +22,7 @@ ARRIVED = (
     0.012  # m; wide, so that the moment to close is passed in motion and not approached for ever by a clone
 )
 ARRIVED_TURN = 0.12  # rad
+STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 AROUND = 0.08  # m, within which bodies count as in the way
 HAND_OVER_RIM = 0.045  # m, of the grip site, so that the palm stays above a container
@@ -64,6 +65,7 @@ class Expert:
         self._hold: tuple[np.ndarray, np.ndarray] | None = None  # pose to keep while the fingers move
         self._offset = np.zeros(3)  # of the object from the grip site when it was taken
         self._steps, self._opening = 0, 0.0
+        self._pressed, self._backing = 0, False  # steps that something resisted the way down; going up again
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
 
@@ -103,6 +105,7 @@ class Expert:
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._steps = phase, 0
+        self._pressed, self._backing = 0, False
 
     def _again(self) -> None:
         self.retries += 1
@@ -123,9 +126,8 @@ class Expert:
             self._hold = goal, mat
             self._enter("close")
             return self._close(view, skill)
-        lift = np.clip(
-            style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, self._rise + style.hover
-        )
+        lift = style.slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
+        lift = self._backed_off(away, goal[2], pos[2], np.clip(lift, 0.0, self._rise + style.hover))
         over = goal.copy()
         over[2] += lift
         if away > 0.05:
@@ -133,6 +135,17 @@ class Expert:
             over[2] = max(over[2], way + FINGER_CLEARANCE + TIP_BELOW)
         lateral = np.clip(1.0 - (over[2] - pos[2] - 0.02) / 0.04, 0.0, 1.0)
         return self._toward(view, over, mat, OPEN, lateral)
+
+    def _backed_off(self, away: float, goal_height: float, height: float, lift: float) -> float:
+        """The lift, or all of it while a finger that came to stand on something goes up and comes down in its middle."""
+        standing = height > goal_height + lift + STANDING and np.linalg.norm(self._velocity) < STILL
+        self._pressed = self._pressed + 1 if standing and self._steps > 5 else 0
+        if self._pressed >= 3:
+            self._backing = True
+        clear = height > goal_height + self._rise - TIP_BELOW + 0.01
+        if away < 0.006 and clear:
+            self._backing = False
+        return self._rise + self.style.hover if self._backing else lift
 
     def _close(self, view: StateView, skill: PickPlace) -> np.ndarray:
         opening = float(np.abs(view.finger_pos).sum())

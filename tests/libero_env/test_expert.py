@@ -190,3 +190,16 @@ def test_a_slip_is_mended():
             break
     env.close()
     assert dropped == 8 and expert.retries >= 1 and success
+
+
+@pytest.mark.sim
+def test_a_finger_on_the_rim_goes_up_again():
+    """A push leaves a finger standing on a wide can; pressing on would last for seventy steps."""
+    task = get_task("libero_object/0")
+    manner, pushes = np.random.SeedSequence([0, 8]).spawn(2)
+    env = BatchEnv(task, 1, cameras=())
+    env.reset(options={"init_state": 8})
+    expert, noise = Expert(task, np.random.default_rng(manner)), Disturbance(np.random.default_rng(pushes))
+    (attempt,) = run_experts(env, [expert], [noise])
+    env.close()
+    assert attempt.success and len(attempt) < 140
