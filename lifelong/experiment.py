@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from libero_env.demos_generate import ensure_demos
 from libero_env.tasks import Task
 from libero_env.vector import BatchEnv
+from lifelong.algorithms import Algorithm
 from lifelong.data import SequenceVLDataset
 from lifelong.errors import ConfigError
 from lifelong.evaluation import EnvPool, EvalSettings
@@ -26,7 +27,7 @@ from lifelong.rundir import RunDirectory
 from lifelong.sequence import Parts, TaskSequence
 from lifelong.settings import CAMERAS, BenchmarkSettings, DataSettings, RunSettings
 from lifelong.tracking import Tracker
-from lifelong.training import seeded
+from lifelong.training import BatchAugmentation, FitSettings, seeded
 from lifelong.types import PolicySpec
 
 GROUPS = ("algo", "benchmark", "policy", "data", "augmentation", "train", "eval", "language", "wandb")
@@ -47,24 +48,62 @@ def run(config: DictConfig, names: Mapping[str, str]) -> Path:
         LiberoError: Something in the configuration, the data or the directory does not work.
     """
     settings = RunSettings(**{k: v for k, v in config.items() if k not in GROUPS})
-    benchmark: BenchmarkSettings = _build(config.benchmark)
-    tasks = benchmark.sequence()
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    built = _build_all(config, settings)  # before anything is written: what cannot work leaves no trace
     label = "_".join([names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])])
     name = f"{names['benchmark']}/{names['algo']}/{label}"
     directory = RunDirectory(Path(settings.runs_dir) / name)
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
     plain = OmegaConf.to_container(config, resolve=True)
     with directory.opened(plain, settings.resume):
         if directory.log.read().finished:
             print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
         else:
-            tracker: Tracker = _build(config.wandb)
-            tracker.start(name, str(directory.path), plain)
-            _record_start(directory, names, settings.seed, tasks, plain)
-            _walk(config, settings, tasks, directory, tracker)
-            tracker.finish()
+            built.tracker.start(name, str(directory.path), plain)
+            _record_start(directory, names, settings.seed, built.tasks, plain)
+            _walk(built, settings, directory)
+            built.tracker.finish()
         return _sum_up(directory, plain)
+
+
+@dataclass(frozen=True)
+class Built:
+    """What the configuration describes, before any data are made or simulations opened."""
+
+    tasks: tuple[Task, ...]
+    data: DataSettings
+    languages: torch.Tensor  # (K, L)
+    spec: PolicySpec
+    policy: Policy
+    algorithm: Algorithm
+    fit: FitSettings
+    eval: EvalSettings
+    augment: BatchAugmentation
+    tracker: Tracker
+    device: torch.device
+
+
+def _build_all(config: DictConfig, settings: RunSettings) -> Built:
+    benchmark: BenchmarkSettings = _build(config.benchmark)
+    tasks, device = benchmark.sequence(), _device(settings.device)
+    data: DataSettings = _build(config.data)
+    languages = _build(config.language).embed([t.language for t in tasks])
+    spec = data.spec(languages.shape[1])
+    with seeded(settings.seed, INIT):
+        policy = _build(config.policy, spec=spec).to(device)
+    return Built(
+        tasks=tasks,
+        data=data,
+        languages=languages,
+        spec=spec,
+        policy=policy,
+        algorithm=_build(config.algo),
+        fit=_build(config.train),
+        eval=_build(config.eval),
+        augment=_build(config.augmentation),
+        tracker=_build(config.wandb),
+        device=device,
+    )
 
 
 def _build(node: DictConfig, **more: Any) -> Any:
@@ -89,54 +128,41 @@ def _record_start(
     )
 
 
-def _walk(
-    config: DictConfig,
-    settings: RunSettings,
-    tasks: tuple[Task, ...],
-    directory: RunDirectory,
-    tracker: Tracker,
-) -> None:
-    """Build all parts and learn the sequence."""
-    began, device = time.perf_counter(), _device(settings.device)
+def _walk(built: Built, settings: RunSettings, directory: RunDirectory) -> None:
+    """Make sure of the demonstrations and learn the sequence."""
+    began = time.perf_counter()
     progress = sys.stderr.isatty() if settings.progress is None else settings.progress
-    data: DataSettings = _build(config.data)
-    evaluation: EvalSettings = _build(config.eval)
-    instructions = tuple(t.language for t in tasks)
-    languages = _build(config.language).embed(instructions)
-    spec = data.spec(languages.shape[1])
-    datasets = DemoDatasets(_demos(tasks, data, directory, progress), spec, languages, data, device)
-    with seeded(settings.seed, INIT):
-        policy: Policy = _build(config.policy, spec=spec).to(device)
-    with EnvPool(lambda key: _env(tasks, key, spec, evaluation), evaluation.open_environments) as envs:
+    paths = _demos(built.tasks, built.data, directory, progress)
+    with EnvPool(lambda key: _env(built, key), built.eval.open_environments) as envs:
         parts = Parts(
-            instructions=instructions,
-            languages=languages,
-            datasets=datasets,
-            policy=policy,
-            algorithm=_build(config.algo),
+            instructions=tuple(t.language for t in built.tasks),
+            languages=built.languages,
+            datasets=DemoDatasets(paths, built.spec, built.languages, built.data, built.device),
+            policy=built.policy,
+            algorithm=built.algorithm,
             envs=envs,
-            fit=_build(config.train),
-            eval=evaluation,
-            augment=_build(config.augmentation),
+            fit=built.fit,
+            eval=built.eval,
+            augment=built.augment,
             directory=directory,
-            tracker=tracker,
+            tracker=built.tracker,
             seed=settings.seed,
-            device=device,
+            device=built.device,
             progress=progress,
         )
         TaskSequence(parts).run()
     directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
 
 
-def _env(tasks: tuple[Task, ...], key: tuple[int, int], spec: PolicySpec, evaluation: EvalSettings) -> BatchEnv:
+def _env(built: Built, key: tuple[int, int]) -> BatchEnv:
     task, simulations = key
     return BatchEnv(
-        tasks[task],
+        built.tasks[task],
         simulations,
-        num_threads=evaluation.sim_threads,
-        cameras=tuple(CAMERAS[view] for view in spec.views),
-        camera_size=spec.image_size,
-        horizon=evaluation.horizon + evaluation.settle_steps,
+        num_threads=built.eval.sim_threads,
+        cameras=tuple(CAMERAS[view] for view in built.spec.views),
+        camera_size=built.spec.image_size,
+        horizon=built.eval.horizon + built.eval.settle_steps,
     )
 
 

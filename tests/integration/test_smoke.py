@@ -29,7 +29,7 @@ def home(tmp_path_factory) -> Path:
 
 def start(home: Path, runs: Path, *overrides: str) -> subprocess.Popen:
     env = os.environ | {"LIBERO_DEMOS": str(home / "demos")}
-    command = [sys.executable, str(ROOT / "train.py"), f"runs_dir={runs}", *overrides]
+    command = [sys.executable, str(ROOT / "train.py"), *overrides, f"runs_dir={runs}"]
     return subprocess.Popen(
         command, env=env, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -136,3 +136,4 @@ def test_what_cannot_run_is_told_in_one_line(home, tmp_path, override, message):
     assert process.returncode == 1
     assert message in output and "Traceback" not in output
     assert len(output.strip().splitlines()) == 1, output
+    assert not list(tmp_path.rglob("config.yaml")), "nothing stands in the way of the mended command"
