@@ -19,15 +19,17 @@ from lifelong.policies.base import Policy
 from lifelong.training import autocast, generator
 from lifelong.types import Observation, PolicySpec
 
+Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
+
 
 class VectorEnv(Protocol):
     """What a rollout needs of `libero_env.vector.BatchEnv`; finished simulations stand still."""
 
     num_envs: int
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]: ...
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict]: ...
 
-    def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]: ...
+    def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict]: ...
 
     def close(self) -> None: ...
 
@@ -195,7 +197,7 @@ def rollout(
 class EnvPool:
     """Environments by task, at most `capacity` of them open; the one not used for longest is closed first."""
 
-    def __init__(self, make: Callable[[Hashable], VectorEnv], capacity: int = 4):
+    def __init__(self, make: Callable[[Any], VectorEnv], capacity: int = 4):
         """Make a pool.
 
         Args:
@@ -243,11 +245,11 @@ class _Observer:
     language: Tensor
     device: torch.device
 
-    def __call__(self, obs: Mapping[str, np.ndarray]) -> Observation:
+    def __call__(self, obs: Obs) -> Observation:
         images = np.stack([obs[view] for view in self.spec.views], axis=1)[:, None]  # (B, 1, V, H, W, C)
         proprio = {
             name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None].to(self.device)
-            for name in self.spec.proprio
+            for name in self.spec.proprio or ()
         }
         language = self.language.to(self.device).expand(len(images), -1)
         return Observation(torch.from_numpy(images).to(self.device), proprio, language)
@@ -255,13 +257,13 @@ class _Observer:
 
 def _step(
     env: VectorEnv, actions: np.ndarray, over: np.ndarray, success: np.ndarray
-) -> tuple[Mapping[str, np.ndarray], np.ndarray, np.ndarray]:
+) -> tuple[Obs, np.ndarray, np.ndarray]:
     """Observation, which episodes are over, which of them with success."""
     obs, _, terminated, truncated, info = env.step(actions)
     success = success | (np.asarray(info["success"], bool) & ~over)
     return obs, over | terminated | truncated, success
 
 
-def _picture(obs: Mapping[str, np.ndarray], spec: PolicySpec) -> np.ndarray:
+def _picture(obs: Obs, spec: PolicySpec) -> np.ndarray:
     """All cameras of the first simulation side by side."""
     return np.concatenate([np.array(obs[view][0]) for view in spec.views], axis=1)

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -47,14 +47,14 @@ def run(config: DictConfig, names: Mapping[str, str]) -> Path:
     Raises:
         LiberoError: Something in the configuration, the data or the directory does not work.
     """
-    settings = RunSettings(**{k: v for k, v in config.items() if k not in GROUPS})
+    settings = RunSettings(**{str(k): v for k, v in config.items() if k not in GROUPS})
     if settings.threads:
         torch.set_num_threads(settings.threads)
     built = _build_all(config, settings)  # before anything is written: what cannot work leaves no trace
     label = "_".join([names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])])
     name = f"{names['benchmark']}/{names['algo']}/{label}"
     directory = RunDirectory(Path(settings.runs_dir) / name)
-    plain = OmegaConf.to_container(config, resolve=True)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
     with directory.opened(plain, settings.resume):
         if directory.log.read().finished:
             print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
@@ -203,9 +203,7 @@ class DemoDatasets(Mapping[int, SequenceVLDataset]):
     languages: torch.Tensor  # (K, L)
     data: DataSettings
     device: torch.device
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_held", WeakValueDictionary())
+    _held: WeakValueDictionary[int, SequenceVLDataset] = field(default_factory=WeakValueDictionary)
 
     def __getitem__(self, task: int) -> SequenceVLDataset:
         dataset = self._held.get(task)

@@ -86,7 +86,7 @@ def check_choices(overrides: Sequence[str], config_dir: Path) -> None:
 
 def _one_line(error: Exception) -> str:
     """The message, with the message of what caused it where Hydra wraps one of ours."""
-    cause = error
+    cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LiberoError):
         cause = cause.__cause__
     return " ".join(str(cause or error).split())

@@ -101,8 +101,8 @@ class TaskSequence:
         for stretch in stretches:
             if saved is not None and stretch.number < saved["phase"]:
                 continue
-            here = saved is not None and stretch.number == saved["phase"]
-            self._train(stretch, dataset, saved["fit"] if here else None)
+            resume = saved["fit"] if saved is not None and stretch.number == saved["phase"] else None
+            self._train(stretch, dataset, resume)
             self._save(task, stretch.number + 1)
         draws = generator(p.seed, END_TASK, task)
         p.algorithm.end_task(task, dataset, p.policy, draws)
