@@ -1,6 +1,6 @@
 """Run the expert from all 50 initial states of each task and write down how it went.
 
-    python experiments/expert/certify.py [--suite libero_object] [--states 50] [--disturb] [--out experiments/expert]
+python experiments/expert/certify.py [--suite libero_object] [--states 50] [--disturb] [--out experiments/expert]
 """
 
 import argparse
@@ -11,10 +11,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from libero_env.demos_studio import GENERATOR
 from libero_env.expert import Disturbance, Expert, Shapes
 from libero_env.expert.driver import run_experts
 from libero_env.tasks import get_suite
 from libero_env.vector import BatchEnv
+
+MARKS = ("<!-- results -->", "<!-- end of results -->")
 
 
 def certify_task(task, states: int, disturb: bool) -> dict:
@@ -41,6 +44,29 @@ def certify_task(task, states: int, disturb: bool) -> dict:
     }
 
 
+def write_table(folder: Path) -> None:
+    """Put the results that there are into the README, between its marks."""
+    columns = [("results.json", "as it is"), ("results-disturbed.json", "disturbed")]
+    found = [(json.loads((folder / f).read_text()), t) for f, t in columns if (folder / f).exists()]
+    head = "| task |" + "".join(f" {title}: success | steps, mean (max) | retries |" for _, title in found)
+    lines = [head, "| --- |" + " ---: | ---: | ---: |" * len(found)]
+    for rows in zip(*(result["tasks"] for result, _ in found), strict=True):
+        cells = [
+            f"{r['successes']}/{r['states']} | {r['mean_length']} ({r['max_length']}) | {r['retries']}"
+            for r in rows
+        ]
+        lines.append(f"| {rows[0]['task'].replace('_', ' ')} | {' | '.join(cells)} |")
+    totals = [
+        f"**{r['successes']}/{r['total']} = {100 * r['successes'] / r['total']:.1f} %** | |" for r, _ in found
+    ]
+    lines.append(f"| all | {' | '.join(totals)} |")
+    readme = folder / "README.md"
+    if readme.exists():
+        before, rest = readme.read_text().split(MARKS[0])
+        after = rest.split(MARKS[1])[1]
+        readme.write_text(before + "\n".join([MARKS[0], *lines, MARKS[1]]) + after)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--suite", default="libero_object")
@@ -58,9 +84,12 @@ def main() -> None:
     total, good = sum(r["states"] for r in rows), sum(r["successes"] for r in rows)
     print(f"{good}/{total} = {100 * good / total:.1f} %")
     if args.out:
-        result = {"mujoco": mujoco.__version__, "disturbed": args.disturb, "successes": good, "total": total}
+        args.out.mkdir(parents=True, exist_ok=True)
+        result = {"mujoco": mujoco.__version__, "generator": GENERATOR, "disturbed": args.disturb}
+        result |= {"complete": len(rows) == len(get_suite(args.suite)), "successes": good, "total": total}
         name = "results-disturbed.json" if args.disturb else "results.json"
         (args.out / name).write_text(json.dumps({**result, "tasks": rows}, indent=1) + "\n")
+        write_table(args.out)
 
 
 if __name__ == "__main__":

@@ -137,7 +137,7 @@ class Expert:
         return self._toward(view, over, mat, OPEN, lateral)
 
     def _backed_off(self, away: float, goal_height: float, height: float, lift: float) -> float:
-        """The lift, or all of it while a finger that came to stand on something goes up and comes down in its middle."""
+        """The lift, or all of it while a finger that came to stand on something goes up and to the middle."""
         standing = height > goal_height + lift + STANDING and np.linalg.norm(self._velocity) < STILL
         self._pressed = self._pressed + 1 if standing and self._steps > 5 else 0
         if self._pressed >= 3:
