@@ -10,7 +10,7 @@ import numpy as np
 
 from libero_env.control import ArmIndex
 from libero_env.errors import UnknownNameError
-from libero_env.problem import And, Atom, Expression, ForAll, Not, Or
+from libero_env.problem import And, Atom, Expression, ForAll, Not, Or, Region
 from libero_env.robot import FINGER_JOINTS
 from libero_env.scene import Scene
 from libero_env.simulation import Simulations
@@ -56,7 +56,7 @@ class StateView:
 
     @property
     def eef_mat(self) -> np.ndarray:
-        """Orientation of the gripper, grip site to world (3, 3); the fingers open along its y axis."""
+        """Orientation of the gripper, grip site to world (3, 3); the fingers open along its x axis."""
         return self._field("site_xmat")[self._arm.site].reshape(3, 3).copy()
 
     @property
@@ -102,10 +102,9 @@ def on(view: StateView, thing: str, place: str) -> bool:
         above, below = view.body_pos(thing), view.body_pos(place)
         near = np.linalg.norm(above[:2] - below[:2]) < _ON_XY_DISTANCE
         return bool(below[2] <= above[2] and near and view.in_contact(thing, place))
-    if not any(_over(box, view.body_pos(thing)) for box in _boxes(view, place)):
-        return False
-    region = view.scene.problem.region(place)
-    return bool(region.ranges) or view.in_contact(thing, region.target)
+    over = any(_over(box, view.body_pos(thing)) for box in _boxes(view, place))
+    region = _region(view, place)
+    return over and (bool(region.ranges) or view.in_contact(thing, region.target))
 
 
 def in_(view: StateView, thing: str, place: str) -> bool:
@@ -153,12 +152,17 @@ def atoms_of(expression: Expression) -> tuple[Atom, ...]:
 Box = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre (3,), orientation to world (3, 3), half size (3,)
 
 
-def _boxes(view: StateView, address: str) -> list[Box]:
-    """The boxes of a region: the site of that name, or a flat box over each rectangle on its surface."""
+def _region(view: StateView, address: str) -> Region:
     region = view.scene.problem.region(address)
     if region is None:
         valid = [r.address for r in view.scene.problem.regions] + list(view.scene.objects)
         raise UnknownNameError("region or object", address, valid)
+    return region
+
+
+def _boxes(view: StateView, address: str) -> list[Box]:
+    """The boxes of a region: the site of that name, or a flat box over each rectangle on its surface."""
+    region = _region(view, address)
     if not region.ranges:
         return [(view.site_pos(address), view.site_mat(address), view.scene.model.site(address).size)]
     workspace = view.scene.workspace

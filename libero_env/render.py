@@ -109,9 +109,14 @@ class Renderer:
         self.close()
 
     def _open(self) -> None:
-        _, self._gl = open_context(self._width, self._height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        backend, gl = open_context(self._width, self._height)
+        gl.make_current()
+        try:
+            self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        except mujoco.FatalError as error:
+            gl.free()
+            raise RenderError(f"{backend} opens, but draws nothing ({error}). Remedy: {REMEDY}") from error
+        self._gl = gl
         mujoco.mjr_resizeOffscreen(self._width, self._height, self._context)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + 100)

@@ -123,7 +123,12 @@ def _take_mode(values: Tensor, index: Tensor) -> Tensor:
 
 
 class DeterministicHead(ActionHead):
-    """One action, squashed by tanh, trained by squared error."""
+    """One action, squashed by tanh, trained by absolute error.
+
+    Absolute rather than squared, because small errors near a grasp decide about success and large ones, where the
+    phase changes, do not (Kim et al., "Fine-tuning vision-language-action models: optimizing speed and success",
+    RSS 2025, section IV).
+    """
 
     def __init__(self, *, in_dim: int, action_dim: int, hidden: int = 1024, layers: int = 2) -> None:
         super().__init__()
@@ -135,8 +140,8 @@ class DeterministicHead(ActionHead):
         return {"means": self.means(self.trunk(latent)).float().tanh()}
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Squared error, mean over the action's dimensions, (..., A) -> (...)."""
-        return (actions.float() - params["means"]).square().mean(-1)
+        """Absolute error, mean over the action's dimensions, (..., A) -> (...)."""
+        return (actions.float() - params["means"]).abs().mean(-1)
 
     def mode(self, params: dict[str, Tensor]) -> Tensor:
         """The action itself."""
