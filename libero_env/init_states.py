@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from tqdm import tqdm
 
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.paths import cache_dir
@@ -93,7 +94,8 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
 def write_suite(path: Path, tasks: list[tuple[Task, Scene]]) -> None:
     """Make the initial states of a suite and write them to one npz: `<task>` states, `<task>.digest`."""
     arrays: dict[str, np.ndarray] = {}
-    for task, scene in tasks:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for task, scene in tqdm(tasks, unit="task", desc="initial states"):
         arrays[task.name] = generate_init_states(task, scene)
         arrays[f"{task.name}.digest"] = np.array(scene_digest(scene))
     _write(path, arrays)

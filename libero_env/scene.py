@@ -150,7 +150,11 @@ def _add_arena(spec: mujoco.MjSpec, workspace: Workspace) -> None:
 
 def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectModel) -> None:
     body = item.spec.body("main")
-    body.add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE, damping=[item.joint_damping, 0, 0])
+    joint = body.add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
+    if np.ndim(joint.damping):  # since MuJoCo 4 a polynomial in the velocity
+        joint.damping[0] = item.joint_damping
+    else:
+        joint.damping = item.joint_damping
     spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())
 
 

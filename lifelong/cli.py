@@ -62,7 +62,7 @@ def run_doctor(args: argparse.Namespace) -> int:
 
 
 def register_tasks(subparsers: Subparsers) -> None:
-    """`libero tasks list|show`"""
+    """`libero tasks list|show|init-states`"""
     parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     listing = commands.add_parser("list", help="the tasks of one suite, or of all")
@@ -72,6 +72,10 @@ def register_tasks(subparsers: Subparsers) -> None:
     show = commands.add_parser("show", help="the BDDL of a task")
     show.add_argument("task", help="such as libero_object/3, or the task's name")
     show.set_defaults(run=run_tasks_show)
+    states = commands.add_parser("init-states", help="make the 50 stored initial states of a suite anew")
+    states.add_argument("suite", help="such as libero_object")
+    states.add_argument("--out", type=Path, help="an .npz file (default: the one the package ships)")
+    states.set_defaults(run=run_tasks_init_states)
 
 
 def run_tasks_list(args: argparse.Namespace) -> None:
@@ -88,6 +92,17 @@ def run_tasks_show(args: argparse.Namespace) -> None:
     from libero_env.tasks import get_task
 
     print(get_task(args.task).bddl_text, end="")
+
+
+def run_tasks_init_states(args: argparse.Namespace) -> None:
+    """Write the file and say where it is."""
+    from libero_env.init_states import shipped_path, write_suite
+    from libero_env.scene import build_scene
+    from libero_env.tasks import get_suite
+
+    path = args.out or shipped_path(args.suite)
+    write_suite(path, [(task, build_scene(task.problem)) for task in get_suite(args.suite).tasks])
+    print(path)
 
 
 def register_report(subparsers: Subparsers) -> None:

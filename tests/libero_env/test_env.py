@@ -1,12 +1,17 @@
 """The environment's contract, and that one simulation and many are the same."""
 
+import dataclasses
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from libero_env import init_states
 from libero_env.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.init_states import generate_init_states, load_init_states
+from libero_env.scene import build_scene
 from libero_env.tasks import get_suite
 from libero_env.vector import BatchEnv
 
@@ -197,3 +202,27 @@ def test_initial_states_are_settled_and_stand_where_they_should(task):
         moved = np.abs(world.simulations.fields["qpos"][0] - before)[world.scene.nq_robot :]
         assert moved.max() < 5e-3
     env.close()
+
+
+def test_stored_initial_states_can_be_made_again():
+    task = get_suite("libero_object").tasks[4]
+    scene = build_scene(task.problem)
+    np.testing.assert_array_equal(generate_init_states(task, scene, 2), load_init_states(task, scene)[:2])
+
+
+def test_initial_states_of_another_model_are_refused(monkeypatch):
+    task = get_suite("libero_object").tasks[4]
+    scene = build_scene(task.problem)
+    monkeypatch.setattr(init_states, "scene_digest", lambda scene: "0" * 16)
+    with pytest.raises(LiberoError, match="libero tasks init-states libero_object"):
+        load_init_states(task, scene)
+
+
+def test_a_task_of_ones_own_gets_initial_states_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    task = dataclasses.replace(get_suite("libero_object").tasks[0], suite="mine", name="my_task")
+    scene = build_scene(task.problem)
+    monkeypatch.setattr(init_states, "generate_init_states", lambda task, scene: generate_init_states(task, scene, 2))
+    made = load_init_states(task, scene)
+    monkeypatch.setattr(init_states, "generate_init_states", None)  # found again, not made again
+    np.testing.assert_array_equal(load_init_states(task, scene), made)
