@@ -110,6 +110,29 @@ class SpatialSoftmax(nn.Module):
         return positions.transpose(1, 2).flatten(1)
 
 
+class FlatReadout(nn.Module):
+    """The whole feature map, reduced to a few channels and read by one linear layer.
+
+    Where a thing is can be read off its pixels linearly: a policy localises after a few hundred steps, where soft
+    keypoints from random features take thousands. It has more weights, and they belong to one image size.
+
+    Args:
+        channels: C.
+        size: H, W of the feature map.
+        features: K, of the output.
+        reduced: channels that are read.
+    """
+
+    def __init__(self, *, channels: int, size: tuple[int, int], features: int, reduced: int = 8) -> None:
+        super().__init__()
+        self.reduce = nn.Conv2d(channels, reduced, 1)
+        self.read = nn.Linear(reduced * size[0] * size[1], features)
+
+    def forward(self, h: Tensor) -> Tensor:
+        """(N, C, H, W) -> (N, K)."""
+        return self.read(self.reduce(h).flatten(1)).relu()
+
+
 class ResNetFiLMEncoder(nn.Module):
     """The image encoder of ResNet-T: ResNet-18's first stages, FiLM after every block, keypoints, one linear map.
 
@@ -125,10 +148,11 @@ class ResNetFiLMEncoder(nn.Module):
         stem_kernel, stem_stride, stem_pool: first convolution, and whether a 3x3 stride 2 max pool follows.
         keypoints: K; None: E / 2.
         temperature: of the keypoints, see `SpatialSoftmax`.
+        readout: how positions leave the feature map: `keypoints` (K of them), or `flat` with 2 K features.
         norm: see `make_norm`.
 
     Raises:
-        PolicyError: when the image is too small for the number of stages.
+        PolicyError: an unknown readout, or an image too small for the number of stages.
     """
 
     def __init__(
@@ -144,6 +168,7 @@ class ResNetFiLMEncoder(nn.Module):
         stem_pool: bool = True,
         keypoints: int | None = None,
         temperature: float = 1.0,
+        readout: str = "keypoints",
         norm: str = "group",
     ) -> None:
         super().__init__()
@@ -163,14 +188,19 @@ class ResNetFiLMEncoder(nn.Module):
                 channels = out
         size = self._map_size(image_size)
         keypoints = keypoints or latent_dim // 2
-        self.keypoints = SpatialSoftmax(
-            channels=channels, size=size, keypoints=keypoints, temperature=temperature
-        )
+        if readout == "keypoints":
+            self.readout: nn.Module = SpatialSoftmax(
+                channels=channels, size=size, keypoints=keypoints, temperature=temperature
+            )
+        elif readout == "flat":
+            self.readout = FlatReadout(channels=channels, size=size, features=2 * keypoints)
+        else:
+            raise PolicyError(f"unknown readout {readout!r}. Valid: flat, keypoints")
         self.project = nn.Linear(2 * keypoints, latent_dim)
         self.to(memory_format=torch.channels_last)
 
     def _map_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the feature map the keypoints are read from."""
+        """Height and width of the feature map that positions are read from."""
         conv, pools = self.stem[0], sum(isinstance(m, nn.MaxPool2d) for m in self.stem)
         size = []
         for n in image_size:
@@ -200,4 +230,4 @@ class ResNetFiLMEncoder(nn.Module):
         h = self.stem(h.to(torch.float32).mul_(2.0 / 255.0).sub_(1.0))
         for block, film in zip(self.blocks, self.films, strict=True):
             h = film(block(h), language)
-        return self.project(self.keypoints(h))
+        return self.project(self.readout(h))

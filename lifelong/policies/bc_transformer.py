@@ -28,8 +28,8 @@ class BCTransformer(Policy):
     Args:
         spec: what the policy sees and does; `spec.seq_len` is the longest history.
         embed_dim: E, also the size of an image's latent.
-        image_width, stage_blocks, stem_kernel, stem_stride, stem_pool, keypoints, keypoint_temperature, norm: image
-            encoder, see `ResNetFiLMEncoder`. Each camera has its own.
+        image_width, stage_blocks, stem_kernel, stem_stride, stem_pool, keypoints, keypoint_temperature, readout, norm:
+            image encoder, see `ResNetFiLMEncoder`. Each camera has its own.
         layers, heads, head_dim, mlp_dim, dropout: transformer, see `TemporalTransformer`.
         head: `gmm` or `deterministic`.
         head_hidden, head_layers, modes, min_std, low_eval_noise: see `GMMHead`.
@@ -54,6 +54,7 @@ class BCTransformer(Policy):
         stem_pool: bool = True,
         keypoints: int | None = None,
         keypoint_temperature: float = 1.0,
+        readout: str = "keypoints",
         norm: str = "group",
         layers: int = 4,
         heads: int = 6,
@@ -86,6 +87,7 @@ class BCTransformer(Policy):
                     stem_pool=stem_pool,
                     keypoints=keypoints,
                     temperature=keypoint_temperature,
+                    readout=readout,
                     norm=norm,
                 )
                 for view in spec.views
