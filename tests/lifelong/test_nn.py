@@ -24,6 +24,7 @@ from lifelong.nn import (
 from lifelong.nn.precision import bf16_runs_on_cpu
 from lifelong.nn.tokens import standardise
 from lifelong.nn.transformer import block_causal_mask
+from lifelong.nn.vision import FlatReadout
 from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit
@@ -68,6 +69,22 @@ def test_a_low_temperature_lets_untrained_keypoints_follow_the_image() -> None:
         nn.init.normal_(layer.heat.weight, std=0.1, generator=generator())
         spread[temperature] = layer(h).std(0).mean()
     assert spread[0.1] > 4 * spread[1.0]
+
+
+def test_flat_readout_reads_every_place_of_the_map() -> None:
+    layer = FlatReadout(channels=3, size=(4, 5), features=6)
+    h = randn(2, 3, 4, 5).requires_grad_()
+    layer(h).sum().backward()
+    assert layer(h).shape == (2, 6)
+    assert (h.grad.abs().sum(1) > 0).all()
+
+
+def test_encoder_takes_either_readout_and_names_the_valid_ones() -> None:
+    images = torch.randint(0, 256, (2, 32, 32, 3), generator=generator(), dtype=torch.uint8)
+    for readout in ("keypoints", "flat"):
+        assert small_encoder(readout=readout)(images, randn(2, 6)).shape == (2, 8)
+    with pytest.raises(PolicyError, match="flat, keypoints"):
+        small_encoder(readout="pooled")
 
 
 @pytest.mark.parametrize("norm", ["group", "batch", "none"])
@@ -150,10 +167,10 @@ def test_gmm_mode_is_the_heaviest_mean_and_samples_follow_the_mixture() -> None:
     assert torch.equal(head.sample(params, generator(3)), head.sample(params, generator(3)))
 
 
-def test_deterministic_head_loss_is_squared_error() -> None:
+def test_deterministic_head_loss_is_absolute_error() -> None:
     head = DeterministicHead(in_dim=4, action_dim=3, hidden=8)
     params, actions = head(randn(5, 4)), randn(5, 3)
-    torch.testing.assert_close(head.losses(params, actions), (params["means"] - actions).pow(2).mean(-1))
+    torch.testing.assert_close(head.losses(params, actions), (params["means"] - actions).abs().mean(-1))
     assert torch.equal(head.mode(params), head.sample(params, None))
 
 
