@@ -34,11 +34,16 @@ class ActionHead(nn.Module, ABC):
         """A random action (..., A)."""
 
 
-def _trunk(in_dim: int, hidden: int, layers: int) -> nn.Sequential:
-    """`layers` hidden layers with ReLU and one linear layer, as the original's heads have."""
+def _trunk(in_dim: int, hidden: int, layers: int, norm: bool) -> nn.Sequential:
+    """`layers` hidden layers and one linear layer; ReLU as in the original's heads, or with `norm` LayerNorm and GELU.
+
+    Under ReLU nearly all units of a small head are dead after a few tasks at a high rate; normalised, they stay alive
+    (Lyle et al., "Understanding plasticity in neural networks", ICML 2023).
+    """
     modules: list[nn.Module] = []
     for index in range(layers):
-        modules += [nn.Linear(in_dim if index == 0 else hidden, hidden), nn.ReLU()]
+        modules.append(nn.Linear(in_dim if index == 0 else hidden, hidden))
+        modules += [nn.LayerNorm(hidden), nn.GELU()] if norm else [nn.ReLU()]
     return nn.Sequential(*modules, nn.Linear(hidden if layers else in_dim, hidden))
 
 
@@ -52,7 +57,7 @@ class GMMHead(ActionHead):
         in_dim: E.
         action_dim: A.
         modes: K.
-        hidden, layers: sizes of the shared trunk.
+        hidden, layers, norm: sizes of the shared trunk, and whether its layers are normalised.
         min_std: smallest standard deviation. The original's 1e-4 lets likelihoods of saturated dimensions
             grow without bound; 0.02 or so balances dimensions when data and time are short.
         low_eval_noise: sample with `min_std` instead of the learned deviation in eval mode.
@@ -66,13 +71,14 @@ class GMMHead(ActionHead):
         modes: int = 5,
         hidden: int = 1024,
         layers: int = 2,
+        norm: bool = False,
         min_std: float = 1e-4,
         low_eval_noise: bool = False,
     ) -> None:
         super().__init__()
         self.modes, self.action_dim = modes, action_dim
         self.min_std, self.low_eval_noise = min_std, low_eval_noise
-        self.trunk = _trunk(in_dim, hidden, layers)
+        self.trunk = _trunk(in_dim, hidden, layers, norm)
         self.means = nn.Linear(hidden, modes * action_dim)
         self.stds = nn.Linear(hidden, modes * action_dim)
         self.logits = nn.Linear(hidden, modes)
@@ -130,9 +136,11 @@ class DeterministicHead(ActionHead):
     RSS 2025, section IV).
     """
 
-    def __init__(self, *, in_dim: int, action_dim: int, hidden: int = 1024, layers: int = 2) -> None:
+    def __init__(
+        self, *, in_dim: int, action_dim: int, hidden: int = 1024, layers: int = 2, norm: bool = False
+    ) -> None:
         super().__init__()
-        self.trunk = _trunk(in_dim, hidden, layers)
+        self.trunk = _trunk(in_dim, hidden, layers, norm)
         self.means = nn.Linear(hidden, action_dim)
 
     def forward(self, latent: Tensor) -> dict[str, Tensor]:

@@ -127,10 +127,11 @@ class FlatReadout(nn.Module):
         super().__init__()
         self.reduce = nn.Conv2d(channels, reduced, 1)
         self.read = nn.Linear(reduced * size[0] * size[1], features)
+        self.norm = nn.LayerNorm(features)  # keeps the features alive from task to task
 
     def forward(self, h: Tensor) -> Tensor:
         """(N, C, H, W) -> (N, K)."""
-        return self.read(self.reduce(h).flatten(1)).relu()
+        return functional.gelu(self.norm(self.read(self.reduce(h).flatten(1))))
 
 
 class ResNetFiLMEncoder(nn.Module):

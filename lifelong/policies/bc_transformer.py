@@ -32,7 +32,7 @@ class BCTransformer(Policy):
             image encoder, see `ResNetFiLMEncoder`. Each camera has its own.
         layers, heads, head_dim, mlp_dim, dropout: transformer, see `TemporalTransformer`.
         head: `gmm` or `deterministic`.
-        head_hidden, head_layers, modes, min_std, low_eval_noise: see `GMMHead`.
+        head_hidden, head_layers, head_norm, modes, min_std, low_eval_noise: see `GMMHead`.
         stochastic: sample actions instead of taking the most likely one; needs generators to act.
         normalise_proprio, proprio_dropout: see `ProprioTokens`.
         standardise_language: bring embeddings to mean 0 and variance 1, so that unit vectors of sentence
@@ -64,6 +64,7 @@ class BCTransformer(Policy):
         head: str = "gmm",
         head_hidden: int = 1024,
         head_layers: int = 2,
+        head_norm: bool = False,
         modes: int = 5,
         min_std: float = 1e-4,
         low_eval_noise: bool = False,
@@ -111,6 +112,7 @@ class BCTransformer(Policy):
             "action_dim": spec.action_dim,
             "hidden": head_hidden,
             "layers": head_layers,
+            "norm": head_norm,
         }
         if head == "gmm":
             self.head = GMMHead(**sizes, modes=modes, min_std=min_std, low_eval_noise=low_eval_noise)
