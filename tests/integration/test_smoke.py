@@ -110,7 +110,7 @@ def test_another_configuration_in_the_same_place_is_refused(home, tmp_path):
     process = start(home, tmp_path, *TINY, "benchmark.tasks=1", "train.lr=0.5")
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 1
-    assert "train.lr 0.001 -> 0.5" in output and "run_id=" in output and "Traceback" not in output
+    assert "train.lr 0.003 -> 0.5" in output and "run_id=" in output and "Traceback" not in output
 
 
 def test_a_sweep_ends_with_a_report_that_compares(home, tmp_path):
