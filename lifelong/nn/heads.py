@@ -133,7 +133,7 @@ class DeterministicHead(ActionHead):
 
     Absolute rather than squared, because small errors near a grasp decide about success and large ones, where the
     phase changes, do not (Kim et al., "Fine-tuning vision-language-action models: optimizing speed and success",
-    RSS 2025, section IV).
+    RSS 2025).
     """
 
     def __init__(

@@ -113,8 +113,8 @@ class SpatialSoftmax(nn.Module):
 class FlatReadout(nn.Module):
     """The whole feature map, reduced to a few channels and read by one linear layer.
 
-    Where a thing is can be read off its pixels linearly: a policy localises after a few hundred steps, where soft
-    keypoints from random features take thousands. It has more weights, and they belong to one image size.
+    Where a thing is can be read off its pixels linearly. In a short training this localises better than keypoints
+    (experiments/laptop); it has more weights, and they belong to one image size.
 
     Args:
         channels: C.
