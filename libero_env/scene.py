@@ -17,6 +17,7 @@ import yaml
 from libero_env.bddl import Problem
 from libero_env.errors import UnknownNameError
 from libero_env.objects import ObjectModel, get_object
+from libero_env.objects.model import set_damping
 from libero_env.robot import OPEN_FINGERS, REST_QPOS, add_panda
 
 TIMESTEP = 0.002  # s
@@ -151,10 +152,7 @@ def _add_arena(spec: mujoco.MjSpec, workspace: Workspace) -> None:
 def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectModel) -> None:
     body = item.spec.body("main")
     joint = body.add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
-    if np.ndim(joint.damping):  # since MuJoCo 4 a polynomial in the velocity
-        joint.damping[0] = item.joint_damping
-    else:
-        joint.damping = item.joint_damping
+    set_damping(joint, item.joint_damping)
     spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())
 
 

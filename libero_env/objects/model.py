@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 ROOT_BODY = "main"
+GLOW_GROUP = 2  # group of the sites that are seen only while their object is turned on
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class ObjectModel:
         bottom_offset: lowest point relative to the root, (3,), metres; placement uses it.
         top_offset: highest point relative to the root, (3,), metres; placement uses it.
         horizontal_radius: radius that placement keeps free around the object, metres.
+        articulation: `open`, `close`, `turnon`, `turnoff` -> (low, high) of the joints, rad or m: where an object is
+            put for an initial condition of that name, and from where on it counts.
     """
 
     category: str
@@ -33,6 +36,7 @@ class ObjectModel:
     bottom_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     top_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     horizontal_radius: float = 0.0
+    articulation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def rest_quat(self, rng: np.random.Generator | None = None) -> np.ndarray:
         """Orientation at rest, wxyz (4,), as `rest_quat` below gives it for this object's ranges."""
@@ -65,3 +69,11 @@ def rest_quat(
         mujoco.mju_mulQuat(product, turn, total)
         total = product
     return np.roll(total, -1)  # (w, x, y, z) -> (x, y, z, w), kept in this order on purpose
+
+
+def set_damping(joint: mujoco.MjsJoint, damping: float) -> None:
+    """Linear damping of a joint: a number in MuJoCo 3, the first coefficient of a polynomial in 4."""
+    if np.ndim(joint.damping):
+        joint.damping[0] = damping
+    else:
+        joint.damping = damping
