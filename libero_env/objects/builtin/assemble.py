@@ -22,11 +22,12 @@ class Look:
     """What an object looks like: a mesh and the picture on it.
 
     Attributes:
-        mesh: in the rest frame: origin at the root, z up, front towards +x.
+        mesh: in the frame that `frame` names, metres: z up, front towards +x.
         image: texture, PNG bytes; the file's first row is v = 0.
         specular: strength of highlights, 0..1.
         shininess: sharpness of highlights, 0..1.
         alpha: 1 is opaque; glass is less.
+        frame: `rest`: origin at the root, axes of the world when the object stands at rest; `body`: that of the body.
     """
 
     mesh: Mesh
@@ -34,6 +35,7 @@ class Look:
     specular: float = 0.25
     shininess: float = 0.4
     alpha: float = 1.0
+    frame: str = "rest"
 
 
 Looks = Look | Mapping[str, Look]  # of the root body, or of several: body name (`main` is the root) -> look
@@ -45,10 +47,7 @@ def builders_of(looks: Mapping[str, Callable[[], Looks]]) -> Mapping[str, Callab
 
 
 def build(category: str, look: Callable[[], Looks]) -> ObjectModel:
-    """Builds one builtin object.
-
-    The look of an object without joints is in the rest frame; that of a part is in the frame of its body.
-    """
+    """Builds one builtin object."""
     facts = load_facts(category)
     spec = mujoco.MjSpec()
     spec.modelname = category
@@ -65,7 +64,7 @@ def build(category: str, look: Callable[[], Looks]) -> ObjectModel:
     looks = look()
     turned = _conjugate(rest_quat(facts.rotation))
     for name, one in looks.items() if isinstance(looks, Mapping) else [(ROOT_BODY, looks)]:
-        mesh = one.mesh if facts.parts else one.mesh.rotated(turned)
+        mesh = one.mesh if one.frame == "body" else one.mesh.rotated(turned)
         prefix = category if name == ROOT_BODY else f"{category}_{name}"
         _add_visual(spec, bodies[name], prefix, one, mesh)
     return ObjectModel(
