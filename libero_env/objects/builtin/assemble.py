@@ -38,7 +38,8 @@ class Look:
     frame: str = "rest"
 
 
-Looks = Look | Mapping[str, Look]  # of the root body, or of several: body name (`main` is the root) -> look
+# Of the root body, or of several: body name (`main` is the root) -> its look, or several, such as a frame and its glass.
+Looks = Look | Mapping[str, Look | tuple[Look, ...]]
 
 
 def builders_of(looks: Mapping[str, Callable[[], Looks]]) -> Mapping[str, Callable[[], ObjectModel]]:
@@ -63,10 +64,10 @@ def build(category: str, look: Callable[[], Looks]) -> ObjectModel:
         _add_sites(bodies[name], part, name == ROOT_BODY)
     looks = look()
     turned = _conjugate(rest_quat(facts.rotation))
-    for name, one in looks.items() if isinstance(looks, Mapping) else [(ROOT_BODY, looks)]:
-        mesh = one.mesh if one.frame == "body" else one.mesh.rotated(turned)
-        prefix = category if name == ROOT_BODY else f"{category}_{name}"
-        _add_visual(spec, bodies[name], prefix, one, mesh)
+    for name, several in looks.items() if isinstance(looks, Mapping) else [(ROOT_BODY, looks)]:
+        for index, one in enumerate(several if isinstance(several, tuple) else (several,)):
+            mesh = one.mesh if one.frame == "body" else one.mesh.rotated(turned)
+            _add_visual(spec, bodies[name], category, one, mesh, suffix=f"_{index}" if index else "")
     return ObjectModel(
         category=category,
         spec=spec,
@@ -116,7 +117,11 @@ def _add_collision(body: mujoco.MjsBody, part: Part, facts: Facts, numbers: Iter
         )
 
 
-def _add_visual(spec: mujoco.MjSpec, body: mujoco.MjsBody, prefix: str, look: Look, mesh: Mesh) -> None:
+def _add_visual(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, category: str, look: Look, mesh: Mesh, *, suffix: str
+) -> None:
+    root = body.name == ROOT_BODY
+    prefix = (category if root else f"{category}_{body.name}") + suffix
     # The category goes in front of each name: scenes share one namespace for textures and materials.
     # A file in `assets`, not a buffer: only so can a scene be written as XML.
     picture = f"{prefix}.png"
@@ -140,7 +145,7 @@ def _add_visual(spec: mujoco.MjSpec, body: mujoco.MjsBody, prefix: str, look: Lo
         inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
     body.add_geom(
-        name="visual" if body.name == ROOT_BODY else f"{body.name}_visual",
+        name=("visual" if root else f"{body.name}_visual") + suffix,
         type=mujoco.mjtGeom.mjGEOM_MESH,
         meshname=f"{prefix}_mesh",
         material=material.name,

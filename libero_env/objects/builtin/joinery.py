@@ -1,0 +1,204 @@
+"""Panels, bars and turned parts, painted with tiles of one picture: what furniture is made of.
+
+Meshes here stand in the frame of the object's root body, joints at zero: z up, metres. `in_body` takes them to the body
+that carries them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import mujoco
+import numpy as np
+
+from libero_env.objects.builtin.facts import load_facts
+from libero_env.objects.builtin.mesh import Mesh, Ring, loft, merge
+from libero_env.objects.builtin.paint import png
+from libero_env.objects.model import ROOT_BODY
+
+TILE = 128  # pixels
+
+Cell = tuple[float, float, float, float]  # u0, v0, u1, v1
+
+_FACES = {  # face -> (to the right, upwards), seen from outside
+    "x+": ((0, 1, 0), (0, 0, 1)),
+    "x-": ((0, -1, 0), (0, 0, 1)),
+    "y+": ((-1, 0, 0), (0, 0, 1)),
+    "y-": ((1, 0, 0), (0, 0, 1)),
+    "z+": ((1, 0, 0), (0, 1, 0)),
+    "z-": ((1, 0, 0), (0, -1, 0)),
+}
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Tiles side by side in one picture.
+
+    Attributes:
+        tiles: name -> (TILE, TILE, 3) uint8, first row on top.
+    """
+
+    tiles: Mapping[str, np.ndarray]
+
+    def __getitem__(self, name: str) -> Cell:
+        """Where a tile is, a little inside its border: neighbours do not shine through."""
+        index, count, margin = list(self.tiles).index(name), len(self.tiles), 3.0 / TILE
+        return ((index + margin) / count, margin, (index + 1 - margin) / count, 1.0 - margin)
+
+    def png(self) -> bytes:
+        """The picture, encoded."""
+        return png(np.concatenate(list(self.tiles.values()), axis=1))
+
+
+def block(
+    low: Sequence[float],
+    high: Sequence[float],
+    cell: Cell,
+    *,
+    bevel: float = 0.0,
+    faces: Mapping[str, Cell] | None = None,
+) -> Mesh:
+    """Box between two corners; each face shows the whole cell.
+
+    Args:
+        low: corner (3,), metres.
+        high: opposite corner (3,), metres.
+        cell: part of the picture.
+        bevel: width of the chamfer along the edges, metres; it catches the light.
+        faces: `x+`, `x-`, ... `z-` -> another part of the picture.
+    """
+    low, high, cells = np.asarray(low, float), np.asarray(high, float), faces or {}
+    center, half = 0.5 * (low + high), 0.5 * (high - low)
+    inner = half - bevel
+    pieces = []
+    for face, (right, up) in _FACES.items():
+        middle = np.cross(right, up) * half
+        corners = [middle + s * np.multiply(right, inner) + t * np.multiply(up, inner) for s, t in _CORNERS]
+        pieces.append(_facet(corners, half, face, cells.get(face, cell)))
+    for corners in _chamfers(half, inner) if bevel else ():
+        # A chamfer continues the picture of the face that it leans to most.
+        pieces.append(_facet(corners, half, _face_of(corners, half), cell))
+    mesh = merge(pieces)
+    return Mesh(mesh.vertices + center, mesh.faces, mesh.texcoords)
+
+
+def prism(outline: Sequence[tuple[float, float]], low: float, high: float, cell: Cell) -> Mesh:
+    """A convex outline of (x, z) points, counter-clockwise seen from -y, from y = low to y = high."""
+    points = np.array(outline, float)
+    near, far = (np.column_stack([points[:, 0], np.full(len(points), y), points[:, 1]]) for y in (low, high))
+    corners = np.concatenate([near, far])
+    center, half = 0.5 * (corners.min(axis=0) + corners.max(axis=0)), 0.5 * np.ptp(corners, axis=0)
+    near, far = near - center, far - center
+    pieces = [_facet(near, half, "y-", cell), _facet(far, half, "y+", cell)]
+    for one, two in zip(range(len(points)), np.roll(range(len(points)), -1), strict=True):
+        side = [near[one], far[one], far[two], near[two]]
+        along = np.abs(points[two] - points[one])
+        pieces.append(_facet(side, half, "z+" if along[0] > along[1] else "x+", cell))
+    mesh = merge(pieces)
+    return Mesh(mesh.vertices + center, mesh.faces, mesh.texcoords)
+
+
+def turned(
+    profile: Sequence[tuple[float, float]],
+    cell: Cell,
+    *,
+    base: Sequence[float] = (0.0, 0.0, 0.0),
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+    segments: int = 12,
+    smooth: bool = False,
+) -> Mesh:
+    """Body of revolution.
+
+    Args:
+        profile: (height, radius), metres, going up on the outside; it starts and ends on the axis.
+        cell: part of the picture; its height is the way along the profile.
+        base: where height 0 is, (3,), metres.
+        axis: unit vector (3,) in which the height grows.
+        segments: corners around.
+        smooth: shade without edges.
+    """
+    points = np.array([(0.0, 0.0), *profile, (0.0, 0.0)])
+    points[0, 0], points[-1, 0] = points[1, 0], points[-2, 0]
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    rings = [Ring(z, r, r, v, crease=not smooth) for (z, r), v in zip(points, way / way[-1], strict=True)]
+    mesh, quat = loft(rings, segments), np.empty(4)
+    mujoco.mju_quatZ2Vec(quat, np.asarray(axis, float))
+    mesh = mesh.rotated(quat)
+    return Mesh(mesh.vertices + np.asarray(base), mesh.faces, _within(mesh.texcoords, cell))
+
+
+def bar(
+    start: Sequence[float], end: Sequence[float], radius: float, cell: Cell, *, segments: int = 10, tip=None
+) -> Mesh:
+    """Round bar between two points, (3,), metres; `tip`: chamfer at its ends, a fifth of the radius by default."""
+    way = np.subtract(end, start)
+    length = float(np.linalg.norm(way))
+    tip = 0.2 * radius if tip is None else tip
+    profile = [(0, radius - tip), (tip, radius), (length - tip, radius), (length, radius - tip)]
+    return turned(profile, cell, base=start, axis=way / length, segments=segments)
+
+
+def capsule(
+    start: Sequence[float], end: Sequence[float], radius: float, cell: Cell, *, segments: int = 12
+) -> Mesh:
+    """Bar with round ends; `start` and `end` are the centres of the ends, (3,), metres."""
+    way = np.subtract(end, start)
+    length = float(np.linalg.norm(way))
+    turns = np.radians((-65, -40, 0))
+    dome = [(radius * np.sin(angle), radius * np.cos(angle)) for angle in turns]
+    profile = [(-radius, 0), *dome, *((length - z, r) for z, r in reversed(dome)), (length + radius, 0)]
+    return turned(profile, cell, base=start, axis=way / length, segments=segments, smooth=True)
+
+
+def in_body(mesh: Mesh, category: str, body: str) -> Mesh:
+    """The mesh, given in the frame of the root body, in that of the body which is to carry it."""
+    parts, chain = load_facts(category).parts, []
+    while body != ROOT_BODY:
+        chain.append(parts[body])
+        body = parts[body].parent
+    for part in reversed(chain):
+        away = Mesh(mesh.vertices - np.asarray(part.pos), mesh.faces, mesh.texcoords)
+        mesh = away.rotated(np.multiply(part.quat, (1.0, -1.0, -1.0, -1.0)))
+    return mesh
+
+
+_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+
+
+def _chamfers(half: np.ndarray, inner: np.ndarray) -> list[list[np.ndarray]]:
+    """Twelve edges and eight corners of a box around the origin, cut off."""
+    outer, cuts = np.diag(half - inner), []
+    for one, two in combinations(range(3), 2):
+        third = 3 - one - two
+        for s, t in _CORNERS:
+            sign = np.ones(3)
+            sign[one], sign[two] = s, t
+            back = sign.copy()
+            sign[third], back[third] = 1.0, -1.0
+            a, b = outer[one], outer[two]
+            cuts.append([sign * (inner + a), back * (inner + a), back * (inner + b), sign * (inner + b)])
+    for sign in product((-1.0, 1.0), repeat=3):
+        cuts.append([np.array(sign) * (inner + step) for step in outer])
+    return cuts
+
+
+def _face_of(corners: Sequence[np.ndarray], half: np.ndarray) -> str:
+    share = np.mean(corners, axis=0) / half
+    axis = int(np.argmax(np.abs(share)))
+    return "xyz"[axis] + ("+" if share[axis] > 0 else "-")
+
+
+def _facet(corners: Sequence[np.ndarray], half: np.ndarray, face: str, cell: Cell) -> Mesh:
+    """Convex polygon of a body around the origin, turned outwards, with the picture of a face of its box."""
+    points = np.array(corners, float)
+    normal = np.cross(points[1] - points[0], points[2] - points[0])
+    if normal @ points.mean(axis=0) < 0:
+        points = points[::-1]
+    share = 0.5 + 0.5 * points @ np.transpose(_FACES[face]) / (np.abs(_FACES[face]) @ half)
+    fan = np.array([(0, i, i + 1) for i in range(1, len(points) - 1)])
+    return Mesh(points, fan, _within(share, cell))
+
+
+def _within(share: np.ndarray, cell: Cell) -> np.ndarray:
+    u0, v0, u1, v1 = cell
+    return (u0, v0) + share * (u1 - u0, v1 - v0)
