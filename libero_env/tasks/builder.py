@@ -4,21 +4,23 @@ A scene says what stands where; a task names its scene, fills in the scene's par
 to or replaces what the scene says. Keys of both:
 
     problem          name of the problem class, as in BDDL
-    language         what the task file's `:language` says
+    language         what the task file's `:language` says; by default the words of the task's name
     fixtures         name: category
     objects          categories in joint order; `plate` is plate_1, `{plate: 2}` is plate_1 and plate_2
     regions          target: {name: facts}; facts are empty for a site of the target's model, else `at` (x, y)
                      and `half` (one number or two), or `ranges` [[x0, y0, x1, y1], ...], with `yaw` (one
-                     angle or two) and `rgba`; metres and radians, angles may be arithmetic with pi
-    init             atoms such as `On plate_1 stove_1`
-    obj_of_interest  names
+                     angle or two) and `rgba`; metres and radians, angles may be arithmetic with pi.
+                     `target: [a, b]` are sites without facts
+    init             atoms such as `On plate_1 stove_1`; those of a task's `init_also` come first
+    obj_of_interest  names; by default the objects and then the fixtures that the goal speaks of, a region's
+                     target for the region
     scene_properties key: value
     goal             a list of atoms that must all hold, or one expression: `(Or (Open a) (Not (On b c)))`
 
 `$x` stands for the parameter x and `$x_0` for the first of a list; a region that a task sets to `null` goes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from string import Template
@@ -28,7 +30,7 @@ import yaml
 
 from libero_env import bddl
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.problem import And, Problem, Region
+from libero_env.problem import And, Atom, Expression, ForAll, Not, Problem, Region
 from libero_env.sexpr import number
 
 KEYS = (
@@ -38,10 +40,14 @@ KEYS = (
     "objects",
     "regions",
     "init",
+    "init_also",
     "obj_of_interest",
     "scene_properties",
     "goal",
 )
+
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where PyYAML has it
 
 
 @cache
@@ -55,7 +61,7 @@ def load_data(name: str) -> Any:
     file = folder.joinpath(*name.split("/"))
     if not file.is_file():
         raise UnknownNameError("task file", name, (entry.name for entry in folder.iterdir()))
-    return yaml.safe_load(file.read_text(encoding="utf-8"))
+    return yaml.load(file.read_text(encoding="utf-8"), _LOADER)
 
 
 def load_scene(name: str) -> Mapping[str, Any]:
@@ -78,31 +84,65 @@ def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
     for key in [*scene, *own]:
         if key not in KEYS:
             raise UnknownNameError(f"key of {where} or its scene", key, KEYS)
-    facts = {**scene, **own}
-    for key in ("regions", "fixtures", "scene_properties"):
+    facts = {"language": language_from_name(task.get("name", "")), **scene, **own}
+    facts["regions"] = _merge(_sites(scene.get("regions")), _sites(own.get("regions")))
+    for key in ("fixtures", "scene_properties"):
         facts[key] = _merge(scene.get(key) or {}, own.get(key) or {})
     facts = _fill(facts, _parameters(task.get("with", {})), where)
-    for key in ("problem", "language", "goal"):
+    for key in ("problem", "goal"):
         if key not in facts:
             raise LiberoError(f"{where}: neither it nor its scene says {key!r}; add it to the YAML")
     regions = tuple(_regions(facts["regions"]))
     objects = dict(_objects(facts.get("objects", [])))
     known = {*facts["fixtures"], *objects, *(region.address for region in regions)}
-    atom = lambda text: bddl.parse_atom(text, known, where)  # noqa: E731
+    atoms = lambda texts: tuple(bddl.parse_atom(text, known, where) for text in texts)  # noqa: E731
     goal = facts["goal"]
+    goal = bddl.parse_expression(goal, known, where) if isinstance(goal, str) else And(atoms(goal))
+    interest = facts.get("obj_of_interest")
+    if interest is None:
+        interest = _goal_things(goal, regions, objects, facts["fixtures"])
     return Problem(
         name=facts["problem"],
         language=facts["language"],
         fixtures=facts["fixtures"],
         objects=objects,
         regions=regions,
-        init=tuple(map(atom, facts.get("init", []))),
-        obj_of_interest=tuple(facts.get("obj_of_interest", [])),
+        init=atoms([*facts.get("init_also", []), *facts.get("init", [])]),
+        obj_of_interest=tuple(interest),
         scene_properties=facts["scene_properties"],
-        goal=bddl.parse_expression(goal, known, where)
-        if isinstance(goal, str)
-        else And(tuple(map(atom, goal))),
+        goal=goal,
     )
+
+
+def language_from_name(name: str) -> str:
+    """The instruction that a task's name spells: without the scene prefix (`KITCHEN_SCENE1_`)."""
+    words = name.split("_")
+    prefix = next((i + 1 for i, word in enumerate(words) if word.startswith("SCENE")), 0)
+    return " ".join(words[prefix:])
+
+
+def _goal_things(goal: Expression, regions: Iterable[Region], *declared: Iterable[str]) -> list[str]:
+    """The declared names that a goal speaks of, in the order declared."""
+    targets = {region.address: region.target for region in regions}
+    spoken = {targets.get(name, name) for name in _arguments(goal)}
+    return [name for names in declared for name in names if name in spoken]
+
+
+def _arguments(node: Expression) -> Iterable[str]:
+    if isinstance(node, Atom):
+        return node.args
+    if isinstance(node, ForAll):
+        return _arguments(node.body)
+    parts = (node.part,) if isinstance(node, Not) else node.parts
+    return [name for part in parts for name in _arguments(part)]
+
+
+def _sites(regions: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The regions with `target: [a, b]` written out as `target: {a: {}, b: {}}`."""
+    return {
+        target: {name: {} for name in facts} if isinstance(facts, list) else facts
+        for target, facts in (regions or {}).items()
+    }
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,9 +5,9 @@ from functools import cache
 from pathlib import Path
 
 from libero_env import bddl
-from libero_env.errors import UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.problem import Problem
-from libero_env.tasks.builder import build_problem, load_data, load_scene
+from libero_env.tasks.builder import build_problem, language_from_name, load_data, load_scene
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Task:
 
 @dataclass(frozen=True)
 class Suite:
-    """The tasks of a suite in the order of their index."""
+    """Tasks in their published order. Those of a suite that consists of others (LIBERO-100 is LIBERO-90 and
+    LIBERO-10) keep the suite and index that they have there, and with them their demonstrations and states."""
 
     name: str
     tasks: tuple[Task, ...]
@@ -59,8 +60,16 @@ class Suite:
 
 
 def suite_names() -> tuple[str, ...]:
-    """The names that `get_suite` knows."""
-    return tuple(load_data("suites.yaml"))
+    """The names that `get_suite` knows; a suite that consists of others comes after them."""
+    return tuple(_parts())
+
+
+def _parts() -> dict[str, list[str]]:
+    """Suite -> the suites it consists of; none for a suite with tasks of its own."""
+    found: dict[str, list[str]] = {}
+    for entry in load_data("suites.yaml"):
+        found |= entry if isinstance(entry, dict) else {entry: []}
+    return found
 
 
 @cache
@@ -70,16 +79,22 @@ def get_suite(name: str) -> Suite:
     Raises:
         UnknownNameError: no suite has this name; the message lists them.
     """
-    if name not in suite_names():
-        raise UnknownNameError("suite", name, suite_names())
+    parts = _parts()
+    if name not in parts:
+        raise UnknownNameError("suite", name, parts)
+    if parts[name]:
+        return Suite(name, tuple(task for part in parts[name] for task in get_suite(part).tasks))
     facts = load_data(f"{name}.yaml")
-    scenes = {scene: load_scene(scene) for scene in {task["scene"] for task in facts["tasks"]}}
-    tasks = []
-    for index, task in enumerate(facts["tasks"]):
-        problem = build_problem(scenes[task["scene"]], task)
-        language = language_from_name(task["name"])
-        tasks.append(Task(name, index, task["name"], language, problem.language, problem))
-    return Suite(name, tuple(tasks))
+    return Suite(name, tuple(_task(name, i, {**facts, **task}) for i, task in enumerate(facts["tasks"])))
+
+
+def _task(suite: str, index: int, facts: dict) -> Task:
+    name = facts["name"]
+    if "scene" not in facts:
+        raise LiberoError(f"task {name}: neither it nor {suite}.yaml says 'scene'; add it to the YAML")
+    own = {key: value for key, value in facts.items() if key != "tasks"}
+    problem = build_problem(load_scene(facts["scene"]), own)
+    return Task(suite, index, name, language_from_name(name), problem.language, problem)
 
 
 def get_task(key: str) -> Task:
@@ -109,10 +124,3 @@ def read_task(path: str | Path) -> Task:
     """
     problem, name = bddl.read(path), Path(path).stem
     return Task("file", 0, name, language_from_name(name), problem.language, problem)
-
-
-def language_from_name(name: str) -> str:
-    """The instruction that a task's name spells: without the scene prefix (`KITCHEN_SCENE1_`)."""
-    words = name.split("_")
-    prefix = next((i + 1 for i, word in enumerate(words) if word.startswith("SCENE")), 0)
-    return " ".join(words[prefix:])
