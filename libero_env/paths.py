@@ -2,6 +2,11 @@
 
 import os
 from pathlib import Path
+from typing import Any
+
+import yaml
+
+from libero_env.errors import LiberoError
 
 
 def cache_dir() -> Path:
@@ -16,3 +21,27 @@ def demos_dir() -> Path:
     if path := os.environ.get("LIBERO_DEMOS"):
         return Path(path).expanduser()
     return cache_dir() / "demos"
+
+
+def config_file() -> Path:
+    """`config.yaml` in `$LIBERO_CONFIG_PATH`, else in `~/.libero`; the original's tools write it, it need not exist."""
+    folder = os.environ.get("LIBERO_CONFIG_PATH")
+    return (Path(folder).expanduser() if folder else Path.home() / ".libero") / "config.yaml"
+
+
+def read_config() -> dict[str, Any]:
+    """The configuration file; empty where there is none.
+
+    Raises:
+        LiberoError: it cannot be read as YAML.
+    """
+    path = config_file()
+    if not path.is_file():
+        return {}
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise LiberoError(f"{path} is not valid YAML ({error}); mend or remove it") from error
+    if not isinstance(found, dict):
+        raise LiberoError(f"{path}: expected keys with values such as `assets: PATH`; mend or remove it")
+    return found
