@@ -106,6 +106,66 @@ def quad(corners: Sequence[Sequence[float]], cell: tuple[float, ...]) -> Mesh:
     return Mesh(np.array(corners, float), np.array([(0, 1, 2), (0, 2, 3)]), texcoords)
 
 
+def sweep(
+    path: Sequence[Sequence[float]],
+    half: Sequence[Sequence[float]],
+    across: Sequence[float],
+    segments: int,
+    cell: tuple[float, ...],
+    round: float = 2.0,
+) -> Mesh:
+    """Skin along a path that stays in one plane: handles, cutlery.
+
+    Args:
+        path: points of the middle line (n, 3), metres.
+        half: half extents of the section at each point (n, 2): along `across`, in the plane.
+        across: unit normal of the plane (3,).
+        segments: vertices around.
+        cell: (u0, v0, u1, v1) of the picture; u runs around, v along the path.
+        round: exponent of the section's superellipse, as in `Ring`.
+    """
+    points, across, (u0, v0, u1, v1) = np.asarray(path, float), np.asarray(across, float), cell
+    along = np.gradient(points, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    rows, coords = [], []
+
+    def add(index: int, size: float) -> None:
+        ring = Ring(0.0, size * half[index][0], size * half[index][1], 0.0, round)
+        section, texcoords = _section(ring, segments, (0.0, 0.0))
+        inwards = np.cross(along[index], across)
+        rows.append(points[index] + section[:, :1] * across + section[:, 1:2] * inwards)
+        v = v0 + (v1 - v0) * length[index] / length[-1]
+        coords.append(np.column_stack([u0 + (u1 - u0) * texcoords[:, 0], np.full(segments + 1, v)]))
+
+    last = len(points) - 1
+    for index, size in [(0, 0.0), (0, 1.0), *((i, 1.0) for i in range(last + 1)), (last, 1.0), (last, 0.0)]:
+        add(index, size)
+    bands = [(0, 1), *((i, i + 1) for i in range(2, last + 2)), (last + 3, last + 4)]
+    faces = np.concatenate([_band(low, high, segments) for low, high in bands])
+    vertices = np.concatenate(rows)
+    return Mesh(vertices, _without_degenerate(vertices, faces), np.concatenate(coords))
+
+
+def seamless(mesh: Mesh, segments: int) -> Mesh:
+    """A loft or sweep closed where its picture begins and ends, so that light shows no seam there.
+
+    The picture then covers each half around, mirrored: u is 0 where the seam was and 1 opposite of it.
+    """
+    row, column = np.divmod(np.arange(len(mesh.vertices)), segments + 1)
+    index = row * segments + column % segments
+    kept = column < segments
+    texcoords = mesh.texcoords[kept] * 1.0
+    texcoords[:, 0] = 1.0 - np.abs(2.0 * texcoords[:, 0] - 1.0)
+    return Mesh(mesh.vertices[kept], index[mesh.faces], texcoords)
+
+
+def faceted(mesh: Mesh) -> Mesh:
+    """The mesh with flat triangles: none shares a vertex with another."""
+    corners = mesh.faces.ravel()
+    return Mesh(mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3), mesh.texcoords[corners])
+
+
 def merge(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles in one mesh."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])

@@ -33,6 +33,14 @@ class Canvas:
         """Fills a band over the whole width."""
         self.rect(0.0, v0, 1.0, v1, color)
 
+    def gradient(self, v0: float, v1: float, low: Color, high: Color) -> None:
+        """Fills a band over the whole width, from one color at v0 to another at v1."""
+        (_, y1), (x1, y0) = self._at(0.0, v0), self._at(1.0, v1)
+        for y in range(round(y0), round(y1)):
+            share = (y1 - y) / (y1 - y0)
+            color = tuple(round(a + share * (b - a)) for a, b in zip(low, high, strict=True))
+            self._draw.line((0, y, x1, y), fill=color)
+
     def disc(self, u: float, v: float, ru: float, rv: float, color: Color) -> None:
         """Fills an ellipse with half axes (ru, rv)."""
         (x0, y1), (x1, y0) = self._at(u - ru, v - rv), self._at(u + ru, v + rv)
