@@ -78,13 +78,13 @@ class ControllerState:
         self.goal_pos[i], self.goal_mat[i], self.gripper[i] = vector[:3], vector[3:12], vector[12:14]
 
 
-def checked_actions(actions: object, num: int | None = None) -> np.ndarray:
-    """Actions as float64, (7,) or (num, 7).
+def checked_actions(actions: object, num: int | None = None, size: int = ACTION_DIM) -> np.ndarray:
+    """Actions as float64, (size,) or (num, size).
 
     Raises:
         ActionError: wrong shape, or a value that is not finite. Values outside [-1, 1] are clipped by the controller.
     """
-    shape = (ACTION_DIM,) if num is None else (num, ACTION_DIM)
+    shape = (size,) if num is None else (num, size)
     try:
         array = np.asarray(actions, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -229,7 +229,7 @@ def control(
             for r in range(3):
                 tau += jac[r, j] * (force[r] - task_pull[r]) + jac[3 + r, j] * (torque[r] - task_pull[3 + r])
             ctrl[i, j] = min(max(tau, -torque_limit[j]), torque_limit[j])
-        _move_gripper(actions[i, 6], gripper[i], ctrl[i], finger_range)
+        _move_gripper(actions[i, actions.shape[1] - 1], gripper[i], ctrl[i], finger_range)
 
 
 @njit(cache=True, nogil=True)
