@@ -1,0 +1,126 @@
+"""Reading the original's MJCF files the way its loader did, with MuJoCo's own reader behind it.
+
+The files rely on what that loader overlooked: it wrote default classes into the elements and dropped `<compiler>` and
+`<size>`, it took the first of two assets of one name, and the mass of a body from collision geoms (group 0) only.
+"""
+
+import copy
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from libero_env.errors import LiberoError
+from libero_env.objects.builtin.assemble import GLOWING_SITES, HIDDEN_GROUP
+from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
+
+REMEDY = "`libero assets check` lists what is missing, `libero assets download` fetches it"
+_OF_BODIES = ("body", "geom", "inertial", "joint", "site")
+_OF_ASSETS = ("material", "mesh", "texture")
+_REFERENCES = ("material", "mesh", "texture")
+
+
+def read_file(path: Path) -> tuple[list[ET.Element], ET.Element]:
+    """Assets, with absolute paths, and world body of a file, its default classes written out.
+
+    Raises:
+        LiberoError: the file is missing or no XML.
+    """
+    try:
+        root = ET.parse(path).getroot()
+    except (OSError, ET.ParseError) as error:
+        raise LiberoError(f"{path}: {error}; {REMEDY}") from error
+    world = root.find("worldbody")
+    if world is None:
+        raise LiberoError(f"{path}: no <worldbody>; {REMEDY}")
+    classes = {c.get("class"): {e.tag: e.attrib for e in c} for c in root.findall("default/default")}
+    for element in world.iter():
+        for key, value in classes.get(element.attrib.pop("class", None), {}).get(element.tag, {}).items():
+            element.attrib.setdefault(key, value)
+    assets: dict[tuple[str, str], ET.Element] = {}
+    for element in root.findall("asset/*"):
+        if "file" in element.attrib:
+            element.set("file", str((path.parent / element.attrib["file"]).absolute()))
+            if element.tag == "mesh":
+                element.attrib.setdefault("name", Path(element.attrib["file"]).stem)
+        if element.tag in _OF_ASSETS:
+            assets.setdefault((element.tag, element.get("name", "")), element)
+    return list(assets.values()), world
+
+
+@lru_cache(maxsize=64)
+def object_xml(path: Path, category: str) -> str:
+    """MJCF of an object: one body `main` with what the file has below its body `object`.
+
+    Raises:
+        LiberoError: a file is missing or not as expected.
+    """
+    assets, world = read_file(path)
+    body = world.find("body/body[@name='object']")
+    if body is None:
+        raise LiberoError(f"{path}: no body named 'object' below the outer body; {REMEDY}")
+    body.attrib = {"name": ROOT_BODY}  # where it stands is up to the scene
+    _keep(body, _OF_BODIES)
+    for joint in body.findall("joint"):
+        body.remove(joint)
+    for number, geom in enumerate(body.iter("geom")):
+        geom.attrib.setdefault("name", f"g{number}")
+        if geom.get("group") == "1":
+            geom.set("mass", "0")
+    for site in body.iter("site"):
+        site.set("group", str(GLOW_GROUP if site.get("name") in GLOWING_SITES else _group(site)))
+    hidden = {"size": "0.002", "rgba": "0 0 0 0", "group": str(HIDDEN_GROUP)}
+    ET.SubElement(body, "site", {"name": "default_site", "pos": "0 0 0", **hidden})
+    assets = used_assets(assets, body)
+    for element in (*assets, *body.iter()):
+        _prefix(element, f"{category}_")
+    return to_xml(category, assets, [body])
+
+
+def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Element]:
+    """The assets that these elements need, and no others: files of the others may be missing.
+
+    Raises:
+        LiberoError: a file that is needed is missing.
+    """
+    wanted = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _REFERENCES}
+    wanted |= {("texture", a.get("texture")) for a in assets if (a.tag, a.get("name")) in wanted}
+    kept = [a for a in assets if (a.tag, a.get("name")) in wanted or a.get("type") == "skybox"]
+    for asset in kept:
+        if (file := asset.get("file")) and not Path(file).is_file():
+            raise LiberoError(f"{file}: no such file; {REMEDY}")
+    return kept
+
+
+def to_xml(name: str, assets: Iterable[ET.Element], bodies: Iterable[ET.Element]) -> str:
+    """A file of its own: angles in radians; masses of collision geoms only; meshes may be open."""
+    root = ET.Element("mujoco", {"model": name})
+    ET.SubElement(root, "compiler", {"angle": "radian", "inertiagrouprange": "0 0", "autolimits": "true"})
+    section = ET.SubElement(root, "asset")
+    for asset in assets:
+        asset = copy.copy(asset)
+        if asset.tag == "mesh":
+            asset.set("inertia", "shell")  # of visual meshes, which weigh nothing: the volume need not be closed
+        section.append(asset)
+    ET.SubElement(root, "worldbody").extend(bodies)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _keep(body: ET.Element, tags: Iterable[str]) -> None:
+    for child in list(body):
+        if child.tag not in tags:
+            body.remove(child)
+        elif child.tag == "body":
+            _keep(child, tags)
+
+
+def _group(site: ET.Element) -> int:
+    rgba = site.get("rgba", "0.5 0.5 0.5 1").split()
+    return int(site.get("group", "0")) if float(rgba[-1]) > 0 else HIDDEN_GROUP
+
+
+def _prefix(element: ET.Element, prefix: str) -> None:
+    keys = ("name", *_REFERENCES) if element.tag in _OF_ASSETS else _REFERENCES
+    for key in keys:
+        if key in element.attrib:
+            element.set(key, prefix + element.attrib[key])
