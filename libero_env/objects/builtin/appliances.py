@@ -3,9 +3,19 @@
 import numpy as np
 
 from libero_env.objects.builtin.assemble import Look
-from libero_env.objects.builtin.joinery import Palette, bar, block, capsule, in_body, prism, turned
+from libero_env.objects.builtin.joinery import (
+    TILE,
+    Palette,
+    bar,
+    block,
+    capsule,
+    in_body,
+    outline_of,
+    prism,
+    turned,
+)
 from libero_env.objects.builtin.mesh import Mesh, merge
-from libero_env.objects.builtin.paint import Canvas
+from libero_env.objects.builtin.paint import Canvas, Color
 from libero_env.objects.builtin.surfaces import brushed, edged, painted, plain
 
 BURNER = (0.15, 0.0)  # axis of the burner, root frame
@@ -21,7 +31,7 @@ def microwave() -> dict[str, Look | tuple[Look, ...]]:
         "inside": plain((202, 200, 192)),
         "floor": painted(_turntable()),
         "keys": painted(_keypad()),
-        "metal": brushed((196, 198, 202), seed=32),
+        "metal": brushed((196, 198, 202), seed=32, depth=0.04, upright=True),
         "rubber": plain((32, 32, 34)),
     }
     palette = Palette(tiles)
@@ -33,7 +43,7 @@ def microwave() -> dict[str, Look | tuple[Look, ...]]:
         "main": Look(_microwave_shell(palette), picture, specular=0.5, shininess=0.6, frame="body"),
         "microdoorroot": (
             Look(door, picture, specular=0.5, shininess=0.6, frame="body"),
-            Look(pane, glass.png(), specular=0.9, shininess=0.9, alpha=0.62, frame="body"),
+            Look(pane, glass.png(), specular=0.9, shininess=0.9, alpha=0.55, frame="body"),
         ),
     }
 
@@ -41,11 +51,11 @@ def microwave() -> dict[str, Look | tuple[Look, ...]]:
 def short_fridge() -> dict[str, Look]:
     """Brushed silver, white inside, a steel rail as handle."""
     tiles = {
-        "shell": brushed((168, 172, 178), seed=40, upright=True),
-        "door": edged(brushed((190, 194, 200), seed=41, upright=True), width=3, shade=0.85),
+        "shell": brushed((172, 176, 182), seed=40, depth=0.03, upright=True),
+        "door": edged(brushed((196, 200, 206), seed=41, depth=0.03, upright=True), width=3, shade=0.85),
         "inside": plain((236, 239, 242)),
         "shelf": plain((196, 214, 226)),
-        "metal": brushed((122, 126, 132), seed=42, upright=True),
+        "metal": brushed((122, 126, 132), seed=42, depth=0.03, upright=True),
         "rubber": plain((48, 48, 52)),
         "lamp": plain((255, 244, 205)),
     }
@@ -61,8 +71,8 @@ def short_fridge() -> dict[str, Look]:
 def flat_stove() -> dict[str, Look]:
     """Steel plate with a black ridged burner, and a black knob beside it."""
     tiles = {
-        "steel": brushed((186, 189, 194), seed=50),
-        "burner": _ridges((34, 34, 38), (18, 18, 20)),
+        "steel": brushed((186, 189, 194), seed=50, depth=0.03),
+        "burner": _enamel((74, 74, 80), (14, 14, 16)),
         "knob": plain((40, 41, 46)),
         "grip": plain((58, 59, 66)),
         "mark": plain((240, 240, 236)),
@@ -96,7 +106,9 @@ def _microwave_shell(palette: Palette) -> Mesh:
             block((0.0635, -0.0880, 0.0050), (0.1723, 0.1105, 0.1867), shell, faces={"x-": inside}),
             block((-0.1435, 0.0805, 0.0050), (0.0635, 0.1105, 0.1867), shell, faces={"y-": inside}),
             block((-0.1435, -0.0880, 0.1680), (0.0635, 0.0805, 0.1867), shell, faces={"z-": inside}),
-            block((-0.1435, -0.0880, 0.0050), (0.0635, 0.0805, 0.0240), shell, faces={"z+": palette["floor"]}),
+            block(
+                (-0.1435, -0.0880, 0.0050), (0.0635, 0.0805, 0.0240), shell, faces={"z+": palette["floor"]}
+            ),
             block(
                 (0.0875, -0.1105, 0.0050),
                 (0.1723, -0.0865, 0.1867),
@@ -163,7 +175,7 @@ def _fridge_body(palette: Palette) -> Mesh:
     ]
     return merge(
         [
-            block((-0.1000, 0.0733, 0.0242), (0.1000, 0.0988, 0.2690), shell, faces={"y-": inside}),
+            block((-0.0975, 0.0733, 0.0242), (0.0995, 0.0988, 0.2690), shell, faces={"y-": inside}),
             block((0.0882, -0.0903, 0.0242), (0.0995, 0.0734, 0.2690), shell, faces={"x-": inside}),
             block((-0.0975, -0.0903, 0.0242), (-0.0860, 0.0734, 0.2690), shell, faces={"x+": inside}),
             block((-0.0860, -0.0900, 0.2603), (0.0882, 0.0734, 0.2690), shell, faces={"z-": inside}),
@@ -195,27 +207,40 @@ def _fridge_door(palette: Palette) -> Mesh:
     )
 
 
-def _ridges(peak: tuple[int, int, int], valley: tuple[int, int, int]) -> np.ndarray:
-    """Dark enamel; the picture's height is the way from below over the rim to the middle."""
-    tile = plain(valley)
-    tile[:64] = peak
-    return tile
-
-
 def _burner_plate(palette: Palette) -> Mesh:
-    rim, valley, half = 0.0650, GLOW_HEIGHT, 0.0035
+    return turned(_ripples(), palette["burner"], base=(*BURNER, 0.0), segments=24)
+
+
+def _ripples() -> list[tuple[float, float]]:
+    """Profile of the burner: a rim, and ridges with flat tops."""
+    rim, half = 0.0650, 0.0035
     profile = [(0.0195, rim), (RIDGE_HEIGHT - 0.0005, rim), (RIDGE_HEIGHT, rim - 0.001)]
     for index, radius in enumerate(reversed(RIDGES)):
         if index:
-            profile += [(valley, radius + half), (RIDGE_HEIGHT, radius + 0.4 * half)]
-        profile += [(RIDGE_HEIGHT, radius - 0.4 * half), (valley, radius - half)]
-    plate = turned(profile, palette["burner"], base=(*BURNER, 0.0), segments=24)
-    return plate
+            profile += [(GLOW_HEIGHT, radius + half), (RIDGE_HEIGHT, radius + 0.4 * half)]
+        profile += [(RIDGE_HEIGHT, radius - 0.4 * half), (GLOW_HEIGHT, radius - half)]
+    return profile
+
+
+def _enamel(peak: Color, valley: Color) -> np.ndarray:
+    """Worn bright on the ridges; the picture's height is the way along the profile."""
+    points, way = outline_of(_ripples())
+    height = np.interp((np.arange(TILE)[::-1] + 0.5) / TILE, way, points[:, 0])  # first row on top
+    share = np.clip((height - GLOW_HEIGHT) / (RIDGE_HEIGHT - GLOW_HEIGHT), 0.0, 1.0) ** 3
+    rows = np.add(np.multiply.outer(1 - share, valley), np.multiply.outer(share, peak))
+    return np.repeat(rows[:, None], TILE, axis=1).astype(np.uint8)
 
 
 def _knob(palette: Palette) -> Mesh:
     center, outline = (-0.0045, 0.0012, 0.0), [(0.0, 0.0475), (0.0095, 0.0475), (0.0128, 0.0440)]
-    grip = [(-0.0480, 0.0020), (0.0390, 0.0020), (0.0390, 0.0310), (0.0270, 0.0425), (0.0100, 0.0500), (-0.0480, 0.0500)]
+    grip = [
+        (-0.0480, 0.0020),
+        (0.0390, 0.0020),
+        (0.0390, 0.0310),
+        (0.0270, 0.0425),
+        (0.0100, 0.0500),
+        (-0.0480, 0.0500),
+    ]
     mark = [(0.0100, 0.0495), (0.0270, 0.0420), (0.0280, 0.0429), (0.0110, 0.0503)]
     return merge(
         [

@@ -11,6 +11,7 @@ import numpy as np
 
 from libero_env.objects.builtin.facts import Facts, Part, load_facts
 from libero_env.objects.builtin.mesh import Mesh
+from libero_env.objects.builtin.stops import add_stops
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel, rest_quat, set_damping
 
 HIDDEN_GROUP = 3
@@ -62,6 +63,7 @@ def build(category: str, look: Callable[[], Looks]) -> ObjectModel:
         _add_joint(bodies[name], part)
         _add_collision(bodies[name], part, facts, numbers)
         _add_sites(bodies[name], part, name == ROOT_BODY)
+    add_stops(spec, category)
     looks = look()
     turned = _conjugate(rest_quat(facts.rotation))
     for name, several in looks.items() if isinstance(looks, Mapping) else [(ROOT_BODY, looks)]:

@@ -7,7 +7,11 @@ from libero_env.objects.builtin.joinery import Cell, Palette, bar, block, in_bod
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.surfaces import brushed, edged, panelled, plain, wood
 
-DRAWERS = {"cabinet_top": 0.0698, "cabinet_middle": 0.0, "cabinet_bottom": -0.0686}  # body -> height over the middle one
+DRAWERS = {
+    "cabinet_top": 0.0698,
+    "cabinet_middle": 0.0,
+    "cabinet_bottom": -0.0686,
+}  # body -> height over the middle one
 HANDLES = {"cabinet_top": 0.1839, "cabinet_middle": 0.1104, "cabinet_bottom": 0.0411}
 SHORT_DRAWERS = {"drawer_top": 0.0460, "drawer_middle": 0.0, "drawer_bottom": -0.0473}
 
@@ -55,7 +59,7 @@ def short_cabinet() -> dict[str, Look]:
 
 def slide_cabinet() -> dict[str, Look]:
     """Blue-grey cupboard: one half closed, a sliding door with a bar before the other."""
-    paint = wood((122, 138, 164), seed=20, depth=0.05)
+    paint = brushed((122, 138, 164), seed=20, depth=0.008)
     tiles = {
         "outside": paint,
         "door": edged(panelled(paint, (0.12, 0.12), shade=0.8), width=3, shade=0.85),
@@ -92,11 +96,17 @@ def _chest(category: str, palette: Palette, *, specular: float) -> dict[str, Loo
 
 def _chest_base(palette: Palette) -> Mesh:
     outside, side, inside = palette["outside"], palette["side"], palette["inside"]
-    boards = [block((-0.1079, -0.0709, z - 0.0012), (0.1158, 0.1082, z + 0.0012), inside) for z in (0.0793, 0.1494)]
+    boards = [
+        block((-0.1079, -0.0709, z - 0.0012), (0.1158, 0.1082, z + 0.0012), inside) for z in (0.0793, 0.1494)
+    ]
     return merge(
         [
-            block((-0.1173, -0.0792, 0.0080), (-0.1070, 0.1117, 0.2190), side, faces={"x+": inside}, bevel=0.001),
-            block((0.1138, -0.0792, 0.0080), (0.1241, 0.1117, 0.2190), side, faces={"x-": inside}, bevel=0.001),
+            block(
+                (-0.1173, -0.0792, 0.0080), (-0.1070, 0.1117, 0.2190), side, faces={"x+": inside}, bevel=0.001
+            ),
+            block(
+                (0.1138, -0.0792, 0.0080), (0.1241, 0.1117, 0.2190), side, faces={"x-": inside}, bevel=0.001
+            ),
             block((-0.1175, 0.1071, 0.0084), (0.1215, 0.1117, 0.2190), outside, faces={"y-": inside}),
             block((-0.1189, -0.0735, 0.0046), (0.1270, 0.1062, 0.0102), outside, faces={"z+": inside}),
             block((-0.1245, -0.0799, 0.2177), (0.1316, 0.1117, 0.2226), outside, bevel=0.0012),
@@ -119,7 +129,10 @@ def _chest_drawer(palette: Palette, shift: float, handle: float) -> Mesh:
             ),
             *_tray((-0.1046, -0.0704, low), (0.1116, 0.0943, high), 0.0054, 0.0072, inside),
             bar((-0.0472, -0.1019, handle), (0.0417, -0.1019, handle), 0.0081, metal),
-            *(bar((x, -0.1000, handle), (x, -0.0775, handle), 0.0053, metal, segments=8) for x in (-0.0356, 0.0292)),
+            *(
+                bar((x, -0.1000, handle), (x, -0.0775, handle), 0.0053, metal, segments=8)
+                for x in (-0.0356, 0.0292)
+            ),
         ]
     )
 
@@ -137,13 +150,21 @@ def _tray(low: np.ndarray, high: np.ndarray, wall: float, floor: float, cell: Ce
 
 def _short_base(palette: Palette) -> Mesh:
     outside, side, inside = palette["outside"], palette["side"], palette["inside"]
-    boards = [block((-0.0987, -0.0935, z - 0.001), (0.0987, 0.0935, z + 0.001), inside) for z in (0.0746, 0.1217)]
+    boards = [
+        block((-0.0987, -0.0935, z - 0.001), (0.0987, 0.0935, z + 0.001), inside) for z in (0.0746, 0.1217)
+    ]
     return merge(
         [
             block((0.0980, -0.0935, 0.0280), (0.1012, 0.0935, 0.1718), side, faces={"x-": inside}),
             block((-0.1012, -0.0935, 0.0280), (-0.0980, 0.0935, 0.1718), side, faces={"x+": inside}),
             block((-0.1012, -0.0950, 0.1684), (0.1012, 0.0935, 0.1724), outside, bevel=0.001),
-            block((-0.1008, 0.0924, 0.0283), (0.1008, 0.0960, 0.1830), outside, bevel=0.001, faces={"y-": outside}),
+            block(
+                (-0.1008, 0.0924, 0.0283),
+                (0.1008, 0.0960, 0.1830),
+                outside,
+                bevel=0.001,
+                faces={"y-": outside},
+            ),
             *boards,
         ]
     )
@@ -161,7 +182,9 @@ def _short_drawer(palette: Palette, shift: float) -> Mesh:
                 bevel=0.001,
                 faces={"y+": inside, "z+": inside},
             ),
-            *_tray((-0.0964, -0.0836, 0.0790 + shift), (0.0964, 0.0905, 0.1184 + shift), 0.0072, 0.0069, inside),
+            *_tray(
+                (-0.0964, -0.0836, 0.0790 + shift), (0.0964, 0.0905, 0.1184 + shift), 0.0072, 0.0069, inside
+            ),
             *(
                 bar((*one, z), (*two, z), 0.0021, metal, segments=8)
                 for one, two in zip(bend[:-1], bend[1:], strict=True)
@@ -178,7 +201,13 @@ def _slide_base(palette: Palette) -> Mesh:
             block((-0.2290, -0.15, 0.08), (0.0, 0.15, 0.10), outside, faces={"z-": inside}),
             block((-0.2290, -0.15, -0.08), (-0.2020, 0.15, 0.08), outside, faces={"x+": inside}),
             block((-0.2020, 0.126, -0.08), (0.0, 0.15, 0.08), outside, faces={"y-": inside}),
-            block((-0.001, -0.15, -0.10), (0.2250, 0.15, 0.10), outside, bevel=0.002, faces={"x-": inside, "y-": front}),
+            block(
+                (-0.001, -0.15, -0.10),
+                (0.2250, 0.15, 0.10),
+                outside,
+                bevel=0.002,
+                faces={"x-": inside, "y-": front},
+            ),
         ]
     )
 
@@ -187,8 +216,13 @@ def _slide_door(palette: Palette) -> Mesh:
     metal = palette["metal"]
     return merge(
         [
-            block((-0.2350, -0.1850, -0.0975), (-0.0100, -0.1550, 0.0975), palette["outside"], bevel=0.002,
-                  faces={"y-": palette["door"]}),
+            block(
+                (-0.2350, -0.1850, -0.0975),
+                (-0.0100, -0.1550, 0.0975),
+                palette["outside"],
+                bevel=0.002,
+                faces={"y-": palette["door"]},
+            ),
             bar((-0.2140, -0.2215, -0.0795), (-0.2140, -0.2215, 0.0795), 0.0110, metal, segments=12),
             *(bar((-0.2140, -0.2200, z), (-0.2140, -0.1840, z), 0.0090, metal) for z in (-0.057, 0.057)),
         ]

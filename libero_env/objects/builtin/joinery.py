@@ -110,21 +110,26 @@ def turned(
     """Body of revolution.
 
     Args:
-        profile: (height, radius), metres, going up on the outside; it starts and ends on the axis.
+        profile: (height, radius), metres, going up on the outside; its ends are joined to the axis.
         cell: part of the picture; its height is the way along the profile.
         base: where height 0 is, (3,), metres.
         axis: unit vector (3,) in which the height grows.
         segments: corners around.
         smooth: shade without edges.
     """
-    points = np.array([(0.0, 0.0), *profile, (0.0, 0.0)])
-    points[0, 0], points[-1, 0] = points[1, 0], points[-2, 0]
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    rings = [Ring(z, r, r, v, crease=not smooth) for (z, r), v in zip(points, way / way[-1], strict=True)]
+    points, way = outline_of(profile)
+    rings = [Ring(z, r, r, v, crease=not smooth) for (z, r), v in zip(points, way, strict=True)]
     mesh, quat = loft(rings, segments), np.empty(4)
     mujoco.mju_quatZ2Vec(quat, np.asarray(axis, float))
     mesh = mesh.rotated(quat)
     return Mesh(mesh.vertices + np.asarray(base), mesh.faces, _within(mesh.texcoords, cell))
+
+
+def outline_of(profile: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """A profile from axis to axis, (n, 2), and how far along it each point lies, (n,) in 0..1."""
+    points = np.array([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return points, way / way[-1]
 
 
 def bar(
