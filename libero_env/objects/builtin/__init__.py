@@ -6,7 +6,8 @@ from libero_env.objects.builtin.bottles import LOOKS as _BOTTLES
 from libero_env.objects.builtin.boxes import LOOKS as _BOXES
 from libero_env.objects.builtin.cans import LOOKS as _CANS
 from libero_env.objects.builtin.cartons import LOOKS as _CARTONS
+from libero_env.objects.builtin.cookware import LOOKS as _COOKWARE
 from libero_env.objects.builtin.mugs import LOOKS as _MUGS
 from libero_env.objects.builtin.tableware import LOOKS as _TABLEWARE
 
-BUILDERS = builders_of({**_BASKET, **_BOTTLES, **_BOXES, **_CANS, **_CARTONS, **_TABLEWARE, **_MUGS})
+BUILDERS = builders_of({**_BASKET, **_BOTTLES, **_BOXES, **_CANS, **_CARTONS, **_TABLEWARE, **_MUGS, **_COOKWARE})
