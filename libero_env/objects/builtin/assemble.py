@@ -39,7 +39,7 @@ class Look:
     frame: str = "rest"
 
 
-# Of the root body, or of several: body name (`main` is the root) -> its look, or several, such as a frame and its glass.
+# Of the root body, or of several: body name (`main` is the root) -> its look, or several: a frame and its glass.
 Looks = Look | Mapping[str, Look | tuple[Look, ...]]
 
 

@@ -19,6 +19,17 @@ STOPS: Mapping[str, tuple[tuple[str, str], ...]] = {  # category -> pairs of col
 
 
 def add_stops(spec: mujoco.MjSpec, category: str) -> None:
-    """Lets those shapes of an object collide that its category names."""
+    """Lets those shapes of an object collide that its category names, as its shapes touch others."""
+    geoms = {geom.name: geom for geom in spec.geoms}
     for fixed, moving in STOPS.get(category, ()):
-        spec.add_pair(name=f"stop_{fixed}_{moving}", geomname1=fixed, geomname2=moving)
+        one = geoms[moving]
+        slide, spin, roll = one.friction
+        spec.add_pair(
+            name=f"stop_{fixed}_{moving}",
+            geomname1=fixed,
+            geomname2=moving,
+            condim=one.condim,
+            friction=(slide, slide, spin, roll, roll),
+            solref=one.solref,
+            solimp=one.solimp,
+        )
