@@ -6,7 +6,9 @@ The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:la
 arithmetic with `pi`; nothing in a file is ever executed.
 """
 
+import re
 from collections.abc import Collection, Iterable, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -55,6 +57,8 @@ SECTIONS = (
     ":goal",
 )
 
+_PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
+
 
 def parse(text: str, file: str = "<string>") -> Problem:
     """Read a task from BDDL text; `file` is only for messages.
@@ -68,7 +72,12 @@ def parse(text: str, file: str = "<string>") -> Problem:
 
 def read(path: str | Path) -> Problem:
     """Read a task file; see `parse`."""
-    return parse(Path(path).read_text(encoding="utf-8"), str(path))
+    content = Path(path).read_bytes()
+    try:
+        return parse(content.decode("utf-8-sig"), str(path))
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        fail(str(path), line, f"the byte 0x{content[error.start]:02x}", "UTF-8 text")
 
 
 def parse_expression(text: str, known: Collection[str], file: str = "<string>") -> Expression:
@@ -118,15 +127,8 @@ def _block(head: str, lines: Iterable[str]) -> str:
 
 
 def _typed_names(names: Mapping[str, str]) -> list[str]:
-    lines: list[str] = []
-    previous = None
-    for name, category in names.items():
-        if category == previous:
-            lines[-1] = f"{lines[-1].removesuffix(f' - {category}')} {name} - {category}"
-        else:
-            lines.append(f"{name} - {category}")
-        previous = category
-    return lines
+    groups = groupby(names, key=names.__getitem__)
+    return [f"{' '.join(group)} - {category}" for category, group in groups]
 
 
 def _region_text(region: Region) -> str:
@@ -191,7 +193,7 @@ class _Reader:
                     line, f"no ({needed} ...) section", f"all of {', '.join(SECTIONS)} but the optional ones"
                 )
         items = {key: section.items[1:] for key, section in sections.items()}
-        regions = tuple(self.region(item) for item in items.get(":regions", ()))
+        regions = self.regions(items.get(":regions", ()))
         fixtures, objects = self.names(sections[":fixtures"]), self.names(sections[":objects"])
         known = {*fixtures, *objects, *(region.address for region in regions)}
         goal_line, goals = sections[":goal"].line, items[":goal"]
@@ -242,13 +244,26 @@ class _Reader:
             self.fail(line, f"{name} has no category", "NAME NAME - CATEGORY")
         return found
 
+    def regions(self, nodes: tuple[Word | List, ...]) -> tuple[Region, ...]:
+        found: dict[str, Region] = {}
+        for node in nodes:
+            region = self.region(node)
+            if region.address in found:
+                self.fail(node.line, f"{region.address} is declared twice", "each region of a target once")
+            found[region.address] = region
+        return tuple(found.values())
+
     def region(self, node: Word | List) -> Region:
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not a region: {show(node)}", "(NAME (:target NAME) ...)")
         found: dict[str, Any] = {}
+        seen: set[str] = set()
         for part in node.items[1:]:
             head = part.head if isinstance(part, List) and len(part.items) == 2 else ""
             value = part.items[1] if isinstance(part, List) and head else part
+            if head in seen:
+                self.fail(part.line, f"a second {head} in a region", "one")
+            seen.add(head)
             if head == ":target":
                 found["target"] = self.word(value)
             elif head in (":ranges", ":yaw_rotation"):
@@ -285,6 +300,8 @@ class _Reader:
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not an atom: {show(node)}", "(PREDICATE NAME ...)")
         predicate, *args = map(self.word, node.items)
+        if not _PREDICATE.fullmatch(predicate):
+            self.fail(node.line, f"{predicate} is no predicate", "letters, such as On, In, Open or Turnon")
         for name, item in zip(args, node.items[1:], strict=True):
             if name not in known:
                 valid = ", ".join(sorted(known)) or "a name, but none is declared"

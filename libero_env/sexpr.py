@@ -1,14 +1,17 @@
 """S-expressions: text -> nested lists of words that remember their line, and numbers as arithmetic."""
 
-import ast
 import math
-import operator
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
 
 from libero_env.errors import BDDLError
+
+MAX_DEPTH = 64  # brackets in brackets; deeper is a mistake, and what walks a tree is recursive
+
+_TOKEN = re.compile(r";[^\n]*|[()]|\n|[^\s();]+")
+_UNREADABLE = re.compile("[\x00-\x08\x0e-\x1f\x7f\ud800-\udfff]")
+_SHOWN = 80  # characters of a node in a message
 
 
 @dataclass(frozen=True)
@@ -38,22 +41,33 @@ def fail(file: str, line: int, what: str, expected: str) -> NoReturn:
 
 
 def show(node: Word | List) -> str:
-    """The node as text, on one line."""
-    return node.text if isinstance(node, Word) else f"({' '.join(map(show, node.items))})"
+    """The node as text, on one line, its end left off where it is long."""
+    text = _text(node)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+def _text(node: Word | List) -> str:
+    return node.text if isinstance(node, Word) else f"({' '.join(map(_text, node.items))})"
 
 
 def parse_tree(text: str, file: str) -> List:
     """The one list that the text holds; `;` starts a comment.
 
     Raises:
-        BDDLError: brackets do not match, or the text is not one list.
+        BDDLError: brackets do not match or go too deep, the text is not one list, or it holds characters that
+            no text file has.
     """
+    if bad := _UNREADABLE.search(text):
+        line = text.count("\n", 0, bad.start()) + 1
+        fail(file, line, f"the character {bad[0]!a}", "text; is this a task file, and is it whole?")
     stack: list[tuple[list, int]] = [([], 1)]
     line = 1
-    for token in re.findall(r";[^\n]*|[()]|\n|[^\s();]+", text):
+    for token in _TOKEN.findall(text):
         if token == "\n":
             line += 1
         elif token == "(":
+            if len(stack) > MAX_DEPTH:
+                fail(file, line, f"more than {MAX_DEPTH} brackets inside each other", "a flatter expression")
             stack.append(([], line))
         elif token == ")":
             if len(stack) == 1:
@@ -71,14 +85,10 @@ def parse_tree(text: str, file: str) -> List:
     return roots[0]
 
 
-_OPERATORS: dict[type, Callable[..., float]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.UAdd: operator.pos,
-    ast.USub: operator.neg,
-}
+_FACTOR = re.compile(
+    r"\s*([-+*/]?)((?:\s*[-+])*)\s*(?:((?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)|(?:np\.|math\.)?pi\b)\s*",
+    re.ASCII | re.IGNORECASE,
+)
 
 
 def number(text: str) -> float:
@@ -87,25 +97,23 @@ def number(text: str) -> float:
     Raises:
         ValueError: the text is anything else, or not finite.
     """
-    if len(text) > 64:  # the parser itself fails on very deep nesting
+    if len(text) > 64:
         raise ValueError(text)
-    try:
-        value = _value(ast.parse(text, mode="eval").body)
-    except (SyntaxError, ZeroDivisionError, RecursionError) as error:
-        raise ValueError(text) from error
-    if not math.isfinite(value):
+    total, product, at = 0.0, None, 0
+    while at < len(text) or product is None:
+        factor = _FACTOR.match(text, at)
+        operation = factor[1] if factor else ""
+        if factor is None or (operation in ("*", "/") if product is None else not operation):
+            raise ValueError(text)
+        value = float(factor[3]) if factor[3] else math.pi
+        value = -value if factor[2].count("-") % 2 else value
+        if product is None or operation in ("+", "-"):
+            total, product = total + (product or 0.0), -value if operation == "-" else value
+        elif operation == "/" and value == 0:
+            raise ValueError(text)
+        else:
+            product = product * value if operation == "*" else product / value
+        at = factor.end()
+    if not math.isfinite(total + product):
         raise ValueError(text)
-    return value
-
-
-def _value(node: ast.expr) -> float:
-    match node:
-        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-            return float(value)
-        case ast.Name(id="pi") | ast.Attribute(value=ast.Name(id="np" | "math"), attr="pi"):
-            return math.pi
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-            return _OPERATORS[type(op)](_value(left), _value(right))
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-            return _OPERATORS[type(op)](_value(operand))
-    raise ValueError(ast.dump(node))
+    return total + product

@@ -3,13 +3,17 @@
 import dataclasses
 import math
 import pickle
+import random
+import re
+from collections.abc import Callable
 
 import pytest
 
 from libero_env import bddl
 from libero_env.bddl import And, Atom, ForAll, Not, Or, Problem, Region
 from libero_env.errors import BDDLError
-from libero_env.sexpr import number
+from libero_env.sexpr import number, parse_tree
+from tests.libero_env.compare_bddl import all_tasks
 
 pytestmark = pytest.mark.unit
 
@@ -34,6 +38,7 @@ TEXT = """
 )
 """
 GOOD = TEXT.replace("(0.0)", "0.0")
+GENERATED = [task.bddl_text for task in all_tasks()]
 
 
 def test_every_construct_is_read():
@@ -70,6 +75,13 @@ def test_round_trip_of_all_originals(shared):
         assert_round_trip(bddl.read(file))
 
 
+def test_round_trip_of_all_generated():
+    assert len(GENERATED) == 130
+    for text in GENERATED:
+        assert_round_trip(bddl.parse(text))
+        assert bddl.write(bddl.parse(text)) == text
+
+
 def test_a_problem_travels_between_processes():
     problem = bddl.parse(GOOD)
     assert pickle.loads(pickle.dumps(problem)) == problem  # noqa: S301
@@ -94,6 +106,15 @@ def test_a_problem_travels_between_processes():
         (("(:domain robosuite)", "(:goal)"), 17, "a second :goal; expected one (the first is on line 3)"),
         (("(:init", "(:obj_of_interest"), 16, "a second :obj_of_interest"),
         (("(Not (Turnon stove_1))", "(Not)"), 18, "(Not); expected (Not EXPRESSION)"),
+        (("(:rgba (0 0 1 0.5))", "(:target table)"), 8, "a second :target in a region; expected one"),
+        (
+            ("(cook_region (:target stove_1)", "(pot_region (:target table)"),
+            8,
+            "table_pot_region is declared twice",
+        ),
+        (("(turnon stove_1)", "(turn/on stove_1)"), 16, "turn/on is no predicate; expected letters"),
+        (("moka_pot\n", "moka_pot\0\n"), 11, "the character '\\x00'; expected text"),
+        (("(Not ", "(" * 70), 18, "more than 64 brackets inside each other"),
         (("(define", "(defined"), 2, "not a problem; expected (define (problem NAME) ...)"),
         (("(define", ") (define"), 2, "a ) closes nothing; expected as many ( as )"),
         (("(:domain robosuite)", "(:domain robosuite"), 2, "this ( is never closed; expected as many ( as )"),
@@ -113,10 +134,39 @@ def test_what_is_no_task_is_refused(text):
         bddl.parse(text, "empty.bddl")
 
 
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    file = tmp_path / "kitchen.bddl"
+    file.write_bytes(GOOD.encode().replace(b"Moka", b"M\xf6ka"))
+    with pytest.raises(BDDLError, match=r"kitchen.bddl:5: the byte 0xf6; expected UTF-8 text"):
+        bddl.read(file)
+    file.write_bytes(b"\xef\xbb\xbf" + GOOD.encode())  # an editor's byte order mark
+    assert bddl.read(file) == bddl.parse(GOOD)
+
+
 def test_numbers_are_arithmetic_and_nothing_else():
     assert number("-pi/4") == -math.pi / 4
     assert number("2*np.pi+.5") == 2 * math.pi + 0.5
-    for text in ("open", "pi()", "[1]", "'a'", "1j", "True", "a.b", "2**9", "9" * 5000, "-" * 100_000 + "1"):
+    assert number("6*pi/7 - pi/100") == 6 * math.pi / 7 - math.pi / 100
+    assert number("1 - 2*-3/4 + +1") == 1 - 2 * -3 / 4 + 1
+    assert number("-2.5e-3") == -0.0025
+    words = (
+        "open",
+        "pi()",
+        "[1]",
+        "'a'",
+        "1j",
+        "True",
+        "a.b",
+        "2**9",
+        "",
+        "*1",
+        "1 2",
+        "1_0",
+        "0x1",
+        "٣",
+        "nan",
+    )
+    for text in (*words, "1e999", "1e300*1e300", "pi/0", "9" * 5000, "-" * 100_000 + "1"):
         with pytest.raises(ValueError):
             number(text)
 
@@ -146,3 +196,135 @@ def test_order_without_meaning_does_not_count():
         problem, init=problem.init[::-1], regions=problem.regions[::-1], goal=And(parts[::-1])
     )
     assert bddl.same_meaning(problem, turned)
+
+
+SPANNERS = [  # what the mutations throw in
+    *(
+        "(",
+        ")",
+        "()",
+        "(" * 3000,
+        ")" * 9,
+        "-",
+        "(- -)",
+        ";",
+        "; end",
+        '"',
+        '"open',
+        "'",
+        "\\",
+        "\r",
+        "\n",
+        "\t",
+    ),
+    *("1e999", "pi/0", "-" * 3000 + "1", "9" * 3000, "nan", "2**9", "1_0", "pi", "np.pi", "__import__('os')"),
+    *(
+        "\0",
+        "\x1b",
+        "\x85",
+        "\u2028",
+        "\u202e",
+        "ß",
+        "ŉ",
+        "İ",
+        "٣",
+        "😀",
+        "\ufeff",
+        "akita_black_bowl_1",
+        "plate_1",
+    ),
+    *(":goal", ":target", ":ranges", ":yaw_rotation", ":rgba", ":", "On", "And", "or", "NOT", "forall", "?x"),
+    *(
+        "(Not (Not (On plate_1 plate_1)))",
+        "(forall (?x - plate) (On ?x plate_1))",
+        "(:rgba (0 0 1 1))",
+        "(Or)",
+    ),
+]
+
+
+def mutate_bytes(text: str, rng: random.Random) -> bytes:
+    content = bytearray(text.encode())
+    at, span = rng.randrange(len(content)), int(2 ** rng.uniform(0, 9))
+    match rng.randrange(6):
+        case 0:
+            content[at] = rng.randrange(256)
+        case 1:
+            content[at] ^= 1 << rng.randrange(8)
+        case 2:
+            del content[at : at + span]
+        case 3:
+            content[at:at] = content[at : at + span]
+        case 4:
+            content[at:at] = rng.randbytes(rng.randrange(1, 5))
+        case _:
+            content[at:at] = rng.choice(SPANNERS).encode()
+    return bytes(content)
+
+
+def mutate_tokens(text: str, rng: random.Random) -> bytes:
+    tokens = re.findall(r"[()]|[^\s()]+|\s+", text)
+    for _ in range(rng.randrange(1, 4)):
+        i, j = rng.randrange(len(tokens)), rng.randrange(len(tokens))
+        match rng.randrange(4):
+            case 0:
+                tokens[i] = ""
+            case 1:
+                tokens[i] = tokens[j]
+            case 2:
+                tokens[i], tokens[j] = tokens[j], tokens[i]
+            case _:
+                tokens[i] = f" {rng.choice(SPANNERS)} "
+    return "".join(tokens).encode()
+
+
+def mutate_tree(text: str, rng: random.Random) -> bytes:
+    def nested(node):
+        return [nested(item) for item in node.items] if hasattr(node, "items") else node.text
+
+    def places(node):
+        for i, item in enumerate(node):
+            yield node, i
+            if isinstance(item, list):
+                yield from places(item)
+
+    def say(node):
+        return f"({' '.join(map(say, node))})" if isinstance(node, list) else node
+
+    tree = nested(parse_tree(text, "fuzz"))
+    spots = list(places(tree))
+    (here, i), (there, j) = rng.choice(spots), rng.choice(spots)
+    match rng.randrange(6):
+        case 0:
+            del here[i]
+        case 1:
+            here.insert(i, say(there[j]))
+        case 2:
+            here[i] = say(there[j])
+        case 3:
+            depth = rng.choice((1, 2, 70, 5000))
+            here[i] = f"{'(' * depth}{say(here[i])}{')' * depth}"
+        case 4:
+            rng.shuffle(here)
+        case _:
+            here[i] = rng.choice(SPANNERS)
+    return say(tree).encode()
+
+
+@pytest.mark.parametrize("mutate", [mutate_bytes, mutate_tokens, mutate_tree])
+def test_damaged_files_are_read_or_refused_by_name(mutate: Callable, tmp_path):
+    """About 10,000 in all; any other error, a warning included, fails."""
+    rng, file, refused = random.Random(mutate.__name__), tmp_path / "fuzz.bddl", 0
+    for i in range(3400):
+        content = mutate(GENERATED[i % len(GENERATED)], rng)
+        file.write_bytes(content)
+        try:
+            problem = bddl.read(file)
+        except BDDLError as error:
+            found = re.match(r".*fuzz\.bddl:(\d+): .*; expected ", str(error), re.DOTALL)
+            assert found and 1 <= int(found[1]) <= content.count(b"\n") + 1, error
+            refused += 1
+        else:
+            assert_round_trip(problem)
+            hash(problem)
+    assert 500 < refused < 3300  # the mutations are neither too wild nor too tame
