@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.paths import cache_dir
-from libero_env.placement import sample_qpos
+from libero_env.placement import Start, sample_start
+from libero_env.predicates import StateView, evaluate
 from libero_env.scene import Scene
 from libero_env.simulation import LoopSimulations, Simulations
 from libero_env.tasks.suites import Task
@@ -19,19 +20,23 @@ from libero_env.tasks.suites import Task
 NUM_INIT_STATES = 50
 _STILL = 2e-4  # m (or quaternion units): what may change in half a second at rest
 _MAX_SETTLE = 10  # half seconds
+_MAX_DRAWS = 20
+_TOLERANCE = 0.02  # m, how far out of its rectangle a start may have slid
 _RESERVED = 0x1B3E0  # separates the seeds of these states from those of `reset(seed=...)`
 
 
-def settle(simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int) -> np.ndarray:
+def settle(
+    simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int, fixtures: np.ndarray | None = None
+) -> np.ndarray:
     """Let the objects of one simulation come to rest while the arm holds its pose; (nq,) -> (nq,).
 
-    Arm and gripper are as they were before.
+    Arm and gripper are as they were before; fixtures (nfixtures, 7) are put where they belong first.
 
     Raises:
         PlacementError: something still moves after five seconds.
     """
     nv, still = simulations.model.nv, np.zeros((simulations.num, 7))
-    simulations.reset([i], qpos[None], np.zeros((1, nv)))
+    simulations.reset([i], qpos[None], np.zeros((1, nv)), fixtures=None if fixtures is None else fixtures[None])
     for _ in range(_MAX_SETTLE):
         before = simulations.fields["qpos"][i].copy()
         for _ in range(10):
@@ -43,31 +48,68 @@ def settle(simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int) ->
     raise PlacementError(f"objects still move after {_MAX_SETTLE * 0.5:.0f} s; do their regions lie on a surface?")
 
 
-def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.random.Generator) -> np.ndarray:
-    """Positions (nq,) drawn from the task's regions and settled in simulation i.
+def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.random.Generator) -> Start:
+    """A start drawn from the task's regions and settled in simulation i; its init atoms hold and its goal does not.
 
     Raises:
-        PlacementError: as `sample_qpos` and `settle`.
+        PlacementError: as `sample_start`; or no draw in 20 comes to rest where it should.
     """
-    return settle(simulations, i, sample_qpos(scene, rng), scene.nq_robot)
+    view, why = StateView(scene, simulations, i), ""
+    for _ in range(_MAX_DRAWS):
+        start = sample_start(scene, rng)
+        try:
+            qpos = settle(simulations, i, start.qpos, scene.nq_robot, start.fixtures)
+        except PlacementError as error:
+            why = str(error)
+            continue
+        simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)))
+        if not (why := "; ".join(start_faults(view))):
+            return Start(qpos, start.fixtures)
+    raise PlacementError(f"{scene.problem.language!r}: no start in {_MAX_DRAWS} draws is as the task says: {why}")
+
+
+def start_faults(view: StateView) -> list[str]:
+    """What is wrong with a state as a start: init atoms that do not hold, a goal that does."""
+    faults = []
+    for atom in view.scene.problem.init:
+        if atom.args[0] in view.scene.fixtures:
+            continue
+        region = view.scene.problem.region(atom.args[-1])
+        if region is not None and region.ranges:
+            point = view.body_pos(atom.args[0])[:2] - np.asarray(view.scene.workspace.offset)[:2]
+            low, high = np.split(np.array(region.ranges), 2, axis=1)
+            holds = ((point > low - _TOLERANCE) & (point < high + _TOLERANCE)).all(axis=1).any()
+        else:
+            holds = evaluate(atom, view)
+        if not holds:
+            faults.append(f"({atom.predicate} {' '.join(atom.args)}) does not hold")
+    if evaluate(view.scene.problem.goal, view):
+        faults.append("the goal holds already")
+    return faults
 
 
 def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -> np.ndarray:
-    """The initial states of a task, made anew: (num, 1 + nq + nv), rows as [time, qpos, qvel].
+    """The initial states of a task, made anew: (num, 1 + nq + nv + 7 nfixtures).
 
-    State i depends on the task's name and i alone.
+    Rows are [time, qpos, qvel, pos and quat (wxyz) of each fixture]; row i depends on the task's name and i alone.
     """
-    simulations = LoopSimulations(scene.model)
+    simulations, nv = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies), scene.model.nv
     name = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
-    states = np.zeros((num, 1 + scene.model.nq + scene.model.nv))
+    rows = []
     for i in range(num):
-        rng = np.random.default_rng([_RESERVED, name, i])
-        states[i, 1 : 1 + scene.model.nq] = sample_settled(scene, simulations, 0, rng)
-    return states
+        start = sample_settled(scene, simulations, 0, np.random.default_rng([_RESERVED, name, i]))
+        rows.append(np.concatenate([[0.0], start.qpos, np.zeros(nv), start.fixtures.ravel()]))
+    return np.array(rows)
+
+
+def split_row(model: mujoco.MjModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (k, n) of initial states -> qpos (k, nq), qvel (k, nv), fixtures (k, nfixtures, 7)."""
+    _, qpos, qvel, fixtures = np.split(rows, np.cumsum([1, model.nq, model.nv]), axis=1)
+    return qpos, qvel, fixtures.reshape(len(rows), -1, 7)
 
 
 def load_init_states(task: Task, scene: Scene) -> np.ndarray:
-    """The task's 50 initial states, (50, 1 + nq + nv): those shipped with the package, else made once and cached.
+    """The task's 50 initial states, rows as of `generate_init_states`: those shipped, else made once and cached.
 
     Raises:
         LiberoError: the shipped states were made for another model.
@@ -107,16 +149,16 @@ def shipped_path(suite: str) -> Path:
 
 
 def scene_digest(scene: Scene) -> str:
-    """What initial states depend on: joints in order and the collision shapes of the objects; 16 hex digits."""
+    """What initial states depend on: joints in order, collision shapes of objects and fixtures; 16 hex digits."""
     model = scene.model
     parts = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
-    for name in scene.objects:
-        body = model.body(f"{name}_main").id
-        for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
-            if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
-                figures = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
-                parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in figures)))
-        parts.append((name, f"{model.body_mass[body]:.6f}"))
+    for name in scene.things:
+        for body in scene.bodies[name]:
+            for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+                if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
+                    figures = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
+                    parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in figures)))
+            parts.append((name, f"{model.body_mass[body]:.6f}"))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 

@@ -1,24 +1,28 @@
 """Predicates: pure functions of a read-only view of one simulation's state.
 
-Semantics are the original's: objects are points (the origin of their root body), a box is tested by |R size|.
+By default their meaning is the original's: objects are points (the origin of their root body), a box is tested by
+|R size|, and standing in a region of the table needs no contact. `semantics="strict"` asks more; see `STRICT`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from libero_env.control import ArmIndex
-from libero_env.errors import UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
 from libero_env.problem import And, Atom, Expression, ForAll, Not, Or, Region
 from libero_env.robot import FINGER_JOINTS
-from libero_env.scene import Scene
+from libero_env.scene import ROBOT, Scene, zone_boxes
 from libero_env.simulation import Simulations
 
 _ON_XY_DISTANCE = 0.03  # m, between the origins of an object and what it stands on
 _BOX_BELOW = 0.01  # m, how far below its box a region still holds a point
 _ON_BELOW, _ON_ABOVE = 0.005, 0.10  # m, how far around the top of a region's box a point lies on it
-_ZONE_HEIGHT, _ZONE_HALF_HEIGHT = 0.02, 0.007  # m, the box of a flat region over its surface
+_UP_HEIGHT = 1.0  # m, world frame
+_STRICT_MARGIN = 0.005  # m, by how much an object may stick out of a box that holds it
 
 
 @dataclass(frozen=True)
@@ -33,12 +37,16 @@ class StateView:
         """Whether the scene has a movable object of this name."""
         return name in self.scene.objects
 
+    def is_thing(self, name: str) -> bool:
+        """Whether the scene has an object or a fixture of this name."""
+        return name in self.scene.objects or name in self.scene.fixtures
+
     def body_pos(self, name: str) -> np.ndarray:
-        """Origin of the root body of an object, (3,)."""
+        """Origin of the root body of an object or fixture, (3,)."""
         return self._field("xpos")[self._body(name)].copy()
 
     def body_quat(self, name: str) -> np.ndarray:
-        """Orientation of the root body of an object, wxyz (4,)."""
+        """Orientation of the root body of an object or fixture, wxyz (4,)."""
         return self._field("xquat")[self._body(name)].copy()
 
     def site_pos(self, name: str) -> np.ndarray:
@@ -48,6 +56,20 @@ class StateView:
     def site_mat(self, name: str) -> np.ndarray:
         """Orientation of a site, site to world (3, 3)."""
         return self._field("site_xmat")[self.scene.model.site(name).id].reshape(3, 3).copy()
+
+    def joint_positions(self, address: str) -> dict[str, float]:
+        """Articulated joints of an object, a fixture or the part that a region is on: name -> rad or m.
+
+        Raises:
+            UnknownNameError: no such object, fixture or region.
+        """
+        scene = self.scene
+        if address not in scene.joints:
+            raise UnknownNameError("object, fixture or region", address, scene.joints)
+        qpos = self._field("qpos")
+        return {
+            scene.model.joint(j).name: float(qpos[scene.model.jnt_qposadr[j]]) for j in scene.joints[address]
+        }
 
     @property
     def eef_pos(self) -> np.ndarray:
@@ -66,7 +88,7 @@ class StateView:
         return self._field("qpos")[addresses]
 
     def in_contact(self, first: str, second: str) -> bool:
-        """Whether geoms of two objects (or of an object and the `robot`) touch."""
+        """Whether geoms of two of these touch: objects, fixtures, the workspace (the whole room) or the `robot`."""
         data, model = self.simulations.data(self.index), self.scene.model
         pairs = model.geom_bodyid[data.contact.geom[: data.ncon]]
         bodies = [self._bodies(first), self._bodies(second)]
@@ -75,10 +97,25 @@ class StateView:
                 return True
         return False
 
+    def bounds(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high corner (3,) of the collision shapes of an object or fixture, world axes."""
+        model, corners = self.scene.model, []
+        for body in self._bodies(name):
+            mat = _mat(self._field("xquat")[body])
+            start = model.body_geomadr[body]
+            for geom in range(start, start + model.body_geomnum[body]):
+                if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+                    turn = mat @ _mat(model.geom_quat[geom])
+                    centre = self._field("xpos")[body] + mat @ model.geom_pos[geom] + turn @ model.geom_aabb[geom, :3]
+                    half = np.abs(turn) @ model.geom_aabb[geom, 3:]
+                    corners.append((centre - half, centre + half))
+        low, high = zip(*corners, strict=True)
+        return np.min(low, axis=0), np.max(high, axis=0)
+
     def _bodies(self, name: str) -> np.ndarray:
-        model = self.scene.model
-        prefixes = ("robot0_", "gripper0_") if name == "robot" else (f"{name}_",)
-        return np.array([b for b in range(model.nbody) if model.body(b).name.startswith(prefixes)])
+        if name not in self.scene.bodies:
+            raise UnknownNameError("object or fixture", name, self.scene.bodies)
+        return self.scene.bodies[name]
 
     @property
     def _arm(self) -> ArmIndex:
@@ -88,9 +125,9 @@ class StateView:
         return self.simulations.fields[name][self.index]
 
     def _body(self, name: str) -> int:
-        if not self.is_object(name):
-            raise UnknownNameError("object", name, self.scene.objects)
-        return self.scene.model.body(f"{name}_main").id
+        if not self.is_thing(name):
+            raise UnknownNameError("object or fixture", name, self.scene.things)
+        return self.scene.model.body(f"{name}_{ROOT_BODY}").id
 
 
 Predicate = Callable[..., bool]
@@ -98,7 +135,7 @@ Predicate = Callable[..., bool]
 
 def on(view: StateView, thing: str, place: str) -> bool:
     """`thing` stands on an object (touching, above it, origins within 3 cm) or lies over the box of a region."""
-    if view.is_object(place):
+    if view.is_thing(place):
         above, below = view.body_pos(thing), view.body_pos(place)
         near = np.linalg.norm(above[:2] - below[:2]) < _ON_XY_DISTANCE
         return bool(below[2] <= above[2] and near and view.in_contact(thing, place))
@@ -112,29 +149,159 @@ def in_(view: StateView, thing: str, place: str) -> bool:
     return any(_inside(box, view.body_pos(thing)) for box in _boxes(view, place))
 
 
-PREDICATES: Mapping[str, Predicate] = {"On": on, "In": in_}
+def up(view: StateView, thing: str) -> bool:
+    """The origin of `thing` is at least a metre above the floor."""
+    return bool(view.body_pos(thing)[2] >= _UP_HEIGHT)
 
 
-def evaluate(expression: Expression, view: StateView) -> bool:
+def in_contact(view: StateView, first: str, second: str) -> bool:
+    """The two touch."""
+    return view.in_contact(first, second)
+
+
+def stack(view: StateView, thing: str, place: str) -> bool:
+    """The two touch, `thing` is over the region or object and inside it."""
+    owner = view.scene.owner(place)
+    touching = owner is not None and view.in_contact(thing, owner)
+    return touching and on(view, thing, place) and (view.is_thing(place) or in_(view, thing, place))
+
+
+def open_(view: StateView, place: str) -> bool:
+    """Any joint of the thing, or of the part that the region is on, is as far out as `open` begins."""
+    return any(_beyond(view, place, "open", "close"))
+
+
+def close(view: StateView, place: str) -> bool:
+    """All joints of the thing, or of the part that the region is on, are as far in as `close` begins."""
+    return all(_beyond(view, place, "close", "open"))
+
+
+def turn_on(view: StateView, thing: str) -> bool:
+    """Any joint is as far as `turnon` begins."""
+    return any(_beyond(view, thing, "turnon", "turnoff"))
+
+
+def turn_off(view: StateView, thing: str) -> bool:
+    """All joints are as far back as `turnoff` begins."""
+    return all(_beyond(view, thing, "turnoff", "turnon"))
+
+
+def print_joint_state(view: StateView, thing: str) -> bool:
+    """Always true. The original prints the joints here; `view.joint_positions(thing)` has them."""
+    view.joint_positions(thing)
+    return True
+
+
+PREDICATES: Mapping[str, Predicate] = {
+    "On": on,
+    "In": in_,
+    "Up": up,
+    "Open": open_,
+    "Close": close,
+    "Turnon": turn_on,
+    "Turnoff": turn_off,
+    "Incontact": in_contact,
+    "Stack": stack,
+    "Printjointstate": print_joint_state,
+    "True": lambda view, *args: True,
+    "False": lambda view, *args: False,
+}
+
+
+def strict_on(view: StateView, thing: str, place: str) -> bool:
+    """`thing` rests on the object or in the region: touching what is under it, let go, its origin over the place."""
+    if view.in_contact(thing, ROBOT):
+        return False
+    if view.is_thing(place):
+        low, high = view.bounds(place)
+        over = ((view.body_pos(thing) > low) & (view.body_pos(thing) < high))[:2].all()
+        return bool(over and view.body_pos(thing)[2] > view.body_pos(place)[2] and view.in_contact(thing, place))
+    region = _region(view, place)
+    point = view.body_pos(thing)
+    if not view.in_contact(thing, region.target):
+        return False
+    boxes = _boxes(view, place)
+    if region.ranges:
+        return any((np.abs(point - centre)[:2] < size[:2]).all() for centre, _, size in boxes)
+    return any(_over((centre, mat.T, size), point) for centre, mat, size in boxes)
+
+
+def strict_in(view: StateView, thing: str, place: str) -> bool:
+    """Footprint and lowest point of `thing` are in the box of the region, in the box's own frame, and it is let go."""
+    if view.in_contact(thing, ROBOT):
+        return False
+    low, high = view.bounds(thing)
+    middle, half = (low + high) / 2, (high - low) / 2
+    for centre, mat, size in _boxes(view, place):
+        own_up = np.abs(mat[2])  # share of each axis of the box in the vertical
+        box_half = np.abs(mat) @ size if own_up.max() > 0.999 else size
+        turn = np.eye(3) if own_up.max() > 0.999 else mat.T
+        delta = turn @ (middle - centre)
+        inside = (np.abs(delta[:2]) + half[:2] < box_half[:2] + _STRICT_MARGIN).all()
+        if inside and -box_half[2] - _BOX_BELOW < delta[2] - half[2] < box_half[2]:
+            return True
+    return False
+
+
+STRICT: Mapping[str, Predicate] = {**PREDICATES, "On": strict_on, "In": strict_in}
+"""On and In as a person would judge them: at rest, let go, with extent, in the frame of the place."""
+
+SEMANTICS: Mapping[str, Mapping[str, Predicate]] = {"original": PREDICATES, "strict": STRICT}
+
+
+def register_predicate(name: str, predicate: Predicate) -> None:
+    """Adds a predicate, or replaces one, in both semantics, for this process.
+
+    Args:
+        name: as task files write it; case does not count.
+        predicate: called with a `StateView` and the atom's names.
+
+    Raises:
+        LiberoError: the name cannot stand in a task file.
+    """
+    if not name.isidentifier():
+        raise LiberoError(f"register_predicate: {name!r} is no name; use letters, digits and underscores")
+    for table in SEMANTICS.values():
+        table[name.capitalize()] = predicate  # type: ignore[index]
+
+
+def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:
     """Truth of a goal in a state.
+
+    Args:
+        expression: goal or atom.
+        view: the state.
+        semantics: `original` or `strict`.
 
     Raises:
         UnknownNameError: a predicate, object or region that does not exist.
+        LiberoError: a predicate that makes no sense for the thing, such as opening a plate.
     """
     match expression:
         case Atom(predicate, args):
-            if predicate not in PREDICATES:
-                raise UnknownNameError("predicate", predicate, PREDICATES)
-            return PREDICATES[predicate](view, *args)
+            table = SEMANTICS[semantics]
+            if predicate not in table:
+                raise UnknownNameError("predicate", predicate, table)
+            return table[predicate](view, *args)
         case And(parts):
-            return all(evaluate(part, view) for part in parts)
+            return all(evaluate(part, view, semantics) for part in parts)
         case Or(parts):
-            return any(evaluate(part, view) for part in parts)
+            return any(evaluate(part, view, semantics) for part in parts)
         case Not(part):
-            return not evaluate(part, view)
+            return not evaluate(part, view, semantics)
         case ForAll(variables, body):
-            return all(evaluate(_bind(body, binding), view) for binding in _bindings(variables, view))
+            return all(evaluate(_bind(body, binding), view, semantics) for binding in _bindings(variables, view))
     raise TypeError(f"not a goal: {expression!r}")
+
+
+def glowing_sites(view: StateView) -> set[int]:
+    """Ids of the sites that glow because their object is turned on, such as a stove's burner."""
+    model, found = view.scene.model, set()
+    for name, item in view.scene.things.items():
+        if "turnon" in item.articulation and turn_on(view, name):
+            own = np.isin(model.site_bodyid, view.scene.bodies[name])
+            found |= set(np.flatnonzero(own & (model.site_group == GLOW_GROUP)).tolist())
+    return found
 
 
 def atoms_of(expression: Expression) -> tuple[Atom, ...]:
@@ -164,17 +331,35 @@ def _boxes(view: StateView, address: str) -> list[Box]:
     """The boxes of a region: the site of that name, or a flat box over each rectangle on its surface."""
     region = _region(view, address)
     if not region.ranges:
-        return [(view.site_pos(address), view.site_mat(address), view.scene.model.site(address).size)]
-    workspace = view.scene.workspace
-    surface = np.array([0.0, 0.0, workspace.region_height + _ZONE_HEIGHT]) + workspace.offset
-    return [
-        (
-            surface + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0),
-            np.eye(3),
-            np.array([x1 - x0, y1 - y0, 2 * _ZONE_HALF_HEIGHT]) / 2,
-        )
-        for x0, y0, x1, y1 in region.ranges
-    ]
+        site = mujoco.mj_name2id(view.scene.model, mujoco.mjtObj.mjOBJ_SITE, address)
+        if site < 0:
+            raise LiberoError(f"region {address}: {region.target} has no site {region.name!r}, and no ranges are given")
+        return [(view.site_pos(address), view.site_mat(address), view.scene.model.site_size[site])]
+    boxes = zone_boxes(region, view.scene.workspace)
+    return [(centre, np.eye(3), half) for centre, half in boxes]
+
+
+def _beyond(view: StateView, place: str, state: str, opposite: str) -> list[bool]:
+    """For each joint whether it is in a state, such as `open`: as far as its range begins, seen from the opposite's."""
+    owner = view.scene.owner(place)
+    if owner is None:
+        raise UnknownNameError("object, fixture or region of one", place, view.scene.joints)
+    ranges = view.scene.things[owner].articulation
+    if state not in ranges:
+        category = view.scene.things[owner].category
+        raise LiberoError(f"{owner}: nothing says when a {category} is {state!r}; it has no such joint range")
+    low, high = sorted(ranges[state])
+    upwards = opposite not in ranges or low + high > sum(ranges[opposite])
+    values = view.joint_positions(place).values()
+    if state == "turnon":
+        return [v >= low if upwards else v <= high for v in values]
+    return [v > low if upwards else v < high for v in values]
+
+
+def _mat(quat: np.ndarray) -> np.ndarray:
+    out = np.empty(9)
+    mujoco.mju_quat2Mat(out, quat)
+    return out.reshape(3, 3)
 
 
 def _inside(box: Box, point: np.ndarray) -> bool:

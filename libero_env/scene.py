@@ -1,107 +1,205 @@
-"""Problem + object catalog + workspace -> one MuJoCo model.
+"""Problem + assets + workspace -> one MuJoCo model.
 
-Joint order is the original's: arm, gripper, then the objects in the order of the task file; so states of the original
-have the same layout.
+Joint order is the original's: arm, gripper, then the objects and the fixtures in the order of the task file; so states
+of the original have the same layout. Where fixtures stand is state, not model; `Simulations` keeps it.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from importlib import resources
-from typing import Any
+from functools import cached_property, lru_cache
 
 import mujoco
 import numpy as np
-import yaml
 
+from libero_env.arena import WORKSPACES, Workspace, load_workspace
+from libero_env.assets import Pack, select_pack
 from libero_env.bddl import Problem
 from libero_env.errors import UnknownNameError
-from libero_env.objects import ObjectModel, get_object
-from libero_env.objects.model import set_damping
+from libero_env.objects.model import ROOT_BODY, ObjectModel, set_damping
+from libero_env.problem import Region
 from libero_env.robot import OPEN_FINGERS, REST_QPOS, add_panda
 
 TIMESTEP = 0.002  # s
-_WORKSPACES = {"floor": "floor"}  # fixture category that is a workspace -> its file
+ROBOT = "robot"  # what contacts call arm and gripper
 _MAX_FRAME = 1024  # pixels, the largest picture the offscreen buffer holds
-
-
-@dataclass(frozen=True)
-class Workspace:
-    """Where a task happens; the figures of one file in `libero_env/workspaces`."""
-
-    name: str
-    offset: tuple[float, float, float]  # origin of the regions, world frame, m
-    region_height: float  # z of the surface that regions lie on, m
-    figures: Mapping[str, Any]
+_FIXTURE_LIFT = 0.01  # m, the original's height of fixtures over the underside of the table top
+_ZONE_HEIGHT, _ZONE_HALF_HEIGHT = 0.02, 0.007  # m, the box of a flat region over its surface
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled task. The model is shared by all environments of the task: nobody writes to it."""
+    """A compiled task. The model is shared by all environments of the task: nobody writes to it.
+
+    Attributes:
+        problem: what the task file says.
+        pack: where the models come from.
+        workspace: table or floor.
+        workspace_name: what the task file calls it, such as `main_table`.
+        model: the compiled model.
+        objects: instance name -> movable object, in the order of the task file.
+        fixtures: instance name -> fixture, without the workspace, in the order of the task file.
+    """
 
     problem: Problem
+    pack: Pack
     workspace: Workspace
+    workspace_name: str
     model: mujoco.MjModel
-    objects: Mapping[str, ObjectModel]  # instance name -> what it is, in the order of the task file
+    objects: Mapping[str, ObjectModel]
+    fixtures: Mapping[str, ObjectModel]
 
     @property
     def nq_robot(self) -> int:
         """Number of position coordinates that belong to arm and gripper; objects follow."""
         return len(REST_QPOS) + len(OPEN_FINGERS)
 
+    @property
+    def things(self) -> dict[str, ObjectModel]:
+        """Objects and fixtures."""
+        return {**self.objects, **self.fixtures}
 
-@lru_cache(maxsize=32)
-def load_workspace(name: str) -> Workspace:
-    """The workspace of that name.
+    @cached_property
+    def fixture_poses(self) -> np.ndarray:
+        """Where fixtures stand unless a state says otherwise: mid-region, (nfixtures, 7) pos and quat wxyz."""
+        return np.concatenate([self.model.body_pos, self.model.body_quat], axis=1)[self.fixture_bodies]
 
-    Raises:
-        UnknownNameError: no such workspace; the message lists the valid ones.
-    """
-    if name not in _WORKSPACES:
-        raise UnknownNameError("workspace", name, _WORKSPACES)
-    text = resources.files("libero_env").joinpath(f"workspaces/{_WORKSPACES[name]}.yaml").read_text()
-    figures = yaml.safe_load(text)
-    return Workspace(name, tuple(figures["offset"]), figures["region_height"], figures)
+    @property
+    def fixture_bodies(self) -> np.ndarray:
+        """Ids of the fixtures' root bodies, (nfixtures,)."""
+        return np.array([self.model.body(f"{name}_{ROOT_BODY}").id for name in self.fixtures], np.int64)
+
+    @cached_property
+    def bodies(self) -> Mapping[str, np.ndarray]:
+        """Name of an object, fixture, the workspace or `robot` -> ids of its bodies."""
+        model = self.model
+        root = {n: model.body(f"{n}_{ROOT_BODY}").id for n in self.things}
+        found = {name: np.flatnonzero(model.body_rootid == body) for name, body in root.items()}
+        names = [model.body(b).name for b in range(model.nbody)]
+        robot = [b for b, name in enumerate(names) if name.startswith(("robot0_", "gripper0_"))]
+        rest = np.setdiff1d(np.arange(model.nbody), np.concatenate([*found.values(), robot]))
+        return {**found, ROBOT: np.array(robot), self.workspace_name: rest}
+
+    @cached_property
+    def joints(self) -> Mapping[str, tuple[int, ...]]:
+        """Object, fixture or address of a site -> its articulated joints; for a site those of its own body."""
+        model = self.model
+        moving = [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
+        owners: dict[str, tuple[int, ...]] = {}
+        for name in self.things:
+            bodies = set(self.bodies[name].tolist())
+            own = [j for j in moving if int(model.jnt_bodyid[j]) in bodies]
+            owners[name] = tuple(own)
+            for site in range(model.nsite):
+                if (body := int(model.site_bodyid[site])) in bodies:
+                    owners[model.site(site).name] = tuple(j for j in own if model.jnt_bodyid[j] == body)
+        return owners
+
+    def owner(self, address: str) -> str | None:
+        """The object or fixture that a name or the address of one of its regions belongs to."""
+        if address in self.things:
+            return address
+        region = self.problem.region(address)
+        return region.target if region is not None and region.target in self.things else None
 
 
-@lru_cache(maxsize=128)
-def build_scene(problem: Problem) -> Scene:
+def build_scene(problem: Problem, pack: Pack | None = None) -> Scene:
     """Compile a problem; the result is cached for the process.
 
-    Raises:
-        UnknownNameError: a fixture or object category that has no model.
-    """
-    objects = {name: get_object(category) for name, category in problem.objects.items()}
-    return Scene(problem, load_workspace(workspace_of(problem)), scene_spec(problem, objects).compile(), objects)
-
-
-def scene_spec(problem: Problem, objects: Mapping[str, ObjectModel] | None = None) -> mujoco.MjSpec:
-    """A fresh, editable model of a problem's scene, with these objects or with those of the catalog.
+    Args:
+        problem: what to build.
+        pack: where the models come from; by default as `select_pack` says.
 
     Raises:
         UnknownNameError: a fixture or object category that has no model.
     """
-    workspace = load_workspace(workspace_of(problem))
+    return _build_scene(problem, pack or select_pack())
+
+
+@lru_cache(maxsize=160)
+def _build_scene(problem: Problem, pack: Pack) -> Scene:
+    name, workspace = workspace_of(problem)
+    things = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
+    model = scene_spec(problem, pack, things).compile()
+    objects = {n: things[n] for n in problem.objects}
+    fixtures = {n: things[n] for n in problem.fixtures if n != name}
+    return Scene(problem, pack, workspace, name, model, objects, fixtures)
+
+
+def scene_spec(
+    problem: Problem, pack: Pack | None = None, things: Mapping[str, ObjectModel] | None = None
+) -> mujoco.MjSpec:
+    """A fresh, editable model of a problem's scene, with these objects and fixtures or with those of the pack.
+
+    Raises:
+        UnknownNameError: a fixture or object category that has no model.
+    """
+    pack = pack or select_pack()
+    name, workspace = workspace_of(problem)
     spec = mujoco.MjSpec()
     spec.modelname = "libero"
     _set_options(spec)
-    _add_arena(spec, workspace)
-    add_panda(spec, workspace.figures["robot"]["base_pos_world"])
-    for name, category in problem.objects.items():
-        _add_object(spec, name, get_object(category) if objects is None else objects[name])
+    pack.add_arena(spec, workspace, problem.scene_properties)
+    add_panda(spec, workspace.robot_base_pos)
+    _add_zones(spec, problem, name, workspace)
+    for thing, category in problem.objects.items():
+        _add_object(spec, thing, pack.build(category) if things is None else things[thing])
+    for thing, category in problem.fixtures.items():
+        if thing != name:
+            item = pack.build(category) if things is None else things[thing]
+            _add_fixture(spec, thing, item, fixture_pose(problem, name, workspace, thing, item))
     return spec
 
 
-def workspace_of(problem: Problem) -> str:
-    """The fixture of a problem that is its workspace.
+def workspace_of(problem: Problem) -> tuple[str, Workspace]:
+    """The fixture of a problem that is its workspace: its name and what it is.
 
     Raises:
         UnknownNameError: none of the fixtures is one.
     """
-    for category in problem.fixtures.values():
-        if category in _WORKSPACES:
-            return category
-    raise UnknownNameError("workspace among the fixtures", list(problem.fixtures.values()), _WORKSPACES)
+    for name, category in problem.fixtures.items():
+        if category in WORKSPACES:
+            return name, load_workspace(category)
+    raise UnknownNameError("workspace among the fixtures", list(problem.fixtures.values()), WORKSPACES)
+
+
+def fixture_pose(
+    problem: Problem,
+    workspace_name: str,
+    workspace: Workspace,
+    name: str,
+    item: ObjectModel,
+    rng: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Pose of a fixture in the region its init atom names, (7,): pos, quat wxyz; without a generator in its middle."""
+    region = next(
+        (
+            problem.region(atom.args[1])
+            for atom in problem.init
+            if atom.predicate == "On" and atom.args[0] == name and len(atom.args) == 2
+        ),
+        None,
+    )
+    height = _FIXTURE_LIFT - workspace.figures.get("table_thickness", 0.05) - item.bottom_offset[2]
+    if region is None or not region.ranges or region.target != workspace_name:
+        x, y, yaw = 0.0, 0.0, 0.0
+    elif rng is None:
+        x0, y0, x1, y1 = region.ranges[0]
+        x, y, yaw = (x0 + x1) / 2, (y0 + y1) / 2, float(np.mean(region.yaw[0])) if region.yaw else 0.0
+    else:
+        x0, y0, x1, y1 = region.ranges[rng.integers(len(region.ranges))]
+        x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
+        yaw = rng.uniform(*region.yaw[0]) if region.yaw else 0.0
+    pos = np.add(workspace.offset, (x, y, height))
+    return np.array([*pos, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def zone_boxes(region: Region, workspace: Workspace) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The flat box over each rectangle of a region on the workspace: centre (3,), half size (3,), world frame, m."""
+    surface = np.array([0.0, 0.0, workspace.region_height + _ZONE_HEIGHT]) + workspace.offset
+    return [
+        (surface + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.array([x1 - x0, y1 - y0, 2 * _ZONE_HALF_HEIGHT]) / 2)
+        for x0, y0, x1, y1 in region.ranges
+    ]
 
 
 def initial_qpos(scene: Scene) -> np.ndarray:
@@ -127,48 +225,24 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     visual.headlight.specular = [0.5] * 3
 
 
-def _add_arena(spec: mujoco.MjSpec, workspace: Workspace) -> None:
-    world, figures = spec.worldbody, workspace.figures
-    for name, camera in figures["cameras"].items():
-        world.add_camera(name=name, pos=camera["pos"], quat=camera["quat"], fovy=camera["fovy_degrees"])
-    for light in figures["lights"]:
-        world.add_light(
-            name=light["name"], pos=light["pos"], dir=light["dir"], diffuse=[0.8] * 3, specular=[0.3] * 3,
-            castshadow=False,
-        )  # fmt: skip
-    _add_material(spec, "floor_tiles", _tiles(*figures["floor"]["colours"]), repeat=1.0 / figures["floor"]["tile"])
-    floor = world.add_body(name="floor")
-    floor.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=figures["floor"]["size"], material="floor_tiles",
-        group=1, condim=3,
-    )  # fmt: skip
-    for wall in figures["walls"]["boxes"]:
-        world.add_geom(
-            name=wall["name"], type=mujoco.mjtGeom.mjGEOM_BOX, pos=wall["pos"], quat=wall["quat"], size=wall["size"],
-            rgba=[*figures["walls"]["colour"], 1.0], group=1, contype=0, conaffinity=0,
-        )  # fmt: skip
+def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Workspace) -> None:
+    """A hidden site for each region on the workspace, so that clients find it by its address."""
+    for region in problem.regions:
+        if region.target == name and region.ranges:
+            centre, half = zone_boxes(region, workspace)[0]
+            spec.worldbody.add_site(
+                name=region.address, type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=np.maximum(half, 1e-4),
+                rgba=(0.0, 0.0, 0.0, 0.0), group=3,
+            )  # fmt: skip
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectModel) -> None:
-    body = item.spec.body("main")
-    joint = body.add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
+    joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
     set_damping(joint, item.joint_damping)
     spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())
 
 
-def _add_material(spec: mujoco.MjSpec, name: str, image: np.ndarray, repeat: float) -> None:
-    texture = spec.add_texture(
-        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, height=image.shape[0], width=image.shape[1], nchannel=3,
-    )  # fmt: skip
-    texture.data = image.tobytes()
-    material = spec.add_material(name=name, texuniform=True, texrepeat=[repeat, repeat], specular=0.0, shininess=0.0)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-
-
-def _tiles(tile_rgb: list[float], joint_rgb: list[float], size: int = 64) -> np.ndarray:
-    """One floor tile with its joint, (size, size, 3) uint8."""
-    image = np.empty((size, size, 3))
-    image[:] = tile_rgb
-    image[:1] = image[:, :1] = joint_rgb
-    image += np.random.default_rng(0).normal(0.0, 0.008, (size, size, 1))  # a little grain
-    return np.clip(image * 255, 0, 255).astype(np.uint8)
+def _add_fixture(spec: mujoco.MjSpec, name: str, item: ObjectModel, pose: np.ndarray) -> None:
+    body = item.spec.body(ROOT_BODY)
+    body.pos, body.quat = pose[:3], pose[3:]
+    spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())

@@ -6,7 +6,8 @@ substep is one pass: controller on the current kinematics, then the rest of the 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 
 import mujoco
 import numpy as np
@@ -20,6 +21,7 @@ from libero_env.control import (
     control,
     set_goals,
 )
+from libero_env.errors import LiberoError
 
 try:
     from mujoco.batch import Batch
@@ -27,21 +29,31 @@ except ImportError:  # before MuJoCo 4
     Batch = None
 
 # What the controller and the views of the state read, as arrays (n, ...).
-_FIELDS = ("qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat", "M", "qfrc_bias")
+_FIELDS = (
+    "qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat",
+    "M", "qfrc_bias",
+)  # fmt: skip
+
+
+Tap = Callable[[mujoco.MjData], None]
 
 
 class Simulations(ABC):
     """n simulations of one model.
 
     Attributes:
-        model: shared by all simulations and never written to.
+        model: a copy of the given one; fixtures stand in it where those of the last simulation touched do.
         num: number of simulations.
+        fixtures: (num, nfixtures, 7) pos, quat wxyz of the fixed bodies whose pose differs between simulations.
         fields: name of an MjData field -> array (num, ...), for reading. Kinematics are those of the current state.
         controller: goals and gripper commands.
     """
 
-    def __init__(self, model: mujoco.MjModel, num: int):
-        self.model, self.num = model, num
+    def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Sequence[int] = ()):
+        self.model, self.num = copy(model), num
+        self.fixture_bodies = np.asarray(fixture_bodies, np.int64)
+        poses = np.concatenate([model.body_pos, model.body_quat], axis=1)[self.fixture_bodies]
+        self.fixtures = np.tile(poses, (num, 1, 1))
         self.arm = ArmIndex.of(model)
         self.controller = ControllerState(num)
         self.fields: dict[str, np.ndarray] = {}
@@ -51,7 +63,7 @@ class Simulations(ABC):
         """Clear these simulations, write positions and velocities, and compute all that follows from them."""
 
     @abstractmethod
-    def _substeps(self, ids: np.ndarray, actions: np.ndarray) -> None:
+    def _substeps(self, ids: np.ndarray, actions: np.ndarray, tap: Tap | None) -> None:
         """Run one control period; the goals are set."""
 
     @abstractmethod
@@ -70,29 +82,55 @@ class Simulations(ABC):
         """Let go of the simulations."""
         self.fields = {}
 
-    def reset(self, ids: Sequence[int], qpos: np.ndarray, qvel: np.ndarray, time: float = 0.0) -> None:
-        """Start simulations afresh from positions (k, nq) and velocities (k, nv); the controller holds the pose."""
+    def reset(
+        self,
+        ids: Sequence[int],
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        time: float = 0.0,
+        fixtures: np.ndarray | None = None,
+    ) -> None:
+        """Start simulations afresh; the controller holds the pose.
+
+        Args:
+            ids: (k,) which.
+            qpos, qvel: (k, nq), (k, nv).
+            time: simulated seconds.
+            fixtures: (k, nfixtures, 7) pos, quat wxyz; without it they stay where they are.
+        """
         ids = np.asarray(ids, np.int64)
+        if fixtures is not None:
+            self.fixtures[ids] = fixtures
         self._start(ids, qpos, qvel, time)
         pos, mat = self._grip()
         self.controller.restart(ids, pos[ids], mat[ids])
 
-    def step(self, ids: Sequence[int], actions: np.ndarray) -> None:
-        """Advance the simulations `ids` by one control period; actions (num, 7), rows of other simulations unused."""
+    def pose_fixtures(self, i: int) -> None:
+        """Put the fixtures of simulation i into the model."""
+        self.model.body_pos[self.fixture_bodies] = self.fixtures[i, :, :3]
+        self.model.body_quat[self.fixture_bodies] = self.fixtures[i, :, 3:]
+
+    def step(self, ids: Sequence[int], actions: np.ndarray, tap: Tap | None = None) -> None:
+        """Advance the simulations `ids` by one control period; actions (num, 7), rows of other simulations unused.
+
+        `tap` sees each MjData after the last integration and before its kinematics follow: positions are those of the
+        end, everything else is one substep old, as in the original's observations. `LoopSimulations` only.
+        """
         ids = np.asarray(ids, np.int64)
         set_goals(ids, actions, *self._grip(), self.controller.goal_pos, self.controller.goal_mat)
-        self._substeps(ids, actions)
+        self._substeps(ids, actions, tap)
 
     def get_state(self, i: int) -> np.ndarray:
-        """All that the future of simulation i depends on: time, qpos, qvel, warm start, controls, controller."""
-        parts = [[self.time(i)], self.fields["qpos"][i], self.fields["qvel"][i], *self._remembered(i)]
-        return np.concatenate([*parts, self.controller.pack(i)])
+        """All that the future of i depends on: time, qpos, qvel, fixtures, warm start, controls, controller."""
+        parts = [[self.time(i)], self.fields["qpos"][i], self.fields["qvel"][i], self.fixtures[i].ravel()]
+        return np.concatenate([*parts, *self._remembered(i), self.controller.pack(i)])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore what `get_state` gave; the simulation goes on to the same bits."""
-        nq, nv, nu = self.model.nq, self.model.nv, self.model.nu
-        time, qpos, qvel, *remembered, goal = np.split(state, np.cumsum([1, nq, nv, nv, nu]))
-        self.reset([i], qpos[None], qvel[None], float(time[0]))
+        nq, nv, nu, nfixtures = self.model.nq, self.model.nv, self.model.nu, len(self.fixture_bodies)
+        sizes = np.cumsum([1, nq, nv, 7 * nfixtures, nv, nu])
+        time, qpos, qvel, fixtures, *remembered, goal = np.split(state, sizes)
+        self.reset([i], qpos[None], qvel[None], float(time[0]), fixtures.reshape(1, nfixtures, 7))
         for view, value in zip(self._remembered(i), remembered, strict=True):
             view[:] = value
         self.controller.unpack(i, goal)
@@ -100,7 +138,8 @@ class Simulations(ABC):
     @property
     def state_size(self) -> int:
         """Length of the vector of `get_state`."""
-        return 1 + self.model.nq + 2 * self.model.nv + self.model.nu + CONTROLLER_STATE_SIZE
+        model = self.model
+        return 1 + model.nq + 2 * model.nv + 7 * len(self.fixture_bodies) + model.nu + CONTROLLER_STATE_SIZE
 
     def _grip(self) -> tuple[np.ndarray, np.ndarray]:
         site = self.arm.site
@@ -120,9 +159,9 @@ class Simulations(ABC):
 class LoopSimulations(Simulations):
     """Simulations stepped one after the other in the calling thread."""
 
-    def __init__(self, model: mujoco.MjModel, num: int = 1):
-        super().__init__(model, num)
-        self._datas = [mujoco.MjData(model) for _ in range(num)]
+    def __init__(self, model: mujoco.MjModel, num: int = 1, fixture_bodies: Sequence[int] = ()):
+        super().__init__(model, num, fixture_bodies)
+        self._datas = [mujoco.MjData(self.model) for _ in range(num)]
         self._views = [self._view(data) for data in self._datas]
         # One simulation is read in place; several are copied together after each step.
         self.fields = self._views[0] if num == 1 else {k: np.concatenate([v[k] for v in self._views]) for k in _FIELDS}
@@ -141,20 +180,25 @@ class LoopSimulations(Simulations):
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
         for k, i in enumerate(ids):
             data = self._datas[i]
+            self.pose_fixtures(i)
             mujoco.mj_resetData(self.model, data)
             data.qpos[:], data.qvel[:], data.time = qpos[k], qvel[k], time
             mujoco.mj_forward(self.model, data)
             data.qacc_warmstart[:] = 0.0
         self._gather(ids)
 
-    def _substeps(self, ids: np.ndarray, actions: np.ndarray) -> None:
+    def _substeps(self, ids: np.ndarray, actions: np.ndarray, tap: Tap | None) -> None:
         model, c, constants, first = self.model, self.controller, self._constants(), np.zeros(1, np.int64)
         for i in ids:
             data, (inputs, ctrl), own = self._datas[i], self._calls[i], slice(i, i + 1)
+            if self.num > 1:
+                self.pose_fixtures(i)
             state = (c.goal_pos[own], c.goal_mat[own], c.gripper[own])
-            for _ in range(SUBSTEPS):
+            for substep in range(SUBSTEPS):
                 control(first, actions[own], *inputs, *state, ctrl, *constants)
                 mujoco.mj_step2(model, data)
+                if tap is not None and substep == SUBSTEPS - 1:
+                    tap(data)
                 mujoco.mj_step1(model, data)
         self._gather(ids)
 
@@ -175,21 +219,28 @@ class LoopSimulations(Simulations):
 class BatchSimulations(Simulations):
     """Simulations stepped together on a thread pool; the same bits as the loop, whatever the number of threads."""
 
-    def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0):
-        super().__init__(model, num)
+    def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Sequence[int] = ()):
+        super().__init__(model, num, fixture_bodies)
         self._batch = Batch(model, num, nthread=threads, persistent=True)
         self.fields = {name: self._batch.bind(name) for name in _FIELDS}
         self.fields["site_xmat"] = self.fields["site_xmat"].reshape(num, model.nsite, 9)
         self._time, self._warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
+        if self.fixture_bodies.size:  # per-simulation values of the model
+            self._body_pos, self._body_quat = self._batch.expand("body_pos"), self._batch.expand("body_quat")
         self._data = mujoco.MjData(model)  # for reading one simulation at a time
 
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        if self.fixture_bodies.size:
+            each = np.ix_(ids, self.fixture_bodies)
+            self._body_pos[each], self._body_quat[each] = self.fixtures[ids, :, :3], self.fixtures[ids, :, 3:]
         self.fields["qpos"][ids], self.fields["qvel"][ids], self._time[ids] = qpos, qvel, time
         self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self._warmstart[ids] = 0.0
 
-    def _substeps(self, ids: np.ndarray, actions: np.ndarray) -> None:
+    def _substeps(self, ids: np.ndarray, actions: np.ndarray, tap: Tap | None) -> None:
+        if tap is not None:
+            raise LiberoError("batched simulations cannot be tapped; use LoopSimulations")
         c, constants, ctrl = self.controller, self._constants(), self.fields["ctrl"]
         inputs = self._inputs(self.fields)
         stage = mujoco.mjtStage.mjSTAGE_VEL
@@ -208,11 +259,20 @@ class BatchSimulations(Simulations):
 
     def close(self) -> None:
         super().close()
-        self._batch = self._time = self._warmstart = None
+        self._batch = self._time = self._warmstart = self._body_pos = self._body_quat = None
 
 
-def make_simulations(model: mujoco.MjModel, num: int, threads: int = 0) -> Simulations:
-    """The fastest way to run `num` simulations here: batched where MuJoCo offers it and there are several."""
+def make_simulations(
+    model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Sequence[int] = ()
+) -> Simulations:
+    """The fastest way to run `num` simulations here: batched where MuJoCo offers it and there are several.
+
+    Args:
+        model: copied.
+        num: number of simulations.
+        threads: of the batch; 0 is one for each core.
+        fixture_bodies: ids of fixed bodies that stand elsewhere in each simulation.
+    """
     if num > 1 and Batch is not None:
-        return BatchSimulations(model, num, threads)
-    return LoopSimulations(model, num)
+        return BatchSimulations(model, num, threads, fixture_bodies)
+    return LoopSimulations(model, num, fixture_bodies)

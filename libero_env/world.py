@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.init_states import load_init_states, sample_settled
+from libero_env.init_states import load_init_states, sample_settled, split_row
 from libero_env.predicates import StateView, atoms_of, evaluate
 from libero_env.render import Renderer
 from libero_env.scene import Scene, build_scene
@@ -44,7 +44,7 @@ class World:
         self.num, self.cameras, self.camera_size = num, tuple(cameras), tuple(camera_size)
         self.renderer = Renderer(self.scene.model, *self.camera_size)
         self._camera_ids = {frame_key(name): self.renderer.camera_id(name) for name in self.cameras}
-        self.simulations: Simulations = make_simulations(self.scene.model, num, threads)
+        self.simulations: Simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
         self._picture = mujoco.MjData(self.scene.model)  # kinematics of the simulation being drawn
         self._hand = self.scene.model.body("robot0_right_hand").id
@@ -52,7 +52,7 @@ class World:
 
     @property
     def init_states(self) -> np.ndarray:
-        """The task's stored initial states, (50, 1 + nq + nv), rows as [time, qpos, qvel]."""
+        """The task's stored initial states, rows as [time, qpos, qvel, 7 numbers for each fixture]."""
         return load_init_states(self.task, self.scene)
 
     def reset_to_init(self, ids: Sequence[int], init_states: Sequence[int]) -> None:
@@ -61,14 +61,14 @@ class World:
         Raises:
             LiberoError: no such initial state.
         """
-        stored, nq = self.init_states, self.scene.model.nq
+        stored = self.init_states
         wanted = np.asarray(init_states)
         if wanted.shape != (len(ids),) or not np.issubdtype(wanted.dtype, np.integer):
             raise LiberoError(f"init_state: expected {len(ids)} integers, got {init_states!r}")
         if ((wanted < 0) | (wanted >= len(stored))).any():
             raise LiberoError(f"init_state {wanted.tolist()}: {self.task.id} has 0 to {len(stored) - 1}")
-        rows = stored[wanted]
-        self.simulations.reset(ids, rows[:, 1 : 1 + nq], rows[:, 1 + nq :])
+        qpos, qvel, fixtures = split_row(self.scene.model, stored[wanted])
+        self.simulations.reset(ids, qpos, qvel, fixtures=fixtures)
 
     def reset_random(self, ids: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Start simulations from new placements, one generator for each.
@@ -76,10 +76,9 @@ class World:
         Raises:
             PlacementError: nothing fits, or nothing comes to rest.
         """
-        qpos = np.stack([
-            sample_settled(self.scene, self.simulations, i, rng) for i, rng in zip(ids, generators, strict=True)
-        ])  # fmt: skip
-        self.simulations.reset(ids, qpos, np.zeros((len(ids), self.scene.model.nv)))
+        starts = [sample_settled(self.scene, self.simulations, i, rng) for i, rng in zip(ids, generators, strict=True)]
+        qpos, fixtures = np.stack([start.qpos for start in starts]), np.stack([start.fixtures for start in starts])
+        self.simulations.reset(ids, qpos, np.zeros((len(ids), self.scene.model.nv)), fixtures=fixtures)
 
     def step(self, ids: Sequence[int], actions: np.ndarray) -> None:
         """Advance by one control period of 50 ms; actions (num, 7), already checked."""
@@ -139,7 +138,8 @@ class World:
         self.simulations.close()
 
     def _pose_picture(self, i: int) -> None:
-        data, model = self._picture, self.scene.model
+        data, model = self._picture, self.simulations.model
+        self.simulations.pose_fixtures(i)
         data.qpos[:] = self.simulations.fields["qpos"][i]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
