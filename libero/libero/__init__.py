@@ -1,0 +1,82 @@
+"""Where the original looks for task files, initial states, demonstrations and assets.
+
+The configuration file is read if it is there and never written unasked. Without it, task files and initial states are
+those of this package, laid out as files in the cache folder when somebody asks for their path.
+"""
+
+import os
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from libero_env.errors import UnknownNameError
+from libero_env.paths import config_file as _config_file
+from libero_env.paths import read_config
+
+if TYPE_CHECKING:
+    libero_config_path: str
+    config_file: str
+
+__all__ = [
+    "config_file",
+    "get_default_path_dict",
+    "get_libero_path",
+    "libero_config_path",
+    "set_libero_default_path",
+]
+
+_HERE = Path(__file__).parent
+_KEYS = ("benchmark_root", "bddl_files", "init_states", "datasets", "assets")
+
+
+def __getattr__(name: str) -> str:
+    """`libero_config_path` and `config_file` follow `$LIBERO_CONFIG_PATH`."""
+    if name in ("libero_config_path", "config_file"):
+        return str(_config_file().parent if name == "libero_config_path" else _config_file())
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def get_default_path_dict(custom_location: str | os.PathLike | None = None) -> dict[str, str]:
+    """Key -> path: of a folder laid out like the original package, or without one of what this package generates.
+
+    Nothing is written: `get_libero_path` lays the files out.
+    """
+    from libero.libero.files import generated_paths
+
+    if custom_location is None:
+        return {"benchmark_root": str(_HERE), **generated_paths()}
+    root = Path(custom_location)
+    folders = ("", "bddl_files", "init_files", "../datasets", "assets")
+    return {key: os.path.normpath(root / folder) for key, folder in zip(_KEYS, folders, strict=True)}
+
+
+def get_path_dict() -> dict[str, str]:
+    """Key -> path as configured, the default where the configuration says nothing."""
+    configured: dict[str, Any] = read_config()
+    return {**get_default_path_dict(), **{k: str(v) for k, v in configured.items() if k in _KEYS and v}}
+
+
+def get_libero_path(query_key: str) -> str:
+    """One of the paths; warns where there is nothing.
+
+    Raises:
+        UnknownNameError: no such key.
+    """
+    from libero.libero.files import ensure
+
+    if query_key not in _KEYS:
+        raise UnknownNameError("path", query_key, _KEYS)
+    path = get_path_dict()[query_key]
+    ensure(query_key, path)
+    if not os.path.exists(path):
+        warnings.warn(f"{query_key}: {path} does not exist (see {_config_file()})", stacklevel=2)
+    return path
+
+
+def set_libero_default_path(custom_location: str | os.PathLike | None = None) -> None:
+    """Write the configuration file with the paths of `get_default_path_dict`."""
+    path = _config_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump(get_default_path_dict(custom_location)), encoding="utf-8")
