@@ -82,9 +82,10 @@ def run_tasks_list(args: argparse.Namespace) -> None:
     """One line per task."""
     from libero_env.tasks import get_suite, suite_names
 
-    for name in [args.suite] if args.suite else suite_names():
-        for task in get_suite(name).order(args.order):
-            print(f"{task.id:18} {task.language}")
+    names = [args.suite] if args.suite else suite_names()
+    tasks = {task.id: task for name in names for task in get_suite(name).order(args.order)}
+    for task in tasks.values():
+        print(f"{task.id:18} {task.language}")
 
 
 def run_tasks_show(args: argparse.Namespace) -> None:

@@ -38,6 +38,12 @@ def test_tasks_are_listed_in_the_asked_order(capsys):
     assert [line.split()[0] for line in lines] == [task.id for task in get_suite("libero_object").order(3)]
 
 
+def test_without_a_suite_every_task_is_listed_once(capsys):
+    assert cli.main(["tasks", "list"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert len(listed) == len(set(listed)) == 130
+
+
 def test_a_task_is_shown_as_bddl(capsys):
     assert cli.main(["tasks", "show", "libero_object/7"]) == 0
     assert bddl.parse(capsys.readouterr().out) == get_task("libero_object/7").problem

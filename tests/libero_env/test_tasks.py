@@ -11,13 +11,14 @@ import yaml
 from libero_env import bddl
 from libero_env.bddl import And, Atom, Not, Or
 from libero_env.errors import BDDLError, LiberoError, UnknownNameError
-from libero_env.tasks import get_suite, get_task, read_task, suite_names
-from libero_env.tasks.builder import build_problem
-from libero_env.tasks.suites import language_from_name
+from libero_env.tasks import builder, get_suite, get_task, read_task, suite_names, suites
+from libero_env.tasks.builder import build_problem, language_from_name, load_data
+from tests.libero_env.compare_bddl import all_tasks, compare
+from tests.libero_env.compare_bddl import main as compare_main
 
 pytestmark = pytest.mark.unit
 
-ALL_TASKS = [task for name in suite_names() for task in get_suite(name).tasks]
+ALL_TASKS = all_tasks()
 SCENE = {
     "problem": "LIBERO_Kitchen_Tabletop_Manipulation",
     "fixtures": {"kitchen_table": "kitchen_table", "stove_1": "flat_stove"},
@@ -48,43 +49,31 @@ def test_generated_bddl_reads_back(task):
     assert pickle.loads(pickle.dumps(task)) == task  # noqa: S301
 
 
-@pytest.mark.parametrize("task", ALL_TASKS, ids=lambda task: task.id)
-def test_tasks_mean_what_the_originals_mean(task, shared):
-    original = bddl.read(shared / "official" / "bddl_files" / task.suite / f"{task.name}.bddl")
-    assert bddl.differences(original, task.problem) == []
+def test_tasks_mean_what_the_originals_mean(shared):
+    found = [(task.id, found) for task, found in compare(shared / "official" / "bddl_files")]
+    assert len(found) == 130
+    assert [(task_id, lines) for task_id, lines in found if lines] == []
 
 
-def test_the_facts_can_say_all_130_tasks(shared):
-    """Kitchens, cabinets and yaw ranges too: every original, put into scene keys, means the same."""
-    files = sorted((shared / "official" / "bddl_files").glob("*/*.bddl"))
-    for file in files:
-        original = bddl.read(file)
-        facts = yaml.safe_load(yaml.safe_dump(facts_of(original), sort_keys=False))
-        assert bddl.differences(original, build_problem(facts, {"name": file.stem})) == [], file
-    assert len(files) == 130
+def test_both_languages_are_the_originals(shared):
+    for task in ALL_TASKS:
+        original = bddl.read(shared / "official" / "bddl_files" / task.suite / f"{task.name}.bddl")
+        assert task.bddl_language == original.language
+    differ = [task for task in ALL_TASKS if task.language.casefold() != task.bddl_language.casefold()]
+    assert len(differ) == 29
 
 
-def facts_of(problem):
-    counts: dict[str, int] = {}
-    for category in problem.objects.values():
-        counts[category] = counts.get(category, 0) + 1
-    regions: dict = {}
-    for region in problem.regions:
-        facts = {"ranges": [list(row) for row in region.ranges]} if region.ranges else {}
-        if region.yaw:
-            facts["yaw"] = list(region.yaw[0])
-        regions.setdefault(region.target, {})[region.name] = facts
-    say = lambda atom: " ".join((atom.predicate, *atom.args))  # noqa: E731
-    return {
-        "problem": problem.name,
-        "language": problem.language,
-        "fixtures": dict(problem.fixtures),
-        "objects": [{category: count} for category, count in counts.items()],
-        "regions": regions,
-        "init": [say(atom) for atom in problem.init],
-        "obj_of_interest": list(problem.obj_of_interest),
-        "goal": [say(atom) for atom in problem.goal.parts],
-    }
+def test_the_comparison_prints_what_differs(tmp_path, capsys):
+    for task in ALL_TASKS:
+        (tmp_path / task.suite).mkdir(exist_ok=True)
+        (tmp_path / task.suite / f"{task.name}.bddl").write_text(
+            task.bddl_text.replace("On milk_1", "In milk_1")
+        )
+    assert compare_main([str(tmp_path)]) == 1
+    printed = capsys.readouterr().out
+    assert "libero_object/0 pick_up_the_alphabet_soup_and_place_it_in_the_basket\n    init: " in printed
+    assert printed.splitlines()[-1] == f"{130 - printed.count('init: ')} of 130 mean the same"
+    assert compare_main([str(tmp_path / "nowhere")]) == 2
 
 
 def test_tasks_are_those_that_were_compared():
@@ -107,10 +96,26 @@ def test_a_task_of_ones_own(tmp_path):
 
 def test_suites_and_orders_are_the_originals(shared):
     facts = json.loads((shared / "official" / "suites.json").read_text())
-    for name in suite_names():
+    assert {*suite_names()} == {*facts["suites"], "libero_100"}
+    for name, tasks in facts["suites"].items():
         suite = get_suite(name)
-        assert [task.name for task in suite.tasks] == facts["suites"][name]
-        assert [[task.index for task in suite.order(i)] for i in range(21)] == facts["task_orders"]
+        assert [task.name for task in suite.tasks] == tasks
+        if len(suite) == 10:
+            assert [[task.index for task in suite.order(i)] for i in range(21)] == facts["task_orders"]
+
+
+def test_libero_100_is_90_then_10():
+    tasks = get_suite("libero_100").tasks
+    assert tasks == get_suite("libero_90").tasks + get_suite("libero_10").tasks
+    assert get_task("libero_100/95") is get_task("libero_10/5")
+
+
+def test_every_scene_is_used_and_says_what_it_is():
+    folder = Path(builder.__file__).parent / "data" / "scenes"
+    facts = [load_data(f"{name}.yaml") for name in suite_names() if name != "libero_100"]
+    used = {task.get("scene", suite.get("scene")) for suite in facts for task in suite["tasks"]}
+    assert {file.stem for file in folder.iterdir()} == used
+    assert all(file.read_text().startswith("# ") for file in folder.iterdir())
 
 
 @pytest.mark.parametrize("name", suite_names())
@@ -118,13 +123,14 @@ def test_orders_are_permutations(name):
     suite = get_suite(name)
     assert suite.order() == suite.tasks
     for i in range(21 if len(suite) == 10 else 1):
-        assert sorted(task.index for task in suite.order(i)) == list(range(len(suite)))
+        assert sorted(map(suite.tasks.index, suite.order(i))) == list(range(len(suite)))
 
 
 @pytest.mark.parametrize(
     ("ask", "hint"),
     [
-        (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_object"),
+        (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, "),
+        (lambda: get_suite("libero_90").order(1), "task order of libero_90 1. Valid: 0"),
         (lambda: get_suite("libero_object").order(21), "task order of libero_object 21"),
         (lambda: get_suite("libero_object").order(-1), "Valid: 0, 1, "),
         (lambda: get_task("libero_object/10"), "index of libero_object '10'"),
@@ -168,13 +174,37 @@ def test_a_task_adds_to_its_scene():
     assert SCENE["regions"]["kitchen_table"].keys() == {"stove_region", "front"}
 
 
+def test_atoms_that_a_task_adds_come_first():
+    problem = build_problem(SCENE, {**TASK, "init_also": ["Turnon stove_1"]})
+    assert problem.init == (Atom("Turnon", ("stove_1",)), *build_problem(SCENE, TASK).init)
+
+
+def test_sites_may_be_a_list():
+    scene = {**SCENE, "regions": {**SCENE["regions"], "stove_1": ["cook_region", "burner"]}}
+    problem = build_problem(scene, {**TASK, "regions": {"stove_1": {"burner": None}}})
+    assert problem == build_problem(SCENE, TASK)
+
+
+def test_what_a_task_need_not_say():
+    """Its language are the words of its name; of interest is what the goal speaks of, objects first."""
+    scene = {key: value for key, value in SCENE.items() if key != "obj_of_interest"}
+    task = {
+        "name": "KITCHEN_SCENE1_cook_the_plate",
+        "with": {"thing": "plate"},
+        "goal": "(Or (On plate_1 stove_1_cook_region) (Not (forall (?x - black_bowl) (On ?x black_bowl_2))))",
+    }
+    problem = build_problem(scene, task)
+    assert problem.language == "cook the plate"
+    assert problem.obj_of_interest == ("black_bowl_2", "plate_1", "stove_1")
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
         ({"goals": []}, UnknownNameError, "key of task cook_it or its scene 'goals'. Did you mean 'goal'?"),
         ({"with": {}}, UnknownNameError, "parameter of task cook_it in '$thing'"),
         ({"goal": ["On plate_1 table"]}, BDDLError, "table is not declared; expected one of black_bowl_1"),
-        ({"language": None, "goal": "Turnon"}, BDDLError, "not an atom"),
+        ({"goal": "Turnon"}, BDDLError, "not an atom"),
         ({"regions": {"stove_1": {"cook_region": {"hlaf": 1}}}}, UnknownNameError, "Did you mean 'half'?"),
     ],
 )
@@ -182,6 +212,14 @@ def test_wrong_facts_are_refused(change, error, message):
     with pytest.raises(error) as caught:
         build_problem(SCENE, {**TASK, **change})
     assert message in str(caught.value)
+
+
+def test_a_task_without_scene_is_refused(monkeypatch):
+    monkeypatch.setattr(
+        suites, "load_data", lambda name: {"tasks": [TASK]} if name == "mine.yaml" else ["mine"]
+    )
+    with pytest.raises(LiberoError, match="task cook_it: neither it nor mine.yaml says 'scene'"):
+        get_suite.__wrapped__("mine")
 
 
 def test_a_task_without_goal_is_refused():
