@@ -100,7 +100,9 @@ def to_xml(name: str, assets: Iterable[ET.Element], bodies: Iterable[ET.Element]
     for asset in assets:
         asset = copy.copy(asset)
         if asset.tag == "mesh":
-            asset.set("inertia", "shell")  # of visual meshes, which weigh nothing: the volume need not be closed
+            asset.set(
+                "inertia", "shell"
+            )  # of visual meshes, which weigh nothing: the volume need not be closed
         section.append(asset)
     ET.SubElement(root, "worldbody").extend(bodies)
     return ET.tostring(root, encoding="unicode")

@@ -1,0 +1,147 @@
+"""Level of detail: visual meshes with fewer triangles, made once per machine and cached."""
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from libero_env.errors import LiberoError
+from libero_env.paths import cache_dir
+
+_CACHE_VERSION = 2
+_CHUNK = 256  # points whose distances to all others are in memory at once
+
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def simplify_visuals(spec: mujoco.MjSpec, faces: int) -> None:
+    """Give the meshes that nothing collides with at most about this many triangles; others stay as they are."""
+    solid = {g.meshname for g in spec.geoms if g.contype or g.conaffinity}
+    for mesh in spec.meshes:
+        if mesh.name not in solid and mesh.file:
+            arrays = _simplified(mesh.file, tuple(mesh.scale), faces)
+            if arrays is not None:
+                vertices, triangles, texcoords, face_texcoords = arrays
+                mesh.file, mesh.scale = "", (1.0, 1.0, 1.0)
+                mesh.uservert, mesh.userface = vertices.ravel(), triangles.ravel()
+                if len(texcoords):
+                    mesh.usertexcoord, mesh.userfacetexcoord = texcoords.ravel(), face_texcoords.ravel()
+
+
+@lru_cache(maxsize=256)
+def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | None:
+    """Vertices (n, 3), triangles (f, 3), texture coordinates (t, 2) and their indices (f, 3); None: small as it is."""
+    try:
+        content = Path(file).read_bytes()
+    except OSError as error:
+        raise LiberoError(f"{file}: {error}; `libero assets download` fetches it") from error
+    digest = hashlib.sha256(repr((_CACHE_VERSION, scale, faces)).encode() + content).hexdigest()[:24]
+    path = cache_dir() / "meshes" / f"lod-{digest}.npz"
+    if path.exists():
+        with np.load(path) as stored:
+            arrays = tuple(stored[f"a{i}"] for i in range(4))
+    else:
+        whole = _load(file, scale)
+        arrays = whole if len(whole[1]) <= faces else decimate(*whole, faces)
+        _store(path, arrays)
+    return arrays if len(arrays[1]) else None
+
+
+def _store(path: Path, arrays: Arrays) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.{np.random.SeedSequence().entropy:x}.npz")
+    np.savez_compressed(partial, **{f"a{i}": array for i, array in enumerate(arrays)})
+    partial.replace(path)
+
+
+def _load(file: str, scale: tuple[float, ...]) -> Arrays:
+    """A mesh as MuJoCo reads it, in the frame of the file."""
+    spec = mujoco.MjSpec()
+    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.add_mesh(name="mesh", file=file, scale=scale, inertia=shell)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    model = spec.compile()
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.mesh_quat[0])
+    vertices = model.mesh_vert.astype(np.float64) @ rotation.reshape(3, 3).T + model.mesh_pos[0]
+    textured = model.mesh_texcoordadr[0] >= 0
+    texcoords = model.mesh_texcoord.astype(np.float64) if textured else np.zeros((0, 2))
+    indices = model.mesh_facetexcoord if textured else np.zeros((0, 3))
+    return vertices, model.mesh_face.astype(np.int32), texcoords, indices.astype(np.int32)
+
+
+def decimate(
+    vertices: np.ndarray, triangles: np.ndarray, texcoords: np.ndarray, indices: np.ndarray, faces: int
+) -> Arrays:
+    """Simplify by quadric error; each corner takes the texture coordinate of the nearest one on the same patch.
+
+    A patch is a piece of the surface that the texture covers without a seam; a new triangle belongs to the patch of the
+    old triangle that lies nearest and faces the same way, so none stretches across a seam.
+
+    Args:
+        vertices: (n, 3), metres.
+        triangles: (f, 3), vertex indices.
+        texcoords: (t, 2); (0, 2) for a mesh without.
+        indices: (f, 3), which texture coordinate each corner has.
+        faces: number of triangles to aim at.
+
+    Returns:
+        The same four of the simplified mesh.
+    """
+    import fast_simplification  # only needed the first time on a machine
+
+    points, where = np.unique(vertices.round(7), axis=0, return_inverse=True)
+    merged = where.reshape(-1)[triangles]
+    new_points, new = fast_simplification.simplify(points, merged.astype(np.int32), target_count=faces, agg=5)
+    new_points, new = np.asarray(new_points, np.float64), np.asarray(new, np.int32)
+    new = new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
+    if not len(new):
+        raise LiberoError(
+            f"a mesh of {len(triangles)} triangles cannot be simplified to {faces}; ask for more"
+        )
+    if not len(texcoords):
+        return new_points, new, texcoords, np.zeros((0, 3), np.int32)
+    old_faces = nearest(_facing(new_points, new), _facing(points, merged))
+    corner_points, corner_texcoords = points[merged].reshape(-1, 3), indices.reshape(-1)
+    face_patch = _patches(merged, texcoords[indices])
+    corner_patch = np.repeat(face_patch, 3)
+    result = np.zeros_like(new)
+    for one in np.unique(face_patch[old_faces]):
+        chosen, there = face_patch[old_faces] == one, np.flatnonzero(corner_patch == one)
+        found = nearest(new_points[new[chosen]].reshape(-1, 3), corner_points[there])
+        result[chosen] = corner_texcoords[there[found]].reshape(-1, 3)
+    used, compact = np.unique(result, return_inverse=True)
+    return new_points, new, texcoords[used], compact.reshape(-1, 3).astype(np.int32)
+
+
+def nearest(points: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """For each of points (n, d) the index of the nearest of `among` (m, d); (n,)."""
+    half = 0.5 * (among**2).sum(axis=1)
+    parts = [points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
+    return np.concatenate([np.argmin(half - part @ among.T, axis=1) for part in parts])
+
+
+def _facing(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Centres of triangles (f, 3), and their normals at a tenth of the mesh's size; (f, 6)."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return np.hstack([(a + b + c) / 3, 0.1 * np.ptp(points, axis=0).max() * normals])
+
+
+def _patches(triangles: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
+    """Label of the piece of texture that each of triangles (f, 3) is on, (f,); texcoords of the corners (f, 3, 2).
+
+    Two triangles are on one piece where they share a vertex that has the same texture coordinate in both.
+    """
+    corners = np.concatenate([triangles.reshape(-1, 1), texcoords.reshape(-1, 2).round(6)], axis=1)
+    shared = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    label = np.arange(shared.max() + 1)
+    while True:
+        before = label.copy()
+        np.minimum.at(label, shared.reshape(-1), np.repeat(label[shared].min(axis=1), 3))
+        label = label[label]
+        if (label == before).all():
+            return label[shared[:, 0]]
