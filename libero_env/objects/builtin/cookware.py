@@ -3,7 +3,7 @@
 import numpy as np
 
 from libero_env.objects.builtin.assemble import Look
-from libero_env.objects.builtin.mesh import Mesh, Ring, box, faceted, loft, merge, sweep
+from libero_env.objects.builtin.mesh import Mesh, Ring, faceted, loft, merge, sweep
 from libero_env.objects.builtin.paint import Canvas
 from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, SPARE, vessel
 
@@ -87,7 +87,7 @@ def wine_bottle() -> Look:
 
 def bowl_drainer() -> Look:
     """White bin with two compartments and handle slots in its walls."""
-    canvas = Canvas((240, 240, 240), (512, 128))
+    canvas = Canvas((240, 240, 240), (1024, 128))
     canvas.gradient(0.0, 0.44, (206, 207, 210), (244, 244, 244))
     canvas.gradient(0.52, 0.92, (240, 240, 240), (188, 190, 194))
     for u in (0.0, 0.25, 0.5, 0.75, 1.0):
@@ -108,9 +108,14 @@ def bowl_drainer() -> Look:
     ]  # fmt: skip
     shell = [Ring(z, depth, width, v, round=9.0, crease=crease) for z, depth, width, v, crease in walls]
     x, y = BIN_CENTER
-    cells = dict.fromkeys(("front", "back", "left", "right", "top", "bottom"), SPARE)
-    divider = box((0.0870, 0.0036, 0.0640), (x, y, 0.0700), cells)
-    return Look(merge([loft(shell, segments=28, center=BIN_CENTER), divider]), canvas.png(), specular=0.3)
+    divider = sweep(  # as wide as the walls leave it
+        [(x, y, 0.0080), (x, y, 0.0300), (x, y, 0.1340)],
+        [(0.0790, 0.0037), (0.0865, 0.0037), (0.0970, 0.0037)],
+        ACROSS, 8, SPARE, 12.0,
+    )  # fmt: skip
+    return Look(
+        merge([loft(shell, segments=28, center=BIN_CENTER), faceted(divider)]), canvas.png(), specular=0.3
+    )
 
 
 LOOKS = {

@@ -53,7 +53,7 @@ def white_yellow_mug() -> Look:
     canvas = _glaze(white, inside=yellow, depth=(176, 128, 20))
     canvas.band(0.0, 0.265, yellow)
     canvas.band(RIM_V - 0.012, INNER_V + 0.01, white)
-    canvas.rect(*SPARE, yellow)
+    canvas.band(FLOOR_V + 0.01, 1.0, yellow)
     outside = [
         (0.0, 0.0010), (0.0255, 0.0), (0.0345, 0.0085), (0.0385, 0.0180), (0.0412, 0.0360),
         (0.0442, 0.0590), (0.0478, 0.0860), (0.0500, 0.1020), (0.0495, 0.1035),
