@@ -28,7 +28,6 @@ _KD = 2.0 * np.sqrt(150.0)
 _NULL_KP = 10.0
 _NULL_KD = 2.0 * np.sqrt(10.0)
 REST = np.array(REST_QPOS)  # rad
-CONTROLLER_STATE_SIZE = 14
 
 
 @dataclass(frozen=True)
@@ -55,27 +54,6 @@ class ArmIndex:
         fingers = np.array([model.joint(n).id for n in FINGER_JOINTS], np.int64)
         limit, finger_range = model.actuator_ctrlrange[:7, 1].copy(), model.actuator_ctrlrange[7:9].copy()
         return cls(joints, address, model.site(GRIP_SITE).id, limit, fingers, finger_range)
-
-
-class ControllerState:
-    """Goals and gripper commands of n simulations; what control remembers between steps."""
-
-    def __init__(self, num: int):
-        self.goal_pos = np.zeros((num, 3))  # world frame, m
-        self.goal_mat = np.zeros((num, 9))  # grip site to world, row major
-        self.gripper = np.zeros((num, 2))  # command state in [-1, 1]
-
-    def restart(self, ids: np.ndarray, site_pos: np.ndarray, site_mat: np.ndarray) -> None:
-        """Hold the current pose, gripper command neutral."""
-        self.goal_pos[ids], self.goal_mat[ids], self.gripper[ids] = site_pos, site_mat, 0.0
-
-    def pack(self, i: int) -> np.ndarray:
-        """The state of simulation i as a vector, (14,)."""
-        return np.concatenate([self.goal_pos[i], self.goal_mat[i], self.gripper[i]])
-
-    def unpack(self, i: int, vector: np.ndarray) -> None:
-        """The inverse of `pack`."""
-        self.goal_pos[i], self.goal_mat[i], self.gripper[i] = vector[:3], vector[3:12], vector[12:14]
 
 
 def checked_actions(actions: object, num: int | None = None, size: int = ACTION_DIM) -> np.ndarray:

@@ -2,15 +2,15 @@
 
 Semantics and gains are those of robosuite 1.4 (`controllers/config/*.json` there):
 
-| name | action, `control_delta=True` | action, `control_delta=False` |
+| name | action, `control_delta=True` | `control_delta=False` |
 |---|---|---|
-| `osc_pose` | position (1 is 5 cm), rotation vector (1 is 0.5 rad), gripper | position m, rotation vector rad, gripper |
-| `osc_position` | position (1 is 5 cm), gripper; the hand points down | position m, gripper; the hand points down |
-| `joint_position` | seven joints (1 is 0.05 rad), gripper | seven joints rad, gripper |
-| `joint_velocity` | seven joints (1 is 0.5 rad/s), gripper | none |
+| `osc_pose` | position (1 is 5 cm), rotation vector (1 is 0.5 rad), gripper | m, rad, gripper |
+| `osc_position` | position (1 is 5 cm), gripper; the hand points down | m, gripper |
+| `joint_position` | seven joints (1 is 0.05 rad), gripper | rad, gripper |
+| `joint_velocity` | seven joints (1 is 0.5 rad/s), gripper | |
 
-Deltas count from the pose at the beginning of the step; poses are the grip site's in the world frame. The gripper's number is
-the last one: -1 opens, +1 closes. Values outside the action space are clipped.
+Deltas count from the pose at the beginning of the step; poses are the grip site's in the world frame. The gripper's
+number is the last one: -1 opens, +1 closes. Values outside the action space are clipped.
 """
 
 from collections.abc import Callable
@@ -73,9 +73,9 @@ class Controller:
 class ControllerState:
     """Goals, memory and gripper commands of n simulations; what control remembers between steps."""
 
-    def __init__(self, num: int, controller: Controller | None = None):
-        self.controller = controller or get_controller()
-        first, second = self.controller.goal_sizes
+    def __init__(self, num: int, kind: Controller | None = None):
+        self.kind = kind or get_controller()
+        first, second = self.kind.goal_sizes
         # OSC: goal position (3) and orientation (9); joints: goal (7) and memory. World frame, SI units.
         self.goal, self.memory = np.zeros((num, first)), np.zeros((num, second))
         self.gripper = np.zeros((num, 2))  # command state in [-1, 1]
@@ -87,7 +87,7 @@ class ControllerState:
 
     def restart(self, ids: np.ndarray, site_pos: np.ndarray, site_mat: np.ndarray) -> None:
         """Hold the current pose, gripper command neutral; (k,), (k, 3), (k, 9)."""
-        holds_pose = self.controller.goal_sizes == (3, 9)
+        holds_pose = self.kind.goal_sizes == (3, 9)
         self.goal[ids], self.memory[ids] = (site_pos, site_mat) if holds_pose else (0.0, 0.0)
         self.gripper[ids] = 0.0
 
@@ -95,7 +95,7 @@ class ControllerState:
         self, ids: np.ndarray, actions: np.ndarray, qpos: np.ndarray, site_pos: np.ndarray, site_mat: np.ndarray
     ) -> None:
         """New goals at the first substep; arrays (num, ...)."""
-        self.controller.set_goals(ids, actions, qpos, site_pos, site_mat, self.goal, self.memory)
+        self.kind.set_goals(ids, actions, qpos, site_pos, site_mat, self.goal, self.memory)
 
     def pack(self, i: int) -> np.ndarray:
         """The state of simulation i as a vector, (state_size,)."""
@@ -103,7 +103,7 @@ class ControllerState:
 
     def unpack(self, i: int, vector: np.ndarray) -> None:
         """The inverse of `pack`."""
-        for array, part in zip(self.arrays, np.split(vector, np.cumsum(self.controller.goal_sizes)), strict=True):
+        for array, part in zip(self.arrays, np.split(vector, np.cumsum(self.kind.goal_sizes)), strict=True):
             array[i] = part
 
 

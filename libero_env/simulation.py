@@ -12,15 +12,8 @@ from copy import copy
 import mujoco
 import numpy as np
 
-from libero_env.control import (
-    CONTROLLER_STATE_SIZE,
-    REST,
-    SUBSTEPS,
-    ArmIndex,
-    ControllerState,
-    control,
-    set_goals,
-)
+from libero_env.control import REST, SUBSTEPS, ArmIndex
+from libero_env.controllers import ControllerState
 from libero_env.errors import LiberoError
 
 try:
@@ -46,7 +39,7 @@ class Simulations(ABC):
         num: number of simulations.
         fixtures: (num, nfixtures, 7) pos, quat wxyz of the fixed bodies whose pose differs between simulations.
         fields: name of an MjData field -> array (num, ...), for reading. Kinematics are those of the current state.
-        controller: goals and gripper commands.
+        controller: which controller runs, its goals and gripper commands; may be replaced by another.
     """
 
     def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Sequence[int] = ()):
@@ -111,13 +104,13 @@ class Simulations(ABC):
         self.model.body_quat[self.fixture_bodies] = self.fixtures[i, :, 3:]
 
     def step(self, ids: Sequence[int], actions: np.ndarray, tap: Tap | None = None) -> None:
-        """Advance the simulations `ids` by one control period; actions (num, 7), rows of other simulations unused.
+        """Advance the simulations `ids` by one control period; actions (num, action_dim), rows of others unused.
 
         `tap` sees each MjData after the last integration and before its kinematics follow: positions are those of the
         end, everything else is one substep old, as in the original's observations. `LoopSimulations` only.
         """
         ids = np.asarray(ids, np.int64)
-        set_goals(ids, actions, *self._grip(), self.controller.goal_pos, self.controller.goal_mat)
+        self.controller.set_goals(ids, actions, self.fields["qpos"], *self._grip())
         self._substeps(ids, actions, tap)
 
     def get_state(self, i: int) -> np.ndarray:
@@ -139,7 +132,8 @@ class Simulations(ABC):
     def state_size(self) -> int:
         """Length of the vector of `get_state`."""
         model = self.model
-        return 1 + model.nq + 2 * model.nv + 7 * len(self.fixture_bodies) + model.nu + CONTROLLER_STATE_SIZE
+        remembered = model.nv + model.nu + self.controller.kind.state_size
+        return 1 + model.nq + model.nv + 7 * len(self.fixture_bodies) + remembered
 
     def _grip(self) -> tuple[np.ndarray, np.ndarray]:
         site = self.arm.site
@@ -193,9 +187,9 @@ class LoopSimulations(Simulations):
             data, (inputs, ctrl), own = self._datas[i], self._calls[i], slice(i, i + 1)
             if self.num > 1:
                 self.pose_fixtures(i)
-            state = (c.goal_pos[own], c.goal_mat[own], c.gripper[own])
+            kernel, state = c.kind.kernel, [array[own] for array in c.arrays]
             for substep in range(SUBSTEPS):
-                control(first, actions[own], *inputs, *state, ctrl, *constants)
+                kernel(first, actions[own], *inputs, *state, ctrl, *constants)
                 mujoco.mj_step2(model, data)
                 if tap is not None and substep == SUBSTEPS - 1:
                     tap(data)
@@ -242,10 +236,10 @@ class BatchSimulations(Simulations):
         if tap is not None:
             raise LiberoError("batched simulations cannot be tapped; use LoopSimulations")
         c, constants, ctrl = self.controller, self._constants(), self.fields["ctrl"]
-        inputs = self._inputs(self.fields)
+        inputs, kernel = self._inputs(self.fields), c.kind.kernel
         stage = mujoco.mjtStage.mjSTAGE_VEL
         for _ in range(SUBSTEPS):
-            control(ids, actions, *inputs, c.goal_pos, c.goal_mat, c.gripper, ctrl, *constants)
+            kernel(ids, actions, *inputs, *c.arrays, ctrl, *constants)
             self._batch.step(ids, nstep=1, stage=stage)
 
     def _remembered(self, i: int) -> list[np.ndarray]:
