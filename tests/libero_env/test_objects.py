@@ -21,6 +21,7 @@ GROCERIES = CANS_AND_BOTTLES + PACKETS
 PACKED = (*GROCERIES, "basket")
 MAX_TRIANGLES, MAX_TRIANGLES_PACKED = 1500, 400
 MAX_BOXES, MAX_BOXES_PACKED = 40, 5
+WALL_MOUNTED = ("basin_faucet",)  # has no free joint in the original, and cannot stand
 SITES_ONLY = ("target_zone",)  # marks a place: no mass, no collision, no figures
 THINGS = tuple(name for name in object_names() if name not in SITES_ONLY)
 
@@ -182,8 +183,8 @@ def test_collision_bounds(category, measured):
 
 
 def test_visual_bounds(category, measured):
-    # The measured picture of the basket is that of another object: its collision box counts.
-    key = "collision_aabb" if category == "basket" else "visual_aabb"
+    # The measured picture of the basket is that of another object, that of the stove lacks its plate.
+    key = "collision_aabb" if category in ("basket", "flat_stove") else "visual_aabb"
     compiled = get_object(category).spec.compile()
     visual = np.flatnonzero(compiled.geom_group == 1)
     assert bounds(compiled, visual) == pytest.approx(np.array(measured[category][key]), abs=0.005)
@@ -199,7 +200,7 @@ def test_sites(category, measured):
         site = compiled.site(record["name"])
         assert data.site(record["name"]).xpos == pytest.approx(np.array(record["pos"]), abs=0.001)
         assert data.site(record["name"]).xmat == pytest.approx(np.array(record["xmat"]), abs=1e-6)
-        used = {"sphere": 1, "box": 3}[record["type"]]
+        used = {"sphere": 1, "cylinder": 2, "box": 3}[record["type"]]
         assert site.size[:used] == pytest.approx(np.array(record["size"][:used]), abs=0.001)
 
 
@@ -215,10 +216,13 @@ def test_placement_figures(category, measured):
     assert model.bottom_offset == pytest.approx(tuple(record["bottom_offset"]))
     assert model.top_offset == pytest.approx(tuple(record["top_offset"]))
     assert model.horizontal_radius == record["horizontal_radius"]
-    assert model.joint_damping == record["joints"][0]["damping"]
+    if category not in WALL_MOUNTED:
+        assert model.joint_damping == record["joints"][0]["damping"]
 
 
 def test_dropped_at_rest_it_stands(category):
+    if category in WALL_MOUNTED:
+        pytest.skip("hangs over its basin")
     model = get_object(category)
     rest = model.rest_quat()
     scene = scene_spec()
@@ -238,13 +242,14 @@ def test_dropped_at_rest_it_stands(category):
     assert np.degrees(np.arccos(np.clip(up[2], -1, 1))) < 5.0
 
 
-@pytest.mark.parametrize("names", [("ketchup", "ketchup"), ("milk", "basket"), object_names()])
+@pytest.mark.parametrize("names", [("ketchup", "ketchup"), ("milk", "basket"), THINGS])
 def test_objects_share_a_scene(names):
     scene = scene_spec()
     for index, name in enumerate(names):
         attach(scene, get_object(name), f"{name}_{index}_", (0.3 * index, 0, 0.2), (1, 0, 0, 0))
     compiled = scene.compile()
-    assert compiled.nq == 7 * len(names)
+    joints = [0, *np.cumsum([1 + get_object(name).spec.compile().njnt for name in names])]
+    assert compiled.njnt == joints[-1] and compiled.nq == joints[-1] + 6 * len(names)
     reread = mujoco.MjSpec.from_string(scene.to_xml(), assets=scene.assets).compile()
     assert reread.nq == compiled.nq and np.array_equal(reread.tex_data, compiled.tex_data)
     for index, name in enumerate(names):
@@ -252,12 +257,20 @@ def test_objects_share_a_scene(names):
         alone = get_object(name).spec.compile()
         assert compiled.body(f"{prefix}main").mass == pytest.approx(alone.body("main").mass)
         assert compiled.body(f"{prefix}main").inertia == pytest.approx(alone.body("main").inertia)
-        assert compiled.jnt(f"{prefix}joint0").id == index
-        assert compiled.dof_damping[6 * index : 6 * index + 6] == pytest.approx(0.0005)
-        material = compiled.geom_matid[compiled.geom(f"{prefix}visual").id]
-        texture = compiled.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
-        start, count = compiled.tex_adr[texture], alone.ntexdata
-        assert np.array_equal(compiled.tex_data[start : start + count], alone.tex_data)
+        assert compiled.jnt(f"{prefix}joint0").id == joints[index]
+        start = compiled.jnt_dofadr[joints[index]]
+        assert compiled.dof_damping[start : start + 6] == pytest.approx(0.0005)
+        assert compiled.dof_damping[start + 6 : start + 6 + alone.nv] == pytest.approx(alone.dof_damping)
+        for texture in range(alone.ntex):
+            data, attached = texture_of(alone, texture), compiled.tex(prefix + alone.tex(texture).name).id
+            assert np.array_equal(texture_of(compiled, attached), data)
+
+
+def texture_of(model: mujoco.MjModel, texture: int) -> np.ndarray:
+    """Bytes of a texture, (n,) uint8."""
+    start = model.tex_adr[texture]
+    size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
+    return model.tex_data[start : start + size]
 
 
 def test_rest_orientations_are_those_of_the_initial_states():
@@ -371,5 +384,5 @@ def test_bad_registrations_are_named(scratch_catalog):
 
 
 def test_every_builtin_has_figures():
-    for name in BUILDERS:
+    for name in set(BUILDERS) - set(SITES_ONLY):
         assert load_facts(name).mass > 0
