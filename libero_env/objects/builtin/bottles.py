@@ -1,4 +1,4 @@
-"""Sauce bottles: elliptic lofts with a label on both sides and a coloured cap."""
+"""Sauce bottles and a jar: lofts with a label on both sides and a coloured cap."""
 
 from collections.abc import Sequence
 
@@ -47,7 +47,32 @@ def bbq_sauce() -> Look:
     return Look(_bbq_mesh(), canvas.png(), specular=0.5, shininess=0.6)
 
 
-LOOKS = {"bbq_sauce": bbq_sauce, "ketchup": ketchup, "salad_dressing": salad_dressing}
+def new_salad_dressing() -> dict[str, Look]:
+    """The same bottle, on a body that stands beside its root."""
+    return {"sald_dressing_body": salad_dressing()}
+
+
+def mayo() -> Look:
+    """Glass jar of cream, blue lid, blue label with a yellow band."""
+    canvas = _bottle((250, 243, 218), cap=(24, 66, 158), groove=(14, 44, 116))
+    canvas.band(0.10, 0.58, (30, 84, 182))
+    canvas.band(0.10, 0.13, (250, 204, 44))
+    canvas.band(0.55, 0.58, (250, 204, 44))
+    for u in (0.0, 0.5, 1.0):
+        canvas.disc(u, 0.34, 0.19, 0.175, (250, 204, 44))
+        canvas.disc(u, 0.34, 0.178, 0.155, (255, 252, 240))
+        canvas.text("MAYO", (u - 0.135, 0.29, u + 0.135, 0.42), (24, 66, 158))
+        canvas.disc(u, 0.235, 0.030, 0.032, (250, 190, 40))
+    return Look(_jar_mesh(), canvas.png(), specular=0.6, shininess=0.7)
+
+
+LOOKS = {
+    "bbq_sauce": bbq_sauce,
+    "ketchup": ketchup,
+    "mayo": mayo,
+    "new_salad_dressing": new_salad_dressing,
+    "salad_dressing": salad_dressing,
+}
 
 
 def _ketchup_mesh() -> Mesh:
@@ -86,6 +111,24 @@ def _bbq_mesh() -> Mesh:
         (0.0260, 0.0140, 0.0140),
     ]
     cap = [(0.0260, 0.0156, 0.0156), (0.0520, 0.0148, 0.0148), (0.0550, 0.0125, 0.0125)]
+    return _skin(body, cap, center=(0.0, 0.0))
+
+
+def _jar_mesh() -> Mesh:
+    body = [
+        (-0.0510, 0.0285, 0.0285),
+        (-0.0490, 0.0312, 0.0312),
+        (-0.0400, 0.0322, 0.0322),
+        (0.0130, 0.0322, 0.0322),
+        (0.0240, 0.0308, 0.0308),
+        (0.0310, 0.0268, 0.0268),
+    ]
+    cap = [
+        (0.0310, 0.0298, 0.0298),
+        (0.0330, 0.0306, 0.0306),
+        (0.0490, 0.0306, 0.0306),
+        (0.0510, 0.0290, 0.0290),
+    ]
     return _skin(body, cap, center=(0.0, 0.0))
 
 
