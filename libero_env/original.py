@@ -46,6 +46,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )  # fmt: skip
 _STEMS = {"rack": "simple_rack"}
+_ROOM = "room_"
 _NAMED_ONLY = ("cherries", "corn", "mayo")  # the original has the names, its files were never published
 
 
@@ -121,11 +122,15 @@ class OriginalPack:
             UnknownNameError: a property names a style that does not exist.
             LiberoError: files are missing.
         """
+        from libero_env.arena import add_cameras_and_lights
         from libero_env.original_arena import arena_spec
 
         room = arena_spec(Path(self.root), workspace, scene_properties)
         self._simplify(room)
-        spec.attach(room, frame=spec.worldbody.add_frame())
+        spec.attach(room, prefix=_ROOM, frame=spec.worldbody.add_frame())
+        for item in (*spec.bodies, *spec.geoms, *spec.sites):
+            item.name = item.name.removeprefix(_ROOM)  # MuJoCo warns of an empty prefix; assets keep theirs
+        add_cameras_and_lights(spec, workspace)
 
     def _simplify(self, spec: mujoco.MjSpec) -> None:
         if self.lod is not None:
