@@ -1,48 +1,48 @@
 """One simulation of a task as a `gymnasium.Env`."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 
-from libero_env.control import ACTION_DIM, SUBSTEPS, checked_actions
+from libero_env.assets import Pack
+from libero_env.control import SUBSTEPS, checked_actions
 from libero_env.errors import LiberoError
+from libero_env.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.predicates import StateView
+from libero_env.rewards import Reward
 from libero_env.scene import TIMESTEP
 from libero_env.tasks import Task
-from libero_env.world import DEFAULT_CAMERAS, World
+from libero_env.world import World
 
 CONTROL_HZ = round(1.0 / (SUBSTEPS * TIMESTEP))  # 20
-
-
-def observation_space(world: World) -> spaces.Dict:
-    """The space of one simulation's observations."""
-    box = lambda n: spaces.Box(-np.inf, np.inf, (n,), np.float64)  # noqa: E731
-    frames = {k: spaces.Box(0, 255, v.shape[1:], np.uint8) for k, v in world.empty_frames().items()}
-    return spaces.Dict({**frames, **{k: box(v.shape[1]) for k, v in world.proprioception().items()}})
-
-
-def action_space() -> spaces.Box:
-    """Seven numbers: position delta (1 is 5 cm), rotation delta (1 is 0.5 rad), gripper (-1 opens, +1 closes)."""
-    return spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 
 
 class LiberoEnv(gymnasium.Env):
     """A task of the benchmark at 20 Hz.
 
     Observations: `<camera>_rgb` (H, W, 3) uint8, first row on top; `joint_states` (7,) rad; `gripper_states` (2,) m;
-    `ee_pos` (3,) m; `ee_ori` (3,) axis-angle. All describe the state after the step.
+    `ee_pos` (3,) m; `ee_ori` (3,) axis-angle; `libero_env.observations` lists what else there is. All describe the
+    state after the step.
 
     Reward is 1 in the step that reaches the goal and 0 otherwise; reaching it terminates the episode, `horizon` steps
     truncate it. `info["success"]` says whether the goal holds, `info["progress"]` the truth of its atoms.
+
+    Attributes:
+        draw: set to False, nothing is drawn, and pictures in observations are the last ones drawn (black before the
+            first); `render_frames` draws when they are wanted.
 
     Args:
         task: a `Task`, or what `get_task` takes: `libero_object/3`, `libero_object-3`, or a task's name.
         cameras: drawn for each observation; `()` for none.
         camera_size: (height, width), pixels.
         horizon: steps after which an episode is truncated.
+        observations: names from `libero_env.observations`.
+        controller, control_delta: what an action means; see `libero_env.controllers`.
+        reward, reward_scale: `sparse` or `staged`, see `libero_env.rewards`; and what success is worth.
+        assets: where the models come from: None for the user's choice, `builtin`, a folder, or a `Pack`.
         render_mode: None, or `rgb_array` for `render()`.
     """
 
@@ -55,13 +55,25 @@ class LiberoEnv(gymnasium.Env):
         cameras: Sequence[str] = DEFAULT_CAMERAS,
         camera_size: tuple[int, int] = (128, 128),
         horizon: int = 600,
+        observations: Sequence[str] = DEFAULT_OBSERVATIONS,
+        controller: str = "osc_pose",
+        control_delta: bool = True,
+        reward: str = "sparse",
+        reward_scale: float = 1.0,
+        assets: Pack | str | Path | None = None,
         render_mode: str | None = None,
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise LiberoError(f"render_mode {render_mode!r}; valid: None, {', '.join(self.metadata['render_modes'])}")
-        self.world = World(task, 1, cameras=cameras, camera_size=camera_size)
+        self.reward = Reward(reward, reward_scale)
+        self.world = World(
+            task, 1, cameras=cameras, camera_size=camera_size, observations=observations, controller=controller,
+            control_delta=control_delta, assets=assets,
+        )  # fmt: skip
         self.task, self.horizon, self.render_mode = self.world.task, horizon, render_mode
-        self.observation_space, self.action_space = observation_space(self.world), action_space()
+        self.observation_space, self.action_space = self.world.observation_space(), self.world.action_space()
+        self.draw = True
+        self._frames = self.world.empty_frames()
         self._steps, self._running = 0, False
 
     @property
@@ -95,13 +107,13 @@ class LiberoEnv(gymnasium.Env):
         """Act for 50 ms.
 
         Args:
-            action: (7,); values outside [-1, 1] are clipped.
+            action: as `action_space` has it, (7,) by default; values outside it are clipped.
 
         Raises:
             ActionError: wrong shape or not finite; nothing has moved.
             LiberoError: the episode is over, or has not begun.
         """
-        action = checked_actions(action)
+        action = checked_actions(action, size=self.world.controller.action_dim)
         if not self._running:
             raise LiberoError("no episode is running; call reset()")
         self.world.step([0], action[None])
@@ -110,7 +122,8 @@ class LiberoEnv(gymnasium.Env):
         terminated = info["success"]
         truncated = not terminated and self._steps >= self.horizon
         self._running = not (terminated or truncated)
-        return self._observe(), float(terminated), terminated, truncated, info
+        reward = self.reward(self.view, terminated, self.world.atoms, list(info["progress"].values()))
+        return self._observe(), reward, terminated, truncated, info
 
     def get_state(self) -> np.ndarray:
         """Everything the rest of the episode depends on, for `set_state`: simulation, controller and step count."""
@@ -142,6 +155,11 @@ class LiberoEnv(gymnasium.Env):
         self._running = True
         return self._observe()
 
+    def render_frames(self) -> dict[str, np.ndarray]:
+        """The observed pictures of the current state, drawn now: name -> (H, W, ...)."""
+        self.world.draw([0], self._frames)
+        return {key: rows[0].copy() for key, rows in self._frames.items()}
+
     def render(self) -> np.ndarray | None:
         """The agent's camera as (H, W, 3) uint8 in `rgb_array` mode, else None."""
         return self.world.frame(0, "agentview") if self.render_mode == "rgb_array" else None
@@ -151,12 +169,14 @@ class LiberoEnv(gymnasium.Env):
         self.world.close()
 
     def _observe(self) -> dict[str, np.ndarray]:
-        frames = self.world.empty_frames()
-        self.world.draw([0], frames)
-        return {key: rows[0] for key, rows in {**frames, **self.world.proprioception()}.items()}
+        if self.draw:
+            self.world.draw([0], self._frames)
+        frames = {key: rows[0].copy() for key, rows in self._frames.items()}
+        return {**frames, **{key: rows[0] for key, rows in self.world.proprioception().items()}}
 
     def _info(self) -> dict[str, Any]:
-        return {"success": bool(self.world.goal_reached([0])[0]), "progress": self.world.progress(0)}
+        success, progress = self.world.judge(0)
+        return {"success": success, "progress": progress}
 
 
 def checked_options(options: dict[str, Any] | None) -> dict[str, Any]:

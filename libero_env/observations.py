@@ -1,12 +1,12 @@
 """What a policy may see of a simulation, and the conventions of it.
 
-Names that `observations=` takes, and the entries they give (H W: `camera_size`; one row for each simulation in a batch):
+Names that `observations=` takes, and the entries they give (H W: `camera_size`; in a batch with a leading axis):
 
 | name | entries |
 |---|---|
 | `rgb` | `<camera>_rgb` (H, W, 3) uint8, first row on top |
 | `depth` | `<camera>_depth` (H, W) float32, metres along the optical axis |
-| `segmentation_instance`, `_class`, `_element` | `<camera>_segmentation` (H, W) int32; `Observer.labels` names the numbers |
+| `segmentation_instance`, `_class`, `_element` | `<camera>_segmentation` (H, W) int32; `Observer.labels` says of what |
 | `proprioception` | the first four of the following |
 | `joint_states` | (7,) rad |
 | `gripper_states` | (2,) m |
@@ -15,8 +15,8 @@ Names that `observations=` takes, and the entries they give (H W: `camera_size`;
 | `ee_quat` | (4,) wxyz, of the hand |
 | `joint_velocities` | (7,) rad/s |
 | `gripper_velocities` | (2,) m/s |
-| `objects` | for each object and fixture `<name>_pos` (3,), `<name>_quat` (4,) wxyz, and seen from the hand at the grip site |
-| | `<name>_to_ee_pos`, `<name>_to_ee_quat`; where it has joints `<name>_joints` (k,) rad or m |
+| `objects` | of each object and fixture `<name>_pos` (3,) and `<name>_quat` (4,) wxyz; the same in the hand frame at |
+| | the grip site, `<name>_to_ee_pos` and `<name>_to_ee_quat`; where it has joints `<name>_joints` (k,) rad or m |
 
 `<camera>` is the camera's name without `robot0_`. Poses are in the world frame unless said otherwise.
 """
@@ -214,10 +214,9 @@ class Observer:
         self.renderer.draw(self._data, pictures, glowing_sites(self.views[i]))
 
     def _pose(self, i: int) -> None:
-        data, model, f = self._data, self.scene.model, self.simulations.fields
-        data.qpos[:] = f["qpos"][i]
-        if model.nmocap:
-            data.mocap_pos[:], data.mocap_quat[:] = f["mocap_pos"][i], f["mocap_quat"][i]
+        data, model = self._data, self.simulations.model
+        self.simulations.pose_fixtures(i)
+        data.qpos[:] = self.simulations.fields["qpos"][i]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)

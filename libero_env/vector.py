@@ -1,6 +1,7 @@
 """Many simulations of one task in one process, as a `gymnasium.vector.VectorEnv`."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -8,11 +9,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from libero_env.assets import Pack
 from libero_env.control import checked_actions
-from libero_env.env import CONTROL_HZ, action_space, checked_options, observation_space
+from libero_env.env import CONTROL_HZ, checked_options
 from libero_env.errors import LiberoError
+from libero_env.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
+from libero_env.rewards import Reward
 from libero_env.tasks import Task
-from libero_env.world import DEFAULT_CAMERAS, World
+from libero_env.world import World
 
 
 class BatchEnv(gymnasium.vector.VectorEnv):
@@ -25,7 +29,11 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         task: a `Task`, or what `get_task` takes.
         num_envs: number of simulations.
         num_threads: threads of the physics; 0 is one for each core. Results do not depend on it.
-        cameras, camera_size, horizon: as in `LiberoEnv`.
+        cameras, camera_size, horizon, observations, controller, control_delta, reward, reward_scale, assets: as in
+            `LiberoEnv`.
+
+    Attributes:
+        draw: as in `LiberoEnv`.
     """
 
     metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
@@ -39,13 +47,25 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         cameras: Sequence[str] = DEFAULT_CAMERAS,
         camera_size: tuple[int, int] = (128, 128),
         horizon: int = 600,
+        observations: Sequence[str] = DEFAULT_OBSERVATIONS,
+        controller: str = "osc_pose",
+        control_delta: bool = True,
+        reward: str = "sparse",
+        reward_scale: float = 1.0,
+        assets: Pack | str | Path | None = None,
     ):
-        self.world = World(task, num_envs, threads=num_threads, cameras=cameras, camera_size=camera_size)
+        self.reward = Reward(reward, reward_scale)
+        self.world = World(
+            task, num_envs, threads=num_threads, cameras=cameras, camera_size=camera_size,
+            observations=observations, controller=controller, control_delta=control_delta, assets=assets,
+        )  # fmt: skip
         self.task, self.num_envs, self.horizon, self.render_mode = self.world.task, num_envs, horizon, None
-        self.single_observation_space, self.single_action_space = observation_space(self.world), action_space()
+        self.single_observation_space = self.world.observation_space()
+        self.single_action_space = self.world.action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
+        self.draw = True
         self._frames = self.world.empty_frames()
         self._steps = np.zeros(num_envs, np.int64)
         self._running = np.zeros(num_envs, bool)
@@ -97,17 +117,17 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         Raises:
             ActionError: wrong shape or not finite; nothing has moved.
         """
-        actions = checked_actions(actions, self.num_envs)
+        actions = checked_actions(actions, self.num_envs, self.world.controller.action_dim)
         ids = np.flatnonzero(self._running)
-        reached = np.zeros(self.num_envs, bool)
+        reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
         if ids.size:
             self.world.step(ids, actions)
-            reached[ids] = self.world.goal_reached(ids)
+            reached[ids], rewards[ids] = self._judge(ids)
             self._steps[ids] += 1
         truncated = self._running & ~reached & (self._steps >= self.horizon)
         self._success |= reached
         self._running &= ~(reached | truncated)
-        return self._observe(ids), reached.astype(np.float64), reached, truncated, self._info()
+        return self._observe(ids), rewards, reached, truncated, self._info()
 
     def get_state(self, i: int) -> np.ndarray:
         """Simulation i as `LiberoEnv.get_state` gives it."""
@@ -117,6 +137,12 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         """Put simulation i into a state of `get_state` (of this or of a single environment)."""
         self.world.simulations.set_state(i, np.asarray(state[:-1], np.float64))
         self._steps[i], self._running[i], self._success[i] = int(state[-1]), True, False
+
+    def render_frames(self, ids: Sequence[int] | None = None) -> dict[str, np.ndarray]:
+        """The observed pictures of the current states, drawn now; by default of all: name -> (n, H, W, ...)."""
+        ids = range(self.num_envs) if ids is None else ids
+        self.world.draw(ids, self._frames)
+        return {key: rows[np.asarray(ids, np.int64)] for key, rows in self._frames.items()}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free simulations and GL context."""
@@ -133,8 +159,21 @@ class BatchEnv(gymnasium.vector.VectorEnv):
             if seeds[i] is not None:
                 self._generators[i] = np.random.Generator(np.random.PCG64(int(seeds[i])))
 
+    def _judge(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether the goal holds in each of the simulations, and its reward."""
+        if self.reward.kind == "sparse":
+            reached = self.world.goal_reached(ids)
+            return reached, self.reward.scale * reached
+        judged = [self.world.judge(i) for i in ids]
+        rewards = [
+            self.reward(self.world.views[i], reached, self.world.atoms, list(progress.values()))
+            for i, (reached, progress) in zip(ids, judged, strict=True)
+        ]
+        return np.array([reached for reached, _ in judged]), np.array(rewards)
+
     def _observe(self, drawn: np.ndarray) -> dict[str, np.ndarray]:
-        self.world.draw(drawn, self._frames)
+        if self.draw:
+            self.world.draw(drawn, self._frames)
         return {**{k: v.copy() for k, v in self._frames.items()}, **self.world.proprioception()}
 
     def _info(self) -> dict[str, Any]:

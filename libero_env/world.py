@@ -4,19 +4,23 @@
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
-import mujoco
 import numpy as np
+from gymnasium import spaces
 
+from libero_env.assets import Pack, select_pack
+from libero_env.controllers import ControllerState, get_controller
 from libero_env.errors import LiberoError
 from libero_env.init_states import load_init_states, sample_settled, split_row
+from libero_env.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS, Observer, axis_angle
 from libero_env.predicates import StateView, atoms_of, evaluate
-from libero_env.render import Renderer
+from libero_env.problem import And
 from libero_env.scene import Scene, build_scene
 from libero_env.simulation import Simulations, make_simulations
 from libero_env.tasks import Task, get_task
 
-DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
+__all__ = ["DEFAULT_CAMERAS", "DEFAULT_OBSERVATIONS", "World", "axis_angle"]
 
 
 class World:
@@ -28,6 +32,9 @@ class World:
         threads: threads of the batched physics; 0 is one for each core.
         cameras: what is drawn for each observation; empty for none.
         camera_size: (height, width) of a frame, pixels.
+        observations: what is observed, by the names of `libero_env.observations`.
+        controller, control_delta: what an action means; see `libero_env.controllers`.
+        assets: where the models come from, a `Pack` or what `select_pack` takes.
     """
 
     def __init__(
@@ -38,17 +45,25 @@ class World:
         threads: int = 0,
         cameras: Sequence[str] = DEFAULT_CAMERAS,
         camera_size: tuple[int, int] = (128, 128),
+        observations: Sequence[str] = DEFAULT_OBSERVATIONS,
+        controller: str = "osc_pose",
+        control_delta: bool = True,
+        assets: Pack | str | Path | None = None,
     ):
+        self.controller = get_controller(controller, control_delta)
         self.task = get_task(task) if isinstance(task, str) else task
-        self.scene: Scene = build_scene(self.task.problem)
-        self.num, self.cameras, self.camera_size = num, tuple(cameras), tuple(camera_size)
-        self.renderer = Renderer(self.scene.model, *self.camera_size)
-        self._camera_ids = {frame_key(name): self.renderer.camera_id(name) for name in self.cameras}
+        pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
+        self.scene: Scene = build_scene(self.task.problem, pack)
+        self.num, self.cameras, self.camera_size = num, tuple(cameras), (int(camera_size[0]), int(camera_size[1]))
         self.simulations: Simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
+        self.simulations.controller = ControllerState(num, self.controller)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
-        self._picture = mujoco.MjData(self.scene.model)  # kinematics of the simulation being drawn
-        self._hand = self.scene.model.body("robot0_right_hand").id
-        self.atoms = atoms_of(self.task.problem.goal)
+        self.observer = Observer(
+            self.scene, self.simulations, self.views,
+            observations=observations, cameras=self.cameras, camera_size=self.camera_size,
+        )  # fmt: skip
+        # without those of quantifiers, whose variables stand for several things
+        self.atoms = tuple(a for a in atoms_of(self.task.problem.goal) if all(map(self._exists, a.args)))
 
     @property
     def init_states(self) -> np.ndarray:
@@ -76,12 +91,17 @@ class World:
         Raises:
             PlacementError: nothing fits, or nothing comes to rest.
         """
-        starts = [sample_settled(self.scene, self.simulations, i, rng) for i, rng in zip(ids, generators, strict=True)]
+        simulations, own = self.simulations, self.simulations.controller
+        simulations.controller = ControllerState(self.num)  # settling holds the pose, whatever an action means
+        try:
+            starts = [sample_settled(self.scene, simulations, i, rng) for i, rng in zip(ids, generators, strict=True)]
+        finally:
+            simulations.controller = own
         qpos, fixtures = np.stack([start.qpos for start in starts]), np.stack([start.fixtures for start in starts])
         self.simulations.reset(ids, qpos, np.zeros((len(ids), self.scene.model.nv)), fixtures=fixtures)
 
     def step(self, ids: Sequence[int], actions: np.ndarray) -> None:
-        """Advance by one control period of 50 ms; actions (num, 7), already checked."""
+        """Advance by one control period of 50 ms; actions (num, action_dim), already checked."""
         self.simulations.step(ids, actions)
 
     def goal_reached(self, ids: Sequence[int]) -> np.ndarray:
@@ -91,6 +111,14 @@ class World:
     def progress(self, i: int) -> dict[str, bool]:
         """Truth of each atom of the goal in simulation i."""
         return {f"({a.predicate} {' '.join(a.args)})": evaluate(a, self.views[i]) for a in self.atoms}
+
+    def judge(self, i: int) -> tuple[bool, dict[str, bool]]:
+        """Truth of the goal in simulation i and of each of its atoms; none is evaluated twice in a conjunction."""
+        goal, progress = self.task.problem.goal, self.progress(i)
+        parts = goal.parts if isinstance(goal, And) else (goal,)
+        if all(part in self.atoms for part in parts):
+            return all(progress.values()), progress
+        return evaluate(goal, self.views[i]), progress
 
     def physics_state(self, i: int) -> np.ndarray:
         """[time, qpos, qvel] of simulation i, the original's layout."""
@@ -102,58 +130,34 @@ class World:
         nq = self.scene.model.nq
         self.simulations.reset([i], state[None, 1 : 1 + nq], state[None, 1 + nq :], float(state[0]))
 
+    def observation_space(self) -> spaces.Dict:
+        """The space of one simulation's observations."""
+        return self.observer.space()
+
+    def action_space(self) -> spaces.Box:
+        """The space of one simulation's actions."""
+        return spaces.Box(self.controller.low.astype(np.float32), self.controller.high.astype(np.float32))
+
     def proprioception(self) -> dict[str, np.ndarray]:
-        """Joints (num, 7), fingers (num, 2), grip site (num, 3) and hand orientation as axis-angle (num, 3)."""
-        f, nq = self.simulations.fields, self.scene.nq_robot
-        return {
-            "joint_states": f["qpos"][:, :7].copy(),
-            "gripper_states": f["qpos"][:, 7:nq].copy(),
-            "ee_pos": f["site_xpos"][:, self.simulations.arm.site].copy(),
-            "ee_ori": axis_angle(f["xquat"][:, self._hand]),
-        }
+        """All that is observed but pictures: name -> (num, length) float64."""
+        return self.observer.state()
 
     def draw(self, ids: Sequence[int], frames: dict[str, np.ndarray]) -> None:
-        """Draw the observation cameras of these simulations into `frames`: key -> (num, height, width, 3) uint8."""
-        if not self._camera_ids:
-            return
-        for i in ids:
-            self._pose_picture(i)
-            out = [frames[key][i] for key in self._camera_ids]
-            self.renderer.render(self._picture, list(self._camera_ids.values()), out)
+        """Draw what is observed of these simulations into rows of `frames`, which `empty_frames` made."""
+        self.observer.draw(ids, frames)
 
-    def frame(self, i: int, camera: str) -> np.ndarray:
-        """One picture of any camera, (height, width, 3) uint8."""
-        out = np.empty((*self.camera_size, 3), np.uint8)
-        self._pose_picture(i)
-        self.renderer.render(self._picture, [self.renderer.camera_id(camera)], [out])
-        return out
+    def frame(self, i: int, camera: str, kind: str = "rgb") -> np.ndarray:
+        """One picture of any camera; see `Observer.picture`."""
+        return self.observer.picture(i, camera, kind)
 
     def empty_frames(self) -> dict[str, np.ndarray]:
-        """Arrays for `draw`, black."""
-        return {key: np.zeros((self.num, *self.camera_size, 3), np.uint8) for key in self._camera_ids}
+        """Arrays for `draw`, zero: name -> (num, height, width, ...)."""
+        return self.observer.empty_frames()
 
     def close(self) -> None:
         """Free the GL context and the simulations. Idempotent."""
-        self.renderer.close()
+        self.observer.close()
         self.simulations.close()
 
-    def _pose_picture(self, i: int) -> None:
-        data, model = self._picture, self.simulations.model
-        self.simulations.pose_fixtures(i)
-        data.qpos[:] = self.simulations.fields["qpos"][i]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_camlight(model, data)
-
-
-def frame_key(camera: str) -> str:
-    """Name of a camera's frames in observations: `robot0_eye_in_hand` -> `eye_in_hand_rgb`."""
-    return f"{camera.removeprefix('robot0_')}_rgb"
-
-
-def axis_angle(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3), rad, of unit quaternions (n, 4); angle in [0, 2 pi) as the original writes it."""
-    w = np.clip(quat_wxyz[:, :1], -1.0, 1.0)
-    sine = np.sqrt(1.0 - w * w)
-    scale = np.where(sine < 1e-9, 0.0, 2.0 * np.arccos(w) / np.maximum(sine, 1e-9))
-    return quat_wxyz[:, 1:] * scale
+    def _exists(self, name: str) -> bool:
+        return name in self.scene.things or self.task.problem.region(name) is not None
