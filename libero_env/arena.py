@@ -9,8 +9,13 @@ from typing import Any
 import mujoco
 import yaml
 
-from libero_env.arena_styles import add_material, styles_of
+from libero_env.arena_furniture import add_furniture, add_visual_mesh, solid
+from libero_env.arena_styles import add_material, furniture_of, styles_of
 from libero_env.errors import UnknownNameError
+from libero_env.objects.builtin.mesh import Mesh, merge
+from libero_env.robot import _load as load_mjcf
+from libero_env.robot import _replace_visuals as replace_visuals
+from libero_env.robot import robosuite_assets
 
 # Fixture category that is a workspace -> its file in `libero_env/workspaces`.
 WORKSPACES: Mapping[str, str] = {
@@ -22,6 +27,7 @@ WORKSPACES: Mapping[str, str] = {
     "floor": "floor",
 }
 _ROOM = "room"  # the file with what all have in common
+_MOUNT_LIFT = 0.01  # m, the mount's origin over the arm's
 _SHARED = ("cameras", "lights", "walls", "floor")
 
 
@@ -105,6 +111,7 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     _add_room(spec, figures, styles)
     if "table" in figures:
         _add_table(spec, figures["table"])
+    add_furniture(spec, furniture_of(figures.get("furniture", ()), scene_properties))
 
 
 def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
@@ -117,6 +124,21 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
         added.diffuse, added.specular = [0.8] * 3, [light.get("specular", 0.3)] * 3
         if light.get("directional"):
             added.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+
+
+def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
+    """Add what the arm stands on, where the workspace has it: names start with `mount0_`, the root is `mount0_base`.
+
+    Raises:
+        LiberoError: robosuite, which supplies the model, is not installed.
+    """
+    if workspace.mount is None:
+        return
+    mount = load_mjcf(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml")
+    mount.body("base").pos = [0.0, 0.0, 0.0]
+    replace_visuals(mount, "mount")
+    pos = (*workspace.robot_base_pos[:2], workspace.robot_base_pos[2] + _MOUNT_LIFT)
+    spec.attach(mount, prefix="mount0_", frame=spec.worldbody.add_frame(pos=pos))
 
 
 def _add_room(
@@ -151,20 +173,24 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
         )  # fmt: skip
         if "solref" in contact:
             geom.solref, geom.solimp = contact["solref"], [*contact["solimp"], 0.5, 2.0]
+    add_material(spec, "table", table["style"])
     for part in table.get("visual", ()):
         body.add_geom(
             name=part["name"], type=getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}"),
-            pos=part.get("pos", [0.0] * 3), size=part["size"], rgba=[0.78, 0.71, 0.63, 1.0], group=1, contype=0,
-            conaffinity=0,
+            pos=part.get("pos", [0.0] * 3), size=part["size"], material="table", group=1, contype=0, conaffinity=0,
         )  # fmt: skip
-    if "visual" not in table:
-        for box in table["collision"]:
-            body.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.get("pos", [0.0] * 3), size=box["size"], group=1, contype=0,
-                conaffinity=0, quat=box.get("quat", [1.0, 0.0, 0.0, 0.0]), rgba=[0.78, 0.71, 0.63, 1.0],
-            )  # fmt: skip
+    if "shapes" in table:
+        first = spec.body(next(iter(table["bodies"])))
+        add_visual_mesh(spec, first, "table_visual", _from_above(table), "table")
     for name, pos in table.get("sites", {}).items():
         body.add_site(name=name, pos=pos, size=[0.001] * 3, rgba=[0.0] * 4)
+
+
+def _from_above(table: Mapping[str, Any]) -> Mesh:
+    """The table's shapes with the texture laid on from above, its second axis along y."""
+    mesh = merge([solid(shape) for shape in table["shapes"]])
+    period = table["style"]["period"]
+    return Mesh(mesh.vertices, mesh.faces, mesh.vertices[:, [1, 0]] / period)
 
 
 @cache
