@@ -18,7 +18,7 @@ def wood(color: Color, seed: int, *, depth: float = 0.25, upright: bool = False)
     """Grain that runs to the right, or upwards; `depth` is how much darker its lines are."""
     rng = np.random.default_rng(seed)
     v, u = np.meshgrid(*[(np.arange(TILE) + 0.5) / TILE] * 2, indexing="ij")
-    bend = 0.05 * np.sin(2 * np.pi * (u + rng.uniform())) + 0.02 * np.sin(2 * np.pi * (3 * u + 2 * v))
+    bend = 0.03 * np.sin(2 * np.pi * (u + rng.uniform())) + 0.02 * np.sin(2 * np.pi * (3 * u + 2 * v))
     grain = np.zeros_like(u)
     for frequency in (3, 5, 8, 13, 21, 34):
         wave = np.sin(2 * np.pi * (frequency * (v + bend * rng.uniform(0.4, 1.0)) + rng.uniform()))
