@@ -10,8 +10,9 @@ import numpy as np
 from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir
 
-_CACHE_VERSION = 2
-_CHUNK = 256  # points whose distances to all others are in memory at once
+_CACHE_VERSION = 3
+_CHUNK = 64  # points whose distances to all others are in memory at once
+_PER_SIDE = 40  # samples along the mesh
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -75,10 +76,10 @@ def _load(file: str, scale: tuple[float, ...]) -> Arrays:
 def decimate(
     vertices: np.ndarray, triangles: np.ndarray, texcoords: np.ndarray, indices: np.ndarray, faces: int
 ) -> Arrays:
-    """Simplify by quadric error; each corner takes the texture coordinate of the nearest one on the same patch.
+    """Simplify by quadric error; corners take the texture coordinate of the nearest point of the old surface.
 
-    A patch is a piece of the surface that the texture covers without a seam; a new triangle belongs to the patch of the
-    old triangle that lies nearest and faces the same way, so none stretches across a seam.
+    A patch is a piece of the surface that the texture covers without a seam; a new triangle belongs to the patch that
+    lies nearest to its centre and faces the same way, and keeps to it: none stretches across a seam.
 
     Args:
         vertices: (n, 3), metres.
@@ -103,17 +104,17 @@ def decimate(
         )
     if not len(texcoords):
         return new_points, new, texcoords, np.zeros((0, 3), np.int32)
-    old_faces = nearest(_facing(new_points, new), _facing(points, merged))
-    corner_points, corner_texcoords = points[merged].reshape(-1, 3), indices.reshape(-1)
-    face_patch = _patches(merged, texcoords[indices])
-    corner_patch = np.repeat(face_patch, 3)
-    result = np.zeros_like(new)
-    for one in np.unique(face_patch[old_faces]):
-        chosen, there = face_patch[old_faces] == one, np.flatnonzero(corner_patch == one)
-        found = nearest(new_points[new[chosen]].reshape(-1, 3), corner_points[there])
-        result[chosen] = corner_texcoords[there[found]].reshape(-1, 3)
-    used, compact = np.unique(result, return_inverse=True)
-    return new_points, new, texcoords[used], compact.reshape(-1, 3).astype(np.int32)
+    samples, texcoord, owner = _samples(points, merged, texcoords[indices])
+    patch = _patches(merged, texcoords[indices])[owner]
+    face_patch = patch[nearest(_facing(points, new_points[new].mean(axis=1), new_points, new), samples)]
+    result = np.zeros((len(new), 3, 2))
+    for one in np.unique(face_patch):
+        chosen, there = np.flatnonzero(face_patch == one), np.flatnonzero(patch == one)
+        for k in range(3):
+            corners = _facing(points, new_points[new[chosen, k]], new_points, new[chosen])
+            result[chosen, k] = texcoord[there[nearest(corners, samples[there])]]
+    found, compact = np.unique(result.reshape(-1, 2), axis=0, return_inverse=True)
+    return new_points, new, found, compact.reshape(-1, 3).astype(np.int32)
 
 
 def nearest(points: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -123,12 +124,35 @@ def nearest(points: np.ndarray, among: np.ndarray) -> np.ndarray:
     return np.concatenate([np.argmin(half - part @ among.T, axis=1) for part in parts])
 
 
-def _facing(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Centres of triangles (f, 3), and their normals at a tenth of the mesh's size; (f, 6)."""
+def _samples(
+    points: np.ndarray, triangles: np.ndarray, texcoords: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points all over a surface: what `_facing` says of them (s, 6), texture coordinates (s, 2), triangles (s,)."""
+    corners = points[triangles]  # (f, 3, 3)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    steps = np.clip(np.ceil(_PER_SIDE * longest / _extent(points)), 1, _PER_SIDE).astype(int)
+    parts = []
+    for n in np.unique(steps):
+        grid = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
+        weights = np.vstack([grid, [[1 / 3, 1 / 3, 1 / 3]]])  # (w, 3)
+        chosen = np.repeat(np.flatnonzero(steps == n), len(weights))
+        spread = np.tile(weights, (len(chosen) // len(weights), 1))[:, :, None]
+        where, texcoord = ((spread * array[chosen]).sum(axis=1) for array in (corners, texcoords))
+        parts.append((_facing(points, where, points, triangles[chosen]), texcoord, chosen))
+    samples, found, owner = map(np.concatenate, zip(*parts, strict=True))
+    return samples, found, owner
+
+
+def _facing(whole: np.ndarray, where: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Points (f, 3) on triangles (f, 3) and the triangles' normals, at a tenth of the size of the whole; (f, 6)."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    return np.hstack([(a + b + c) / 3, 0.1 * np.ptp(points, axis=0).max() * normals])
+    return np.hstack([where, 0.1 * _extent(whole) * normals])
+
+
+def _extent(points: np.ndarray) -> float:
+    return float(np.ptp(points, axis=0).max())
 
 
 def _patches(triangles: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
