@@ -1,8 +1,11 @@
 """The fixed initial states of each task: complete, settled, and tied to the model they were made for."""
 
 import hashlib
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from importlib import resources
+from multiprocessing import get_context
 from pathlib import Path
 
 import mujoco
@@ -13,7 +16,7 @@ from libero_env.errors import LiberoError, PlacementError
 from libero_env.paths import cache_dir
 from libero_env.placement import Start, sample_start
 from libero_env.predicates import StateView, evaluate
-from libero_env.scene import Scene
+from libero_env.scene import Scene, build_scene
 from libero_env.simulation import LoopSimulations, Simulations
 from libero_env.tasks.suites import Task
 
@@ -133,14 +136,26 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
     return states
 
 
-def write_suite(path: Path, tasks: list[tuple[Task, Scene]]) -> None:
-    """Make the initial states of a suite and write them to one npz: `<task>` states, `<task>.digest`."""
+def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
+    """Make the initial states of tasks and write them to one npz: `<task>` states, `<task>.digest`.
+
+    Args:
+        path: the file.
+        tasks: of one suite.
+        jobs: processes; the states do not depend on it.
+    """
     arrays: dict[str, np.ndarray] = {}
     path.parent.mkdir(parents=True, exist_ok=True)
-    for task, scene in tqdm(tasks, unit="task", desc="initial states"):
-        arrays[task.name] = generate_init_states(task, scene)
-        arrays[f"{task.name}.digest"] = np.array(scene_digest(scene))
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        made = zip(tasks, pool.map(_generate, tasks), strict=True)
+        for task, (states, digest) in tqdm(made, unit="task", desc="initial states", total=len(tasks)):
+            arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
     _write(path, arrays)
+
+
+def _generate(task: Task) -> tuple[np.ndarray, str]:
+    scene = build_scene(task.problem)
+    return generate_init_states(task, scene), scene_digest(scene)
 
 
 def shipped_path(suite: str) -> Path:

@@ -1,6 +1,7 @@
 """The `libero` command. Each subcommand is a small function that imports what it needs when it runs."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -74,7 +75,8 @@ def register_tasks(subparsers: Subparsers) -> None:
     show.set_defaults(run=run_tasks_show)
     states = commands.add_parser("init-states", help="make the 50 stored initial states of a suite anew")
     states.add_argument("suite", help="such as libero_object")
-    states.add_argument("--out", type=Path, help="an .npz file (default: the one the package ships)")
+    states.add_argument("--out", type=Path, help="folder for the .npz files (default: those the package ships)")
+    states.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
     states.set_defaults(run=run_tasks_init_states)
 
 
@@ -96,14 +98,15 @@ def run_tasks_show(args: argparse.Namespace) -> None:
 
 
 def run_tasks_init_states(args: argparse.Namespace) -> None:
-    """Write the file and say where it is."""
+    """Write the files, one for each suite that the tasks come from, and say where they are."""
     from libero_env.init_states import shipped_path, write_suite
-    from libero_env.scene import build_scene
     from libero_env.tasks import get_suite
 
-    path = args.out or shipped_path(args.suite)
-    write_suite(path, [(task, build_scene(task.problem)) for task in get_suite(args.suite).tasks])
-    print(path)
+    tasks = get_suite(args.suite).tasks
+    for suite in dict.fromkeys(task.suite for task in tasks):
+        path = args.out / f"{suite}.npz" if args.out else shipped_path(suite)
+        write_suite(path, [task for task in tasks if task.suite == suite], args.jobs)
+        print(path)
 
 
 def register_report(subparsers: Subparsers) -> None:

@@ -54,7 +54,7 @@ class BenchmarkSettings:
             if not 1 <= self.tasks <= len(tasks):
                 raise ConfigError(f"benchmark.tasks is {self.tasks}; {self.suite} has {len(tasks)} tasks")
             return tasks[: self.tasks]
-        known = {t.name: t for t in suite.tasks} | {str(t.index): t for t in suite.tasks}
+        known = {t.name: t for t in suite.tasks} | {str(i): t for i, t in enumerate(suite.tasks)}
         for name in self.tasks:
             if str(name) not in known:
                 raise UnknownNameError(f"task of {self.suite}", name, [t.name for t in suite.tasks])
