@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from libero_env.errors import LiberoError
-from lifelong import cli_demos
+from lifelong import cli_assets, cli_demos
 from lifelong.errors import LifelongError
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
@@ -134,6 +134,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     register_doctor,
     register_tasks,
     cli_demos.register,
+    cli_assets.register,
     register_report,
 )
 
