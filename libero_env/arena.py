@@ -9,12 +9,10 @@ from typing import Any
 import mujoco
 import yaml
 
-from libero_env.arena_furniture import add_furniture, add_visual_mesh, solid
+from libero_env.arena_furniture import add_furniture, add_visual_mesh, furniture, solid
 from libero_env.arena_styles import add_material, furniture_of, styles_of
 from libero_env.errors import UnknownNameError
 from libero_env.objects.builtin.mesh import Mesh, merge
-from libero_env.robot import _load as load_mjcf
-from libero_env.robot import _replace_visuals as replace_visuals
 from libero_env.robot import robosuite_assets
 
 # Fixture category that is a workspace -> its file in `libero_env/workspaces`.
@@ -134,9 +132,12 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     """
     if workspace.mount is None:
         return
-    mount = load_mjcf(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml")
+    mount = mujoco.MjSpec.from_file(str(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml"))
+    mount.compiler.degree = False
     mount.body("base").pos = [0.0, 0.0, 0.0]
-    replace_visuals(mount, "mount")
+    mount.delete(mount.geom("pedestal_vis"))  # 33,000 triangles
+    mount.delete(mount.mesh("pedestal"))
+    add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
     pos = (*workspace.robot_base_pos[:2], workspace.robot_base_pos[2] + _MOUNT_LIFT)
     spec.attach(mount, prefix="mount0_", frame=spec.worldbody.add_frame(pos=pos))
 
@@ -151,7 +152,7 @@ def _add_room(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=figures["floor"]["size"], material="floor", group=1,
         condim=3,
     )  # fmt: skip
-    add_material(spec, "wall", styles["wall"])
+    add_material(spec, "wall", styles["wall"], *figures["wall_gloss"])
     for name, wall in figures["walls"].items():
         world.add_geom(
             name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=wall["pos"], quat=wall["quat"], size=wall["size"],
@@ -173,7 +174,7 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
         )  # fmt: skip
         if "solref" in contact:
             geom.solref, geom.solimp = contact["solref"], [*contact["solimp"], 0.5, 2.0]
-    add_material(spec, "table", table["style"])
+    add_material(spec, "table", table["style"], *table["gloss"])
     for part in table.get("visual", ()):
         body.add_geom(
             name=part["name"], type=getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}"),

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import yaml
 
+from libero_env.arena_styles import add_texture
 from libero_env.objects.builtin.mesh import Mesh, Ring, box, loft, merge, quad
 
 _CELLS = 8  # colours along a side of the picture
@@ -22,21 +23,18 @@ _COVERS = ("red", "navy", "teal", "cream", "yellow", "black", "orange", "white",
 
 def add_furniture(spec: mujoco.MjSpec, sets: tuple[str, ...]) -> None:
     """Add sets of furniture, such as `kitchen`, as one geom that nothing collides with."""
-    if not sets:
-        return
-    mesh = furniture(sets)
-    material = spec.add_material(name="furniture", specular=0.1, shininess=0.1)
-    image = palette_picture()
-    texture = spec.add_texture(
-        name="furniture", type=mujoco.mjtTexture.mjTEXTURE_2D, height=len(image), width=len(image), nchannel=3
-    )
-    texture.data = image.tobytes()
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "furniture"
-    add_visual_mesh(spec, spec.worldbody, "furniture", mesh, "furniture")
+    if sets:
+        add_visual_mesh(spec, spec.worldbody, "furniture", furniture(sets))
 
 
-def add_visual_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, material: str) -> None:
-    """Add a mesh to a body as a geom that is seen and touches nothing."""
+def add_visual_mesh(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, material: str | None = None
+) -> None:
+    """Add a mesh to a body as a geom that touches nothing, in a material or else in the colours of furniture."""
+    if material is None:
+        material = f"{name}_colours"
+        added = spec.add_material(name=material, specular=0.1, shininess=0.1)
+        add_texture(spec, added, palette_picture())
     added = spec.add_mesh(
         name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel(), usertexcoord=mesh.texcoords.ravel()
     )  # fmt: skip

@@ -44,19 +44,25 @@ def furniture_of(own: Sequence[str], scene_properties: Mapping[str, str]) -> tup
     return tuple(dict.fromkeys([*own, *load_styles()["scene"][scene].get("furniture", ())]))
 
 
-def add_material(spec: mujoco.MjSpec, name: str, style: Mapping[str, Any]) -> None:
-    """Add a style to a scene as a material; textures of meshes follow their own coordinates, in periods."""
-    material = spec.add_material(name=name, specular=style.get("specular", 0.0), shininess=0.0)
+def add_material(
+    spec: mujoco.MjSpec, name: str, style: Mapping[str, Any], specular: float = 0.0, shininess: float = 0.0
+) -> None:
+    """Add a style to a scene as a material; its texture repeats each period, on meshes as their coordinates say."""
+    material = spec.add_material(name=name, specular=specular, shininess=shininess)
     if style["pattern"] == "plain":
         material.rgba = [*style["colours"][0], 1.0]
         return
-    image = picture(style)
+    add_texture(spec, material, picture(style))
+    material.texuniform, material.texrepeat = True, [1.0 / style["period"]] * 2
+
+
+def add_texture(spec: mujoco.MjSpec, material: mujoco.MjsMaterial, image: np.ndarray) -> None:
+    """Give a material a picture, (height, width, 3) uint8."""
     texture = spec.add_texture(
-        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, height=image.shape[0], width=image.shape[1], nchannel=3,
+        name=material.name, type=mujoco.mjtTexture.mjTEXTURE_2D, height=image.shape[0], width=image.shape[1], nchannel=3
     )  # fmt: skip
     texture.data = image.tobytes()
-    material.texuniform, material.texrepeat = True, [1.0 / style["period"]] * 2
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
 
 
 def picture(style: Mapping[str, Any]) -> np.ndarray:
@@ -122,10 +128,10 @@ def _wood(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator)
 
 
 def _streaks(size: int, rng: np.random.Generator) -> np.ndarray:
-    return 0.8 * _smooth(size, (5, 40), rng) + 0.5 * _smooth(size, (2, 24), rng)
+    return 0.6 * _smooth(size, (4, 30), rng) + 0.6 * _smooth(size, (1.5, 16), rng)
 
 
-def _smooth(size: int, widths: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+def _smooth(size: int, widths: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
     """Periodic noise of mean 0 and deviation 1 that is correlated over so many pixels down and across."""
     frequency = np.fft.fftfreq(size)
     decay = [np.exp(-2.0 * (np.pi * frequency * width) ** 2) for width in widths]
