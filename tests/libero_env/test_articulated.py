@@ -8,7 +8,6 @@ import pytest
 
 from libero_env.objects import get_object, object_names
 from libero_env.objects.builtin.facts import load_facts
-from libero_env.objects.builtin.stops import STOPS
 from libero_env.objects.model import GLOW_GROUP
 
 pytestmark = pytest.mark.sim
@@ -40,13 +39,13 @@ def measured(shared) -> dict:
     return json.loads((shared / "official" / "objects.json").read_text())
 
 
-def fixture_spec(category: str, *, mocap: bool = True) -> mujoco.MjSpec:
+def fixture_spec(category: str) -> mujoco.MjSpec:
     """The object alone, its root fixed at 1 m, under the options of the benchmark's scenes."""
     spec = get_object(category).spec
     spec.option.timestep = 0.002
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 20.0
-    spec.body("main").pos, spec.body("main").mocap = (0.0, 0.0, 1.0), mocap
+    spec.body("main").pos = (0.0, 0.0, 1.0)
     return spec
 
 
@@ -181,25 +180,6 @@ def test_all_joints_open_together(category):
     for joint, end in enumerate(ends):
         push(model, data, joint, np.sign(end), 3.0)
     assert data.qpos == pytest.approx(np.array(ends), rel=0.02, abs=0.001)
-
-
-@pytest.mark.parametrize("name", sorted(STOPS))
-def test_stops_are_those_of_a_root_fixed_to_the_world(name):
-    """Ours end where a part would end if its parent were part of the world, as in the original."""
-    ends = []
-    for mocap in (True, False):
-        spec = fixture_spec(name, mocap=mocap)
-        assert len(spec.pairs) == len(STOPS[name])
-        for pair in () if mocap else tuple(spec.pairs):
-            spec.delete(pair)
-        model = spec.compile()
-        for joint in range(model.njnt):
-            for way in (-1.0, 1.0):
-                data = mujoco.MjData(model)
-                push(model, data, joint, way, 2.0)
-                ends.append(data.qpos[joint])
-    ours, fixed = np.split(np.array(ends), 2)
-    assert ours == pytest.approx(fixed, abs=1e-4)
 
 
 def test_burner_glows_only_in_its_group():

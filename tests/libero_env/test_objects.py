@@ -15,9 +15,10 @@ from libero_env.objects.model import rest_quat
 
 pytestmark = pytest.mark.sim
 
-CANS_AND_BOTTLES = ("alphabet_soup", "bbq_sauce", "ketchup", "salad_dressing", "tomato_sauce")
-PACKETS = ("butter", "chocolate_pudding", "cream_cheese", "milk", "orange_juice")
-GROCERIES = CANS_AND_BOTTLES + PACKETS
+CANS = ("alphabet_soup", "cherries", "corn", "tomato_sauce")
+BOTTLES = ("bbq_sauce", "ketchup", "mayo", "salad_dressing")
+PACKETS = ("butter", "chocolate_pudding", "cookies", "cream_cheese", "milk", "orange_juice", "popcorn")
+GROCERIES = CANS + BOTTLES + PACKETS
 PACKED = (*GROCERIES, "basket")
 MAX_TRIANGLES, MAX_TRIANGLES_PACKED = 1500, 400
 MAX_BOXES, MAX_BOXES_PACKED = 40, 5
@@ -36,6 +37,14 @@ def category(request) -> str:
 def measured(shared) -> dict:
     """The original's figures, category -> record."""
     return json.loads((shared / "official" / "objects.json").read_text())
+
+
+@pytest.fixture
+def record(category, measured) -> dict:
+    """The original's figures of the category; it names cherries, corn and mayo, but has no model of them."""
+    if "error" in measured[category]:
+        pytest.skip("the original has no model of it")
+    return measured[category]
 
 
 @pytest.fixture
@@ -112,7 +121,7 @@ def test_conventions_of_the_model(category):
     solid = collision_geoms(compiled)
     assert [compiled.geom(i).name for i in solid] == [f"g{i}" for i in range(len(solid))]
     assert 1 <= len(solid) <= (MAX_BOXES_PACKED if category in PACKED else MAX_BOXES)
-    assert (compiled.geom_group[solid] == 0).all() and (compiled.geom_condim[solid] == 4).all()
+    assert (compiled.geom_group[solid] == 0).all() and (compiled.geom_condim[solid] == 3).all()
     visual = np.setdiff1d(np.arange(compiled.ngeom), solid)
     assert len(visual) >= 1 and (compiled.geom_group[visual] == 1).all()
     assert compiled.site("default_site").bodyid == compiled.body("main").id
@@ -160,8 +169,8 @@ def test_meshes_are_closed_surfaces(category):
         assert all(edges.get((b, a), 0) == n for (a, b), n in edges.items())
 
 
-def test_mass_and_inertia(category, measured):
-    compiled, record = get_object(category).spec.compile(), measured[category]
+def test_mass_and_inertia(category, record):
+    compiled = get_object(category).spec.compile()
     assert compiled.body_mass.sum() == pytest.approx(record["mass"], rel=0.01)
     if load_facts(category).parts:
         return  # the original gave most moving parts a mass and inertia of their own
@@ -173,39 +182,38 @@ def test_mass_and_inertia(category, measured):
     assert (body.inertia < record["mass"] * (x * x + y * y + z * z)).all()
 
 
-def test_collision_bounds(category, measured):
+def test_collision_bounds(category, record):
     compiled = get_object(category).spec.compile()
     low_high = bounds(compiled, collision_geoms(compiled))
-    assert low_high == pytest.approx(np.array(measured[category]["collision_aabb"]), abs=0.005)
-    frictions = np.unique([geom["friction"] for geom in measured[category]["collision_geoms"]], axis=0)
+    assert low_high == pytest.approx(np.array(record["collision_aabb"]), abs=0.005)
+    frictions = np.unique([geom["friction"] for geom in record["collision_geoms"]], axis=0)
     solid = compiled.geom_friction[collision_geoms(compiled)]
     assert np.unique(solid, axis=0) == pytest.approx(frictions)
 
 
-def test_visual_bounds(category, measured):
+def test_visual_bounds(category, record):
     # The measured picture of the basket is that of another object, that of the stove lacks its plate.
     key = "collision_aabb" if category in ("basket", "flat_stove") else "visual_aabb"
     compiled = get_object(category).spec.compile()
     visual = np.flatnonzero(compiled.geom_group == 1)
-    assert bounds(compiled, visual) == pytest.approx(np.array(measured[category][key]), abs=0.005)
+    assert bounds(compiled, visual) == pytest.approx(np.array(record[key]), abs=0.005)
 
 
-def test_sites(category, measured):
+def test_sites(category, record):
     compiled = get_object(category).spec.compile()
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
-    records = measured[category]["sites"]
-    assert compiled.nsite == len(records)
-    for record in records:
-        site = compiled.site(record["name"])
-        assert data.site(record["name"]).xpos == pytest.approx(np.array(record["pos"]), abs=0.001)
-        assert data.site(record["name"]).xmat == pytest.approx(np.array(record["xmat"]), abs=1e-6)
-        used = {"sphere": 1, "cylinder": 2, "box": 3}[record["type"]]
-        assert site.size[:used] == pytest.approx(np.array(record["size"][:used]), abs=0.001)
+    assert compiled.nsite == len(record["sites"])
+    for one in record["sites"]:
+        site = compiled.site(one["name"])
+        assert data.site(one["name"]).xpos == pytest.approx(np.array(one["pos"]), abs=0.001)
+        assert data.site(one["name"]).xmat == pytest.approx(np.array(one["xmat"]), abs=1e-5)
+        used = {"sphere": 1, "cylinder": 2, "box": 3}[one["type"]]
+        assert site.size[:used] == pytest.approx(np.array(one["size"][:used]), abs=0.001)
 
 
-def test_placement_figures(category, measured):
-    model, record = get_object(category), measured[category]
+def test_placement_figures(category, record):
+    model = get_object(category)
     ranges = record["rotation"]
     if not isinstance(ranges, dict):
         ranges = {record["rotation_axis"]: ranges}
@@ -303,7 +311,7 @@ def test_basket_is_open_and_holds_what_is_dropped_into_it():
     assert (np.abs(offset) < compiled.site("basket_contain_region").size).all()
 
 
-@pytest.mark.parametrize("name", GROCERIES)
+@pytest.mark.parametrize("name", (*GROCERIES, "new_salad_dressing"))
 def test_parallel_jaws_lift_it(name):
     """Two pads of a finger's size close on it across, press with 20 N each, and rise by 0.1 m."""
     model = get_object(name)

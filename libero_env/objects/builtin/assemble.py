@@ -11,7 +11,6 @@ import numpy as np
 
 from libero_env.objects.builtin.facts import Facts, Part, load_facts
 from libero_env.objects.builtin.mesh import Mesh
-from libero_env.objects.builtin.stops import add_stops
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel, rest_quat, set_damping
 
 HIDDEN_GROUP = 3
@@ -63,7 +62,6 @@ def build(category: str, look: Callable[[], Looks]) -> ObjectModel:
         _add_joint(bodies[name], part)
         _add_collision(bodies[name], part, facts, numbers)
         _add_sites(bodies[name], part, name == ROOT_BODY)
-    add_stops(spec, category)
     looks = look()
     turned = _conjugate(rest_quat(facts.rotation))
     for name, several in looks.items() if isinstance(looks, Mapping) else [(ROOT_BODY, looks)]:
@@ -111,7 +109,7 @@ def _add_collision(body: mujoco.MjsBody, part: Part, facts: Facts, numbers: Iter
             size=_padded(solid.size),
             quat=solid.quat,
             friction=solid.friction or facts.friction,
-            condim=4,
+            condim=3,
             solref=solid.solref or facts.solref,
             solimp=(*(solid.solimp or facts.solimp), 0.5, 2.0),
             group=0,
