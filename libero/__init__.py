@@ -1,1 +1,1 @@
-"""The original benchmark's import paths, for code written against it: adapters to `libero_env`, nothing of their own."""
+"""Import paths of the original benchmark, for code written against it: adapters to `libero_env` only."""

@@ -1,0 +1,364 @@
+"""The environment behind the wrappers: one simulation of a task file, stepped as robosuite would step it."""
+
+import os
+import re
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from libero.libero.envs import bddl_utils as BDDLUtils
+from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState
+from libero.libero.envs.observations import Observer, cameras
+from libero.libero.envs.predicates import eval_predicate_fn
+from libero.libero.envs.robots.single_arm import SingleArm, controller_of
+from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
+from libero.libero.envs.sim import MjSim
+from libero.libero.envs.stepping import ObservedSimulations
+from libero_env.assets import select_pack
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.init_states import sample_settled
+from libero_env.predicates import StateView, evaluate, glowing_sites
+from libero_env.robot import OPEN_FINGERS, REST_QPOS
+from libero_env.scene import build_scene, scene_spec
+
+TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
+CONTROL_FREQ = 20  # Hz
+
+
+class EpisodeOverError(LiberoError, ValueError):
+    """A step after the horizon."""
+
+
+def register_problem(target_class: type["BDDLBaseDomain"]) -> type["BDDLBaseDomain"]:
+    """Make a problem class known by its name; task files name it after `define (problem`, in whatever case."""
+    TASK_MAPPING[target_class.__name__.lower()] = target_class
+    return target_class
+
+
+class BDDLBaseDomain:
+    """One simulation of a task file.
+
+    Attributes:
+        sim: the simulation, like robosuite's.
+        scene, view: the compiled task and the state that predicates see, of `libero_env`.
+        parsed_problem: the task file as dictionaries.
+        objects_dict, fixtures_dict, object_sites_dict, object_states_dict: by name.
+        robots: the arm, one.
+        done: whether the horizon is reached.
+
+    Args:
+        bddl_file_name: task file.
+        controller_configs: `{"type": "OSC_POSE"}`, `control_delta` or `use_delta` for absolute actions.
+        initialization_noise: None for none; else the arm starts near its rest pose.
+        reward_scale: what success is worth.
+        horizon: control steps after which `step` raises, unless `ignore_done`.
+        placement_initializer: an object whose `sample()` gives name -> (pos, quat wxyz, object); by default regions are
+            sampled as the task file says.
+        kwargs: what else the original's classes take (`hard_reset`, `table_full_size`, ...) is accepted, of no effect.
+    """
+
+    def __init__(
+        self,
+        bddl_file_name: str,
+        robots: Any = ("Panda",),
+        env_configuration: str = "default",
+        controller_configs: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
+        gripper_types: Any = "default",
+        initialization_noise: Any = "default",
+        use_latch: bool = False,
+        use_camera_obs: bool = True,
+        use_object_obs: bool = True,
+        reward_scale: float | None = 1.0,
+        reward_shaping: bool = False,
+        placement_initializer: Any = None,
+        object_property_initializers: Any = None,
+        has_renderer: bool = False,
+        has_offscreen_renderer: bool = True,
+        render_camera: str = "frontview",
+        control_freq: float = CONTROL_FREQ,
+        horizon: int = 1000,
+        ignore_done: bool = False,
+        camera_names: str | Sequence[str] = "agentview",
+        camera_heights: int | Sequence[int] = 256,
+        camera_widths: int | Sequence[int] = 256,
+        camera_depths: bool | Sequence[bool] = False,
+        camera_segmentations: Any = None,
+        **kwargs: Any,
+    ):
+        if control_freq != CONTROL_FREQ:
+            raise LiberoError(f"control_freq={control_freq}: the benchmark is defined at {CONTROL_FREQ} Hz")
+        self.bddl_file_name, self.control_freq = str(bddl_file_name), control_freq
+        self.problem = BDDLUtils.read_problem(bddl_file_name)
+        self.parsed_problem = BDDLUtils.robosuite_parse_problem(bddl_file_name)
+        self.obj_of_interest = self.parsed_problem["obj_of_interest"]
+        self.conditioned_initial_place_dict: dict[str, Any] = {}
+        self.use_object_obs, self.use_camera_obs = use_object_obs, use_camera_obs
+        self.reward_scale, self.reward_shaping = reward_scale, reward_shaping
+        self.horizon, self.ignore_done, self.render_camera = horizon, ignore_done, render_camera
+        self.initialization_noise = initialization_noise
+        self.placement_initializer = placement_initializer
+        self.camera_list = cameras(
+            camera_names, camera_heights, camera_widths, camera_depths, camera_segmentations
+        )
+        self.camera_names = [camera.name for camera in self.camera_list]
+        self.rng = np.random.default_rng()
+        self.timestep, self.cur_time, self.done = 0, 0.0, False
+        self._load_model()
+        self._setup_references(controller_configs, robots)
+        self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
+
+    # What subclasses may change about the scene ---------------------------------------------------------------------
+
+    def _load_fixtures_in_arena(self, mujoco_arena: Any) -> None:
+        """Hook: called with the scene before it is compiled, its fixtures in place."""
+
+    def _load_objects_in_arena(self, mujoco_arena: Any) -> None:
+        """Hook: called with the scene before it is compiled, its objects in place."""
+
+    def _load_sites_in_arena(self, mujoco_arena: Any) -> None:
+        """Hook: called with the scene before it is compiled, its regions in place."""
+
+    def _setup_camera(self, mujoco_arena: Any) -> None:
+        """Hook: called with the scene before it is compiled; `mujoco_arena.set_camera` moves a camera."""
+
+    def _add_placement_initializer(self) -> None:
+        """Hook: called once, before the first reset; may set `placement_initializer`."""
+
+    def _load_model(self) -> None:
+        pack = select_pack()
+        self.scene = build_scene(self.problem, pack)
+        hooks = ("_load_fixtures_in_arena", "_load_objects_in_arena", "_load_sites_in_arena", "_setup_camera")
+        model = self.scene.model
+        if any(getattr(type(self), hook) is not getattr(BDDLBaseDomain, hook) for hook in hooks):
+            from libero.libero.envs.arenas import Arena
+
+            arena = Arena(scene_spec(self.problem, pack))
+            for hook in hooks:
+                getattr(self, hook)(arena)
+            model = arena.spec.compile()
+        self.simulations = ObservedSimulations(model, 1, self.scene.fixture_bodies)
+        self.sim = MjSim(self.simulations, self.get_xml)
+        self.view = StateView(self.scene, self.simulations, 0)
+        self.sim.glowing = lambda: glowing_sites(self.view)
+
+    def _setup_references(self, controller_configs: Any, robots: Any) -> None:
+        scene = self.scene
+        self.workspace_name, self.workspace_offset = scene.workspace_name, scene.workspace.offset
+        self.objects_dict, self.fixtures_dict = scene_objects(scene), scene_fixtures(scene)
+        self.object_sites_dict = scene_sites(scene)
+        self.objects, self.fixtures = list(self.objects_dict.values()), list(self.fixtures_dict.values())
+        self.obj_body_id = {n: self.sim.model.body_name2id(f"{n}_main") for n in scene.things}
+        self.object_states_dict: dict[str, BaseObjectState] = {
+            name: ObjectState(self, name, is_fixture=name in scene.fixtures) for name in scene.things
+        }
+        for name, site in self.object_sites_dict.items():
+            fixed = site.parent_name not in scene.objects
+            self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name, is_fixture=fixed)
+        self.tracking_object_states_changes = [
+            state
+            for state in self.object_states_dict.values()
+            if getattr(state, "has_turnon_affordance", False)
+        ]
+        self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
+        self.model = TaskModel(scene, self.sim.model._model)
+        drawn = self.camera_list if self.use_camera_obs else ()
+        self.observer = Observer(
+            self.sim, list(scene.objects) if self.use_object_obs else [], drawn, self.model.segments
+        )
+        self._add_placement_initializer()
+
+    # Episodes -------------------------------------------------------------------------------------------------------
+
+    def seed(self, seed: int) -> None:
+        """Placements from now on follow from this number."""
+        self.rng = np.random.default_rng(seed)
+
+    def reset(self) -> "OrderedDict[str, np.ndarray]":
+        """Place everything anew and observe.
+
+        Raises:
+            PlacementError: nothing fits.
+        """
+        start = sample_settled(self.scene, self.simulations, 0, self.rng)
+        qpos = start.qpos.copy()
+        if self.initialization_noise is None:
+            qpos[: self.scene.nq_robot] = REST_QPOS + OPEN_FINGERS
+        if self.placement_initializer is not None:
+            for name, (pos, quat, *_) in self.placement_initializer.sample().items():
+                address = self.sim.model.get_joint_qpos_addr(f"{name}_joint0")
+                qpos[slice(*address)] = [*pos, *quat]
+        self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
+        self.timestep, self.cur_time, self.done = 0, 0.0, False
+        return self._get_observations(force_update=True)
+
+    def restart(self, state: np.ndarray) -> None:
+        """Start afresh from [time, qpos, qvel], poses of the fixtures behind it or not; the arm holds its pose.
+
+        Raises:
+            LiberoError: a state of another length.
+        """
+        nq, nv = self.scene.model.nq, self.scene.model.nv
+        state, short = np.asarray(state, np.float64).ravel(), 1 + nq + nv
+        whole = short + 7 * len(self.scene.fixtures)
+        if state.size not in (short, whole) or not np.isfinite(state).all():
+            raise LiberoError(
+                f"{self.bddl_file_name}: a state is {short} finite numbers, or {whole} with the fixtures' poses; "
+                f"got {state.size}. Is it of another task?"
+            )
+        self.simulations.read_fixtures()
+        fixtures = state[short:].reshape(1, -1, 7) if state.size == whole else None
+        self.simulations.reset(
+            [0], state[None, 1 : 1 + nq], state[None, 1 + nq : short], float(state[0]), fixtures
+        )
+
+    def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
+        """Act for 50 ms: observation, reward, success, and an empty dictionary.
+
+        The observation is of 2 ms before the end, as the original's.
+
+        Raises:
+            EpisodeOverError: the horizon is reached.
+            ActionError: wrong shape or not finite; nothing has moved.
+        """
+        if self.done:
+            raise EpisodeOverError(
+                f"{self.horizon} steps are over: call reset(), or set horizon or ignore_done"
+            )
+        command = self.robots[0].command(action)
+        self.timestep += 1
+        mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
+        self.simulations.step([0], command[None], tap=self._tap)
+        self.cur_time += 1.0 / self.control_freq
+        reward, self.done, info = self._post_action(action)
+        return self._get_observations(), reward, self._check_success(), info
+
+    def _tap(self, _: mujoco.MjData) -> None:
+        self._observations = self.observer.observe()
+
+    def _post_action(self, action: Any) -> tuple[float, bool, dict[str, Any]]:
+        return self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
+
+    def _post_process(self) -> None:
+        """Nothing to do: what a state looks like follows from the state."""
+        for state in self.tracking_object_states_changes:
+            state.update_state()
+
+    def reward(self, action: Any = None) -> float:
+        """`reward_scale` on success, else 0."""
+        return float(self._check_success()) * (1.0 if self.reward_scale is None else self.reward_scale)
+
+    def _check_success(self) -> bool:
+        """Whether the goal holds."""
+        goal = self.problem.goal
+        return all(
+            self._eval_predicate(BDDLUtils.as_list(part))
+            for part in (goal.parts if isinstance(goal, And) else [goal])
+        )
+
+    def _eval_predicate(self, state: Sequence[Any]) -> bool:
+        """Truth of an atom such as `["on", "a_1", "b_1"]`, or of a nested goal; case does not count."""
+        if state[0].lower() in ("and", "or", "not", "forall"):
+            return evaluate(BDDLUtils.as_expression(list(state)), self.view)
+        return bool(eval_predicate_fn(state[0], *(self._state(name) for name in state[1:])))
+
+    def _state(self, name: str) -> BaseObjectState:
+        if name not in self.object_states_dict:
+            raise UnknownNameError("object, fixture or region", name, self.object_states_dict)
+        return self.object_states_dict[name]
+
+    # Observations ---------------------------------------------------------------------------------------------------
+
+    def _update_observables(self, force: bool = False) -> None:
+        """Observe the present state."""
+        self._observations = self.observer.observe()
+
+    def _get_observations(self, force_update: bool = False) -> "OrderedDict[str, np.ndarray]":
+        """What was observed last."""
+        if force_update:
+            self._update_observables(force=True)
+        return OrderedDict(self._observations)
+
+    def get_robot_state_vector(self, obs: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Fingers, grip position and hand orientation of an observation, (9,)."""
+        return np.concatenate([obs[f"robot0_{key}"] for key in ("gripper_qpos", "eef_pos", "eef_quat")])
+
+    def visualize(self, vis_settings: Mapping[str, bool]) -> None:
+        """Nothing to do: helper sites are never shown."""
+
+    def set_visualization(self) -> None:
+        """Nothing to do: sites glow while their object is on."""
+
+    # Small things ---------------------------------------------------------------------------------------------------
+
+    def is_fixture(self, object_name: str) -> bool:
+        """Whether a name is that of a fixture."""
+        return object_name in self.fixtures_dict
+
+    def get_object(self, object_name: str) -> Any:
+        """The object, fixture or region of this name.
+
+        Raises:
+            UnknownNameError: there is none.
+        """
+        every = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
+        if object_name not in every:
+            raise UnknownNameError("object, fixture or region", object_name, every)
+        return every[object_name]
+
+    @property
+    def language_instruction(self) -> str:
+        """What the task file says."""
+        return self.problem.language
+
+    @property
+    def action_spec(self) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high of an action."""
+        return self.robots[0].action_limits
+
+    @property
+    def action_dim(self) -> int:
+        """Length of an action."""
+        return self.robots[0].action_dim
+
+    @property
+    def _visualizations(self) -> set[str]:
+        return {"env", "robots", "grippers"}
+
+    def get_xml(self) -> str:
+        """The scene as MJCF without textures, fixtures where they stand now."""
+        spec = scene_spec(self.problem, self.scene.pack)
+        for material in spec.materials:
+            material.textures = [""] * len(list(material.textures))
+        for texture in list(spec.textures):
+            spec.delete(texture)
+        for name in self.scene.fixtures:
+            body, index = spec.body(f"{name}_main"), self.obj_body_id[name]
+            body.pos, body.quat = self.sim.model.body_pos[index], self.sim.model.body_quat[index]
+        spec.compile()
+        return spec.to_xml()
+
+    def reset_from_xml_string(self, xml_string: str) -> None:
+        """Put the fixtures where a stored model of this task has them, everything else at its origin."""
+        for body in ElementTree.fromstring(xml_string).iter("body"):
+            name = re.sub("_main$", "", body.get("name", ""))
+            if name in self.scene.fixtures:
+                index = self.obj_body_id[name]
+                self.sim.model.body_pos[index] = [float(x) for x in body.get("pos", "0 0 0").split()]
+                self.sim.model.body_quat[index] = [float(x) for x in body.get("quat", "1 0 0 0").split()]
+        self.sim.reset()
+        self.sim.forward()
+        self.timestep, self.cur_time, self.done = 0, 0.0, False
+
+    def close(self) -> None:
+        """Free the simulation and its GL contexts. Idempotent."""
+        self.sim.free()
+
+    def render(self) -> None:
+        """Nothing to do: there is no window."""
+
+
+DIR_PATH = os.path.dirname(os.path.realpath(__file__))

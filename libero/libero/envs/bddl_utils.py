@@ -1,0 +1,110 @@
+"""Task files as the original's dictionaries and lists; names and predicates in lower case."""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from libero_env import bddl
+from libero_env.problem import And, Atom, Expression, ForAll, Not, Or, Problem
+
+_NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
+
+
+def read_problem(problem_filename: str) -> Problem:
+    """A task file; read once as long as it does not change.
+
+    Raises:
+        BDDLError: it is not a task file.
+    """
+    stamp = Path(problem_filename).stat()
+    return _read(str(problem_filename), stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=256)
+def _read(path: str, *_: int) -> Problem:
+    return bddl.read(path)
+
+
+def get_problem_info(problem_filename: str) -> dict[str, str]:
+    """Problem class, domain and instruction of a task file."""
+    problem = read_problem(problem_filename)
+    return {
+        "problem_name": problem.name.lower(),
+        "domain_name": problem.domain,
+        "language_instruction": problem.language.lower(),
+    }
+
+
+def robosuite_parse_problem(problem_filename: str) -> dict[str, Any]:
+    """All of a task file."""
+    problem = read_problem(problem_filename)
+    goal = problem.goal.parts if isinstance(problem.goal, And) else (problem.goal,)
+    return {
+        "problem_name": problem.name.lower(),
+        "fixtures": _by_category(problem.fixtures),
+        "regions": regions(problem),
+        "objects": _by_category(problem.objects),
+        "scene_properties": dict(problem.scene_properties),
+        "initial_state": [as_list(atom) for atom in problem.init],
+        "goal_state": [as_list(part) for part in goal],
+        "language_instruction": problem.language.lower().split(),
+        "language": problem.language,
+        "obj_of_interest": list(problem.obj_of_interest),
+    }
+
+
+def get_regions(problem_filename: str) -> dict[str, dict[str, Any]]:
+    """The regions of a task file by their address."""
+    return regions(read_problem(problem_filename))
+
+
+def get_scenes(problem_filename: str) -> dict[str, str]:
+    """The scene properties of a task file, such as the styles of floor and wall."""
+    return dict(read_problem(problem_filename).scene_properties)
+
+
+def regions(problem: Problem) -> dict[str, dict[str, Any]]:
+    """Address of each region -> what it is."""
+    return {
+        region.address: {
+            "target": region.target,
+            "ranges": [list(row) for row in region.ranges],
+            "extra": [],
+            "yaw_rotation": list(region.yaw[0]) if region.yaw else list(_NO_YAW),
+            "rgba": list(region.rgba) or list(_NO_COLOUR),
+        }
+        for region in problem.regions
+    }
+
+
+def as_list(expression: Expression) -> list[Any]:
+    """A goal or atom as nested lists: `["on", "plate_1", "flat_stove_1_cook_region"]`."""
+    match expression:
+        case Atom(predicate, args):
+            return [predicate.lower(), *args]
+        case And(parts) | Or(parts):
+            return [type(expression).__name__.lower(), *map(as_list, parts)]
+        case Not(part):
+            return ["not", as_list(part)]
+        case ForAll(variables, part):
+            return ["forall", [list(variable) for variable in variables], as_list(part)]
+    raise TypeError(f"not a goal: {expression!r}")
+
+
+def as_expression(state: list[Any]) -> Expression:
+    """The inverse of `as_list`; case does not count."""
+    head = str(state[0]).lower()
+    if head in ("and", "or"):
+        return (And if head == "and" else Or)(tuple(map(as_expression, state[1:])))
+    if head == "not":
+        return Not(as_expression(state[1]))
+    if head == "forall":
+        return ForAll(tuple((name, category) for name, category in state[1]), as_expression(state[2]))
+    return Atom(head.capitalize(), tuple(state[1:]))
+
+
+def _by_category(things: Any) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name, category in things.items():
+        found.setdefault(category, []).append(name)
+    return found

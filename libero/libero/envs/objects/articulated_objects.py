@@ -1,0 +1,19 @@
+"""What opens, closes and turns."""
+
+from libero.libero.envs.base_object import BuiltinObject, declare, register_visual_change_object
+
+
+class ArticulatedObject(BuiltinObject):
+    """What opens, closes and turns; see `libero.libero.envs.base_object.BaseObject`."""
+
+
+(
+    BasinFaucet, Faucet, FlatStove, Microwave, ShortCabinet, ShortFridge, SlideCabinet, WhiteCabinet,
+    Window, WoodenCabinet,
+) = declare(
+    ArticulatedObject,
+    __name__,
+    "BasinFaucet Faucet FlatStove Microwave ShortCabinet ShortFridge SlideCabinet WhiteCabinet "
+    "Window WoodenCabinet",
+)  # fmt: skip
+register_visual_change_object(FlatStove)

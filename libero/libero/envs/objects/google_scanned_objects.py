@@ -1,0 +1,16 @@
+"""Kitchenware of the Google scanned objects."""
+
+from libero.libero.envs.base_object import BuiltinObject, declare
+
+
+class GoogleScannedObject(BuiltinObject):
+    """Kitchenware of the Google scanned objects; see `libero.libero.envs.base_object.BaseObject`."""
+
+
+(
+    AkitaBlackBowl, Basket, Chefmate8Frypan, GlazedRimPorcelainRamekin, Plate, Rack, WhiteBowl,
+) = declare(
+    GoogleScannedObject,
+    __name__,
+    "AkitaBlackBowl Basket Chefmate8Frypan GlazedRimPorcelainRamekin Plate Rack WhiteBowl",
+)  # fmt: skip

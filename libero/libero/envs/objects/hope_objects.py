@@ -1,0 +1,18 @@
+"""Groceries of the HOPE data set."""
+
+from libero.libero.envs.base_object import BuiltinObject, declare
+
+
+class HopeBaseObject(BuiltinObject):
+    """Groceries of the HOPE data set; see `libero.libero.envs.base_object.BaseObject`."""
+
+
+(
+    AlphabetSoup, BbqSauce, Butter, Cherries, ChocolatePudding, Cookies, Corn, CreamCheese, Ketchup,
+    MacaroniAndCheese, Mayo, Milk, NewSaladDressing, OrangeJuice, Popcorn, SaladDressing, TomatoSauce,
+) = declare(
+    HopeBaseObject,
+    __name__,
+    "AlphabetSoup BbqSauce Butter Cherries ChocolatePudding Cookies Corn CreamCheese Ketchup "
+    "MacaroniAndCheese Mayo Milk NewSaladDressing OrangeJuice Popcorn SaladDressing TomatoSauce",
+)  # fmt: skip

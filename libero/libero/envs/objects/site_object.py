@@ -1,0 +1,48 @@
+"""Regions as objects: a named site."""
+
+from typing import Any
+
+import numpy as np
+
+
+class SiteObject:
+    """A region that is a box around a site.
+
+    Attributes:
+        name: address of the region.
+        parent_name: the thing that it belongs to.
+        size: half size, (3,) m.
+        joints: names of the joints that move it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parent_name: str | None = None,
+        joints: Any = None,
+        size: Any = (0.0, 0.0, 0.0),
+        rgba: Any = None,
+        site_type: str = "box",
+        site_pos: Any = None,
+        site_quat: Any = None,
+        object_properties: dict[str, Any] | None = None,
+    ):
+        self.name, self.parent_name, self.joints = name, parent_name, joints
+        self.size, self.rgba, self.site_type = np.asarray(size, np.float64), rgba, site_type
+        self.site_pos, self.site_quat = site_pos, site_quat
+        self.object_properties = object_properties or {"vis_site_names": {}}
+
+    def in_box(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
+        """Whether a point is in the box of half size |R size| around the site, or up to 1 cm below it."""
+        half = np.abs(np.asarray(this_mat).reshape(3, 3) @ self.size)
+        low, high = np.asarray(this_position) - half, np.asarray(this_position) + half
+        low[2] -= 0.01
+        return bool((other_position > low).all() and (other_position < high).all())
+
+    def under(
+        self, this_position: Any, this_mat: Any, other_position: Any, other_height: float = 0.10
+    ) -> bool:
+        """Whether a point is over the box, by less than `other_height`."""
+        delta = np.asarray(this_mat).reshape(3, 3) @ (np.asarray(other_position) - np.asarray(this_position))
+        over = self.size[2] - 0.005 < delta[2] < self.size[2] + other_height
+        return bool(over and (np.abs(delta[:2]) < self.size[:2]).all())

@@ -1,0 +1,20 @@
+"""Furniture, books and tableware."""
+
+from libero.libero.envs.base_object import BuiltinObject, declare
+
+
+class TurbosquidObjects(BuiltinObject):
+    """Furniture, books and tableware; see `libero.libero.envs.base_object.BaseObject`."""
+
+
+(
+    BlackBook, BowlDrainer, DeskCaddy, DiningSetGroup, MokaPot, PorcelainMug, RedCoffeeMug,
+    WhiteStorageBox, WhiteYellowMug, WineBottle, WineRack, WoodenShelf, WoodenTray, WoodenTwoLayerShelf,
+    YellowBook,
+) = declare(
+    TurbosquidObjects,
+    __name__,
+    "BlackBook BowlDrainer DeskCaddy DiningSetGroup MokaPot PorcelainMug RedCoffeeMug "
+    "WhiteStorageBox WhiteYellowMug WineBottle WineRack WoodenShelf WoodenTray WoodenTwoLayerShelf "
+    "YellowBook",
+)  # fmt: skip

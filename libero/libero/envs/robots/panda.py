@@ -1,0 +1,56 @@
+"""What is the same of the arm wherever it stands."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+
+from libero_env.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_QPOS
+
+
+class Panda:
+    """Figures of the arm.
+
+    Attributes:
+        default_mount: what it stands on, None for the ground.
+        base_xpos_offset: workspace -> where its base goes, (3,) m; for a table as a function of its length.
+    """
+
+    default_mount: ClassVar[str | None] = None
+    default_gripper: ClassVar[str] = "PandaGripper"
+    default_controller_config: ClassVar[str] = "default_panda"
+    arm_type: ClassVar[str] = "single"
+    naming_prefix: ClassVar[str] = "robot0_"
+    eef_name: ClassVar[str] = "robot0_right_hand"
+    grip_site: ClassVar[str] = GRIP_SITE
+    joints: ClassVar[tuple[str, ...]] = ARM_JOINTS
+    gripper_joints: ClassVar[tuple[str, ...]] = FINGER_JOINTS
+    base_xpos_offset: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, idn: int = 0):
+        self.idn, self.name = idn, f"Panda{idn}"
+
+    @property
+    def init_qpos(self) -> np.ndarray:
+        """Rest pose, (7,) rad."""
+        return np.array(REST_QPOS)
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return len(ARM_JOINTS)
+
+    @property
+    def top_offset(self) -> np.ndarray:
+        """Highest point over the base, (3,) m."""
+        return np.array([0.0, 0.0, 1.0])
+
+    @property
+    def horizontal_radius(self) -> float:
+        """Radius that the arm keeps to itself, m."""
+        return 0.5
+
+
+def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, float, float]]:
+    """Where the base goes behind a table of a given length."""
+    return lambda table_length: (x - table_length / 2, 0.0, height)

@@ -1,0 +1,174 @@
+"""The arm of an environment, under robosuite's names: `env.robots[0].controller`, `.gripper`, ..."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from libero.libero.envs.robots.mounted_panda import MountedPanda
+from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
+from libero_env.control import checked_actions
+from libero_env.errors import LiberoError, UnknownNameError
+
+if TYPE_CHECKING:
+    from libero.libero.envs.bddl_base_domain import BDDLBaseDomain
+
+CONTROLLERS = {"OSC_POSE": 7, "OSC_POSITION": 4}
+
+
+def controller_of(configs: Any) -> dict[str, Any]:
+    """The controller's configuration: one, a list with one, a name, or None for the default.
+
+    Raises:
+        UnknownNameError: no such controller.
+    """
+    if isinstance(configs, Sequence) and not isinstance(configs, str):
+        configs = configs[0] if configs else None
+    config = {"type": configs} if isinstance(configs, str) else dict(configs or {})
+    config.setdefault("type", "OSC_POSE")
+    if config["type"] not in CONTROLLERS:
+        raise UnknownNameError("controller", config["type"], CONTROLLERS)
+    return config
+
+
+class Controller:
+    """Goals of the arm.
+
+    Attributes:
+        name: such as `OSC_POSE`.
+        use_delta: whether actions count from the present pose; may be set at any time.
+    """
+
+    def __init__(self, env: "BDDLBaseDomain", config: Mapping[str, Any]):
+        self._env, self.name = env, config["type"]
+        self.use_delta = bool(config.get("control_delta", config.get("use_delta", True)))
+
+    @property
+    def control_dim(self) -> int:
+        """Length of an action without the gripper."""
+        return CONTROLLERS[self.name] - 1
+
+    @property
+    def ee_pos(self) -> np.ndarray:
+        """Position of the grip site, (3,) m."""
+        return self._env.view.eef_pos
+
+    @property
+    def ee_ori_mat(self) -> np.ndarray:
+        """Orientation of the grip site, (3, 3)."""
+        return self._env.view.eef_mat
+
+    @property
+    def joint_pos(self) -> np.ndarray:
+        """(7,) rad."""
+        return self._env.sim.data.qpos[:7].copy()
+
+    @property
+    def goal_pos(self) -> np.ndarray:
+        """Where the grip site is to go, (3,) m."""
+        return self._env.simulations.controller.goal_pos[0]
+
+    @property
+    def goal_ori(self) -> np.ndarray:
+        """Orientation that the grip site is to have, (3, 3)."""
+        return self._env.simulations.controller.goal_mat[0].reshape(3, 3)
+
+    def update(self, force: bool = False) -> None:
+        """Nothing to do: kinematics are read when they are needed."""
+
+    def update_base_pose(self, base_pos: Any = None, base_ori: Any = None) -> None:
+        """Nothing to do: goals are in the world frame."""
+
+    def reset_goal(self) -> None:
+        """Hold the present pose; the gripper's command stays."""
+        state = self._env.simulations.controller
+        gripper = state.gripper[0].copy()
+        state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
+        state.gripper[0] = gripper
+
+
+class Gripper:
+    """The two fingers."""
+
+    dof = 1
+
+    def __init__(self, env: "BDDLBaseDomain"):
+        self._env = env
+
+    @property
+    def current_action(self) -> np.ndarray:
+        """Command of the two fingers in [-1, 1], (2,)."""
+        return self._env.simulations.controller.gripper[0]
+
+    @current_action.setter
+    def current_action(self, value: Any) -> None:
+        self._env.simulations.controller.gripper[0] = value
+
+
+class SingleArm:
+    """The arm with controller and gripper."""
+
+    def __init__(self, env: "BDDLBaseDomain", config: Mapping[str, Any], robots: Any = ("Panda",)):
+        names = [robots] if isinstance(robots, str) else list(robots)
+        if len(names) != 1 or not str(names[0]).endswith("Panda"):
+            raise LiberoError(f"robots={names}: the benchmark has one arm, ['Panda']")
+        self._env, self.sim = env, env.sim
+        self.robot_model = (OnTheGroundPanda if env.scene.workspace.mount is None else MountedPanda)()
+        self.controller, self.gripper = Controller(env, config), Gripper(env)
+        self.controller_config = dict(config)
+        self.name, self.idn, self.dof = "Panda", 0, 8
+        self.init_qpos = self.robot_model.init_qpos
+        self.joint_indexes = self._ref_joint_pos_indexes = self._ref_joint_vel_indexes = list(range(7))
+        self._ref_gripper_joint_pos_indexes = self._ref_gripper_joint_vel_indexes = [7, 8]
+        self.eef_site_id = env.sim.model.site_name2id(self.robot_model.grip_site)
+
+    @property
+    def action_dim(self) -> int:
+        """Length of an action."""
+        return CONTROLLERS[self.controller.name]
+
+    @property
+    def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high of an action."""
+        return -np.ones(self.action_dim), np.ones(self.action_dim)
+
+    @property
+    def _joint_positions(self) -> np.ndarray:
+        return self.sim.data.qpos[:7].copy()
+
+    @property
+    def _joint_velocities(self) -> np.ndarray:
+        return self.sim.data.qvel[:7].copy()
+
+    @property
+    def _hand_pos(self) -> np.ndarray:
+        return self.sim.data.get_body_xpos(self.robot_model.eef_name).copy()
+
+    @property
+    def _hand_orn(self) -> np.ndarray:
+        return self.sim.data.get_body_xmat(self.robot_model.eef_name).copy()
+
+    @property
+    def _hand_quat(self) -> np.ndarray:
+        return np.roll(self.sim.data.get_body_xquat(self.robot_model.eef_name), -1)
+
+    @property
+    def base_pos(self) -> np.ndarray:
+        """Where the arm stands, (3,) m."""
+        return self.sim.data.get_body_xpos("robot0_base").copy()
+
+    def set_robot_joint_positions(self, jpos: Any) -> None:
+        """Put the arm into a pose, (7,) rad."""
+        self.sim.data.qpos[:7] = jpos
+        self.sim.forward()
+
+    def command(self, action: Any) -> np.ndarray:
+        """An action as the seven numbers that the simulation takes.
+
+        Raises:
+            ActionError: wrong shape or not finite.
+        """
+        action = np.asarray(action, np.float64).ravel()
+        if self.controller.name == "OSC_POSITION" and action.size in (4, 7):
+            action = np.concatenate([action[:3], np.zeros(3), action[-1:]])
+        return checked_actions(action)

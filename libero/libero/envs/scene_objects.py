@@ -1,0 +1,120 @@
+"""A compiled task as the original's objects: instances, regions, and which geoms belong to which."""
+
+from collections import OrderedDict
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
+from libero.libero.envs.objects.site_object import SiteObject
+from libero_env.objects.model import ObjectModel
+from libero_env.scene import Scene
+
+_ROBOT_PARTS = OrderedDict(Panda0=("robot0_",), RethinkMount0=("mount0_",), PandaGripper0=("gripper0_",))
+
+
+def scene_objects(scene: Scene) -> dict[str, BaseObject]:
+    """Movable objects by name."""
+    return {name: _instance(name, model) for name, model in scene.objects.items()}
+
+
+def scene_fixtures(scene: Scene) -> dict[str, Any]:
+    """Fixtures by name."""
+    fixtures = {name: _instance(name, model) for name, model in scene.fixtures.items()}
+    for fixture in fixtures.values():
+        fixture._fixed = True
+    return fixtures
+
+
+def _instance(name: str, model: ObjectModel) -> BaseObject:
+    found = OBJECTS_DICT.get(model.category)
+    if found is None or not issubclass(found, BuiltinObject):
+        instance = found(name=name) if found is not None else _anonymous(model)(name=name, model=model)
+    else:
+        instance = found(name=name, model=model)
+    return instance
+
+
+def _anonymous(model: ObjectModel) -> type:
+    """A class for a category that was registered with `libero_env` only."""
+    return type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
+
+
+def scene_sites(scene: Scene) -> dict[str, SiteObject]:
+    """Regions by address."""
+    model, found = scene.model, {}
+    for region in scene.problem.regions:
+        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address)
+        if site >= 0:
+            joints = [model.joint(j).name for j in scene.joints.get(region.address, ())]
+            found[region.address] = SiteObject(
+                region.address,
+                region.target,
+                joints=joints,
+                size=model.site_size[site].copy(),
+                rgba=model.site_rgba[site].copy(),
+                site_pos=model.site_pos[site].copy(),
+                site_quat=model.site_quat[site].copy(),
+            )
+    return found
+
+
+class TaskModel:
+    """Which geoms and sites belong to which instance and class.
+
+    Attributes:
+        instances_to_ids, classes_to_ids: name -> `geom` and `site` -> indices.
+        geom_ids_to_instances, geom_ids_to_classes: index -> name.
+        segments: `instance` and `class` -> (ngeom + 1,) number of each geom from 1 on; 0 is everything else.
+    """
+
+    def __init__(self, scene: Scene, model: mujoco.MjModel):
+        self.mujoco_model = model
+        geoms, sites = self._owners(scene, model, "geom"), self._owners(scene, model, "site")
+        robot = [name for name in _ROBOT_PARTS if name in geoms]
+        names = [*scene.things, *robot]
+        categories = {
+            **{n: _class_name(m.category) for n, m in scene.things.items()},
+            **{n: n[:-1] for n in robot},
+        }
+        self.instances_to_ids = {n: {"geom": geoms.get(n, []), "site": sites.get(n, [])} for n in names}
+        self.classes_to_ids: dict[str, dict[str, list[int]]] = {}
+        for name in names:
+            ids = self.classes_to_ids.setdefault(categories[name], {"geom": [], "site": []})
+            for kind in ids:
+                ids[kind] += self.instances_to_ids[name][kind]
+        self.geom_ids_to_instances = _inverse(self.instances_to_ids)
+        self.geom_ids_to_classes = _inverse(self.classes_to_ids)
+        self.segments = {
+            "instance": _numbers(self.instances_to_ids, model.ngeom),
+            "class": _numbers(self.classes_to_ids, model.ngeom),
+        }
+
+    @staticmethod
+    def _owners(scene: Scene, model: mujoco.MjModel, kind: str) -> dict[str, list[int]]:
+        """Instance -> its geoms or sites."""
+        bodies = getattr(model, f"{kind}_bodyid")
+        found = {n: np.flatnonzero(np.isin(bodies, scene.bodies[n])).tolist() for n in scene.things}
+        names = [model.body(b).name for b in range(model.nbody)]
+        for part, prefixes in _ROBOT_PARTS.items():
+            own = [b for b in range(model.nbody) if names[b].startswith(prefixes)]
+            if ids := np.flatnonzero(np.isin(bodies, own)).tolist():
+                found[part] = ids
+        return found
+
+
+def _class_name(category: str) -> str:
+    found = OBJECTS_DICT.get(category)
+    return found.__name__ if found is not None else category
+
+
+def _inverse(ids: dict[str, dict[str, list[int]]]) -> dict[int, str]:
+    return {geom: name for name, kinds in ids.items() for geom in kinds["geom"]}
+
+
+def _numbers(ids: dict[str, dict[str, list[int]]], ngeom: int) -> np.ndarray:
+    table = np.zeros(ngeom + 1, np.int32)
+    for number, kinds in enumerate(ids.values()):
+        table[kinds["geom"]] = number + 1
+    return table

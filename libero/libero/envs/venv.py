@@ -1,0 +1,21 @@
+"""Several environments together, with the interface that the original took from Tianshou."""
+
+from libero.libero.envs.vector_env import BaseVectorEnv, DummyVectorEnv, SubprocVectorEnv
+from libero.libero.envs.workers import (
+    CloudpickleWrapper,
+    DummyEnvWorker,
+    EnvWorker,
+    ShArray,
+    SubprocEnvWorker,
+)
+
+__all__ = [
+    "BaseVectorEnv",
+    "CloudpickleWrapper",
+    "DummyEnvWorker",
+    "DummyVectorEnv",
+    "EnvWorker",
+    "ShArray",
+    "SubprocEnvWorker",
+    "SubprocVectorEnv",
+]
