@@ -1,0 +1,124 @@
+"""Each way to command the arm: it goes where it is told, in one simulation and in many, and from a state on."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from libero_env.controllers import CONTROLLERS, JOINT_SCALE, VELOCITY_SCALE, get_controller
+from libero_env.env import LiberoEnv
+from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.vector import BatchEnv
+
+pytestmark = pytest.mark.sim
+TASK = "libero_object/2"
+MODES = [*itertools.product(CONTROLLERS, (True, False))]
+MODES.remove(("joint_velocity", False))
+
+
+def make(mode, cls=LiberoEnv, *args, **kwargs):
+    return cls(TASK, *args, controller=mode[0], control_delta=mode[1], cameras=(), **kwargs)
+
+
+def commands(env, steps, num, seed=0):
+    """Actions that move a little, whatever they mean."""
+    rng, controller = np.random.default_rng(seed), env.world.controller
+    small = rng.uniform(-1, 1, (steps, num, controller.action_dim))
+    if controller.control_delta:
+        return small
+    here = {
+        "osc_pose": np.append(env.view.eef_pos, [np.pi, 0, 0]),
+        "osc_position": env.view.eef_pos,
+        "joint_position": env.world.simulations.fields["qpos"][0, :7],
+    }[controller.name]
+    return np.append(here, 0.0) + small * np.append(np.full(here.size, 0.05), 1.0)
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_batch_and_states_give_the_same_bits(mode):
+    env, batch = make(mode), make(mode, BatchEnv, 3, num_threads=2)
+    env.reset(options={"init_state": 2})
+    moves = commands(env, 8, 3)
+    batch.reset(options={"init_state": 2})
+    for move in moves:
+        seen = batch.step(move)[0]
+    for move in moves[:3, 1]:
+        env.step(move)
+    middle = env.get_state()
+    for _ in range(2):
+        env.set_state(middle)
+        for move in moves[3:, 1]:
+            single = env.step(move)[0]
+    for key in single:
+        np.testing.assert_array_equal(seen[key][1], single[key])
+    np.testing.assert_array_equal(batch.get_state(1), env.get_state())
+    env.close()
+    batch.close()
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_the_action_space_is_the_controllers(mode):
+    env = make(mode)
+    assert env.action_space.shape == (env.world.controller.action_dim,)
+    env.reset(options={"init_state": 0})
+    env.action_space.seed(0)
+    env.step(env.action_space.sample())
+    for bad in (np.zeros(env.action_space.shape[0] + 1), np.full(env.action_space.shape, np.nan)):
+        with pytest.raises(ActionError):
+            env.step(bad)
+    env.close()
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_starts_do_not_depend_on_the_controller(mode):
+    env, usual = make(mode), LiberoEnv(TASK, cameras=())
+    np.testing.assert_array_equal(env.reset(seed=4)[0]["joint_states"], usual.reset(seed=4)[0]["joint_states"])
+    np.testing.assert_array_equal(env.world.physics_state(0), usual.world.physics_state(0))
+    env.close()
+    usual.close()
+
+
+@pytest.mark.parametrize("name", ["osc_pose", "osc_position"])
+def test_an_absolute_pose_is_reached(name):
+    env = make((name, False))
+    env.reset(options={"init_state": 0})
+    goal, turn = env.view.eef_pos + [0.05, -0.04, -0.03], [np.pi, 0.0, 0.0]
+    action = np.array([*goal, *(turn if name == "osc_pose" else []), -1.0])
+    for _ in range(60):
+        env.step(action)
+    np.testing.assert_allclose(env.view.eef_pos, goal, atol=5e-3)
+    down = [[1, 0, 0], [0, -1, 0], [0, 0, -1]] if name == "osc_pose" else [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+    np.testing.assert_allclose(env.view.eef_mat, down, atol=0.05)
+    assert env.view.finger_pos[0] > 0.035
+    env.close()
+
+
+def test_absolute_joints_are_reached_and_steps_count_from_the_present():
+    for delta in (True, False):
+        env = make(("joint_position", delta))
+        env.reset(options={"init_state": 0})
+        start = env.world.simulations.fields["qpos"][0, :7].copy()
+        goal = start + [0.2, -0.1, 0.1, 0.15, -0.1, 0.1, 0.2]
+        for _ in range(80):
+            now = env.world.simulations.fields["qpos"][0, :7]
+            move = np.clip((goal - now) / JOINT_SCALE, -1, 1) if delta else goal
+            env.step(np.append(move, 0.0))
+        np.testing.assert_allclose(env.world.simulations.fields["qpos"][0, :7], goal, atol=0.02)
+        env.close()
+
+
+def test_joint_velocities_are_held():
+    env = make(("joint_velocity", True), observations=["joint_velocities"])
+    env.reset(options={"init_state": 0})
+    command = np.array([0.4, -0.2, 0.2, 0.3, -0.4, 0.3, 0.5, 0.0])
+    for _ in range(15):
+        seen = env.step(command)[0]
+    np.testing.assert_allclose(seen["joint_velocities"], VELOCITY_SCALE * command[:7], atol=0.03)
+    env.close()
+
+
+def test_unknown_controllers_are_refused():
+    with pytest.raises(UnknownNameError, match="osc_pose"):
+        get_controller("osc_pos")
+    with pytest.raises(LiberoError, match="no absolute mode"):
+        get_controller("joint_velocity", control_delta=False)
