@@ -9,6 +9,7 @@ import pytest
 from libero_env.objects import get_object, object_names
 from libero_env.objects.builtin.facts import load_facts
 from libero_env.objects.model import GLOW_GROUP
+from libero_env.render import Picture, Renderer
 
 pytestmark = pytest.mark.sim
 
@@ -191,19 +192,16 @@ def test_burner_glows_only_in_its_group():
 def test_a_turned_on_burner_is_red_from_above():
     spec = get_object("flat_stove").spec
     spec.worldbody.add_light(pos=(0.3, 0.3, 2), dir=(-0.1, -0.1, -1))
+    spec.worldbody.add_camera(name="above", pos=(0.15, 0.0, 0.32), quat=(1.0, 0.0, 0.0, 0.0))
     model = spec.compile()
-    data = mujoco.MjData(model)
+    data, redness = mujoco.MjData(model), []
     mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance, camera.elevation = (0.15, 0.0, 0.02), 0.3, -70
-    redness = []
-    for shown in (0, 1):
-        option = mujoco.MjvOption()
-        option.geomgroup[0], option.sitegroup[GLOW_GROUP] = 0, shown
-        with mujoco.Renderer(model, 64, 64) as renderer:
-            renderer.update_scene(data, camera, option)
-            picture = renderer.render().astype(int)
-        redness.append(((picture[..., 0] - picture[..., 1:].max(axis=-1)) > 60).mean())
+    renderer, picture = Renderer(model, 64, 64), np.zeros((64, 64, 3), np.uint8)
+    for glowing in ((), (model.site("burner").id,)):
+        renderer.draw(data, [Picture(renderer.camera_id("above"), picture)], glowing)
+        rgb = picture.astype(int)
+        redness.append(((rgb[..., 0] - rgb[..., 1:].max(axis=-1)) > 60).mean())
+    renderer.close()
     assert redness[0] == 0.0 and redness[1] > 0.03
 
 
