@@ -38,8 +38,8 @@ class Workspace:
         problem: name of the problem class in task files.
         offset: origin of the regions, (3,).
         region_height: z of the surface that things stand on, over the offset.
-        zone_origin: what the original's goals measure regions from, (3,): the origin of the body that carries their
-            sites, which is not always the offset.
+        zone_origin: of the flat boxes over regions that goals ask after, (3,): x and y of regions count from here, z is
+            the middle of the boxes. The original puts them at another height in each problem.
         robot_base_pos: origin of `robot0_base`, (3,).
         mount: what stands under the arm: `rethink` or None.
         figures: all of the file.
