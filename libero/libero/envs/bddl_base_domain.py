@@ -19,8 +19,10 @@ from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_ob
 from libero.libero.envs.sim import MjSim
 from libero.libero.envs.stepping import ObservedSimulations
 from libero_env.assets import select_pack
+from libero_env.controllers import ControllerState
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states import sample_settled
+from libero_env.placement import Start
 from libero_env.predicates import StateView, evaluate, glowing_sites
 from libero_env.robot import OPEN_FINGERS, REST_QPOS
 from libero_env.scene import build_scene, scene_spec
@@ -183,7 +185,7 @@ class BDDLBaseDomain:
         Raises:
             PlacementError: nothing fits.
         """
-        start = sample_settled(self.scene, self.simulations, 0, self.rng)
+        start = self._sample()
         qpos = start.qpos.copy()
         if self.initialization_noise is None:
             qpos[: self.scene.nq_robot] = REST_QPOS + OPEN_FINGERS
@@ -194,6 +196,14 @@ class BDDLBaseDomain:
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
         self.timestep, self.cur_time, self.done = 0, 0.0, False
         return self._get_observations(force_update=True)
+
+    def _sample(self) -> Start:
+        """A start, settled with the arm holding its pose whatever the controller."""
+        own, self.simulations.controller = self.simulations.controller, ControllerState(1)
+        try:
+            return sample_settled(self.scene, self.simulations, 0, self.rng)
+        finally:
+            self.simulations.controller = own
 
     def restart(self, state: np.ndarray) -> None:
         """Start afresh from [time, qpos, qvel], poses of the fixtures behind it or not; the arm holds its pose.
@@ -253,11 +263,7 @@ class BDDLBaseDomain:
 
     def _check_success(self) -> bool:
         """Whether the goal holds."""
-        goal = self.problem.goal
-        return all(
-            self._eval_predicate(BDDLUtils.as_list(part))
-            for part in (goal.parts if isinstance(goal, And) else [goal])
-        )
+        return all(map(self._eval_predicate, self.parsed_problem["goal_state"]))
 
     def _eval_predicate(self, state: Sequence[Any]) -> bool:
         """Truth of an atom such as `["on", "a_1", "b_1"]`, or of a nested goal; case does not count."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from libero_env.control import SUBSTEPS, control
+from libero_env.control import SUBSTEPS
 from libero_env.simulation import LoopSimulations
 
 
@@ -23,7 +23,7 @@ class ObservedSimulations(LoopSimulations):
         model, c, constants = self.model, self.controller, self._constants()
         data, (inputs, ctrl) = self._datas[0], self._calls[0]
         for substep in range(SUBSTEPS):
-            control(ids, actions, *inputs, c.goal_pos, c.goal_mat, c.gripper, ctrl, *constants)
+            c.kind.kernel(ids, actions, *inputs, *c.arrays, ctrl, *constants)
             mujoco.mj_step2(model, data)
             if tap is not None and substep == SUBSTEPS - 2:
                 tap(data)

@@ -1,6 +1,6 @@
 """One environment of a vector: in this process, or in one of its own.
 
-A worker answers requests in order. `send` starts one and `recv` waits for its answer, so that several workers work at once.
+A worker answers requests in order: `send` starts one and `recv` waits for its answer, so that several work at once.
 """
 
 import multiprocessing

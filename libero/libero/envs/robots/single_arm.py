@@ -8,12 +8,14 @@ import numpy as np
 from libero.libero.envs.robots.mounted_panda import MountedPanda
 from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
 from libero_env.control import checked_actions
+from libero_env.controllers import CONTROLLERS as KINDS
+from libero_env.controllers import ControllerState, get_controller
 from libero_env.errors import LiberoError, UnknownNameError
 
 if TYPE_CHECKING:
     from libero.libero.envs.bddl_base_domain import BDDLBaseDomain
 
-CONTROLLERS = {"OSC_POSE": 7, "OSC_POSITION": 4}
+CONTROLLERS = tuple(name.upper() for name in KINDS)
 
 
 def controller_of(configs: Any) -> dict[str, Any]:
@@ -36,17 +38,30 @@ class Controller:
 
     Attributes:
         name: such as `OSC_POSE`.
-        use_delta: whether actions count from the present pose; may be set at any time.
     """
 
     def __init__(self, env: "BDDLBaseDomain", config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
-        self.use_delta = bool(config.get("control_delta", config.get("use_delta", True)))
+        delta = bool(config.get("control_delta", config.get("use_delta", True)))
+        env.simulations.controller = ControllerState(1, get_controller(self.name.lower(), delta))
+
+    @property
+    def _state(self) -> ControllerState:
+        return self._env.simulations.controller
+
+    @property
+    def use_delta(self) -> bool:
+        """Whether actions count from the present pose; may be set at any time."""
+        return self._state.kind.control_delta
+
+    @use_delta.setter
+    def use_delta(self, value: bool) -> None:
+        self._state.kind = get_controller(self.name.lower(), bool(value))
 
     @property
     def control_dim(self) -> int:
         """Length of an action without the gripper."""
-        return CONTROLLERS[self.name] - 1
+        return self._state.kind.action_dim - 1
 
     @property
     def ee_pos(self) -> np.ndarray:
@@ -65,13 +80,13 @@ class Controller:
 
     @property
     def goal_pos(self) -> np.ndarray:
-        """Where the grip site is to go, (3,) m."""
-        return self._env.simulations.controller.goal_pos[0]
+        """Where an OSC takes the grip site, (3,) m."""
+        return self._state.goal[0]
 
     @property
     def goal_ori(self) -> np.ndarray:
-        """Orientation that the grip site is to have, (3, 3)."""
-        return self._env.simulations.controller.goal_mat[0].reshape(3, 3)
+        """Orientation that an OSC gives the grip site, (3, 3)."""
+        return self._state.memory[0].reshape(3, 3)
 
     def update(self, force: bool = False) -> None:
         """Nothing to do: kinematics are read when they are needed."""
@@ -81,10 +96,9 @@ class Controller:
 
     def reset_goal(self) -> None:
         """Hold the present pose; the gripper's command stays."""
-        state = self._env.simulations.controller
-        gripper = state.gripper[0].copy()
-        state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
-        state.gripper[0] = gripper
+        gripper = self._state.gripper[0].copy()
+        self._state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
+        self._state.gripper[0] = gripper
 
 
 class Gripper:
@@ -125,12 +139,13 @@ class SingleArm:
     @property
     def action_dim(self) -> int:
         """Length of an action."""
-        return CONTROLLERS[self.controller.name]
+        return self.controller.control_dim + 1
 
     @property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Low and high of an action."""
-        return -np.ones(self.action_dim), np.ones(self.action_dim)
+        kind = self._env.simulations.controller.kind
+        return kind.low.copy(), kind.high.copy()
 
     @property
     def _joint_positions(self) -> np.ndarray:
@@ -163,12 +178,12 @@ class SingleArm:
         self.sim.forward()
 
     def command(self, action: Any) -> np.ndarray:
-        """An action as the seven numbers that the simulation takes.
+        """An action as the controller takes it; of seven numbers for `OSC_POSITION` the rotation is left out.
 
         Raises:
             ActionError: wrong shape or not finite.
         """
-        action = np.asarray(action, np.float64).ravel()
-        if self.controller.name == "OSC_POSITION" and action.size in (4, 7):
-            action = np.concatenate([action[:3], np.zeros(3), action[-1:]])
-        return checked_actions(action)
+        action = np.asarray(action)
+        if self.action_dim == 4 and action.shape == (7,):
+            action = action[[0, 1, 2, 6]]
+        return checked_actions(action, size=self.action_dim)
