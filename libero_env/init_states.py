@@ -16,6 +16,7 @@ from libero_env.errors import LiberoError, PlacementError
 from libero_env.paths import cache_dir
 from libero_env.placement import Start, sample_start
 from libero_env.predicates import StateView, evaluate
+from libero_env.problem import Region
 from libero_env.scene import Scene, build_scene
 from libero_env.simulation import LoopSimulations, Simulations
 from libero_env.tasks.suites import Task
@@ -78,10 +79,8 @@ def start_faults(view: StateView) -> list[str]:
         if atom.args[0] in view.scene.fixtures:
             continue
         region = view.scene.problem.region(atom.args[-1])
-        if region is not None and region.ranges:
-            point = view.body_pos(atom.args[0])[:2] - np.asarray(view.scene.workspace.offset)[:2]
-            low, high = np.split(np.array(region.ranges), 2, axis=1)
-            holds = ((point > low - _TOLERANCE) & (point < high + _TOLERANCE)).all(axis=1).any()
+        if atom.predicate == "On" and region is not None:
+            holds = _stands_on(view, atom.args[0], region)
         else:
             holds = evaluate(atom, view)
         if not holds:
@@ -89,6 +88,17 @@ def start_faults(view: StateView) -> list[str]:
     if evaluate(view.scene.problem.goal, view):
         faults.append("the goal holds already")
     return faults
+
+
+def _stands_on(view: StateView, name: str, region: Region) -> bool:
+    """Over the region as seen from above, and touching its target; the heights that `On` asks for do not count."""
+    if region.ranges:
+        point = view.body_pos(name)[:2] - np.asarray(view.scene.workspace.offset)[:2]
+        low, high = np.split(np.array(region.ranges), 2, axis=1)
+        return bool(((point > low - _TOLERANCE) & (point < high + _TOLERANCE)).all(axis=1).any())
+    half = np.abs(view.site_mat(region.address) @ view.scene.model.site(region.address).size)
+    near = np.abs(view.body_pos(name) - view.site_pos(region.address))[:2] < half[:2]
+    return bool(near.all()) and view.in_contact(name, region.target)
 
 
 def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -> np.ndarray:
