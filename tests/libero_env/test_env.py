@@ -33,7 +33,6 @@ def same(a, b):
         np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
-@pytest.mark.filterwarnings("ignore:.*WARN.*:UserWarning")
 def test_gymnasium_accepts_it():
     env = LiberoEnv(TASK, **SMALL, render_mode="rgb_array")
     check_env(env, skip_render_check=True)

@@ -1,0 +1,238 @@
+"""What can be observed: pictures that agree with each other and with the state, and drawing on request only."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from libero_env.env import LiberoEnv
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.observations import NAMES, PROPRIOCEPTION, product, rotated
+from libero_env.predicates import glowing_sites
+from libero_env.registration import env_ids
+from libero_env.rewards import Reward, approach, joint_share, staged
+from libero_env.tasks import get_suite, suite_names
+from libero_env.vector import BatchEnv
+
+pytestmark = pytest.mark.sim
+TASK = "libero_object/2"
+STOVE = "libero_goal/7"  # turn it on
+EVERYTHING = [n for n in NAMES if n not in ("segmentation_class", "segmentation_element")]
+
+
+@pytest.fixture(scope="module")
+def kitchen():
+    env = LiberoEnv(STOVE, camera_size=(96, 128), observations=EVERYTHING)
+    env.reset(seed=0)
+    yield env
+    env.close()
+
+
+def world_points(env, camera, depth):
+    """Where each pixel's surface is in the world, (H, W, 3), from depth and the camera's figures."""
+    observer = env.world.observer
+    rows, cols = np.indices(depth.shape)
+    rays = np.stack([cols + 0.5, rows + 0.5, np.ones(depth.shape)], -1) @ np.linalg.inv(observer.intrinsics(camera)).T
+    pose = observer.camera_to_world(0, camera)
+    return rays * depth[..., None] @ pose[:3, :3].T + pose[:3, 3]
+
+
+def turned_on(env):
+    state, model = env.get_state(), env.world.scene.model
+    state[1 + model.joint("flat_stove_1_button").qposadr[0]] = 1.5
+    return state
+
+
+def test_names_give_what_the_table_says(kitchen):
+    seen = kitchen.set_state(kitchen.get_state())
+    assert kitchen.observation_space.contains(seen)
+    assert seen["agentview_depth"].dtype == np.float32 and seen["agentview_segmentation"].dtype == np.int32
+    assert seen["agentview_rgb"].shape == (96, 128, 3) and seen["eye_in_hand_depth"].shape == (96, 128)
+    np.testing.assert_array_equal(seen["akita_black_bowl_1_pos"], kitchen.view.body_pos("akita_black_bowl_1"))
+    assert seen["wooden_cabinet_1_joints"].shape == (3,) and seen["flat_stove_1_joints"].shape == (1,)
+    few = LiberoEnv(TASK, cameras=(), observations=["ee_quat", "objects"])
+    assert "joint_states" not in few.reset(seed=0)[0]
+    few.close()
+
+
+def test_by_default_nothing_has_changed():
+    env = LiberoEnv(TASK, camera_size=(8, 8))
+    assert list(env.reset(seed=0)[0]) == ["agentview_rgb", "eye_in_hand_rgb", *PROPRIOCEPTION]
+    env.close()
+
+
+def test_depth_and_segmentation_place_every_object_where_it_is(kitchen):
+    seen = kitchen.render_frames()
+    labels = kitchen.world.observer.labels()
+    points = world_points(kitchen, "agentview", seen["agentview_depth"])
+    found = 0
+    for number, name in labels.items():
+        pixels = points[seen["agentview_segmentation"] == number]
+        if kitchen.view.is_thing(name) and len(pixels):
+            low, high = kitchen.view.bounds(name)
+            inside = ((pixels > low - 0.02) & (pixels < high + 0.02)).all(1)
+            assert inside.mean() > 0.95, name
+            found += 1
+    assert found >= 5
+    assert {labels[n] for n in (0, 1, 2)} == {"arena", "robot", "gripper"}
+
+
+def test_the_hands_camera_moves_with_the_hand(kitchen):
+    data = kitchen.world.simulations.data(0)
+    camera = kitchen.world.scene.model.camera("robot0_eye_in_hand").id
+    pose = kitchen.world.observer.camera_to_world(0, "robot0_eye_in_hand")
+    np.testing.assert_allclose(pose[:3, 3], data.cam_xpos[camera], atol=1e-9)
+    np.testing.assert_allclose(pose[:3, 2], -data.cam_xmat[camera].reshape(3, 3)[:, 2], atol=1e-9)
+
+
+def test_kinds_of_segmentation_agree(kitchen):
+    world = kitchen.world
+    of = {kind: world.frame(0, "agentview", f"segmentation_{kind}") for kind in ("instance", "class", "element")}
+    names = {kind: world.observer.labels(kind) for kind in of}
+    scene = world.scene
+    for instance, category, element in {*zip(*(of[kind].ravel().tolist() for kind in of), strict=True)}:
+        name = names["instance"][instance]
+        expected = scene.things[name].category if name in scene.things else name
+        assert names["class"][category] == expected
+        if name in scene.things:
+            assert scene.model.geom_bodyid[element - 1] in scene.bodies[name]
+    with pytest.raises(LiberoError, match="one kind"):
+        LiberoEnv(TASK, observations=["segmentation_class", "segmentation_element"])
+
+
+def test_poses_seen_from_the_hand_lead_back_to_the_world(kitchen):
+    seen = kitchen.set_state(kitchen.get_state())
+    for name in kitchen.world.scene.things:
+        back = rotated(seen["ee_quat"][None], seen[f"{name}_to_ee_pos"][None])[0] + seen["ee_pos"]
+        np.testing.assert_allclose(back, seen[f"{name}_pos"], atol=1e-9)
+        quat = product(seen["ee_quat"][None], seen[f"{name}_to_ee_quat"][None])[0]
+        assert abs(quat @ seen[f"{name}_quat"]) == pytest.approx(1.0)
+
+
+def test_what_glows_is_seen_only_while_it_is_on(kitchen):
+    before = kitchen.get_state()
+    off = kitchen.set_state(before)
+    assert not glowing_sites(kitchen.view)
+    on = kitchen.set_state(turned_on(kitchen))
+    assert glowing_sites(kitchen.view)
+    redder = on["agentview_rgb"].astype(int)[..., 0] - off["agentview_rgb"].astype(int)[..., 0]
+    assert (redder > 100).sum() > 5
+    element = kitchen.world.frame(0, "agentview", "segmentation_element")
+    site = 1 + kitchen.world.scene.model.ngeom + next(iter(glowing_sites(kitchen.view)))
+    assert (element == site).any()
+    again = kitchen.set_state(before)
+    np.testing.assert_array_equal(again["agentview_rgb"], off["agentview_rgb"])
+
+
+def test_one_and_many_observe_the_same():
+    kwargs = {"camera_size": (24, 32), "observations": EVERYTHING, "reward": "staged"}
+    batch, env = BatchEnv(STOVE, 2, num_threads=2, **kwargs), LiberoEnv(STOVE, **kwargs)
+    moves = np.random.default_rng(1).uniform(-1, 1, (3, 2, 7))
+    rows = [batch.reset(seed=3)[0]]
+    steps = [batch.step(move) for move in moves]
+    assert batch.observation_space.contains(rows[0])
+    for i in range(2):
+        singles = [env.reset(seed=3 + i)[0]]
+        for t, move in enumerate(moves[:, i]):
+            observation, reward, *_ = env.step(move)
+            singles.append(observation)
+            assert reward == steps[t][1][i]
+        for many, one in zip([*rows, *(step[0] for step in steps)], singles, strict=True):
+            for key in one:
+                np.testing.assert_array_equal(many[key][i], one[key], err_msg=key)
+    batch.close()
+    env.close()
+
+
+@pytest.mark.parametrize("make", [LiberoEnv, lambda *args, **kwargs: BatchEnv(*args, 2, **kwargs)])
+def test_frames_are_drawn_only_when_wanted(make, monkeypatch):
+    env = make(TASK, camera_size=(16, 16))
+    drawn = []
+    renderer = env.world.observer.renderer
+    draw = renderer.draw
+    monkeypatch.setattr(renderer, "draw", lambda *args: drawn.append(1) or draw(*args))
+    env.draw = False
+    seen, _ = env.reset(options={"init_state": 0})
+    still = np.zeros(env.action_space.shape)
+    for _ in range(3):
+        seen = env.step(still)[0]
+    assert not drawn and not seen["agentview_rgb"].any()
+    frames = env.render_frames()
+    env.draw = True
+    state = env.get_state() if make is LiberoEnv else env.get_state(0)
+    seen = env.step(still)[0]
+    assert drawn and seen["agentview_rgb"].any()
+    if make is LiberoEnv:
+        np.testing.assert_array_equal(env.set_state(state)["agentview_rgb"], frames["agentview_rgb"])
+    env.close()
+
+
+def test_observations_are_the_callers_own():
+    env = LiberoEnv(TASK, camera_size=(8, 8))
+    first, _ = env.reset(seed=0)
+    copy = {key: value.copy() for key, value in first.items()}
+    env.step(np.ones(7))
+    for key in first:
+        np.testing.assert_array_equal(first[key], copy[key])
+    env.close()
+
+
+def test_staged_rewards_rise_towards_the_goal_and_only_success_is_one(kitchen):
+    env = LiberoEnv(STOVE, cameras=(), reward="staged", reward_scale=2.0)
+    env.reset(seed=0)
+    _, reward, *_ = env.step(np.zeros(7))
+    assert 0 < reward < 2
+    atom, address = env.world.atoms[0], 1 + env.world.scene.model.joint("flat_stove_1_button").qposadr[0]
+    state, shares = env.get_state(), []
+    for angle in (0.0, 0.1, 0.3, 0.45):
+        state[address] = angle
+        env.set_state(state)
+        shares.append((joint_share(env.view, "flat_stove_1", "turnon"), approach(env.view, atom)))
+    assert shares == sorted(shares) and shares[-1][0] < 1 and shares[0][1] < shares[-1][1] < 0.9
+    env.set_state(turned_on(env))
+    _, reward, terminated, *_ = env.step(np.zeros(7))
+    assert terminated and reward == 2.0
+    assert staged(env.view, [atom], [True]) == 0.99  # atoms hold, the goal does not
+    with pytest.raises(UnknownNameError, match="staged"):
+        Reward("dense")
+    env.close()
+
+
+@pytest.mark.parametrize("suite", suite_names())
+def test_every_goal_can_be_approached(suite):
+    for task in get_suite(suite).tasks[:: max(1, len(get_suite(suite)) // 3)]:
+        env = LiberoEnv(task, cameras=(), reward="staged", observations=["ee_pos"])
+        scene = env.world.scene
+        env.world.simulations.reset([0], scene.model.qpos0[None], np.zeros((1, scene.model.nv)))
+        for atom in env.world.atoms:
+            assert 0 < approach(env.view, atom) <= 0.9, (task.name, atom)
+        assert len(env.world.atoms) == len(env.world.progress(0)) > 0
+        env.close()
+
+
+def test_gymnasium_makes_every_task_by_name():
+    ids = env_ids()
+    assert set(ids) <= set(gymnasium.registry)
+    assert ids["libero/libero_object-3"] == "libero_object/3"
+    assert {name.split("-")[0].removeprefix("libero/") for name in ids} == set(suite_names())
+    assert all(f"libero/{name}-{len(get_suite(name)) - 1}" in ids for name in suite_names())
+    env = gymnasium.make("libero/libero_object-3", camera_size=(16, 16), render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.close()
+    many = gymnasium.make_vec("libero/libero_object-3", num_envs=2, camera_size=(16, 16))
+    assert isinstance(many, BatchEnv) and many.spec.id == "libero/libero_object-3"
+    seen, _ = many.reset(seed=1)
+    assert many.observation_space.contains(seen)
+    seen, rewards, terminated, truncated, _ = many.step(many.action_space.sample())
+    assert many.observation_space.contains(seen)
+    assert rewards.shape == terminated.shape == truncated.shape == (2,)
+    many.close()
+
+
+def test_wrong_names_list_the_valid_ones(kitchen):
+    with pytest.raises(UnknownNameError, match="depth"):
+        LiberoEnv(TASK, observations=["deph"])
+    with pytest.raises(UnknownNameError, match="segmentation_class"):
+        kitchen.world.frame(0, "agentview", "segmentation")
+    with pytest.raises(UnknownNameError, match="agentview"):
+        kitchen.world.observer.camera_to_world(0, "agentveiw")
