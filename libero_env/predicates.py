@@ -340,17 +340,21 @@ def _boxes(view: StateView, address: str) -> list[Box]:
 
 
 def _beyond(view: StateView, place: str, state: str, opposite: str) -> list[bool]:
-    """For each joint whether it is in a state, such as `open`: as far as its range begins, seen from the opposite's."""
+    """For each joint whether it is in a state, such as `open`: as far as its range begins, seen from the opposite's.
+
+    A thing without joints has none that is open, and all it has are closed, as in the original.
+    """
     owner = view.scene.owner(place)
     if owner is None:
         raise UnknownNameError("object, fixture or region of one", place, view.scene.joints)
-    ranges = view.scene.things[owner].articulation
+    ranges, values = view.scene.things[owner].articulation, view.joint_positions(place).values()
+    if not values:
+        return []
     if state not in ranges:
         category = view.scene.things[owner].category
         raise LiberoError(f"{owner}: nothing says when a {category} is {state!r}; it has no such joint range")
     low, high = sorted(ranges[state])
     upwards = opposite not in ranges or low + high > sum(ranges[opposite])
-    values = view.joint_positions(place).values()
     if state == "turnon":
         return [v >= low if upwards else v <= high for v in values]
     return [v > low if upwards else v < high for v in values]

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 import mujoco
 import numpy as np
 
-from libero_env.arena import WORKSPACES, Workspace, load_workspace
+from libero_env.arena import WORKSPACES, Workspace, add_mount, load_workspace
 from libero_env.assets import Pack, select_pack
 from libero_env.bddl import Problem
 from libero_env.errors import UnknownNameError
@@ -23,7 +23,7 @@ TIMESTEP = 0.002  # s
 ROBOT = "robot"  # what contacts call arm and gripper
 _MAX_FRAME = 1024  # pixels, the largest picture the offscreen buffer holds
 _FIXTURE_LIFT = 0.01  # m, the original's height of fixtures over the underside of the table top
-_ZONE_HEIGHT, _ZONE_HALF_HEIGHT = 0.02, 0.007  # m, the box of a flat region over its surface
+_ZONE_HEIGHT = 0.014  # m, of the box over a flat region
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,7 @@ def scene_spec(
     spec.modelname = "libero"
     _set_options(spec)
     pack.add_arena(spec, workspace, problem.scene_properties)
+    add_mount(spec, workspace)
     add_panda(spec, workspace.robot_base_pos)
     _add_zones(spec, problem, name, workspace)
     for thing, category in problem.objects.items():
@@ -195,9 +196,9 @@ def fixture_pose(
 
 def zone_boxes(region: Region, workspace: Workspace) -> list[tuple[np.ndarray, np.ndarray]]:
     """The flat box over each rectangle of a region on the workspace: centre (3,), half size (3,), world frame, m."""
-    surface = np.array([0.0, 0.0, workspace.region_height + _ZONE_HEIGHT]) + workspace.offset
+    origin = np.array(workspace.zone_origin)
     return [
-        (surface + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.array([x1 - x0, y1 - y0, 2 * _ZONE_HALF_HEIGHT]) / 2)
+        (origin + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.array([x1 - x0, y1 - y0, _ZONE_HEIGHT]) / 2)
         for x0, y0, x1, y1 in region.ranges
     ]
 
