@@ -149,12 +149,16 @@ def _hub(folder: Path) -> Iterator[Any]:
         raise LiberoError(
             "huggingface_hub is not installed; it fetches the assets: pip install huggingface_hub"
         ) from error
+    errors: tuple[type[Exception], ...] = (
+        OSError,
+        HfHubHTTPError.__mro__[1],
+    )  # and what the HTTP library raises
     before = constants.HF_HUB_DISABLE_XET
     constants.HF_HUB_DISABLE_XET = True
     again = f"what arrived is kept in {folder}: run it again to go on"
     try:
         yield hub
-    except (OSError, *HfHubHTTPError.__bases__) as error:
+    except errors as error:
         where = os.environ.get("HF_ENDPOINT", constants.ENDPOINT)
         if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
             raise DownloadError(f"{folder}: the disk is full; make room. {again}") from error

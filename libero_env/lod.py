@@ -53,7 +53,8 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
 def _store(path: Path, arrays: Arrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.stem}.{np.random.SeedSequence().entropy:x}.npz")
-    np.savez_compressed(partial, **{f"a{i}": array for i, array in enumerate(arrays)})
+    vertices, triangles, texcoords, indices = arrays
+    np.savez_compressed(partial, a0=vertices, a1=triangles, a2=texcoords, a3=indices)
     partial.replace(path)
 
 

