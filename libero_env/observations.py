@@ -232,7 +232,7 @@ class _Things:
         self._joints = {name: addresses for name, addresses in joints.items() if addresses}
 
     def space(self) -> dict[str, spaces.Box]:
-        found = {}
+        found: dict[str, spaces.Box] = {}
         for name in self._bodies:
             found |= {f"{name}_pos": box(3, _FAR), f"{name}_quat": box(4, 1.0)}
             found |= {f"{name}_to_ee_pos": box(3, _FAR), f"{name}_to_ee_quat": box(4, 1.0)}
@@ -243,7 +243,7 @@ class _Things:
     def observe(self, simulations: Simulations, eef: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
         f, (eef_pos, eef_quat) = simulations.fields, eef
         back = eef_quat * (1.0, -1.0, -1.0, -1.0)
-        found = {}
+        found: dict[str, np.ndarray] = {}
         for name, body in self._bodies.items():
             pos, quat = f["xpos"][:, body].copy(), f["xquat"][:, body].copy()
             found |= {f"{name}_pos": pos, f"{name}_quat": quat}

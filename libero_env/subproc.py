@@ -135,7 +135,7 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
             ActionError: wrong shape or not finite; nothing has moved.
             WorkerError: some failed; the others have moved, see `WorkerError.outcome`.
         """
-        actions = checked_actions(actions, self.num_envs, self.single_action_space.shape[0])
+        actions = checked_actions(actions, self.num_envs, self._action_size)
         ids = [int(i) for i in np.flatnonzero(self._running)]
         for i in ids:
             self._workers[i].send("step", actions[i])
@@ -189,9 +189,9 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         for worker, space in zip(self._workers, observed, strict=True):
             worker.share(space)
         self._attached(range(self.num_envs))
-        common = [k for k, box in observed[0].items() if all(o.spaces.get(k) == box for o in observed)]
-        self.single_observation_space = spaces.Dict({key: observed[0][key] for key in common})
-        self.single_action_space = first
+        self._common = [k for k, box in observed[0].items() if all(o.spaces.get(k) == box for o in observed)]
+        self.single_observation_space = spaces.Dict({key: observed[0][key] for key in self._common})
+        self.single_action_space, self._action_size = first, first.shape[0]
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(first, self.num_envs)
         return observed
@@ -230,15 +230,16 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
                 view[...] = 0
 
     def _observe(self) -> dict[str, np.ndarray]:
-        views = [worker.shared.views for worker in self._workers]
-        return {key: np.stack([v[key] for v in views]) for key in self.single_observation_space.spaces}
+        views = self._views()
+        return {key: np.stack([v[key] for v in views]) for key in self._common}
+
+    def _views(self) -> list[dict[str, np.ndarray]]:
+        return [worker.shared.views if worker.shared else {} for worker in self._workers]
 
     def _info(self) -> dict[str, Any]:
         info: dict[str, Any] = {"success": self._success.copy(), "progress": [dict(p) for p in self._progress]}
-        common = self.single_observation_space.spaces
         own = [
-            {key: view.copy() for key, view in worker.shared.views.items() if key not in common}
-            for worker in self._workers
+            {key: view.copy() for key, view in views.items() if key not in self._common} for views in self._views()
         ]
         return {**info, "own": own} if any(own) else info
 

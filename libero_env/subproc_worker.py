@@ -26,7 +26,7 @@ class Shared:
 
     def __init__(self, space: spaces.Dict, name: str | None = None):
         """Make a block, or attach to the one of this name."""
-        boxes = [(key, box.shape, np.dtype(box.dtype)) for key, box in space.items()]
+        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in space.items()]
         starts = np.cumsum([0, *(-(-int(np.prod(s)) * d.itemsize // 64) * 64 for _, s, d in boxes)])  # aligned
         self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
         self.name = self._memory.name
@@ -79,7 +79,9 @@ class _Host:
     """The commands."""
 
     def __init__(self, make: Callable[[], gymnasium.Env]):
-        self._make, self._env, self._shared = make, None, None
+        self._make = make
+        self._env: Any = None
+        self._shared: Any = None
 
     def open(self) -> tuple[spaces.Space, spaces.Space]:
         self._env = self._make()
@@ -96,7 +98,7 @@ class _Host:
     def step(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
         observation, *outcome = self._env.step(action)
         self._shared.write(observation)
-        return tuple(outcome)
+        return tuple(outcome)  # type: ignore[return-value]
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         value = getattr(self._env.unwrapped, name)

@@ -55,7 +55,9 @@ class World:
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
         self.scene: Scene = build_scene(self.task.problem, pack)
         self.num, self.cameras, self.camera_size = num, tuple(cameras), (int(camera_size[0]), int(camera_size[1]))
-        self.simulations: Simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
+        self.simulations: Simulations = make_simulations(
+            self.scene.model, num, threads, self.scene.fixture_bodies.tolist()
+        )
         self.simulations.controller = ControllerState(num, self.controller)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
         self.observer = Observer(
