@@ -55,6 +55,12 @@ class Workspace:
     figures: Mapping[str, Any]
 
 
+    @property
+    def surface_height(self) -> float:
+        """World z of the surface that things stand on, m."""
+        return self.offset[2] + self.region_height
+
+
 @cache
 def load_workspace(category: str) -> Workspace:
     """The workspace that a fixture category stands for.

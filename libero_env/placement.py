@@ -175,8 +175,8 @@ def _place(scene: Scene, data: mujoco.MjData, name: str, place: Place, rng: np.r
         assert place.region is not None
         x0, y0, x1, y1 = place.region.ranges[rng.integers(len(place.region.ranges))]
         quat = _turned(scene.objects[name].rest_quat(rng), place.region, rng)
-        ox, oy, oz = scene.workspace.offset
-        surface = oz + scene.workspace.region_height
+        ox, oy, _ = scene.workspace.offset
+        surface = scene.workspace.surface_height
         x, y = rng.uniform(x0, x1) + ox, rng.uniform(y0, y1) + oy
     else:
         quat = scene.objects[name].rest_quat(rng)

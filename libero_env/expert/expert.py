@@ -217,7 +217,7 @@ class Expert:
                 self._grasp = None
         if self._grasp is None:
             cloud, others = self.shapes.cloud(view, skill.thing), self.shapes.others(view, skill.thing)
-            support = view.scene.workspace.region_height
+            support = view.scene.workspace.surface_height
             grasp = choose_grasp(cloud, others, support, finger_axis(view.eef_mat), skill.thing)
             self._grasp, self._rise = (grasp, now), cloud[:, 2].max() - grasp.pos_world[2] + TIP_BELOW
         grasp, then = self._grasp
@@ -234,4 +234,4 @@ class Expert:
         way = way * min(1.0, 0.10 / max(length, 1e-9))
         along = np.clip((others[:, :2] - start) @ way / max(way @ way, 1e-12), 0.0, 1.0)
         near = np.linalg.norm(others[:, :2] - start - along[:, None] * way, axis=1) < AROUND
-        return float(others[near, 2].max(initial=view.scene.workspace.region_height))
+        return float(others[near, 2].max(initial=view.scene.workspace.surface_height))
