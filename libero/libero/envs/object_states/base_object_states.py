@@ -39,6 +39,10 @@ class BaseObjectState:
     def _true(self, predicate: str, *args: str) -> bool:
         return evaluate(Atom(predicate, args), self.env.view)
 
+    def _of_joints(self, predicate: str, without: bool) -> bool:
+        """Truth of a predicate about joints; `without` any as of the empty `any` and `all`."""
+        return self._true(predicate, self.object_name) if self.get_joint_state() else without
+
     def get_geom_state(self) -> dict[str, np.ndarray]:
         """`pos` (3,) m and `quat` (4,) wxyz in the world frame."""
         raise NotImplementedError
@@ -57,7 +61,8 @@ class BaseObjectState:
 
     def get_joint_state(self) -> list[float]:
         """Positions of the joints that open, close or turn it, rad or m."""
-        return list(self.env.view.joint_positions(self.object_name).values())
+        known = self.object_name in self.env.scene.joints
+        return list(self.env.view.joint_positions(self.object_name).values()) if known else []
 
     def set_joint(self, qpos: float = 1.5) -> None:
         """Put the joints of the thing somewhere."""
@@ -67,19 +72,19 @@ class BaseObjectState:
 
     def is_open(self) -> bool:
         """Whether any joint is as far out as open begins."""
-        return self._true("Open", self.object_name)
+        return self._of_joints("Open", without=False)
 
     def is_close(self) -> bool:
         """Whether all joints are as far in as closed begins."""
-        return self._true("Close", self.object_name)
+        return self._of_joints("Close", without=True)
 
     def turn_on(self) -> bool:
         """Whether any joint is as far as on begins."""
-        return self._true("Turnon", self.object_name)
+        return self._of_joints("Turnon", without=False)
 
     def turn_off(self) -> bool:
         """Whether all joints are as far back as off begins."""
-        return self._true("Turnoff", self.object_name)
+        return self._of_joints("Turnoff", without=True)
 
     def update_state(self) -> None:
         """Nothing to do: what a state looks like follows from the state."""

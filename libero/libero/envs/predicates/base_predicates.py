@@ -106,25 +106,33 @@ class PrintJointState(_Native, UnaryAtomic):
         return super().__call__(*args)
 
 
-class Open(_Native, UnaryAtomic):
+class Open(UnaryAtomic):
     """Any joint is as far out as open begins."""
 
-    predicate = "Open"
+    def __call__(self, arg1: Any) -> bool:
+        """Truth for this object state."""
+        return arg1.is_open()
 
 
-class Close(_Native, UnaryAtomic):
+class Close(UnaryAtomic):
     """All joints are as far in as closed begins."""
 
-    predicate = "Close"
+    def __call__(self, arg1: Any) -> bool:
+        """Truth for this object state."""
+        return arg1.is_close()
 
 
-class TurnOn(_Native, UnaryAtomic):
+class TurnOn(UnaryAtomic):
     """Any joint is as far as on begins."""
 
-    predicate = "Turnon"
+    def __call__(self, arg1: Any) -> bool:
+        """Truth for this object state."""
+        return arg1.turn_on()
 
 
-class TurnOff(_Native, UnaryAtomic):
+class TurnOff(UnaryAtomic):
     """All joints are as far back as off begins."""
 
-    predicate = "Turnoff"
+    def __call__(self, arg1: Any) -> bool:
+        """Truth for this object state."""
+        return arg1.turn_off()

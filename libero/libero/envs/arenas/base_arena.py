@@ -1,0 +1,77 @@
+"""A scene that is being put together, with the interface of robosuite's arenas."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import mujoco
+
+from libero.libero.envs.arenas.style import STYLE_KINDS
+from libero_env.arena import load_workspace
+from libero_env.assets import select_pack
+
+
+class Arena:
+    """Floor, walls, table, cameras and lights as an editable model.
+
+    Attributes:
+        spec: the model.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec):
+        self.spec = spec
+
+    @property
+    def worldbody(self) -> Any:
+        """The world's body."""
+        return self.spec.worldbody
+
+    def set_camera(
+        self,
+        camera_name: str,
+        pos: Sequence[float],
+        quat: Sequence[float],
+        camera_attribs: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Move a camera, or add one; attributes as in MJCF, such as `fovy`."""
+        camera = self.spec.camera(camera_name)
+        camera = self.spec.worldbody.add_camera(name=camera_name) if camera is None else camera
+        camera.pos, camera.quat = pos, quat
+        for key, value in (camera_attribs or {}).items():
+            if key == "fovy":
+                camera.fovy = float(value)
+
+    def get_xml(self) -> str:
+        """The model as MJCF."""
+        return self.spec.to_xml()
+
+
+class WorkspaceArena(Arena):
+    """The arena of one workspace.
+
+    Args:
+        floor_style, wall_style: names of `libero.libero.envs.arenas.style`.
+        scene: style of the whole scene, such as `warm`.
+        kwargs: what else the original's classes take (`table_full_size`, `xml`, ...) is accepted, of no effect.
+    """
+
+    category: ClassVar[str]
+
+    def __init__(
+        self,
+        floor_style: str | None = None,
+        wall_style: str | None = None,
+        scene: str | None = None,
+        **kwargs: Any,
+    ):
+        spec = mujoco.MjSpec()
+        given = dict(zip((*STYLE_KINDS, "scene"), (floor_style, wall_style, scene), strict=True))
+        self.workspace = load_workspace(self.category)
+        select_pack().add_arena(
+            spec, self.workspace, {key: name for key, name in given.items() if name is not None}
+        )
+        super().__init__(spec)
+
+    @property
+    def table_offset(self) -> tuple[float, ...]:
+        """Origin of the regions, (3,) m."""
+        return self.workspace.offset

@@ -1,0 +1,21 @@
+"""Styles of floors and walls by name."""
+
+from libero_env.arena_styles import load_styles
+from libero_env.errors import UnknownNameError
+from libero_env.original_arena import TEXTURES
+
+STYLE_KINDS = ("floor", "wall")
+STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
+
+
+def get_texture_filename(type: str, style: str) -> str:
+    """Name of the picture of a style in the original's `textures`.
+
+    Raises:
+        UnknownNameError: no such kind or style.
+    """
+    if type not in STYLE_MAPPING:
+        raise UnknownNameError("kind of style", type, STYLE_MAPPING)
+    if style not in STYLE_MAPPING[type]:
+        raise UnknownNameError(f"{type} style", style, load_styles()[type])
+    return STYLE_MAPPING[type][style]

@@ -1,0 +1,9 @@
+"""A table."""
+
+from libero.libero.envs.arenas.base_arena import WorkspaceArena
+
+
+class TableArena(WorkspaceArena):
+    """A table with its room."""
+
+    category = "table"

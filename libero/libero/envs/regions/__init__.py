@@ -1,0 +1,63 @@
+"""Samplers of places and of joint positions, by problem and region."""
+
+from libero.libero.envs.regions.object_property_sampler import (
+    ObjectPropertySampler,
+    OpenCloseSampler,
+    TurnOnOffSampler,
+)
+from libero.libero.envs.regions.samplers import (
+    InSiteRegionRandomSampler,
+    Libero100TableRegionSampler,
+    MultiRegionRandomSampler,
+    ObjectBasedSampler,
+    SiteRegionRandomSampler,
+    SiteSequentialCompositeSampler,
+    TableRegionSampler,
+)
+from libero_env.errors import UnknownNameError
+
+_TABLES = {
+    "libero_tabletop_manipulation": ("table", TableRegionSampler),
+    "libero_kitchen_tabletop_manipulation": ("kitchen_table", Libero100TableRegionSampler),
+    "libero_living_room_tabletop_manipulation": ("living_room_table", Libero100TableRegionSampler),
+    "libero_study_tabletop_manipulation": ("study_table", Libero100TableRegionSampler),
+    "libero_coffee_table_manipulation": ("coffee_table", Libero100TableRegionSampler),
+    "libero_floor_manipulation": ("floor", TableRegionSampler),
+}
+REGION_SAMPLERS: dict[str, dict[str, type]] = {problem: dict([entry]) for problem, entry in _TABLES.items()}
+
+
+def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
+    """The sampler of a workspace in a problem.
+
+    Raises:
+        UnknownNameError: no such problem or workspace.
+    """
+    if problem_name not in REGION_SAMPLERS:
+        raise UnknownNameError("problem", problem_name, REGION_SAMPLERS)
+    known = REGION_SAMPLERS[problem_name]
+    if region_sampler_name not in known:
+        raise UnknownNameError(f"region sampler of {problem_name}", region_sampler_name, known)
+    return known[region_sampler_name]
+
+
+def update_region_samplers(problem_name: str, region_sampler_name: str, region_sampler: type) -> None:
+    """Add a sampler or replace one."""
+    REGION_SAMPLERS.setdefault(problem_name, {})[region_sampler_name] = region_sampler
+
+
+__all__ = [
+    "REGION_SAMPLERS",
+    "InSiteRegionRandomSampler",
+    "Libero100TableRegionSampler",
+    "MultiRegionRandomSampler",
+    "ObjectBasedSampler",
+    "ObjectPropertySampler",
+    "OpenCloseSampler",
+    "SiteRegionRandomSampler",
+    "SiteSequentialCompositeSampler",
+    "TableRegionSampler",
+    "TurnOnOffSampler",
+    "get_region_samplers",
+    "update_region_samplers",
+]

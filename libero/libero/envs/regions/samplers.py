@@ -1,0 +1,176 @@
+"""Where objects go, for clients that place them themselves: name -> (pos (3,) m, quat wxyz (4,), object).
+
+The environments place things with `libero_env.placement`; these samplers share its rule of bounded tries.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from libero_env.arena import load_workspace
+from libero_env.errors import PlacementError
+
+Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
+_TRIES = 5000
+
+
+class MultiRegionRandomSampler:
+    """Puts objects into rectangles, each range of x with the range of y at its place, without overlap.
+
+    Args:
+        name: what messages call it.
+        mujoco_objects: one or several with `name`, `bottom_offset`, `top_offset`, `horizontal_radius` and `init_quat`.
+        x_ranges, y_ranges: (low, high), m, from `reference_pos`.
+        rotation: (low, high) rad about the vertical, a number, or None for a full turn.
+        ensure_object_boundary_in_range: whether the whole object stays inside.
+        ensure_valid_placement: whether objects keep off each other.
+        reference_pos: (3,) m, world frame.
+        z_offset: m, above the reference.
+        rng: draws the places.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        mujoco_objects: Any = None,
+        x_ranges: Sequence[Sequence[float]] | None = None,
+        y_ranges: Sequence[Sequence[float]] | None = None,
+        rotation: Any = None,
+        rotation_axis: str = "z",
+        ensure_object_boundary_in_range: bool = True,
+        ensure_valid_placement: bool = True,
+        reference_pos: Sequence[float] = (0.0, 0.0, 0.0),
+        z_offset: float = 0.0,
+        rng: np.random.Generator | None = None,
+    ):
+        self.name, self.rotation, self.rotation_axis = name, rotation, rotation_axis
+        self.x_ranges, self.y_ranges = x_ranges or [(0.0, 0.0)], y_ranges or [(0.0, 0.0)]
+        self.whole, self.apart = ensure_object_boundary_in_range, ensure_valid_placement
+        self.reference_pos, self.z_offset = np.asarray(reference_pos, np.float64), z_offset
+        self.rng = np.random.default_rng() if rng is None else rng
+        self.mujoco_objects: list[Any] = []
+        self.add_objects(mujoco_objects if mujoco_objects is not None else ())
+
+    def add_objects(self, mujoco_objects: Any) -> None:
+        """Place these too."""
+        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
+
+    def sample(
+        self, fixtures: Mapping[str, Any] | None = None, reference: Any = None, on_top: bool = True
+    ) -> Placements:
+        """Places for all objects.
+
+        Args:
+            fixtures: placements that are there already.
+            reference: name of one of them, or a position, to count from instead of `reference_pos`.
+            on_top: whether objects stand on the reference rather than at its height.
+
+        Raises:
+            PlacementError: nothing free was found in 5000 tries.
+        """
+        placed: Placements = dict(fixtures or {})
+        origin = self._origin(placed, reference, on_top)
+        found: Placements = {}
+        for item in self.mujoco_objects:
+            found[item.name] = placed[item.name] = self._place(item, origin, placed)
+        return found
+
+    def _origin(self, placed: Placements, reference: Any, on_top: bool) -> np.ndarray:
+        if reference is None:
+            return self.reference_pos
+        if not isinstance(reference, str):
+            return np.asarray(reference, np.float64)
+        if reference not in placed:
+            raise PlacementError(f"{self.name}: {reference!r} is not placed yet; placed: {', '.join(placed)}")
+        pos, _, item = placed[reference]
+        return np.asarray(pos) + (np.array([0.0, 0.0, item.top_offset[-1]]) if on_top else 0.0)
+
+    def _place(self, item: Any, origin: np.ndarray, placed: Placements) -> Any:
+        margin = item.horizontal_radius if self.whole else 0.0
+        for _ in range(_TRIES):
+            k = self.rng.integers(len(self.x_ranges))
+            xy = [self._draw(*ranges[k], margin) for ranges in (self.x_ranges, self.y_ranges)]
+            pos = origin + (*xy, self.z_offset - item.bottom_offset[-1])
+            if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
+                return tuple(pos), self._quat(item), item
+        raise PlacementError(
+            f"{self.name}: no free place for {item.name} in {_TRIES} tries. (1) make the ranges larger, (2) use "
+            "fewer or smaller objects"
+        )
+
+    def _draw(self, low: float, high: float, margin: float) -> float:
+        low, high = min(low, high) + margin, max(low, high) - margin
+        return self.rng.uniform(low, high) if low <= high else (low + high) / 2
+
+    @staticmethod
+    def _clear(item: Any, pos: np.ndarray, other: Any) -> bool:
+        """Whether circles of the two keep apart, or the one is over the other."""
+        there, _, thing = other
+        apart = (
+            np.hypot(*(pos[:2] - np.asarray(there)[:2])) > item.horizontal_radius + thing.horizontal_radius
+        )
+        return bool(apart or pos[2] + item.bottom_offset[-1] >= there[2] + thing.top_offset[-1])
+
+    def _quat(self, item: Any) -> np.ndarray:
+        if self.rotation is None:
+            angle = self.rng.uniform(0.0, 2 * np.pi)
+        else:
+            angle = self.rng.uniform(*self.rotation) if np.ndim(self.rotation) else float(self.rotation)
+        quat = np.zeros(4)
+        quat[0], quat[1 + "xyz".index(self.rotation_axis)] = np.cos(angle / 2), np.sin(angle / 2)
+        return quat
+
+
+class TableRegionSampler(MultiRegionRandomSampler):
+    """Places on the table."""
+
+    category = "table"
+
+    def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
+        kwargs.setdefault("reference_pos", load_workspace(self.category).offset)
+        super().__init__(name, mujoco_objects, *args, **{"rotation": (0.0, 0.0), **kwargs})
+
+
+class Libero100TableRegionSampler(TableRegionSampler):
+    """Places on the tables of LIBERO-100."""
+
+    category = "kitchen_table"
+
+
+class ObjectBasedSampler(MultiRegionRandomSampler):
+    """Places on another object: pass its name to `sample` as `reference`."""
+
+
+class SiteRegionRandomSampler(MultiRegionRandomSampler):
+    """Places around a site: pass its position to `sample` as `reference`."""
+
+
+class InSiteRegionRandomSampler(SiteRegionRandomSampler):
+    """Places inside a site's box, of which objects may stick out."""
+
+    def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
+        super().__init__(name, mujoco_objects, *args, **{"ensure_object_boundary_in_range": False, **kwargs})
+
+
+class SiteSequentialCompositeSampler:
+    """Samplers one after the other, each with what the ones before it have placed."""
+
+    def __init__(self, name: str):
+        self.name = name
+        self.samplers: dict[str, tuple[MultiRegionRandomSampler, dict[str, Any]]] = {}
+
+    def append_sampler(
+        self, sampler: MultiRegionRandomSampler, sample_args: Mapping[str, Any] | None = None
+    ) -> None:
+        """Add a sampler at the end, with arguments of its `sample`."""
+        self.samplers[sampler.name] = sampler, dict(sample_args or {})
+
+    def sample(self, fixtures: Mapping[str, Any] | None = None, **_: Any) -> Placements:
+        """All placements."""
+        placed, found = dict(fixtures or {}), {}
+        for sampler, arguments in self.samplers.values():
+            new = sampler.sample(fixtures=placed, **arguments)
+            placed.update(new)
+            found.update(new)
+        return found

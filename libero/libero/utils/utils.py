@@ -1,0 +1,43 @@
+"""Helpers for stored models and pictures."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from libero_env.assets import chosen_assets
+from libero_env.robot import robosuite_assets
+
+_ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
+
+
+def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, Any]] | None = None) -> str:
+    """A stored model with this machine's paths, and with cameras changed: name -> attributes."""
+    root = ElementTree.fromstring(xml_str)
+    for element in root.iterfind("asset/*[@file]"):
+        file = element.get("file", "")
+        if _ROBOSUITE in file:
+            element.set("file", str(robosuite_assets() / file.split(_ROBOSUITE)[-1]))
+        elif _ASSETS in file and Path(chosen_assets().value).is_dir():
+            element.set("file", str(Path(chosen_assets().value) / file.split(_ASSETS)[-1]))
+    for camera in root.iter("camera"):
+        for key, value in (cameras_dict or {}).get(camera.get("name", ""), {}).items():
+            camera.set(key, value if isinstance(value, str) else " ".join(map(str, np.atleast_1d(value))))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def process_image_input(img_tensor: np.ndarray) -> np.ndarray:
+    """Pixels 0 to 255 -> 0 to 1."""
+    return img_tensor / 255.0
+
+
+def reconstruct_image_output(img_array: np.ndarray) -> np.ndarray:
+    """Pixels 0 to 1 -> 0 to 255."""
+    return img_array * 255.0
+
+
+def update_env_kwargs(env_kwargs: dict[str, Any], **kwargs: Any) -> None:
+    """Set arguments of an environment in place."""
+    env_kwargs.update(kwargs)

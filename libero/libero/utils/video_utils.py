@@ -1,0 +1,103 @@
+"""Films of episodes."""
+
+import importlib
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+_TINT = np.array([0, 255, 0])  # mixed into the pictures after success
+_SHARE = 0.2
+
+
+class VideoWriter:
+    """Collects pictures and writes them on `save`, or at the end of its block.
+
+    MP4 where the package imageio-ffmpeg is installed, else GIF.
+
+    Args:
+        video_path: folder for the files.
+        save_video: without it nothing is collected.
+        fps: pictures for each second.
+        single_video: all environments in one film, one after the other, instead of `video_<i>`.
+    """
+
+    def __init__(
+        self, video_path: str | Path, save_video: bool = False, fps: int = 30, single_video: bool = True
+    ):
+        self.video_path, self.save_video, self.fps, self.single_video = (
+            Path(video_path),
+            save_video,
+            fps,
+            single_video,
+        )
+        self.image_buffer: dict[int, list[np.ndarray]] = {}
+        self.last_images: dict[int, np.ndarray] = {}
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.save()
+
+    def reset(self) -> None:
+        """The next pictures are of a new episode."""
+        self.last_images.clear()
+
+    def append_image(self, img: np.ndarray, idx: int = 0) -> None:
+        """Add a picture (H, W, 3), lowest row first, of environment `idx`."""
+        if self.save_video:
+            self.image_buffer.setdefault(idx, []).append(np.asarray(img, np.uint8)[::-1])
+
+    def append_obs(
+        self, obs: Mapping[str, np.ndarray], done: bool, idx: int = 0, camera_name: str = "agentview_image"
+    ) -> None:
+        """Add the picture of an observation; after success the last one, tinted green."""
+        if not done:
+            self.last_images[idx] = np.asarray(obs[camera_name])
+            self.append_image(self.last_images[idx], idx)
+        else:
+            last = self.last_images.get(idx, np.asarray(obs[camera_name]))
+            self.append_image((1 - _SHARE) * last + _SHARE * _TINT, idx)
+
+    def append_vector_obs(
+        self,
+        obs: Sequence[Mapping[str, np.ndarray]],
+        dones: Sequence[bool],
+        camera_name: str = "agentview_image",
+    ) -> None:
+        """Add the pictures of several environments."""
+        for i, (own, done) in enumerate(zip(obs, dones, strict=True)):
+            self.append_obs(own, bool(done), i, camera_name)
+
+    def save(self) -> list[Path]:
+        """Write the films; their paths."""
+        if not self.save_video or not self.image_buffer:
+            return []
+        self.video_path.mkdir(parents=True, exist_ok=True)
+        if self.single_video:
+            films = {"video": [image for images in self.image_buffer.values() for image in images]}
+        else:
+            films = {f"video_{i}": images for i, images in self.image_buffer.items()}
+        return [_write(self.video_path / name, images, self.fps) for name, images in films.items()]
+
+
+def _write(path: Path, images: Sequence[np.ndarray], fps: int) -> Path:
+    try:
+        importlib.import_module("imageio_ffmpeg")
+        imageio: Any = importlib.import_module("imageio.v2")
+    except ImportError:
+        warnings.warn("for MP4: pip install imageio imageio-ffmpeg; writing GIF", stacklevel=3)
+        first, *rest = map(Image.fromarray, images)
+        film = path.with_suffix(".gif")
+        first.save(film, save_all=True, append_images=rest, duration=1000 / fps, loop=0)
+        return film
+    film = path.with_suffix(".mp4")
+    imageio.mimwrite(film, images, fps=fps)
+    return film
