@@ -54,7 +54,6 @@ class Workspace:
     mount: str | None
     figures: Mapping[str, Any]
 
-
     @property
     def surface_height(self) -> float:
         """World z of the surface that things stand on, m."""
