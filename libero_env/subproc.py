@@ -215,7 +215,13 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         self, ids: Sequence[int], timeout: float, keep_running: bool = False
     ) -> tuple[dict[int, Any], dict[int, str]]:
         """Answers, and why some gave none; those whose process is lost get a new one."""
-        answers, failures = wait_for({i: self._workers[i] for i in ids}, timeout)
+        asked = {i: self._workers[i] for i in ids}
+        try:
+            answers, failures = wait_for(asked, timeout)
+        except KeyboardInterrupt:
+            for worker in asked.values():  # their answers would be taken for those to the next question
+                worker.process.kill()
+            raise
         for i, failure in failures.items():
             self._abandon(i, failure, keep_running)
         return answers, {i: failure.why for i, failure in failures.items()}

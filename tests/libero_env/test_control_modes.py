@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from libero_env.controllers import CONTROLLERS, JOINT_SCALE, VELOCITY_SCALE, get_controller
+from libero_env.controllers import CONTROLLERS, JOINT_SCALE, VELOCITY_SCALE, ControllerState, get_controller
 from libero_env.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
 from libero_env.vector import BatchEnv
@@ -115,6 +115,27 @@ def test_joint_velocities_are_held():
         seen = env.step(command)[0]
     np.testing.assert_allclose(seen["joint_velocities"], VELOCITY_SCALE * command[:7], atol=0.03)
     env.close()
+
+
+def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summing_when_it_saturates():
+    rng, limit = np.random.default_rng(0), np.array([80.0] * 4 + [12.0] * 3)
+    state = ControllerState(1, get_controller("joint_velocity"))
+    state.goal[0] = rng.uniform(-0.5, 0.5, 7)
+    bias, ctrl = rng.normal(size=(1, 9)), np.zeros((1, 9))
+    total, last, changes, saturated = np.zeros(7), np.zeros(7), [], False
+    for velocity in np.cumsum(rng.normal(scale=0.02, size=(40, 7)), axis=0):
+        qvel, unused = np.append(velocity, [0.0, 0.0])[None], np.zeros((1, 9, 3))
+        state.kind.kernel(
+            np.zeros(1, np.int64), np.zeros((1, 8)), np.zeros((1, 9)), qvel, unused, unused, np.zeros((1, 3)),
+            np.zeros((1, 9)), np.zeros((1, 81)), bias, *state.arrays, ctrl, np.zeros((7, 7), np.int64), limit,
+            np.array([[0.0, 0.04], [-0.04, 0.0]]), np.zeros(7),
+        )  # fmt: skip
+        error = state.goal[0] - velocity
+        changes, last = [*changes, error - last][-5:], error
+        total = total if saturated else total + error
+        wanted = 6 * limit * (error + 0.005 * total + 0.001 * np.mean(changes, axis=0)) + bias[0, :7]
+        np.testing.assert_allclose(ctrl[0, :7], np.clip(wanted, -limit, limit), atol=1e-9)
+        saturated = bool((np.abs(wanted) > limit).any())
 
 
 def test_unknown_controllers_are_refused():
