@@ -20,13 +20,15 @@ def wooden_tray() -> Look:
         block((-0.1380, y0, z0), (0.1535, y1, z1), side, bevel=0.0008, faces={"z+": grip})
         for y0, y1, z0, z1 in ((-0.0872, -0.0818, 0.0030, 0.0620), (0.0730, 0.0782, 0.0028, 0.0602))
     ]
+    for x0, x1 in ((-0.1364, -0.1256), (0.1417, 0.1526)):
+        parts.append(block((x0, -0.0818, 0.0001), (x1, 0.0734, 0.0051), palette["post"]))
     for x0, x1 in ((-0.1412, -0.1364), (0.1507, 0.1556)):
         parts.append(block((x0, -0.0845, 0.0045), (x1, 0.0760, 0.0545), palette["end"], bevel=0.0008))
     for x0, x1 in ((-0.1383, -0.1259), (0.1391, 0.1515)):
         for y0, y1 in ((-0.0835, -0.0730), (0.0630, 0.0738)):
             parts.append(block((x0, y0, 0.0017), (x1, y1, 0.0785), post))
     for x0, x1 in ((-0.1402, -0.1262), (0.1390, 0.1534)):
-        parts.append(block((x0, -0.0850, 0.0755), (x1, 0.0750, 0.0812), grip, bevel=0.0012))
+        parts.append(block((x0, -0.0850, 0.0762), (x1, 0.0750, 0.0812), grip, bevel=0.0012))
     return Look(merge(parts), palette.png(), specular=0.1, frame="body")
 
 

@@ -13,7 +13,7 @@ SHELVES = (  # centre (y, z), metres, and slope of the planes that bottles lie o
 )
 SHELF_HALF = (0.1344, 0.0789, 0.0045)
 SLATS = 7
-ARCH = (0.1340, 0.0255, 0.0070)  # half length, height, thickness of the bent foot
+ARCH = (0.1320, 0.0245, 0.0080)  # half length, height, thickness of the bent foot
 PEGS_X, PEGS_Y = (-0.0438, 0.0311), (-0.1012, -0.0694, -0.0358, 0.0, 0.0309, 0.0598, 0.0930)
 PEG = [(0.0165, 0.0039), (0.1034, 0.0036)]
 
@@ -29,7 +29,8 @@ def wine_rack() -> Look:
     }
     palette = Palette(tiles)
     post = block((-0.0090, -0.0100, -0.1600), (0.0090, 0.0100, 0.1590), palette["post"], bevel=0.0015)
-    parts = [_arch(palette), _placed(post, (0.00886, 0.17026), -np.arcsin(0.273))]
+    stretcher = block((-0.0665, -0.0930, 0.0021), (0.0665, 0.0930, 0.0111), palette["post"])
+    parts = [_arch(palette), stretcher, _placed(post, (0.00886, 0.17026), -np.arcsin(0.273))]
     parts += [_placed(_slatted(palette), center, slope) for center, slope in SHELVES]
     return Look(merge(parts), palette.png(), specular=0.25, shininess=0.5, frame="body")
 
@@ -57,10 +58,10 @@ def _slatted(palette: Palette) -> Mesh:
     for index in range(SLATS):
         x0 = -x + index * pitch
         cell = palette["odd" if index % 2 else "even"]
-        parts.append(block((x0 + 0.0015, -y, -0.0005), (x0 + pitch - 0.0015, y, z), cell))
+        parts.append(block((x0 + 0.0015, -y, -0.0035), (x0 + pitch - 0.0015, y, z), cell))
     for at in (-0.052, 0.052):
         parts.append(block((-x, at - 0.009, -z), (x, at + 0.009, 0.0), palette["batten"]))
-    parts.append(block((-x, -y - 0.0030, -z), (x, -y + 0.0005, 0.0120), palette["batten"], bevel=0.0008))
+    parts.append(block((-x, -y + 0.0028, -z), (x, -y + 0.0068, 0.0178), palette["batten"], bevel=0.0008))
     return merge(parts)
 
 
@@ -74,7 +75,7 @@ def _arch(palette: Palette) -> Mesh:
     """Bent board along y, ends on the floor."""
     length, height, thickness = ARCH
     y = np.linspace(-length, length, 9)
-    top = height - (height - thickness) * (y / length) ** 2
+    top = height - (height - thickness) * np.abs(y / length) ** 1.5
     pieces = []
     for i in range(len(y) - 1):
         outline = [
