@@ -55,8 +55,7 @@ def _book(low, high, cover: Canvas, spine: Canvas, cloth: Color, *, pages: Color
         "cover": painted(cover),
         "spine": painted(spine),
         "cloth": plain(cloth),
-        "pages": _leaves(pages, upright=True),
-        "head": _leaves(pages, upright=True),
+        "pages": _leaves(pages),
     }
     palette = Palette(tiles)
     return Look(_bound(low, high, palette), palette.png(), specular=0.25, shininess=0.5, frame="body")
@@ -65,7 +64,6 @@ def _book(low, high, cover: Canvas, spine: Canvas, cloth: Color, *, pages: Color
 def _bound(low, high, palette: Palette) -> Mesh:
     (x0, y0, z0), (x1, y1, z1) = low, high
     cloth, art = palette["cloth"], palette["cover"]
-    paper = {"y-": palette["pages"], "z+": palette["head"], "z-": palette["head"]}
     return merge(
         [
             block((x0, y0, z0), (x0 + BOARD, y1 - 0.001, z1), cloth, bevel=0.0006, faces={"x-": art}),
@@ -81,19 +79,17 @@ def _bound(low, high, palette: Palette) -> Mesh:
                 (x0 + BOARD, y0 + OVERHANG, z0 + OVERHANG),
                 (x1 - BOARD, y1 - BOARD, z1 - OVERHANG),
                 palette["pages"],
-                faces=paper,
             ),
         ]
     )
 
 
-def _leaves(color: Color, *, upright: bool) -> np.ndarray:
+def _leaves(color: Color) -> np.ndarray:
     """Edges of paper: fine lines, a gap here and there."""
     rng = np.random.default_rng(7)
     lines = 1.0 - 0.16 * rng.random(TILE // 2).repeat(2) - 0.25 * (rng.random(TILE // 2) > 0.88).repeat(2)
     shade = np.broadcast_to(lines, (TILE, TILE))[..., None]
-    tile = np.clip(shade * color, 0, 255).astype(np.uint8)
-    return tile if upright else tile.transpose(1, 0, 2)
+    return np.clip(shade * color, 0, 255).astype(np.uint8)
 
 
 def _frame(canvas: Canvas, color: Color, inset: float) -> None:
