@@ -171,8 +171,11 @@ class BaseObject:
             raise LiberoError(
                 f"{self.category_name}: nothing says when it is {state!r}; it has {', '.join(ranges)}"
             )
-        upwards = opposite not in ranges or sum(ranges[state]) > sum(ranges[opposite])
-        return qpos >= min(ranges[state]) if upwards else qpos <= max(ranges[state])
+        low, high = sorted(ranges[state])
+        upwards = opposite not in ranges or low + high > sum(ranges[opposite])
+        if state == "turnon":
+            return qpos >= low if upwards else qpos <= high
+        return qpos > low if upwards else qpos < high
 
 
 class BuiltinObject(BaseObject):

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from libero.libero.envs.workers import DummyEnvWorker, EnvWorker, SubprocEnvWorker
+from libero.libero.envs.workers import DummyEnvWorker, EnvWorker, SubprocEnvWorker, WorkerError
 from libero_env.errors import LiberoError
 
 Ids = int | Sequence[int] | np.ndarray | None
@@ -73,7 +73,7 @@ class BaseVectorEnv:
             self.waiting_id += ids
             self.ready_id = [i for i in self.ready_id if i not in ids]
             ids = self._ready()
-        results = [self.workers[i].recv() for i in ids]
+        results = self._receive(ids)
         for i, (_, _, _, info) in zip(ids, results, strict=True):
             info["env_id"] = i
         observations, rewards, successes, infos = zip(*results, strict=True)
@@ -136,7 +136,19 @@ class BaseVectorEnv:
             raise LiberoError(f"{method}: {len(each)} values for {len(ids)} environments")
         for k, i in enumerate(ids):
             self.workers[i].send(method, *(() if each is None else (each[k],)), **kwargs)
-        return [self.workers[i].recv() for i in ids]
+        return self._receive(ids)
+
+    def _receive(self, ids: Sequence[int]) -> list[Any]:
+        """All answers, so that none is left for the next call; then the first failure is raised."""
+        results, failures = [], []
+        for i in ids:
+            try:
+                results.append(self.workers[i].recv())
+            except WorkerError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
+        return results
 
     def _ids(self, id: Ids) -> list[int]:
         if self.is_closed:

@@ -4,10 +4,12 @@ A worker answers requests in order: `send` starts one and `recv` waits for its a
 """
 
 import multiprocessing
+import sys
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing import connection, shared_memory
 from typing import Any
 
@@ -196,7 +198,8 @@ class SubprocEnvWorker(EnvWorker):
         self._timeout, self._buffers = timeout, {}  # type: ignore[var-annotated]
         self.share_memory, self._method = share_memory, "making the environment"
         self.process = context.Process(target=_serve, args=(child, CloudpickleWrapper(env_fn)), daemon=True)
-        self.process.start()
+        with _without_main():
+            self.process.start()
         child.close()
 
     def send(self, method: str, *args: Any, **kwargs: Any) -> None:
@@ -297,6 +300,18 @@ class SubprocEnvWorker(EnvWorker):
             if left == 0.0:
                 break
         return ready
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Keep a process that is spawned from running the script again: what it needs of it comes with the factory."""
+    main = sys.modules["__main__"]
+    hidden = {name: main.__dict__.pop(name) for name in ("__file__", "__spec__") if name in main.__dict__}
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        main.__dict__.update(hidden)
 
 
 def _set(env: Any, key: str, value: Any) -> None:

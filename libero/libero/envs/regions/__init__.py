@@ -24,7 +24,10 @@ _TABLES = {
     "libero_coffee_table_manipulation": ("coffee_table", Libero100TableRegionSampler),
     "libero_floor_manipulation": ("floor", TableRegionSampler),
 }
-REGION_SAMPLERS: dict[str, dict[str, type]] = {problem: dict([entry]) for problem, entry in _TABLES.items()}
+REGION_SAMPLERS: dict[str, dict[str, type]] = {
+    problem: {category: type(f"{base.__name__}_{category}", (base,), {"category": category})}
+    for problem, (category, base) in _TABLES.items()
+}
 
 
 def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:

@@ -1,0 +1,31 @@
+"""Fixtures of the facade's tests: no configuration file, a cache that lasts for the session."""
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def no_configuration(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path_factory.getbasetemp() / "no-config"))
+
+
+@pytest.fixture(scope="session")
+def suite():
+    from libero.libero import benchmark
+
+    return benchmark.get_benchmark("libero_object")()
+
+
+@pytest.fixture
+def make_env(suite):
+    """A factory of environments that are closed at the end."""
+    from libero.libero.envs import ControlEnv
+
+    made = []
+
+    def make(cls=ControlEnv, task=0, **kwargs):
+        made.append(cls(bddl_file_name=suite.get_task_bddl_file_path(task), **kwargs))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()

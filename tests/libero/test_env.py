@@ -1,0 +1,229 @@
+"""The environments: what is observed and when, states, fixtures, success, cameras."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
+from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
+from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.render import Renderer
+
+pytestmark = pytest.mark.sim
+BLIND = {"use_camera_obs": False}
+REST = [0.0] * 6 + [-1.0]
+
+
+def test_observations_under_the_original_names(make_env, suite):
+    env = make_env(OffScreenRenderEnv, camera_heights=32, camera_widths=48, camera_depths=True)
+    obs = env.set_init_state(suite.get_task_init_states(0)[0])
+    assert obs["robot0_proprio-state"].shape == (39,)
+    assert obs["object-state"].shape == (7 * 14,)
+    assert obs["agentview_image"].shape == (32, 48, 3)
+    assert obs["agentview_image"].dtype == np.uint8
+    assert obs["robot0_eye_in_hand_depth"].shape == (32, 48, 1)
+    assert 0 <= obs["agentview_depth"].min() < obs["agentview_depth"].max() <= 1
+    w, pos = obs["milk_1_quat"][3], obs["milk_1_pos"]
+    assert np.isclose(w, env.sim.data.get_body_xquat("milk_1_main")[0])
+    hand = env.sim.data.get_body_xmat("robot0_right_hand")
+    assert np.allclose(hand @ obs["milk_1_to_robot0_eef_pos"] + obs["robot0_eef_pos"], pos)
+    assert env.env.get_robot_state_vector(obs).shape == (9,)
+
+
+def test_pictures_have_opengl_rows(make_env):
+    env = make_env(OffScreenRenderEnv, camera_heights=64, camera_widths=64)
+    image = env.reset()["agentview_image"]
+    upright = np.empty((64, 64, 3), np.uint8)
+    with Renderer(env.sim.model._model, 64, 64) as renderer:
+        renderer.render(env.sim.data._data, [env.sim.model.camera_name2id("agentview")], [upright])
+    assert (image == upright[::-1]).all()
+
+
+def test_nothing_is_drawn_without_camera_observations(make_env, monkeypatch):
+    monkeypatch.setattr(Renderer, "_open", lambda self: pytest.fail("a GL context was opened"))
+    env = make_env(**BLIND)
+    env.reset()
+    assert "agentview_image" not in env.step(REST)[0]
+
+
+def test_step_returns_the_old_four_tuple(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    obs, reward, done, info = env.step(REST)
+    assert (reward, done, info) == (0.0, False, {})
+    assert np.isclose(env.get_sim_state()[0], 0.05)
+    with pytest.raises(ActionError, match=r"\(7,\)"):
+        env.step([0.0] * 6)
+
+
+def test_horizon(make_env):
+    env = make_env(**BLIND, horizon=2)
+    env.reset()
+    assert not env.step(REST)[2]
+    assert not env.step(REST)[2]
+    with pytest.raises(EpisodeOverError, match="2 steps"):
+        env.step(REST)
+    env.reset()
+    env.step(REST)
+
+
+def test_a_seed_decides_the_placement_and_the_global_generator_nothing(make_env):
+    states = []
+    for noise in range(2):
+        np.random.seed(noise)  # noqa: NPY002 - that it does not matter
+        env = make_env(**BLIND)
+        env.seed(3)
+        env.reset()
+        states.append(env.get_sim_state())
+    assert (states[0] == states[1]).all()
+    env.reset()
+    assert (env.get_sim_state() != states[0]).any()
+
+
+def test_states_come_back(make_env, suite):
+    env = make_env(**BLIND)
+    row = suite.get_task_init_states(0)[1]
+    env.set_init_state(row)
+    assert (env.get_sim_state() == row[: env.get_sim_state().size]).all()
+    for _ in range(3):
+        env.step(REST)
+    state = env.get_sim_state()
+    env.step(REST)
+    obs = env.regenerate_obs_from_state(state)
+    assert (env.get_sim_state() == state).all()
+    assert (obs["robot0_joint_pos"] == state[1:8]).all()
+    assert env.sim.get_state().flatten().tolist() == state.tolist()
+    with pytest.raises(LiberoError, match="another task"):
+        env.set_init_state(state[:-1])
+
+
+def test_fixtures_move_where_a_client_writes_them():
+    env = ControlEnv(bddl_file_name=_stove_task(), **BLIND)
+    env.reset()
+    model, fixture = env.sim.model, env.env.fixtures_dict["flat_stove_1"]
+    body = model.body_name2id(fixture.root_body)
+    other = ControlEnv(bddl_file_name=_stove_task(), **BLIND)
+    other.seed(0)
+    other.reset()
+    before = other.sim.data.get_body_xpos(fixture.root_body).copy()
+    model.body_pos[body] = before + (0.01, 0.02, 0.0)
+    mujoco.mj_forward(model._model, env.sim.data._data)
+    expected = before + (0.01, 0.02, 0.0)
+    assert np.allclose(env.env.object_states_dict["flat_stove_1"].get_geom_state()["pos"], expected)
+    env.set_init_state(env.get_sim_state())
+    env.step(REST)
+    assert np.allclose(env.sim.data.get_body_xpos(fixture.root_body), expected)
+    assert (other.sim.data.get_body_xpos(fixture.root_body) == before).all(), "models are not shared"
+    xml = env.sim.model.get_xml()
+    other.reset_from_xml_string(xml)
+    assert np.allclose(other.sim.data.get_body_xpos(fixture.root_body), expected, atol=1e-5)
+    env.close()
+    other.close()
+
+
+def _stove_task() -> str:
+    from libero.libero import benchmark
+
+    goal = benchmark.get_benchmark("libero_goal")()
+    return goal.get_task_bddl_file_path(goal.get_task_names().index("turn_on_the_stove"))
+
+
+def test_turning_a_stove_on_is_success():
+    env = ControlEnv(bddl_file_name=_stove_task(), **BLIND)
+    env.reset()
+    env.env.object_states_dict["flat_stove_1"].set_joint(-0.004)
+    assert env.env._eval_predicate(["Turnoff", "flat_stove_1"])
+    env.env.object_states_dict["flat_stove_1"].set_joint(1.5)
+    assert env.check_success()
+    assert env.step(REST)[1:3] == (1.0, True)
+    with pytest.raises(UnknownNameError, match="flat_stove_1"):
+        env.env._eval_predicate(["turnon", "flat_stove_2"])
+    env.close()
+
+
+def test_goal_by_placing(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    data, basket = env.sim.data, env.sim.data.get_body_xpos("basket_1_main")
+    data.set_joint_qpos("alphabet_soup_1_joint0", [*(basket + (0, 0, 0.02)), 1, 0, 0, 0])
+    env.sim.forward()
+    assert env.check_success()
+    states = env.env.object_states_dict
+    assert states["basket_1_contain_region"].check_contain(states["alphabet_soup_1"])
+    assert not env.env._eval_predicate(["not", ["in", "alphabet_soup_1", "basket_1_contain_region"]])
+
+
+def test_segmentation(make_env, suite):
+    env = make_env(SegmentationRenderEnv, camera_heights=96, camera_widths=96)
+    env.reset()
+    obs = env.set_init_state(suite.get_task_init_states(0)[0])
+    image = obs["agentview_segmentation_instance"]
+    assert image.shape == (96, 96, 1)
+    assert set(np.unique(image)) >= {0, env.instance_to_id["basket_1"], env.segmentation_robot_id + 1}
+    parts = env.get_segmentation_instances(image)
+    assert (sum(np.minimum(part, 1) for part in parts.values()) == (image > 0)).all()
+    interest = env.get_segmentation_of_interest(image)
+    assert set(np.unique(interest)) == {-1, 0, 1}
+    assert ((interest == 1) == np.isin(image, [env.instance_to_id[n] for n in env.obj_of_interest])).all()
+    for random in (False, True):
+        colours = env.segmentation_to_rgb(image, random)
+        assert colours.shape == (96, 96, 3)
+        assert len(np.unique(colours.reshape(-1, 3), axis=0)) == len(np.unique(image))
+
+
+def test_absolute_actions_and_other_controllers(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    robot = env.robots[0]
+    robot.controller.use_delta = False
+    target = robot.controller.ee_pos + (0.03, 0.02, 0.05)
+    turn = np.zeros(4)
+    mujoco.mju_mat2Quat(turn, robot.controller.ee_ori_mat.ravel())
+    axis = 2 * np.arccos(turn[0]) * turn[1:] / np.linalg.norm(turn[1:])
+    for _ in range(30):
+        env.step([*target, *axis, -1.0])
+    assert np.allclose(robot.controller.ee_pos, target, atol=5e-3)
+    for name, size in (("OSC_POSITION", 4), ("JOINT_POSITION", 8), ("JOINT_VELOCITY", 8)):
+        env = make_env(controller=name, **BLIND)
+        env.reset()
+        assert env.env.action_dim == size
+        env.step(np.zeros(size))
+    env = make_env(controller="OSC_POSITION", **BLIND)
+    env.reset()
+    env.step(np.zeros(7))
+
+
+def test_a_problem_class_may_move_a_camera(suite):
+    from libero.libero.envs.bddl_base_domain import TASK_MAPPING, register_problem
+
+    original = TASK_MAPPING["libero_floor_manipulation"]
+    try:
+
+        @register_problem
+        class Libero_Floor_Manipulation(BDDLBaseDomain):
+            def _setup_camera(self, mujoco_arena):
+                mujoco_arena.set_camera("agentview", (2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+
+        env = ControlEnv(bddl_file_name=suite.get_task_bddl_file_path(0), **BLIND)
+        assert env.sim.data.model.cam_pos[env.sim.model.camera_name2id("agentview")].tolist() == [
+            2.0,
+            0.0,
+            1.0,
+        ]
+        env.close()
+    finally:
+        TASK_MAPPING["libero_floor_manipulation"] = original
+
+
+def test_observations_are_those_of_the_recordings(shared, make_env):
+    with np.load(shared / "parity" / "libero_object-00-random.npz", allow_pickle=False) as stored:
+        keys, states, actions, seen = (stored[k] for k in ("obs_keys", "states", "actions", "obs"))
+    env = make_env(**BLIND)
+    env.reset()
+    env.set_init_state(states[0])
+    for action, expected in zip(actions[:25], seen, strict=False):
+        obs = env.step(action)[0]
+        found = np.concatenate([np.ravel(obs[key]) for key in json.loads(str(keys))])
+        assert np.abs(found - expected)[[*range(7), *range(14, 23)]].max() < 1e-6

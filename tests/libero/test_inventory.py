@@ -1,0 +1,232 @@
+"""Every public name of the original's environment half is there and can be called."""
+
+import importlib
+
+import numpy as np
+import pytest
+
+from libero.libero.envs import ControlEnv
+from libero.libero.envs.base_object import OBJECTS_DICT
+from libero_env.errors import LiberoError
+
+pytestmark = pytest.mark.sim
+
+NAMES = {
+    "libero.libero": """libero_config_path config_file get_default_path_dict get_libero_path
+        set_libero_default_path""",
+    "libero.libero.utils": "get_path_dict get_libero_path set_libero_path",
+    "libero.libero.utils.video_utils": "VideoWriter",
+    "libero.libero.utils.time_utils": "Timer",
+    "libero.libero.utils.dataset_utils": "get_dataset_info",
+    "libero.libero.utils.log_utils": "get_logger",
+    "libero.libero.utils.utils": """postprocess_model_xml process_image_input reconstruct_image_output
+        update_env_kwargs""",
+    "libero.libero.benchmark": """BENCHMARK_MAPPING register_benchmark get_benchmark_dict get_benchmark print_benchmark
+        Task grab_language_from_filename libero_suites task_maps task_orders Benchmark LIBERO_SPATIAL LIBERO_OBJECT
+        LIBERO_GOAL LIBERO_90 LIBERO_10 LIBERO_100""",
+    "libero.libero.benchmark.libero_suite_task_map": "libero_task_map",
+    "libero.libero.envs": """ControlEnv OffScreenRenderEnv SegmentationRenderEnv BaseVectorEnv DummyVectorEnv
+        SubprocVectorEnv TASK_MAPPING register_problem""",
+    "libero.libero.envs.env_wrapper": "ControlEnv OffScreenRenderEnv DemoRenderEnv SegmentationRenderEnv",
+    "libero.libero.envs.venv": """BaseVectorEnv DummyVectorEnv SubprocVectorEnv EnvWorker DummyEnvWorker
+        SubprocEnvWorker ShArray CloudpickleWrapper""",
+    "libero.libero.envs.bddl_utils": "get_problem_info robosuite_parse_problem get_regions get_scenes",
+    "libero.libero.envs.bddl_base_domain": "BDDLBaseDomain TASK_MAPPING register_problem",
+    "libero.libero.envs.problems": """Libero_Tabletop_Manipulation Libero_Kitchen_Tabletop_Manipulation
+        Libero_Living_Room_Tabletop_Manipulation Libero_Study_Tabletop_Manipulation
+        Libero_Coffee_Table_Manipulation Libero_Floor_Manipulation""",
+    "libero.libero.envs.predicates": """Expression UnaryAtomic BinaryAtomic MultiarayAtomic InContactPredicateFn Stack
+        eval_predicate_fn get_predicate_fn_dict get_predicate_fn update_predicate_fn_dict""",
+    "libero.libero.envs.object_states": "BaseObjectState ObjectState SiteObjectState",
+    "libero.libero.envs.base_object": """register_object register_visual_change_object OBJECTS_DICT
+        VISUAL_CHANGE_OBJECTS_DICT get_object_fn get_object_dict""",
+    "libero.libero.envs.objects": """HopeBaseObject GoogleScannedObject TurbosquidObjects ArticulatedObject SiteObject
+        TargetZone AlphabetSoup Chefmate8Frypan BasinFaucet get_object_fn get_object_dict""",
+    "libero.libero.envs.regions": """MultiRegionRandomSampler TableRegionSampler Libero100TableRegionSampler
+        ObjectBasedSampler SiteRegionRandomSampler InSiteRegionRandomSampler SiteSequentialCompositeSampler
+        ObjectPropertySampler OpenCloseSampler TurnOnOffSampler REGION_SAMPLERS get_region_samplers
+        update_region_samplers""",
+    "libero.libero.envs.utils": "MultiRegionRandomSampler postprocess_model_xml rectangle2xyrange",
+    "libero.libero.envs.robots": "MountedPanda OnTheGroundPanda ROBOT_CLASS_MAPPING",
+    "libero.libero.envs.arenas": """TableArena KitchenTableArena LivingRoomTableArena StudyTableArena CoffeeTableArena
+        EmptyArena""",
+    "libero.libero.envs.arenas.style": "get_texture_filename",
+    "libero.libero.envs.textures": "TEXTURE_MAPPING get_texture_file_list",
+}
+CONTROL_ENV = """step reset check_success get_sim_state set_state set_init_state regenerate_obs_from_state
+    reset_from_xml_string seed close _post_process _update_observables obj_of_interest robots sim _visualizations env
+    problem_name domain_name language_instruction"""
+DOMAIN = """_load_fixtures_in_arena _load_objects_in_arena _load_sites_in_arena _add_placement_initializer
+    _check_success _eval_predicate _setup_camera _setup_references set_visualization is_fixture get_object get_robot_state_vector
+    language_instruction fixtures_dict objects_dict object_states_dict object_sites_dict parsed_problem robots"""
+STATES = """get_geom_state check_contact check_contain check_ontop get_joint_state set_joint is_open is_close turn_on
+    turn_off update_state"""
+PREDICATES = "true false in on up printjointstate open close turnon turnoff"
+
+
+@pytest.mark.parametrize("module", NAMES)
+def test_names(module):
+    found = importlib.import_module(module)
+    assert [name for name in NAMES[module].split() if not hasattr(found, name)] == []
+
+
+@pytest.fixture(scope="module")
+def env():
+    from libero.libero import benchmark
+
+    suite = benchmark.get_benchmark("libero_goal")()
+    env = ControlEnv(bddl_file_name=suite.get_task_bddl_file_path(0), use_camera_obs=False)
+    env.reset()
+    yield env
+    env.close()
+
+
+def test_members(env):
+    assert [name for name in CONTROL_ENV.split() if not hasattr(env, name)] == []
+    assert [name for name in DOMAIN.split() if not hasattr(env.env, name)] == []
+    states = env.env.object_states_dict.values()
+    assert [name for name in STATES.split() for state in states if not hasattr(state, name)] == []
+    assert env.env.language_instruction.lower() == env.language_instruction
+
+
+def test_states_answer(env):
+    for state in env.env.object_states_dict.values():
+        assert state.get_geom_state()["pos"].shape == (3,)
+        assert state.get_geom_state()["quat"].shape == (4,)
+        for question in ("is_open", "is_close", "turn_on", "turn_off"):
+            try:
+                assert getattr(state, question)() in (True, False)
+            except LiberoError as error:
+                assert state.get_joint_state(), "without joints there is always an answer"  # noqa: PT017
+                assert "nothing says when" in str(error)  # noqa: PT017
+    cabinet, region = (env.env.object_states_dict[f"wooden_cabinet_1{n}"] for n in ("", "_top_region"))
+    region.set_joint(-0.15)
+    assert region.is_open()
+    assert cabinet.is_open()
+    assert not env.env.object_states_dict["wooden_cabinet_1_bottom_region"].is_open()
+    assert env.env.object_states_dict["plate_1"].check_contact(cabinet) is False
+
+
+def test_predicates(env, capsys):
+    from libero.libero.envs import predicates
+
+    states = env.env.object_states_dict
+    assert set(PREDICATES.split()) <= set(predicates.get_predicate_fn_dict())
+    assert predicates.eval_predicate_fn("true", states["plate_1"])
+    assert not predicates.eval_predicate_fn("false")
+    assert predicates.eval_predicate_fn("printjointstate", states["flat_stove_1"])
+    assert capsys.readouterr().out.startswith("[")
+    for name in ("in", "on", "stack"):
+        fn = predicates.get_predicate_fn(name.upper())
+        assert fn(states["plate_1"], states["wooden_cabinet_1_top_region"]) is False
+    assert predicates.eval_predicate_fn("up", states["plate_1"]) is False
+    assert predicates.InContactPredicateFn()(states["plate_1"], states["akita_black_bowl_1"]) in (True, False)
+    predicates.update_predicate_fn_dict("Level", lambda state: bool(state.get_geom_state()["pos"][2] > 0))
+    try:
+        assert env.env._eval_predicate(["level", "plate_1"])
+    finally:
+        del predicates.VALIDATE_PREDICATE_FN_DICT["level"]
+    with pytest.raises(LiberoError, match="turnon"):
+        predicates.eval_predicate_fn("turn_on", states["flat_stove_1"])
+
+
+def test_bddl_utils(env):
+    from libero.libero.envs import bddl_utils
+
+    parsed = bddl_utils.robosuite_parse_problem(env.env.bddl_file_name)
+    assert parsed["goal_state"] == [["open", "wooden_cabinet_1_middle_region"]]
+    assert parsed["fixtures"]["main_table" if "main_table" in parsed["fixtures"] else "table"] == [
+        "main_table"
+    ]
+    assert all(len(atom) in (2, 3) for atom in parsed["initial_state"])
+    assert bddl_utils.get_regions(env.env.bddl_file_name) == parsed["regions"]
+    assert bddl_utils.get_scenes(env.env.bddl_file_name) == {}
+    goal = ["or", ["open", "a_1"], ["not", ["on", "b_1", "c_1"]]]
+    assert bddl_utils.as_list(bddl_utils.as_expression(goal)) == goal
+
+
+@pytest.mark.parametrize("category", sorted(OBJECTS_DICT))
+def test_objects(category):
+    item = OBJECTS_DICT[category](name=f"{category}_1")
+    assert item.category_name == category
+    assert item.root_body == f"{category}_1_main"
+    assert f"{category}_1_main" in item.bodies
+    assert item.object_properties["vis_site_names"] == {}
+    assert set(item.object_properties["articulation"]) == {
+        f"default_{s}_ranges" for s in ("open", "close", "turnon", "turnoff")
+    }
+    assert item.bottom_offset.shape == item.top_offset.shape == (3,)
+    opens = item.object_properties["articulation"]["default_open_ranges"]
+    if opens:
+        assert item.is_open(np.mean(opens))
+        assert not item.is_close(np.mean(opens))
+
+
+def test_site_objects_and_zones():
+    from libero.libero.envs.objects import SiteObject, TargetZone
+
+    site, eye = SiteObject("bin_region", size=(0.1, 0.1, 0.02)), np.eye(3)
+    assert site.in_box(np.zeros(3), eye, np.array([0.05, 0.0, -0.025]))
+    assert not site.in_box(np.zeros(3), eye, np.array([0.15, 0.0, 0.0]))
+    assert site.under(np.zeros(3), eye, np.array([0.05, 0.0, 0.05]))
+    zone = TargetZone(zone_size=(0.1, 0.05))
+    assert zone.in_box(np.zeros(3), np.array([0.05, 0.0, 0.0]))
+    assert zone.on_top(np.zeros(3), np.array([0.05, 0.0, 0.01]))
+
+
+def test_samplers():
+    from libero.libero.envs import regions
+
+    rng = np.random.default_rng(0)
+    items = [OBJECTS_DICT[name](name=f"{name}_1") for name in ("milk", "butter")]
+    cls = regions.get_region_samplers("libero_floor_manipulation", "floor")
+    sampler = cls("floor", items, [(-0.2, 0.2)], [(-0.2, 0.2)], rng=rng)
+    placed = sampler.sample()
+    (a, quat, _), (b, _, _) = placed.values()
+    assert np.hypot(a[0] - b[0], a[1] - b[1]) > sum(item.horizontal_radius for item in items)
+    assert np.linalg.norm(quat) == pytest.approx(1.0)
+    both = regions.SiteSequentialCompositeSampler("both")
+    both.append_sampler(sampler)
+    cup = OBJECTS_DICT["porcelain_mug"](name="mug_1")
+    both.append_sampler(regions.ObjectBasedSampler("on", cup, rng=rng), {"reference": "milk_1"})
+    found = both.sample()
+    assert found["mug_1"][0][2] > found["milk_1"][0][2]
+    with pytest.raises(LiberoError, match="no free place"):
+        regions.TableRegionSampler("small", items, [(0, 0)], [(0, 0)], rng=rng).sample()
+    assert 0.5 <= regions.TurnOnOffSampler("knob", "turnon", None, (0.5, 2.1), rng).sample() <= 2.1
+    assert regions.OpenCloseSampler("door", "open", None, (-0.1, -0.2), rng).sample() < 0
+    with pytest.raises(LiberoError, match="ajar"):
+        regions.OpenCloseSampler("door", "ajar")
+
+
+def test_small_helpers(tmp_path):
+    from libero.libero.envs.arenas import KitchenTableArena
+    from libero.libero.envs.arenas.style import get_texture_filename
+    from libero.libero.envs.robots import MountedPanda, OnTheGroundPanda
+    from libero.libero.envs.textures import TEXTURE_MAPPING, get_texture_file_list
+    from libero.libero.envs.utils import rectangle2xyrange
+    from libero.libero.utils.utils import process_image_input, reconstruct_image_output
+
+    assert rectangle2xyrange([(0, 1, 2, 3)]) == ([[0, 2]], [[1, 3]])
+    assert len(TEXTURE_MAPPING) == 35
+    assert get_texture_filename("floor", "dark") in TEXTURE_MAPPING.values()
+    assert all(path.startswith(str(tmp_path)) for _, path in get_texture_file_list("wall", tmp_path))
+    assert (MountedPanda().default_mount, OnTheGroundPanda().default_mount) == ("RethinkMount", None)
+    assert KitchenTableArena(wall_style="white").spec.compile().ncam >= 3
+    assert (reconstruct_image_output(process_image_input(np.arange(3))) == np.arange(3)).all()
+
+
+def test_sim_answers_by_name(env):
+    sim = env.sim
+    assert sim.model.body_id2name(sim.model.body_name2id("plate_1_main")) == "plate_1_main"
+    assert sim.model.joint_names[0] == "robot0_joint1"
+    assert sim.model.get_joint_qpos_addr("robot0_joint3") == 2
+    start, end = sim.model.get_joint_qpos_addr("plate_1_joint0")
+    assert (sim.data.get_joint_qpos("plate_1_joint0") == sim.data.qpos[start:end]).all()
+    assert np.allclose(sim.data.get_site_xvelp("gripper0_grip_site"), 0.0, atol=1e-6)
+    assert sim.data.get_body_xmat("plate_1_main").shape == (3, 3)
+    with pytest.raises(LiberoError, match="plate_1_main"):
+        sim.model.body_name2id("plate_one")
+    sim.step()
+    sim.set_state(sim.get_state())
+    sim.forward()

@@ -1,0 +1,110 @@
+"""Paths: importing writes nothing and asks nothing; files are laid out when somebody wants them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
+from libero.libero.benchmark.libero_suite_task_map import libero_task_map
+from libero_env import bddl
+from libero_env.errors import UnknownNameError
+from libero_env.original_states import read_states, write_states
+
+pytestmark = pytest.mark.unit
+
+
+def test_importing_writes_nothing_and_asks_nothing(tmp_path):
+    code = (
+        "import libero.libero, libero.libero.benchmark, libero.libero.envs, libero.libero.utils.video_utils"
+    )
+    env = {
+        "HOME": str(tmp_path),
+        "PATH": "",
+        "PYTHONPATH": str(Path(__file__).parents[2]),
+        "NUMBA_CACHE_DIR": "/tmp",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=env,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_configured_paths(tmp_path, monkeypatch):
+    import libero.libero
+
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path / "config"))
+    assert libero.libero.libero_config_path == str(tmp_path / "config")
+    assert libero.libero.config_file == str(tmp_path / "config" / "config.yaml")
+    set_libero_default_path(tmp_path / "here")
+    assert get_default_path_dict(tmp_path / "here")["init_states"] == str(tmp_path / "here" / "init_files")
+    with pytest.warns(UserWarning, match=r"bddl_files: .*here/bddl_files does not exist"):
+        assert get_libero_path("bddl_files") == str(tmp_path / "here" / "bddl_files")
+    with pytest.raises(UnknownNameError, match="Did you mean 'bddl_files'"):
+        get_libero_path("bddl_file")
+
+
+def test_task_files_are_those_of_the_suites():
+    root = Path(get_libero_path("bddl_files"))
+    for name in benchmark.libero_suites:
+        suite = benchmark.get_benchmark(name)()
+        for i, task in enumerate(suite.tasks):
+            path = root / task.problem_folder / task.bddl_file
+            assert str(path) == suite.get_task_bddl_file_path(i)
+            assert path.is_file()
+        assert len((root / name / "tasks_info.txt").read_text().split()) == suite.n_tasks
+    assert bddl.read(path).goal == benchmark.get_native_task(f"{name}/{i}").problem.goal
+
+
+def test_init_state_files_are_read_by_torch():
+    torch = pytest.importorskip("torch")
+    task = benchmark.get_benchmark("libero_object")().get_task(4)
+    path = Path(get_libero_path("init_states"), task.problem_folder, task.init_states_file)
+    assert (torch.load(path, weights_only=False) == read_states(path)).all()
+
+
+def test_init_states_of_a_configured_folder(tmp_path, monkeypatch):
+    rows = np.arange(12.0).reshape(3, 4)
+    task = benchmark.get_benchmark("libero_goal")().get_task(2)
+    write_states(tmp_path / "init_files" / task.problem_folder / task.init_states_file, rows)
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    set_libero_default_path(tmp_path)
+    assert (benchmark.get_benchmark("libero_goal")().get_task_init_states(2) == rows).all()
+
+
+def test_benchmarks():
+    assert set(benchmark.get_benchmark_dict()) >= {*benchmark.libero_suites, "libero_100"}
+    assert benchmark.get_benchmark("LIBERO_Spatial") is benchmark.LIBERO_SPATIAL
+    with pytest.raises(UnknownNameError, match="libero_goal"):
+        benchmark.get_benchmark("libero_goals")
+    ordered = benchmark.LIBERO_10(task_order_index=5)
+    assert sorted(ordered.get_task_names()) == sorted(libero_task_map["libero_10"])
+    assert ordered.get_task_names() == [libero_task_map["libero_10"][i] for i in benchmark.task_orders[5]]
+    assert benchmark.LIBERO_100().n_tasks == 100
+    with pytest.raises(UnknownNameError, match="task order"):
+        benchmark.LIBERO_90(1)
+
+
+def test_a_benchmark_of_ones_own():
+    names = libero_task_map["libero_spatial"][:3]
+    benchmark.task_maps["mine"] = {name: benchmark.task_maps["libero_spatial"][name] for name in names}
+
+    @benchmark.register_benchmark
+    class Mine(benchmark.Benchmark):
+        def __init__(self, task_order_index=0):
+            super().__init__(task_order_index)
+            self.name = "mine"
+            self._make_benchmark()
+
+    try:
+        assert benchmark.get_benchmark("mine")().get_task_names() == names
+    finally:
+        del benchmark.BENCHMARK_MAPPING["mine"], benchmark.task_maps["mine"]

@@ -1,0 +1,109 @@
+"""Vectors of environments, in this process and in others."""
+
+import numpy as np
+import pytest
+
+from libero.libero.envs import ControlEnv, DummyVectorEnv, SubprocVectorEnv
+from libero.libero.envs.venv import CloudpickleWrapper, ShArray
+from libero.libero.envs.workers import WorkerError
+from libero_env.errors import LiberoError
+
+pytestmark = pytest.mark.sim
+
+
+class Slow:
+    """An environment that takes its time, breaks and dies on request."""
+
+    def __init__(self, wait=0.0):
+        self.wait, self.count = wait, 0
+
+    def reset(self):
+        return {"count": np.zeros(2)}
+
+    def step(self, action):
+        import os
+        import time
+
+        if action == -1:
+            raise ValueError("no such action")
+        if action == -2:
+            os._exit(7)
+        time.sleep(self.wait)
+        self.count += action
+        return {"count": np.full(2, float(self.count))}, 1.0, False, {}
+
+    def close(self):
+        pass
+
+
+def test_subprocesses_do_what_one_process_does(suite):
+    args = {"bddl_file_name": suite.get_task_bddl_file_path(0), "use_camera_obs": False}
+    rows = suite.get_task_init_states(0)[:2]
+    results = []
+    for make, options in ((DummyVectorEnv, {}), (SubprocVectorEnv, {"share_memory": True})):
+        env = make([lambda: ControlEnv(**args) for _ in range(2)], **options)
+        assert len(env) == 2
+        env.seed(5)
+        env.reset()
+        env.set_init_state(rows)
+        for _ in range(3):
+            obs, reward, done, info = env.step(np.full((2, 7), 0.1))
+        assert [i["env_id"] for i in info] == [0, 1]
+        assert not done.any()
+        assert env.check_success() == [False, False]
+        assert env.get_env_attr("problem_name") == ["libero_floor_manipulation"] * 2
+        env.set_env_attr("horizon", 7, id=1)
+        results.append((np.array(env.get_sim_state()), np.array([o["robot0_eef_pos"] for o in obs])))
+        one = env.step(np.zeros((1, 7)), id=[1])[0]
+        assert one.shape == (1,)
+        env.close()
+        env.close()
+        with pytest.raises(LiberoError, match="closed"):
+            env.reset()
+    for one, many in zip(*results, strict=True):
+        assert (one == many).all()
+
+
+def test_errors_and_deaths_are_named_and_the_others_go_on():
+    env = SubprocVectorEnv([Slow, Slow], call_timeout=30.0)
+    env.reset()
+    with pytest.raises(WorkerError, match="no such action"):
+        env.step([-1, 1])
+    assert env.step([1, 1])[0][1]["count"].tolist() == [2.0, 2.0]
+    with pytest.raises(WorkerError, match="exit code 7"):
+        env.step([-2, 1])
+    assert env.step([1], id=1)[0][0]["count"].tolist() == [4.0, 4.0]
+    env.close()
+
+
+def test_a_hanging_worker_is_given_up():
+    env = SubprocVectorEnv([lambda: Slow(60.0)], call_timeout=15.0)
+    env.reset()
+    env.workers[0]._timeout = 0.3
+    with pytest.raises(WorkerError, match=r"step took more than 0.3 s"):
+        env.step([1])
+    env.close()
+    assert not env.workers[0].process.is_alive()
+
+
+def test_waiting_for_some():
+    env = SubprocVectorEnv([lambda: Slow(0.0), lambda: Slow(2.0)], wait_num=1)
+    env.reset()
+    obs, _, _, info = env.step([1, 1])
+    assert [i["env_id"] for i in info] == [0]
+    with pytest.raises(LiberoError, match="last step"):
+        env.reset(id=1)
+    assert env.step([1], id=0)[3][0]["env_id"] in (0, 1)
+    env.close()
+
+
+def test_shared_arrays_and_factories_travel():
+    import pickle
+
+    array = ShArray(np.float32, (2, 3))
+    array.save(np.ones((2, 3)))
+    other = pickle.loads(pickle.dumps(array))  # noqa: S301 - our own
+    assert (other.get() == 1).all()
+    other.close()
+    array.close()
+    assert pickle.loads(pickle.dumps(CloudpickleWrapper(lambda: 3))).data() == 3  # noqa: S301 - our own
