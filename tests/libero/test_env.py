@@ -58,6 +58,16 @@ def test_step_returns_the_old_four_tuple(make_env):
         env.step([0.0] * 6)
 
 
+def test_arguments(make_env):
+    make_env(**BLIND, hard_reset=False, table_full_size=(1.0, 1.0, 0.05))
+    with pytest.raises(UnknownNameError, match="Did you mean 'camera_heights'"):
+        make_env(**BLIND, camera_hights=64)
+    with pytest.raises(UnknownNameError, match="agentview"):
+        make_env(OffScreenRenderEnv, camera_names=["agent"]).reset()
+    with pytest.raises(LiberoError, match="20 Hz"):
+        make_env(**BLIND, control_freq=10)
+
+
 def test_horizon(make_env):
     env = make_env(**BLIND, horizon=2)
     env.reset()

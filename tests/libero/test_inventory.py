@@ -57,8 +57,9 @@ CONTROL_ENV = """step reset check_success get_sim_state set_state set_init_state
     reset_from_xml_string seed close _post_process _update_observables obj_of_interest robots sim _visualizations env
     problem_name domain_name language_instruction"""
 DOMAIN = """_load_fixtures_in_arena _load_objects_in_arena _load_sites_in_arena _add_placement_initializer
-    _check_success _eval_predicate _setup_camera _setup_references set_visualization is_fixture get_object get_robot_state_vector
-    language_instruction fixtures_dict objects_dict object_states_dict object_sites_dict parsed_problem robots"""
+    _check_success _eval_predicate _setup_camera _setup_references set_visualization is_fixture get_object
+    get_robot_state_vector language_instruction fixtures_dict objects_dict
+    object_states_dict object_sites_dict parsed_problem robots"""
 STATES = """get_geom_state check_contact check_contain check_ontop get_joint_state set_joint is_open is_close turn_on
     turn_off update_state"""
 PREDICATES = "true false in on up printjointstate open close turnon turnoff"

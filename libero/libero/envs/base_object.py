@@ -17,8 +17,8 @@ from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin.facts import Facts, load_facts
 from libero_env.original_mjcf import object_xml
 
-OBJECTS_DICT: dict[str, type] = {}
-VISUAL_CHANGE_OBJECTS_DICT: dict[str, type] = {}
+OBJECTS_DICT: dict[str, Any] = {}
+VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
 _STATES = ("open", "close", "turnon", "turnoff")
 
 
@@ -27,7 +27,7 @@ def category_of(name: str) -> str:
     return "_".join(re.sub(r"([A-Z0-9])", r" \1", name).split()).lower()
 
 
-def register_object(target_class: type) -> type:
+def register_object(target_class: Any) -> Any:
     """Make a class known by its name; a class with an MJCF file of its own also to the scenes built from now on."""
     category = category_of(target_class.__name__)
     OBJECTS_DICT[category] = target_class
@@ -252,7 +252,9 @@ def model_of(item: Any, category: str) -> ObjectModel:
     sites = {
         s.get("name"): s.get("pos", "0 0 0") for s in ElementTree.parse(path).iterfind("worldbody/body/site")
     }
-    place = {name: tuple(map(float, sites.get(f"{name}_site", "0 0 0").split())) for name in _OFFSETS}
+    place: dict[str, Any] = {
+        name: tuple(map(float, sites.get(f"{name}_site", "0 0 0").split())) for name in _OFFSETS
+    }
     joints = [joint for joint in _listed(getattr(item, "joint_specs", None)) if joint.get("type") == "free"]
     rotation = getattr(item, "rotation", None)
     if rotation is not None and not isinstance(rotation, Mapping):

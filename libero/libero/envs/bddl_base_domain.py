@@ -1,11 +1,10 @@
 """The environment behind the wrappers: one simulation of a task file, stepped as robosuite would step it."""
 
 import os
-import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from typing import Any
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -18,6 +17,7 @@ from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero.libero.envs.sim import MjSim
 from libero.libero.envs.stepping import ObservedSimulations
+from libero.libero.envs.stored_model import fixtures_of, write_model
 from libero_env.assets import select_pack
 from libero_env.controllers import ControllerState
 from libero_env.errors import LiberoError, UnknownNameError
@@ -29,6 +29,31 @@ from libero_env.scene import build_scene, scene_spec
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz
+# What robosuite or the original take, and what follows from the task file or means nothing without a window here.
+WITHOUT_EFFECT = frozenset(
+    [
+        "arena_type",
+        "custom_material",
+        "env_name",
+        "hard_reset",
+        "mount_types",
+        "render_collision_mesh",
+        "render_gpu_device_id",
+        "render_visual_mesh",
+        "renderer",
+        "renderer_config",
+        "robot_configs",
+        "scene_properties",
+        "scene_xml",
+        "table_friction",
+        "table_full_size",
+        "table_offset",
+        "visualization_sites_list",
+        "workspace_name",
+        "workspace_offset",
+        "z_offset",
+    ]
+)
 
 
 class EpisodeOverError(LiberoError, ValueError):
@@ -60,7 +85,11 @@ class BDDLBaseDomain:
         horizon: control steps after which `step` raises, unless `ignore_done`.
         placement_initializer: an object whose `sample()` gives name -> (pos, quat wxyz, object); by default regions are
             sampled as the task file says.
-        kwargs: what else the original's classes take (`hard_reset`, `table_full_size`, ...) is accepted, of no effect.
+        kwargs: what else the original's classes take (`WITHOUT_EFFECT`) is accepted, of no effect.
+
+    Raises:
+        BDDLError: it is no task file.
+        UnknownNameError: no such argument, controller or camera.
     """
 
     def __init__(
@@ -91,6 +120,10 @@ class BDDLBaseDomain:
         camera_segmentations: Any = None,
         **kwargs: Any,
     ):
+        if unknown := [key for key in kwargs if key not in WITHOUT_EFFECT]:
+            raise UnknownNameError(
+                "argument", unknown[0], [*signature(BDDLBaseDomain).parameters, *WITHOUT_EFFECT]
+            )
         if control_freq != CONTROL_FREQ:
             raise LiberoError(f"control_freq={control_freq}: the benchmark is defined at {CONTROL_FREQ} Hz")
         self.bddl_file_name, self.control_freq = str(bddl_file_name), control_freq
@@ -142,7 +175,7 @@ class BDDLBaseDomain:
             for hook in hooks:
                 getattr(self, hook)(arena)
             model = arena.spec.compile()
-        self.simulations = ObservedSimulations(model, 1, self.scene.fixture_bodies)
+        self.simulations = ObservedSimulations(model, 1, self.scene.fixture_bodies.tolist())
         self.sim = MjSim(self.simulations, self.get_xml)
         self.view = StateView(self.scene, self.simulations, 0)
         self.sim.glowing = lambda: glowing_sites(self.view)
@@ -191,8 +224,8 @@ class BDDLBaseDomain:
             qpos[: self.scene.nq_robot] = REST_QPOS + OPEN_FINGERS
         if self.placement_initializer is not None:
             for name, (pos, quat, *_) in self.placement_initializer.sample().items():
-                address = self.sim.model.get_joint_qpos_addr(f"{name}_joint0")
-                qpos[slice(*address)] = [*pos, *quat]
+                joint = self.scene.model.joint(f"{name}_joint0").qposadr[0]
+                qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
         self.timestep, self.cur_time, self.done = 0, 0.0, False
         return self._get_observations(force_update=True)
@@ -336,25 +369,13 @@ class BDDLBaseDomain:
 
     def get_xml(self) -> str:
         """The scene as MJCF without textures, fixtures where they stand now."""
-        spec = scene_spec(self.problem, self.scene.pack)
-        for material in spec.materials:
-            material.textures = [""] * len(list(material.textures))
-        for texture in list(spec.textures):
-            spec.delete(texture)
-        for name in self.scene.fixtures:
-            body, index = spec.body(f"{name}_main"), self.obj_body_id[name]
-            body.pos, body.quat = self.sim.model.body_pos[index], self.sim.model.body_quat[index]
-        spec.compile()
-        return spec.to_xml()
+        return write_model(self.scene, self.sim.model._model)
 
     def reset_from_xml_string(self, xml_string: str) -> None:
         """Put the fixtures where a stored model of this task has them, everything else at its origin."""
-        for body in ElementTree.fromstring(xml_string).iter("body"):
-            name = re.sub("_main$", "", body.get("name", ""))
-            if name in self.scene.fixtures:
-                index = self.obj_body_id[name]
-                self.sim.model.body_pos[index] = [float(x) for x in body.get("pos", "0 0 0").split()]
-                self.sim.model.body_quat[index] = [float(x) for x in body.get("quat", "1 0 0 0").split()]
+        for name, (pos, quat) in fixtures_of(self.scene, xml_string).items():
+            self.sim.model.body_pos[self.obj_body_id[name]] = pos
+            self.sim.model.body_quat[self.obj_body_id[name]] = quat
         self.sim.reset()
         self.sim.forward()
         self.timestep, self.cur_time, self.done = 0, 0.0, False

@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -134,7 +134,11 @@ class Observer:
     def _pictures(self) -> dict[str, np.ndarray]:
         found: dict[str, np.ndarray] = {}
         for camera in self.cameras:
-            size = {"width": camera.width, "height": camera.height, "camera_name": camera.name}
+            size: dict[str, Any] = {
+                "width": camera.width,
+                "height": camera.height,
+                "camera_name": camera.name,
+            }
             if camera.depth:
                 image, depth = self.sim.render(**size, depth=True)
                 found[f"{camera.name}_image"], found[f"{camera.name}_depth"] = image, depth[..., None]

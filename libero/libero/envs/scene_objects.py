@@ -29,14 +29,12 @@ def scene_fixtures(scene: Scene) -> dict[str, Any]:
 
 def _instance(name: str, model: ObjectModel) -> BaseObject:
     found = OBJECTS_DICT.get(model.category)
-    if found is None or not issubclass(found, BuiltinObject):
-        instance = found(name=name) if found is not None else _anonymous(model)(name=name, model=model)
-    else:
-        instance = found(name=name, model=model)
-    return instance
+    if found is None:
+        return _anonymous(model)(name=name, model=model)
+    return found(name=name, model=model) if issubclass(found, BuiltinObject) else found(name=name)
 
 
-def _anonymous(model: ObjectModel) -> type:
+def _anonymous(model: ObjectModel) -> type[BuiltinObject]:
     """A class for a category that was registered with `libero_env` only."""
     return type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
 

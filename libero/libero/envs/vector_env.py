@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from libero.libero.envs.workers import DummyEnvWorker, EnvWorker, SubprocEnvWorker, WorkerError
+from libero.libero.envs.subproc_worker import SubprocEnvWorker
+from libero.libero.envs.workers import DummyEnvWorker, EnvWorker, WorkerError
 from libero_env.errors import LiberoError
 
 Ids = int | Sequence[int] | np.ndarray | None

@@ -89,8 +89,8 @@ class MultiRegionRandomSampler:
     def _place(self, item: Any, origin: np.ndarray, placed: Placements) -> Any:
         margin = item.horizontal_radius if self.whole else 0.0
         for _ in range(_TRIES):
-            k = self.rng.integers(len(self.x_ranges))
-            xy = [self._draw(*ranges[k], margin) for ranges in (self.x_ranges, self.y_ranges)]
+            k = int(self.rng.integers(len(self.x_ranges)))
+            xy = [self._draw(ranges[k], margin) for ranges in (self.x_ranges, self.y_ranges)]
             pos = origin + (*xy, self.z_offset - item.bottom_offset[-1])
             if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
                 return tuple(pos), self._quat(item), item
@@ -99,8 +99,8 @@ class MultiRegionRandomSampler:
             "fewer or smaller objects"
         )
 
-    def _draw(self, low: float, high: float, margin: float) -> float:
-        low, high = min(low, high) + margin, max(low, high) - margin
+    def _draw(self, limits: Sequence[float], margin: float) -> float:
+        low, high = min(limits) + margin, max(limits) - margin
         return self.rng.uniform(low, high) if low <= high else (low + high) / 2
 
     @staticmethod
