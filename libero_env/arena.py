@@ -12,6 +12,7 @@ import yaml
 from libero_env.arena_furniture import add_furniture, add_visual_mesh, furniture, solid
 from libero_env.arena_styles import add_material, furniture_of, styles_of
 from libero_env.errors import UnknownNameError
+from libero_env.mjspec import delete
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.robot import robosuite_assets
 
@@ -126,7 +127,10 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
         added = world.add_light(name=name, pos=light["pos"], dir=light["dir"], castshadow=False)
         added.diffuse, added.specular = [0.8] * 3, [light.get("specular", 0.3)] * 3
         if light.get("directional"):
-            added.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            if hasattr(mujoco, "mjtLightType"):
+                added.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            else:  # before MuJoCo 3.4
+                added.directional = True
 
 
 def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
@@ -140,8 +144,8 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     mount = mujoco.MjSpec.from_file(str(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml"))
     mount.compiler.degree = False
     mount.body("base").pos = [0.0, 0.0, 0.0]
-    mount.delete(mount.geom("pedestal_vis"))  # 33,000 triangles
-    mount.delete(mount.mesh("pedestal"))
+    delete(mount, mount.geom("pedestal_vis"))  # 33,000 triangles
+    delete(mount, mount.mesh("pedestal"))
     add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
     pos = (*workspace.robot_base_pos[:2], workspace.robot_base_pos[2] + _MOUNT_LIFT)
     spec.attach(mount, prefix="mount0_", frame=spec.worldbody.add_frame(pos=pos))

@@ -30,6 +30,24 @@ _NULL_KD = 2.0 * np.sqrt(10.0)
 REST = np.array(REST_QPOS)  # rad
 
 
+# MjData's sparse mass matrix: rows of the lower triangle, or before MuJoCo 3.3.3 the way from each joint to the root.
+MASS_FIELD = "M" if hasattr(mujoco.MjModel, "M_rowadr") else "qM"
+
+
+def _mass_address(model: mujoco.MjModel) -> np.ndarray:
+    """Index of each entry of the arm's block in the sparse mass matrix, (7, 7)."""
+    address = np.zeros((7, 7), np.int64)
+    for i in range(7):
+        for j in range(i + 1):
+            if MASS_FIELD == "M":
+                row = slice(model.M_rowadr[i], model.M_rowadr[i] + model.M_rownnz[i])
+                entry = row.start + int(np.flatnonzero(model.M_colind[row] == j)[0])
+            else:
+                entry = model.dof_Madr[i] + i - j
+            address[i, j] = address[j, i] = entry
+    return address
+
+
 @dataclass(frozen=True)
 class ArmIndex:
     """Where the arm is in a model's arrays."""
@@ -46,11 +64,7 @@ class ArmIndex:
         """Look the arm up by its names; it must be the first chain of the model."""
         joints = np.array([model.joint(n).id for n in ARM_JOINTS], np.int64)
         assert (joints == np.arange(7)).all() and (model.jnt_dofadr[:7] == joints).all(), "the arm comes first"
-        address = np.zeros((7, 7), np.int64)
-        for i in range(7):
-            start = model.M_rowadr[i]
-            for k in range(start, start + model.M_rownnz[i]):
-                address[i, model.M_colind[k]] = address[model.M_colind[k], i] = k
+        address = _mass_address(model)
         fingers = np.array([model.joint(n).id for n in FINGER_JOINTS], np.int64)
         limit, finger_range = model.actuator_ctrlrange[:7, 1].copy(), model.actuator_ctrlrange[7:9].copy()
         return cls(joints, address, model.site(GRIP_SITE).id, limit, fingers, finger_range)

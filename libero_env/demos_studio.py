@@ -19,6 +19,7 @@ from libero_env.env import CONTROL_HZ, LiberoEnv
 from libero_env.errors import DemoError, PlacementError
 from libero_env.expert import Disturbance, Expert, Shapes
 from libero_env.expert.driver import Attempt, run_experts
+from libero_env.mjspec import delete
 from libero_env.scene import build_scene, scene_spec
 from libero_env.tasks import Task, get_task
 from libero_env.vector import BatchEnv
@@ -166,7 +167,7 @@ def _model_file(task: Task) -> str:
     for material in spec.materials:
         material.textures = [""] * len(list(material.textures))
     for texture in list(spec.textures):
-        spec.delete(texture)
+        delete(spec, texture)
     spec.compile()
     return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', spec.to_xml())
 

@@ -52,6 +52,9 @@ TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(
     }
 )
 _TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
+_STIFF = 0.004  # s, the stiffest time constant that the timestep allows
+_FIRM_SOLREF = (0.02, 1.0)
+_DEEP_BOXES = tuple(int(n) for n in mujoco.__version__.split(".")[:2]) >= (3, 4)
 _NOT_HERE = ("camera", "light")  # they come with the workspace's figures
 
 
@@ -81,7 +84,22 @@ def arena_spec(root: Path, workspace: "Workspace", scene_properties: Mapping[str
         if element.tag in _NOT_HERE:
             world.remove(element)
     _fit_table(world, workspace.figures.get("table", {}))
-    return mujoco.MjSpec.from_string(to_xml(workspace.name, used_assets(assets, world), world))
+    spec = mujoco.MjSpec.from_string(to_xml(workspace.name, used_assets(assets, world), world))
+    if _DEEP_BOXES:
+        _soften(spec)
+    return spec
+
+
+def _soften(spec: mujoco.MjSpec) -> None:
+    """Make stiff table tops as firm as before MuJoCo 3.4.
+
+    Since then the depth between two boxes is what they overlap by, where it was half of that; and a push grows with the
+    depth over the square of the time constant. Some of the original's states start three centimetres deep in the table
+    of the living room: the same figures would shoot things half a metre up.
+    """
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_BOX and geom.contype and geom.solref[0] < _STIFF:
+            geom.solref, geom.solimp = _FIRM_SOLREF, (0.9, 0.95, 0.001, 0.5, 2.0)
 
 
 def scene_file(root: Path, workspace: str, scene: str = "base") -> Path:

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
+from libero_env.mjspec import delete
 from libero_env.paths import cache_dir
 
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
@@ -86,10 +87,10 @@ def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
                 contype=0, conaffinity=0, mass=0.0,
             )  # fmt: skip
     for geom in visuals:
-        spec.delete(geom)
+        delete(spec, geom)
     used = {g.meshname for g in spec.geoms}
     for item in [m for m in spec.meshes if m.name not in used] + list(spec.materials):
-        spec.delete(item)
+        delete(spec, item)
 
 
 def _simplified(spec: mujoco.MjSpec, name: str, groups: dict) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -15,7 +15,8 @@ from libero_env.arena import WORKSPACES, Workspace, add_mount, load_workspace
 from libero_env.assets import Pack, select_pack
 from libero_env.bddl import Problem
 from libero_env.errors import UnknownNameError
-from libero_env.objects.model import ROOT_BODY, ObjectModel, set_damping
+from libero_env.mjspec import set_damping
+from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.problem import Region
 from libero_env.robot import OPEN_FINGERS, REST_QPOS, add_panda
 

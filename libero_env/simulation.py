@@ -12,7 +12,7 @@ from copy import copy
 import mujoco
 import numpy as np
 
-from libero_env.control import REST, SUBSTEPS, ArmIndex
+from libero_env.control import MASS_FIELD, REST, SUBSTEPS, ArmIndex
 from libero_env.controllers import ControllerState
 from libero_env.errors import LiberoError
 
@@ -24,7 +24,7 @@ except ImportError:  # before MuJoCo 4
 # What the controller and the views of the state read, as arrays (n, ...).
 _FIELDS = (
     "qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat",
-    "M", "qfrc_bias",
+    MASS_FIELD, "qfrc_bias",
 )  # fmt: skip
 
 
@@ -144,7 +144,7 @@ class Simulations(ABC):
         site = self.arm.site
         names = ("qpos", "qvel", "xanchor", "xaxis")
         return (*(fields[n] for n in names), fields["site_xpos"][:, site], fields["site_xmat"][:, site],
-                fields["M"], fields["qfrc_bias"])  # fmt: skip
+                fields[MASS_FIELD], fields["qfrc_bias"])  # fmt: skip
 
     def _constants(self) -> tuple[np.ndarray, ...]:
         return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, REST

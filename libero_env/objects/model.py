@@ -69,11 +69,3 @@ def rest_quat(
         mujoco.mju_mulQuat(product, turn, total)
         total = product
     return np.roll(total, -1)  # (w, x, y, z) -> (x, y, z, w), kept in this order on purpose
-
-
-def set_damping(joint: mujoco.MjsJoint, damping: float) -> None:
-    """Linear damping of a joint: a number in MuJoCo 3, the first coefficient of a polynomial in 4."""
-    if np.ndim(joint.damping):
-        joint.damping[0] = damping
-    else:
-        joint.damping = damping
