@@ -42,6 +42,7 @@ class LiberoEnv(gymnasium.Env):
         observations: names from `libero_env.observations`.
         controller, control_delta: what an action means; see `libero_env.controllers`.
         reward, reward_scale: `sparse` or `staged`, see `libero_env.rewards`; and what success is worth.
+        semantics: of the predicates: `original`, or `strict` for On and In as a person would judge them.
         assets: where the models come from: None for the user's choice, `builtin`, a folder, or a `Pack`.
         render_mode: None, or `rgb_array` for `render()`.
     """
@@ -61,6 +62,7 @@ class LiberoEnv(gymnasium.Env):
         reward: str = "sparse",
         reward_scale: float = 1.0,
         assets: Pack | str | Path | None = None,
+        semantics: str = "original",
         render_mode: str | None = None,
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -68,7 +70,7 @@ class LiberoEnv(gymnasium.Env):
         self.reward = Reward(reward, reward_scale)
         self.world = World(
             task, 1, cameras=cameras, camera_size=camera_size, observations=observations, controller=controller,
-            control_delta=control_delta, assets=assets,
+            control_delta=control_delta, assets=assets, semantics=semantics,
         )  # fmt: skip
         self.task, self.horizon, self.render_mode = self.world.task, horizon, render_mode
         self.observation_space, self.action_space = self.world.observation_space(), self.world.action_space()

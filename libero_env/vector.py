@@ -29,8 +29,8 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         task: a `Task`, or what `get_task` takes.
         num_envs: number of simulations.
         num_threads: threads of the physics; 0 is one for each core. Results do not depend on it.
-        cameras, camera_size, horizon, observations, controller, control_delta, reward, reward_scale, assets: as in
-            `LiberoEnv`.
+        cameras, camera_size, horizon, observations, controller, control_delta, reward, reward_scale, assets,
+            semantics: as in `LiberoEnv`.
 
     Attributes:
         draw: as in `LiberoEnv`.
@@ -53,11 +53,13 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         reward: str = "sparse",
         reward_scale: float = 1.0,
         assets: Pack | str | Path | None = None,
+        semantics: str = "original",
     ):
         self.reward = Reward(reward, reward_scale)
         self.world = World(
             task, num_envs, threads=num_threads, cameras=cameras, camera_size=camera_size,
             observations=observations, controller=controller, control_delta=control_delta, assets=assets,
+            semantics=semantics,
         )  # fmt: skip
         self.task, self.num_envs, self.horizon, self.render_mode = self.world.task, num_envs, horizon, None
         self.single_observation_space = self.world.observation_space()

@@ -11,10 +11,10 @@ from gymnasium import spaces
 
 from libero_env.assets import Pack, select_pack
 from libero_env.controllers import ControllerState, get_controller
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states import load_init_states, sample_settled, split_row
 from libero_env.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS, Observer, axis_angle
-from libero_env.predicates import StateView, atoms_of, evaluate
+from libero_env.predicates import SEMANTICS, StateView, atoms_of, evaluate
 from libero_env.problem import And
 from libero_env.scene import Scene, build_scene
 from libero_env.simulation import Simulations, make_simulations
@@ -35,6 +35,7 @@ class World:
         observations: what is observed, by the names of `libero_env.observations`.
         controller, control_delta: what an action means; see `libero_env.controllers`.
         assets: where the models come from, a `Pack` or what `select_pack` takes.
+        semantics: of the predicates, `original` or `strict`; see `libero_env.predicates`.
     """
 
     def __init__(
@@ -49,7 +50,11 @@ class World:
         controller: str = "osc_pose",
         control_delta: bool = True,
         assets: Pack | str | Path | None = None,
+        semantics: str = "original",
     ):
+        if semantics not in SEMANTICS:
+            raise UnknownNameError("semantics", semantics, SEMANTICS)
+        self.semantics = semantics
         self.controller = get_controller(controller, control_delta)
         self.task = get_task(task) if isinstance(task, str) else task
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
@@ -108,11 +113,11 @@ class World:
 
     def goal_reached(self, ids: Sequence[int]) -> np.ndarray:
         """Truth of the goal in each of the simulations, (len(ids),) bool."""
-        return np.array([evaluate(self.task.problem.goal, self.views[i]) for i in ids], bool)
+        return np.array([evaluate(self.task.problem.goal, self.views[i], self.semantics) for i in ids], bool)
 
     def progress(self, i: int) -> dict[str, bool]:
         """Truth of each atom of the goal in simulation i."""
-        return {f"({a.predicate} {' '.join(a.args)})": evaluate(a, self.views[i]) for a in self.atoms}
+        return {f"({a.predicate} {' '.join(a.args)})": evaluate(a, self.views[i], self.semantics) for a in self.atoms}
 
     def judge(self, i: int) -> tuple[bool, dict[str, bool]]:
         """Truth of the goal in simulation i and of each of its atoms; none is evaluated twice in a conjunction."""
@@ -120,7 +125,7 @@ class World:
         parts = goal.parts if isinstance(goal, And) else (goal,)
         if all(part in self.atoms for part in parts):
             return all(progress.values()), progress
-        return evaluate(goal, self.views[i]), progress
+        return evaluate(goal, self.views[i], self.semantics), progress
 
     def physics_state(self, i: int) -> np.ndarray:
         """[time, qpos, qvel] of simulation i, the original's layout."""
