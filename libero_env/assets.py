@@ -22,6 +22,8 @@ VARIABLE = "LIBERO_ASSETS"
 class Pack(Protocol):
     """Where the models of objects and rooms come from. Hashable: scenes are cached by it."""
 
+    def __hash__(self) -> int: ...
+
     @property
     def name(self) -> str:
         """What results and messages call it."""

@@ -102,7 +102,7 @@ class _Array:
     def array(self) -> np.ndarray:
         """The array that was described."""
         _, shape, dtype, fortran, raw = self._state
-        if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes)):
+        if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes) and isinstance(shape, tuple)):
             raise StateFileError("an array of something else than numbers")
         return np.frombuffer(raw, dtype.dtype).reshape(shape, order="F" if fortran else "C")
 

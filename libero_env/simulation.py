@@ -106,8 +106,8 @@ class Simulations(ABC):
     def step(self, ids: Sequence[int], actions: np.ndarray, tap: Tap | None = None) -> None:
         """Advance the simulations `ids` by one control period; actions (num, action_dim), rows of others unused.
 
-        `tap` sees each MjData after the last integration and before its kinematics follow: positions are those of the
-        end, everything else is one substep old, as in the original's observations. `LoopSimulations` only.
+        `tap` sees each MjData one substep before the end, after that substep's integration and before kinematics follow
+        it: there the original observes (measured). `LoopSimulations` only.
         """
         ids = np.asarray(ids, np.int64)
         self.controller.set_goals(ids, actions, self.fields["qpos"], *self._grip())
@@ -191,7 +191,7 @@ class LoopSimulations(Simulations):
             for substep in range(SUBSTEPS):
                 kernel(first, actions[own], *inputs, *state, ctrl, *constants)
                 mujoco.mj_step2(model, data)
-                if tap is not None and substep == SUBSTEPS - 1:
+                if tap is not None and substep == SUBSTEPS - 2:
                     tap(data)
                 mujoco.mj_step1(model, data)
         self._gather(ids)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import libero
 import libero_env
 import lifelong
 
@@ -17,6 +18,7 @@ pytestmark = pytest.mark.unit
 
 ROOT = Path(__file__).parents[1]
 ENV_SIDE = sorted(module.name for module in pkgutil.walk_packages(libero_env.__path__, "libero_env."))
+FACADE = sorted(module.name for module in pkgutil.walk_packages(libero.__path__, "libero."))
 LEARNING_SIDE = sorted(module.name for module in pkgutil.walk_packages(lifelong.__path__, "lifelong."))
 
 # What other packages do when they are imported: numba tries whether its cache can be written, matplotlib lists the
@@ -72,7 +74,7 @@ def import_in_fresh_process(names: list[str], home: Path) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("names", [ENV_SIDE, LEARNING_SIDE], ids=["libero_env", "lifelong"])
+@pytest.mark.parametrize("names", [ENV_SIDE, FACADE, LEARNING_SIDE], ids=["libero_env", "libero", "lifelong"])
 def test_importing_does_nothing(names, tmp_path):
     done = import_in_fresh_process(names, tmp_path)
     theirs = {f"set {name}" for name in THEIR_VARIABLES}

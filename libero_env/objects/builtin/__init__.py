@@ -1,6 +1,7 @@
 """The builtin pack: objects generated in code; `BUILDERS` maps category to builder."""
 
 from types import MappingProxyType
+from typing import Any
 
 from libero_env.objects.builtin.appliances import LOOKS as _APPLIANCES
 from libero_env.objects.builtin.assemble import builders_of
@@ -20,7 +21,7 @@ from libero_env.objects.builtin.shelves import LOOKS as _SHELVES
 from libero_env.objects.builtin.tableware import LOOKS as _TABLEWARE
 from libero_env.objects.builtin.zone import BUILDERS as _ZONES
 
-_LOOKS = {
+_LOOKS: dict[str, Any] = {
     **_APPLIANCES,
     **_BASKET,
     **_BOOKS,

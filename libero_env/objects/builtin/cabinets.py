@@ -1,6 +1,7 @@
 """Cabinets: two of drawers with bar handles, a low one, and one with a sliding door. All open towards -y."""
 
-import numpy as np
+
+from collections.abc import Sequence
 
 from libero_env.objects.builtin.assemble import Look
 from libero_env.objects.builtin.joinery import Cell, Palette, bar, block, in_body
@@ -137,7 +138,7 @@ def _chest_drawer(palette: Palette, shift: float, handle: float) -> Mesh:
     )
 
 
-def _tray(low: np.ndarray, high: np.ndarray, wall: float, floor: float, cell: Cell) -> list[Mesh]:
+def _tray(low: Sequence[float], high: Sequence[float], wall: float, floor: float, cell: Cell) -> list[Mesh]:
     """Sides, back and floor of a drawer without its front."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     return [

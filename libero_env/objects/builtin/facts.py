@@ -106,10 +106,9 @@ def load_facts(category: str) -> Facts:
     raw = dict(_all_facts()[category])
     root = _part({key: raw.pop(key) for key in _OF_PART if key in raw})
     parts = {name: _part(part) for name, part in raw.pop("parts", {}).items()}
-    ranges = {
-        key: MappingProxyType(_tuples(raw.pop(key))) for key in ("rotation", "articulation") if key in raw
-    }
-    return Facts(root=root, parts=MappingProxyType(parts), **ranges, **_tuples(raw))
+    for key in ("rotation", "articulation"):
+        raw[key] = MappingProxyType(_tuples(raw.get(key, {})))
+    return Facts(root=root, parts=MappingProxyType(parts), **_tuples(raw))
 
 
 def _part(raw: Mapping[str, Any]) -> Part:

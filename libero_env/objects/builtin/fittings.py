@@ -21,8 +21,10 @@ def window() -> dict[str, Look | tuple[Look, ...]]:
         "handle": plain((236, 236, 232)),
     }
     palette, glass = Palette(tiles), Palette({"glass": plain((150, 205, 225))})
-    picture, looks = palette.png(), {}
-    looks["main"] = Look(_window_frame(palette), picture, specular=0.2, frame="body")
+    picture = palette.png()
+    looks: dict[str, Look | tuple[Look, ...]] = {
+        "main": Look(_window_frame(palette), picture, specular=0.2, frame="body")
+    }
     for body, ((x0, x1), y) in SASHES.items():
         sash = _sash(palette, x0, x1, y)
         if body == "windowb_a":

@@ -67,8 +67,8 @@ def block(
         bevel: width of the chamfer along the edges, metres; it catches the light.
         faces: `x+`, `x-`, ... `z-` -> another part of the picture.
     """
-    low, high, cells = np.asarray(low, float), np.asarray(high, float), faces or {}
-    center, half = 0.5 * (low + high), 0.5 * (high - low)
+    (bottom, top), cells = np.array([low, high], float), faces or {}
+    center, half = 0.5 * (bottom + top), 0.5 * (top - bottom)
     inner = half - bevel
     pieces = []
     for face, (right, up) in _FACES.items():
@@ -140,7 +140,7 @@ def bar(
     length = float(np.linalg.norm(way))
     tip = 0.2 * radius if tip is None else tip
     profile = [(0, radius - tip), (tip, radius), (length - tip, radius), (length, radius - tip)]
-    return turned(profile, cell, base=start, axis=way / length, segments=segments)
+    return turned(profile, cell, base=start, axis=(way / length).tolist(), segments=segments)
 
 
 def capsule(
@@ -152,7 +152,7 @@ def capsule(
     turns = np.radians((-65, -40, 0))
     dome = [(radius * np.sin(angle), radius * np.cos(angle)) for angle in turns]
     profile = [(-radius, 0), *dome, *((length - z, r) for z, r in reversed(dome)), (length + radius, 0)]
-    return turned(profile, cell, base=start, axis=way / length, segments=segments, smooth=True)
+    return turned(profile, cell, base=start, axis=(way / length).tolist(), segments=segments, smooth=True)
 
 
 def in_body(mesh: Mesh, category: str, body: str) -> Mesh:
@@ -182,8 +182,8 @@ def _chamfers(half: np.ndarray, inner: np.ndarray) -> list[list[np.ndarray]]:
             sign[third], back[third] = 1.0, -1.0
             a, b = outer[one], outer[two]
             cuts.append([sign * (inner + a), back * (inner + a), back * (inner + b), sign * (inner + b)])
-    for sign in product((-1.0, 1.0), repeat=3):
-        cuts.append([np.array(sign) * (inner + step) for step in outer])
+    for signs in product((-1.0, 1.0), repeat=3):
+        cuts.append([np.array(signs) * (inner + step) for step in outer])
     return cuts
 
 
