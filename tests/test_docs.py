@@ -9,7 +9,8 @@ import yaml
 
 from libero_env.env import LiberoEnv
 from libero_env.objects import catalog
-from libero_env.tasks import Task
+from libero_env.objects.builtin import BUILDERS
+from libero_env.tasks import Task, get_suite, suite_names
 from libero_env.tasks.builder import build_problem, load_scene
 
 ROOT = Path(__file__).parents[1]
@@ -77,3 +78,19 @@ def test_what_is_named_exists(file):
     named += re.findall(r"\]\((?!http)([^)#]+)\)", text)
     missing = [name for name in named if not (ROOT / name).exists() and "l2." not in name]
     assert named and not missing, f"{file} names what is not there: {missing}"
+
+
+@pytest.mark.unit
+def test_the_gallery_is_whole():
+    docs = ROOT / "docs"
+    text = (docs / "gallery.md").read_text(encoding="utf-8")
+    shown = re.findall(r"\]\(([^)]+)\)", text)
+    assert not [path for path in shown if not (docs / path).exists()]
+    tasks = [task for suite in suite_names() for task in get_suite(suite).tasks]
+    assert {f"images/gallery/objects/{name}.jpg" for name in BUILDERS} <= set(shown)
+    assert {f"images/gallery/tasks/{task.suite}-{task.index}.jpg" for task in tasks} <= set(shown)
+    assert not [
+        task.id
+        for task in tasks
+        if f"{task.suite}-{task.index}.jpg)<br>{task.index}: {task.language} |" not in text
+    ]

@@ -22,6 +22,15 @@ from libero_env.world import World
 
 FLOOR_COLOR = (0.86, 0.84, 0.80, 1.0)
 VISUAL_GROUP = 1
+FRONT = 165.0  # degrees, where the camera looks
+ELSEWHERE = {  # what opens, or is read, on another side
+    "black_book": 215.0,
+    "yellow_book": 215.0,
+    "white_storage_box": 245.0,
+    "wine_rack": 225.0,
+    "wooden_shelf": 245.0,
+    "wooden_two_layer_shelf": 245.0,
+}
 
 
 def main() -> None:
@@ -41,16 +50,17 @@ def main() -> None:
         "--collision", action="store_true", help="only a sheet, with what collides drawn over it"
     )
     parser.add_argument(
-        "--far", action="store_true", help="only one picture from the benchmark's camera, 128 pixels"
+        "--far", action="store_true", help="only a sheet, from the benchmark's camera at 128 pixels"
     )
     args = parser.parse_args()
     names, out = args.names or object_names(), args.out or args.docs / "images" / "objects.png"
     everything = not (args.objects or args.tasks or args.suite)
-    if args.far:
-        picture = from_agentview([get_object(name) for name in names])
-        save(Image.fromarray(picture).resize((768, 768), Image.Resampling.NEAREST), out)
-    elif args.names or args.collision:
-        tiles = [portrait(get_object(n), size=args.size, collision=args.collision) for n in names]
+    if args.far or args.names or args.collision:
+        models = [get_object(name) for name in names]
+        if args.far:
+            tiles = [from_agentview(model).repeat(2, axis=0).repeat(2, axis=1) for model in models]
+        else:
+            tiles = [portrait(model, size=args.size, collision=args.collision) for model in models]
         save(sheet(tiles, names, args.columns), out)
     else:
         if everything or args.objects:
@@ -81,16 +91,17 @@ def draw_tasks(docs: Path, suite: str) -> None:
 
 def first_view(task: Task, size: int = 256) -> np.ndarray:
     """The first initial state of a task as `agentview` sees it, (size, size, 3) uint8."""
-    world = World(task, camera_size=(size, size))
+    world = World(task, camera_size=(2 * size, 2 * size))  # and shrunk, as the portraits are
     try:
         if shipped_path(task.suite).exists():
             world.reset_to_init([0], [0])
         else:  # the same state, without the other 49
             qpos, qvel, fixtures = split_row(world.scene.model, generate_init_states(task, world.scene, 1))
             world.simulations.reset([0], qpos, qvel, fixtures=fixtures)
-        return world.frame(0, "agentview")
+        picture = world.frame(0, "agentview")
     finally:
         world.close()
+    return shrunk(picture, size)
 
 
 def portrait(model: ObjectModel, *, size: int, collision: bool = False) -> np.ndarray:
@@ -106,28 +117,33 @@ def portrait(model: ObjectModel, *, size: int, collision: bool = False) -> np.nd
     """
     scene = studio(2 * size)  # drawn at twice the size and shrunk: smooth edges whatever the renderer offers
     scene.visual.headlight.ambient, scene.visual.headlight.diffuse = (0.4,) * 3, (0.35,) * 3
-    scene.worldbody.add_light(pos=(2.4, -2.0, 4.8), dir=(-0.45, 0.4, -0.8), diffuse=(0.5,) * 3)
     scene.attach(model.spec, prefix="object_", frame=scene.worldbody.add_frame(quat=model.rest_quat()))
     compiled, data = posed(scene)
     low, high = bounds(compiled, data)
     scene.geom("floor").pos = (0, 0, low[2] - 1e-4)
-    scene.stat.extent, scene.stat.center = np.linalg.norm(high - low), (low + high) / 2
+    middle, extent = (low + high) / 2, float(np.linalg.norm(high - low))
+    azimuth = ELSEWHERE.get(model.category, FRONT)
+    behind = np.deg2rad(azimuth - 35)  # over the photographer's left shoulder
+    towards = np.array([0.6 * np.cos(behind), 0.6 * np.sin(behind), -0.8])
+    scene.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=middle - 3 * extent * towards, dir=towards, diffuse=(0.5,) * 3
+    )  # fmt: skip
+    scene.stat.extent, scene.stat.center = extent, middle
     compiled, data = posed(scene)
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = 0.5 * (low + high)
-    camera.distance = 1.5 * np.linalg.norm(high - low)
-    camera.azimuth, camera.elevation = 165.0, -28.0
+    camera.lookat[:], camera.distance = middle, 1.45 * extent
+    camera.azimuth, camera.elevation = azimuth, -28.0
     option = visual_option()
     option.geomgroup[0] = collision
     compiled.geom_rgba[(compiled.geom_group == 0) & (compiled.geom_bodyid > 0), 3] = 0.4
     with mujoco.Renderer(compiled, 2 * size, 2 * size) as renderer:
         renderer.update_scene(data, camera, option)
         picture = renderer.render()
-    return np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
+    return shrunk(picture, size)
 
 
-def from_agentview(models: Sequence[ObjectModel], size: int = 128, columns: int = 6) -> np.ndarray:
-    """Objects on the floor before the robot, as the camera `agentview` of the floor scenes sees them.
+def from_agentview(model: ObjectModel, size: int = 128) -> np.ndarray:
+    """One object on the floor before the robot, as the camera `agentview` of the floor scenes sees it.
 
     Returns:
         Picture (size, size, 3) uint8.
@@ -138,10 +154,8 @@ def from_agentview(models: Sequence[ObjectModel], size: int = 128, columns: int 
     scene.worldbody.add_camera(
         name="agentview", pos=(0.897, 0, 0.65), quat=(0.618, 0.343, 0.343, 0.618), fovy=45
     )
-    for index, model in enumerate(models):
-        x, y = -0.25 + 0.16 * (index // columns), -0.36 + 0.14 * (index % columns)
-        frame = scene.worldbody.add_frame(pos=(x, y, -model.bottom_offset[2]), quat=model.rest_quat())
-        scene.attach(model.spec, prefix=f"object_{index}_", frame=frame)
+    frame = scene.worldbody.add_frame(pos=(0, 0, -model.bottom_offset[2]), quat=model.rest_quat())
+    scene.attach(model.spec, prefix="object_", frame=frame)
     compiled, data = posed(scene)
     with mujoco.Renderer(compiled, size, size) as renderer:
         renderer.update_scene(data, "agentview", visual_option())
@@ -167,9 +181,9 @@ def studio(size: int) -> mujoco.MjSpec:
     """A floor and room for pictures of this many pixels."""
     scene = mujoco.MjSpec()
     scene.visual.global_.offwidth = scene.visual.global_.offheight = size
-    scene.visual.quality.shadowsize = 4096
+    scene.visual.quality.shadowsize, scene.visual.map.shadowclip = 4096, 3.0
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    scene.worldbody.add_geom(name="floor", type=plane, size=(4, 4, 0.1), rgba=FLOOR_COLOR, group=VISUAL_GROUP)
+    scene.worldbody.add_geom(name="floor", type=plane, size=(0, 0, 0.1), rgba=FLOOR_COLOR, group=VISUAL_GROUP)
     return scene
 
 
@@ -204,6 +218,11 @@ def _visual_points(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[np.nd
             middle, half = np.split(model.geom_aabb[geom], 2)
             local = middle + half * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
         yield local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+
+
+def shrunk(picture: np.ndarray, size: int) -> np.ndarray:
+    """A picture at half the size or less, without jagged edges."""
+    return np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
 
 
 def save(image: Image.Image, path: Path) -> None:
