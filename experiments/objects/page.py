@@ -66,11 +66,16 @@ def families() -> dict[str, list[str]]:
 
 
 def _object_cell(category: str) -> str:
-    return f"![{category}]({object_file(category).as_posix()})<br>`{category}`"
+    return f"{_image(object_file(category), category, 150)}<br>`{category}`"
 
 
 def _task_cell(task: Task) -> str:
-    return f"![{task.id}]({task_file(task).as_posix()})<br>{task.index}: {task.language}"
+    return f"{_image(task_file(task), task.id, 190)}<br>{task.index}: {task.language}"
+
+
+def _image(path: Path, name: str, width: int) -> str:
+    """HTML, because Markdown has no widths and the tables must fit the page."""
+    return f'<img src="{path.as_posix()}" alt="{name}" width="{width}">'
 
 
 def _table(columns: int, cells: Sequence[str]) -> str:
