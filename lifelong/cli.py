@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from libero_env.errors import LiberoError
-from lifelong import cli_assets, cli_demos
+from lifelong import cli_assets, cli_demos, cli_tasks
 from lifelong.errors import LifelongError
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
@@ -63,7 +63,7 @@ def run_doctor(args: argparse.Namespace) -> int:
 
 
 def register_tasks(subparsers: Subparsers) -> None:
-    """`libero tasks list|show|init-states`"""
+    """`libero tasks list|show|init-states|certify|lint`"""
     parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     listing = commands.add_parser("list", help="the tasks of one suite, or of all")
@@ -78,6 +78,7 @@ def register_tasks(subparsers: Subparsers) -> None:
     states.add_argument("--out", type=Path, help="folder for the .npz files (default: those the package ships)")
     states.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
     states.set_defaults(run=run_tasks_init_states)
+    cli_tasks.register(commands)
 
 
 def run_tasks_list(args: argparse.Namespace) -> None:

@@ -1,0 +1,151 @@
+"""Certificates: what is known is not run again, every start counts once, and the command's status says it."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from libero_env import certify as module
+from libero_env.assets import BuiltinPack
+from libero_env.certify import Certificate, Outcome, certify, markdown_table, results
+from libero_env.errors import LiberoError
+from libero_env.problem import And, Atom
+from libero_env.tasks import get_suite, get_task, read_task
+from lifelong import cli
+
+TASKS = get_suite("libero_object").tasks[:2]
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """Stand-in for the simulator: start 3 always fails. Returns the starts that were tried."""
+    seen = []
+
+    def attempt(task, states, pack, disturb):
+        seen.extend((task.id, i) for i in states)
+        return [Outcome(i, i != 3, 80 + i, i % 2, "" if i != 3 else "it fell") for i in states]
+
+    monkeypatch.setattr(module, "attempt", attempt)
+    monkeypatch.setattr(module, "_digest", lambda task, pack, disturb: f"{task.id} {disturb}")
+    return seen
+
+
+@pytest.mark.unit
+def test_only_what_is_missing_is_tried(tried, tmp_path):
+    first = certify(TASKS, 20, out=tmp_path, progress=False)
+    assert sorted(tried) == [(task.id, i) for task in TASKS for i in range(20)]
+    assert certify(TASKS, 20, out=tmp_path, progress=False) == first
+    assert len(tried) == 40
+    more = certify(TASKS, 25, out=tmp_path, progress=False)
+    assert sorted(tried[40:]) == [(task.id, i) for task in TASKS for i in range(20, 25)]
+    assert [[o.state for o in c.outcomes] for c in more] == [list(range(25))] * 2
+    assert certify(TASKS, 20, out=tmp_path, progress=False) == first
+    certify(TASKS, 5, out=tmp_path, again=True, progress=False)
+    assert len(tried) == 60
+
+
+@pytest.mark.unit
+def test_what_was_done_before_a_stop_is_kept(tried, tmp_path, monkeypatch):
+    whole, tries = module.attempt, []
+
+    def stopped(*args):
+        tries.append(args)
+        if len(tries) == 3:
+            raise KeyboardInterrupt
+        return whole(*args)
+
+    monkeypatch.setattr(module, "attempt", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        certify(TASKS, 40, out=tmp_path, progress=False)
+    found = certify(TASKS, 40, out=tmp_path, progress=False)
+    assert len(tried) == len(set(tried)) == 80
+    assert [len(c.outcomes) for c in found] == [40, 40]
+
+
+@pytest.mark.unit
+def test_another_scene_or_expert_is_tried_anew(tried, tmp_path, monkeypatch):
+    certify(TASKS[:1], 4, out=tmp_path, progress=False)
+    monkeypatch.setattr(module, "_digest", lambda *args: "another")
+    certify(TASKS[:1], 4, out=tmp_path, progress=False)
+    assert len(tried) == 8
+
+
+@pytest.mark.unit
+def test_a_broken_certificate_is_named(tried, tmp_path):
+    certify(TASKS[:1], 4, out=tmp_path, progress=False)
+    (path,) = tmp_path.rglob("*.json")
+    path.write_text('{"outcomes": [1]}')
+    with pytest.raises(LiberoError, match=f"{path.name} is no certificate.*--again"):
+        certify(TASKS[:1], 4, out=tmp_path, progress=False)
+
+
+@pytest.mark.unit
+def test_figures_by_hand(tried):
+    (row,) = results(certify(TASKS[:1], 5, progress=False))["tasks"]
+    assert (row["successes"], row["states"], row["retries"]) == (4, 5, 2)
+    assert row["median_length"] == 81.5 and row["max_length"] == 84  # of 80, 81, 82, 84
+    assert row["failures"] == {3: "it fell"}
+    nothing = Certificate("a/0", "a", "", (Outcome(0, False, 9, 0, "one | two"),))
+    assert nothing.rate == 0.0 and nothing.summary()["median_length"] is None
+    table = markdown_table([nothing])
+    assert "| a/0 a | 0/1 |  | 0 | 1x one / two |" in table and "0/1 = 0.0 %" in table
+
+
+@pytest.mark.unit
+def test_the_status_says_whether_each_task_has_its_share(tried, tmp_path, capsys):
+    words = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--out", str(tmp_path)]
+    assert cli.main([*words, "--states", "4"]) == 1  # three of four
+    assert "FAIL  libero_object/0" in capsys.readouterr().out
+    assert cli.main([*words, "--states", "4", "--require", "0.75"]) == 0
+    assert cli.main([*words, "--states", "10"]) == 0
+    written = json.loads((tmp_path / "results.json").read_text())
+    assert written["successes"] == 9 and written["total"] == 10 and len(written["tasks"]) == 1
+    assert "9/10" in (tmp_path / "results.md").read_text()
+    assert (tmp_path / "libero_object.png").stat().st_size > 1000
+
+
+@pytest.mark.unit
+def test_without_matplotlib_there_is_no_picture_and_no_error(tried, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    argv = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--states", "2", "--out", str(tmp_path)]
+    assert cli.main(argv) == 0
+    assert "no picture of libero_object" in capsys.readouterr().out
+    assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.unit
+def test_tasks_are_named_once(tmp_path):
+    from lifelong.cli_tasks import find_tasks
+
+    files = [tmp_path / "a.bddl", tmp_path / "b.bddl"]
+    for file in files:
+        file.write_text(TASKS[0].bddl_text)
+    found = find_tasks(["libero_object/3", "libero_object", *map(str, files), str(files[0])])
+    assert len(found) == 12 and [task.name for task in found[-2:]] == ["a", "b"]
+
+
+@pytest.mark.sim
+def test_an_outcome_depends_on_its_start_alone():
+    pack = BuiltinPack()
+    together = module.attempt(TASKS[0], [0, 1, 2], pack, False)
+    assert all(o.success and o.steps > 20 for o in together)
+    assert module.attempt(TASKS[0], [2], pack, False) == together[2:]
+
+
+@pytest.mark.sim
+def test_what_cannot_be_tried_fails_with_the_reason():
+    problem = replace(TASKS[0].problem, goal=And((Atom("In", ("basket_1", "basket_1")),)))
+    outcomes = module.attempt(replace(TASKS[0], problem=problem), [0, 1], BuiltinPack(), False)
+    assert [o.success for o in outcomes] == [False, False] and all(o.reason for o in outcomes)
+    unknown = replace(TASKS[0].problem, objects={**TASKS[0].problem.objects, "sword_1": "sword"})
+    (certificate,) = certify([replace(TASKS[0], problem=unknown)], 1, progress=False)
+    assert "unknown object category 'sword'" in certificate.outcomes[0].reason
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_a_task_file_is_certified_in_two_processes(tmp_path):
+    file = tmp_path / "mine.bddl"
+    file.write_text(get_task("libero_object/2").bddl_text)
+    (found,) = certify([read_task(file)], 17, jobs=2, progress=False)
+    assert [o.state for o in found.outcomes] == list(range(17)) and found.rate > 0.8
