@@ -41,13 +41,13 @@ ROWS = {
     ),
     "resets": (
         Row("reset to a stored state, two pictures", "original reset", "reset", ">= 50"),
-        Row("  theirs without what differs between episodes", "original put", "reset"),
+        Row("  theirs as set_init_state alone", "original put", "reset"),
         Row("  reset to a new placement, ours settled", "original placement", "placement"),
     ),
     "construction": (
-        Row("construction in a fresh process, without imports", "original build", "build", ">= 5"),
-        Row("  with imports", "original import and build", "import and build", ">= 5"),
-        Row("  with imports and the first reset and pictures", "original to first", "to first"),
+        Row("construction in a fresh process, after imports", "original build", "build", ">= 5"),
+        Row("  with the first reset and pictures", "original build and reset", "build and reset"),
+        Row("  imports and construction", "original import and build", "import and build"),
         Row("  imports alone", "original import", "import"),
     ),
     "limits": (
