@@ -3,7 +3,9 @@
 A file holds `data/demo_i` with `actions` (T, 7), `states` (T, 1 + nq + nv), `robot_states` (T, 9: fingers, gripper
 position, gripper quaternion xyzw), `rewards` and `dones` (T,) uint8, and `obs/` with `agentview_rgb`,
 `eye_in_hand_rgb` (T, H, W, 3) uint8 stored upside down (OpenGL rows), `gripper_states` (T, 2), `joint_states` (T, 7),
-`ee_states` (T, 6), `ee_pos` (T, 3), `ee_ori` (T, 3 axis-angle, rad). States are always those before the action.
+`ee_states` (T, 6), `ee_pos` (T, 3), `ee_ori` (T, 3 axis-angle, rad). States are always those before the action. Other
+cameras and kinds of picture are named the same way: `<camera>_rgb`, `<camera>_depth` (T, H, W) float metres,
+`<camera>_segmentation` (T, H, W) int32. The attribute `model_file` is the scene as MJCF, fixtures where they stood.
 
 Pairing. The original stores with each action the observation *after* it. Files of this package say in the attribute
 `pairing` which they hold: "aligned" (the observation the action was chosen on, the default) or "libero".
@@ -26,7 +28,7 @@ Pairing = Literal["aligned", "libero"]
 
 LOW_DIM_KEYS = {"gripper_states": 2, "joint_states": 7, "ee_states": 6, "ee_pos": 3, "ee_ori": 3}
 IMAGE_KEYS = ("agentview_rgb", "eye_in_hand_rgb")
-DEPTH_KEYS = ("agentview_depth", "eye_in_hand_depth")
+PICTURES = {"_rgb": "u", "_depth": "f", "_segmentation": "iu"}  # end of a key -> kinds of number
 
 
 class BrokenDemoError(DemoError):
@@ -149,12 +151,28 @@ def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]
             _check_shape(_dataset(group, key, file, name), key, file, name, shape, kind)
     for key in obs_keys:
         dataset = _dataset(group, f"obs/{key}", file, name)
-        if key in IMAGE_KEYS:
-            _check_shape(dataset, f"obs/{key}", file, name, (steps, None, None, 3), "u")
-        elif key in DEPTH_KEYS:
-            _check_shape(dataset, f"obs/{key}", file, name, (steps, None, None, None)[: dataset.ndim], "f")
+        if is_picture(key):
+            _check_shape(
+                dataset, f"obs/{key}", file, name, _picture_shape(key, steps, dataset.ndim), _kinds(key)
+            )
         else:
             _check_shape(dataset, f"obs/{key}", file, name, (steps, LOW_DIM_KEYS.get(key)), "f")
+
+
+def is_picture(key: str) -> bool:
+    """Whether an observation is a picture, stored upside down; `obs/agentview_rgb` is, `obs/ee_pos` is not."""
+    return key.endswith(tuple(PICTURES))
+
+
+def _kinds(key: str) -> str:
+    return next(kinds for end, kinds in PICTURES.items() if key.endswith(end))
+
+
+def _picture_shape(key: str, steps: int, ndim: int) -> tuple[int | None, ...]:
+    """(T, H, W, 3) of colours; (T, H, W) of others, where the original has one more axis of length 1."""
+    if key.endswith("_rgb"):
+        return steps, None, None, 3
+    return (steps, None, None, 1) if ndim == 4 else (steps, None, None)
 
 
 def opened(file: Path) -> h5py.File:
@@ -182,7 +200,8 @@ def _wanted_keys(
             raise BrokenDemoError(
                 f"{file}: {name}/obs is missing; expected a group with {', '.join(IMAGE_KEYS)}, ..."
             )
-        return [key for key in (*IMAGE_KEYS, *DEPTH_KEYS, *LOW_DIM_KEYS) if key in obs]
+        known = dict.fromkeys((*IMAGE_KEYS, *filter(is_picture, sorted(obs)), *LOW_DIM_KEYS))
+        return [key for key in known if key in obs]
     return []
 
 
@@ -225,8 +244,8 @@ def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str)
             ) from error
 
     obs = {key: read(f"obs/{key}") for key in keys}
-    for key in (*IMAGE_KEYS, *DEPTH_KEYS):
-        if key in obs:
+    for key in obs:
+        if is_picture(key):
             obs[key] = np.ascontiguousarray(obs[key][:, ::-1])  # the file has OpenGL rows
     wanted = "expert_actions" if labels == "expert" and "expert_actions" in group else "actions"
     actions = read(wanted).astype(np.float64)

@@ -8,9 +8,11 @@ import multiprocessing
 import os
 import shutil
 import threading
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace as changed
 from multiprocessing import connection
 from pathlib import Path
 
@@ -18,11 +20,11 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from libero_env.demos import Pairing
-from libero_env.demos_studio import BATCH, GENERATOR, Recipe, record_chunk
+from libero_env.demos_studio import BATCH, GENERATOR, Recipe, Tally, record_chunk
 from libero_env.demos_write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.paths import demos_dir
-from libero_env.tasks import Task, get_suite, get_task
+from libero_env.tasks import Task, get_suite
 
 
 def generate(
@@ -39,8 +41,10 @@ def generate(
 ) -> Path:
     """Record the first `n` demonstrations of a task into one file; those that are there already stay.
 
+    `make_demos` takes a whole `Recipe`: other cameras, depth, variation.
+
     Args:
-        task: a `Task`, or what `get_task` takes.
+        task: a `Task`, what `get_task` takes, or a BDDL file.
         n: number of successful demonstrations; failed attempts are left out and counted in the file.
         path: the file. An interrupted recording leaves `<path>.parts`, and goes on when called again.
         seed: of placements, manners and disturbances. The 50 stored initial states are never used.
@@ -51,14 +55,11 @@ def generate(
         progress: show a bar; None where stderr is a terminal.
 
     Raises:
-        DemoError: the file there was made otherwise, cannot be written, or the expert fails again and again.
+        DemoError: the file there was made otherwise, cannot be written, or the expert cannot do the task.
     """
-    task = get_task(task) if isinstance(task, str) else task
-    recipe = Recipe(task.id, tuple(camera_size), seed, pairing, disturb)
+    recipe = Recipe(Recipe(task).task, tuple(camera_size), seed, pairing, disturb)
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(path.parent):
-        record([(recipe, path)], n, workers=workers, progress=progress)
+    _refuse_failures(make_demos([(recipe, path)], n, workers=workers, progress=progress))
     return path
 
 
@@ -88,69 +89,123 @@ def ensure_demos(
     """
     tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
     root = demos_dir() if root is None else Path(root)
-    jobs = [(r, demo_path(root, r)) for r in (Recipe(t.id, tuple(camera_size), seed) for t in tasks)]
-    missing = [job for job in jobs if not _complete(*job, n)]
-    if missing:
-        with _locked(root):
-            missing = [job for job in missing if not _complete(*job, n)]
-            for recipe, path in missing:
-                _make_way(DemoWriter(path, recipe.header()))
-            record(missing, n, workers=workers, progress=progress)
+    jobs = [(r, demo_path(root, r)) for r in (Recipe(t, tuple(camera_size), seed) for t in tasks)]
+    _refuse_failures(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
     return [path for _, path in jobs]
 
 
+def make_demos(
+    jobs: Sequence[tuple[Recipe, Path]],
+    n: int,
+    *,
+    workers: int = 0,
+    progress: bool | None = None,
+    replace: bool = False,
+) -> dict[Path, Tally]:
+    """Record what is missing of the first `n` demonstrations of each job, all jobs on one pool of processes.
+
+    A task that the expert cannot do stops nothing else; its tally says why.
+
+    Args:
+        jobs: what to record, and into which file.
+        n: demonstrations of each.
+        workers, progress: as for `generate`.
+        replace: record again what was made otherwise; only for files that this package named itself.
+
+    Returns:
+        File -> what came of it, in the order of the jobs; no attempts where all was there.
+
+    Raises:
+        DemoError: a file there was made otherwise, or one cannot be written.
+    """
+    tallies = {path: Tally(n) for _, path in jobs}
+    missing = [job for job in jobs if not _complete(*job, n)]
+    folders = sorted({path.parent for _, path in missing})
+    with ExitStack() as locks:
+        for folder in folders:
+            locks.enter_context(_locked(folder))
+        missing = [job for job in missing if not _complete(*job, n)]
+        for recipe, path in missing if replace else ():
+            _make_way(DemoWriter(path, recipe.header()))
+        if missing:
+            tallies |= record(missing, n, workers=workers, progress=progress)
+    return tallies
+
+
+def _refuse_failures(tallies: dict[Path, Tally]) -> None:
+    failed = {path: tally for path, tally in tallies.items() if tally.error}
+    if failed:
+        each = "; ".join(f"{path.name}: {tally.error}" for path, tally in failed.items())
+        raise DemoError(f"{len(failed)} of {len(tallies)} files are not complete. {each}")
+
+
 def demo_path(root: Path, recipe: Recipe) -> Path:
-    """Where `ensure_demos` keeps the demonstrations of a recipe."""
-    height, width = recipe.camera_size
-    folder = f"{height}x{width}-seed{recipe.seed}-{GENERATOR}"
-    return root / recipe.task.suite / folder / f"{recipe.task.name}_demo.hdf5"
+    """Where `ensure_demos` keeps the demonstrations of a recipe: named by all that matters."""
+    (height, width), task = recipe.camera_size, recipe.task
+    usual = Recipe(recipe.source, recipe.camera_size, recipe.seed)
+    more = "" if recipe == usual else f"-{zlib.crc32(repr(changed(recipe, source='')).encode()):08x}"
+    return (
+        root / task.suite / f"{height}x{width}-seed{recipe.seed}-{GENERATOR}{more}" / f"{task.name}_demo.hdf5"
+    )
 
 
 def record(
     jobs: Sequence[tuple[Recipe, Path]], n: int, *, workers: int = 0, progress: bool | None = None
-) -> None:
-    """Record what is missing of the first `n` demonstrations of each job, all jobs on one pool of processes."""
+) -> dict[Path, Tally]:
+    """As `make_demos`, without a look at what other processes do."""
     writers = [DemoWriter(path, recipe.header()) for recipe, path in jobs]
     missing = [sorted(set(range(n)) - writer.recorded()) for writer in writers]
+    tallies = [Tally(n - len(numbers)) for numbers in missing]
     chunks = [
         (j, numbers[i : i + BATCH])
         for j, numbers in enumerate(missing)
         for i in range(0, len(numbers), BATCH)
     ]
-    left = {j: len(numbers) for j, numbers in enumerate(missing)}
-    total = n * len(jobs)
     bar = tqdm(
-        total=total, initial=total - sum(left.values()), desc="demonstrations", unit="demo", smoothing=0.1,
-        disable=None if progress is None else not progress,
+        total=n * len(jobs), initial=sum(tally.recorded for tally in tallies), desc="demonstrations", unit="demo",
+        smoothing=0.1, disable=None if progress is None else not progress,
     )  # fmt: skip
     with bar:
-        for j, count in _run(
+        done = _run(
             [(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cores()
-        ):
-            bar.update(count)
-            left[j] -= count
-            if left[j] == 0:
+        )
+        for j, tally in done:
+            tallies[j].add(tally)
+            bar.update(tally.recorded)
+            bar.set_postfix(failed=sum(t.reasons.total() for t in tallies), refresh=False)
+            if tallies[j].recorded == n:
                 writers[j].finish()
+    return {path: tally for (_, path), tally in zip(jobs, tallies, strict=True)}
 
 
 def _run(
     chunks: list[tuple[Recipe, Path, list[int]]], owners: list[int], workers: int
-) -> Iterator[tuple[int, int]]:
-    """Record chunks in processes; yields (owner, demonstrations) as each is done."""
-    workers = min(workers, len(chunks))
+) -> Iterator[tuple[int, Tally]]:
+    """Record chunks in processes; yields (owner, tally) as each is done. Chunks of an owner that has failed are left
+    out, as far as they have not begun."""
+    workers, failed = min(workers, len(chunks)), set()
     if workers <= 1:
         for owner, chunk in zip(owners, chunks, strict=True):
-            yield owner, record_chunk(*chunk)
+            if owner not in failed:
+                tally = record_chunk(*chunk)
+                failed |= {owner} if tally.error else set()
+                yield owner, tally
         return
     # spawn: an OpenGL context that a fork inherits hangs.
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_die_with_parent)
-    futures: dict[Future[int], int] = {}
+    futures: dict[Future[Tally], int] = {}
     try:
         for owner, chunk in zip(owners, chunks, strict=True):
             futures[pool.submit(record_chunk, *chunk)] = owner
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            if future.cancelled():
+                continue
+            tally, owner = future.result(), futures[future]
+            if tally.error:
+                for other in [other for other, whose in futures.items() if whose == owner]:
+                    other.cancel()
+            yield owner, tally
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

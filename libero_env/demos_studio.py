@@ -2,9 +2,9 @@
 
 import hashlib
 import json
-import re
 import zlib
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -14,80 +14,154 @@ import numpy as np
 
 from libero_env.control import POSITION_SCALE, ROTATION_SCALE
 from libero_env.demos import Pairing
+from libero_env.demos_film import Filmer, Shots, model_file
 from libero_env.demos_write import DemoWriter, Episode, make_header
-from libero_env.env import CONTROL_HZ, LiberoEnv
-from libero_env.errors import DemoError, PlacementError
-from libero_env.expert import Disturbance, Expert, Shapes
-from libero_env.expert.driver import Attempt, run_experts
-from libero_env.mjspec import delete
-from libero_env.scene import build_scene, scene_spec
-from libero_env.tasks import Task, get_task
+from libero_env.env import CONTROL_HZ
+from libero_env.errors import PlacementError
+from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoalError
+from libero_env.expert.driver import MAX_STEPS, Attempt, run_experts
+from libero_env.init_states import NUM_INIT_STATES
+from libero_env.observations import DEFAULT_CAMERAS
+from libero_env.scene import build_scene
+from libero_env.tasks import Task, get_task, read_task
 from libero_env.vector import BatchEnv
 
 GENERATOR = "scripted-expert-3"  # change it when the same seed gives other demonstrations
 MAX_ATTEMPTS = 10  # of one demonstration
-MAX_STEPS = 250  # of one attempt
 BATCH = 5  # demonstrations simulated together, and recorded before the next
+
+
+@dataclass(frozen=True)
+class Variation:
+    """In what the demonstrations of a task differ from each other.
+
+    Attributes:
+        style: draw the expert's manner for each; else all have the same.
+        noise: standard deviation of the smooth noise on the executed actions, in units of the action.
+        push_rate: pushes started per step.
+        reserved: start demonstration k from stored state k (modulo 50), which evaluation uses, instead of new ones.
+    """
+
+    style: bool = True
+    noise: float = 0.12
+    push_rate: float = 0.02
+    reserved: bool = False
+
+    def header(self) -> dict:
+        """Attributes of a file: what is unusual."""
+        changed = {key: value for key, value in vars(self).items() if value != getattr(Variation, key)}
+        return {"variation": json.dumps(changed)} if changed else {}
 
 
 @dataclass(frozen=True)
 class Recipe:
     """What the demonstrations of a task depend on."""
 
-    task_id: str  # `libero_object/3`
+    source: Task | str  # a task, its name (`libero_object/3`) or a BDDL file
     camera_size: tuple[int, int] = (128, 128)
     seed: int = 0
     pairing: Pairing = "aligned"
     disturb: bool = True
+    variation: Variation = Variation()
+    cameras: tuple[str, ...] = DEFAULT_CAMERAS
+    pictures: tuple[str, ...] = ("rgb",)  # see `Shots`
 
     @property
     def task(self) -> Task:
         """The task itself."""
-        return get_task(self.task_id)
+        if isinstance(self.source, Task):
+            return self.source
+        return read_task(self.source) if self.source.endswith(".bddl") else get_task(self.source)
+
+    @property
+    def shots(self) -> Shots:
+        """What is drawn."""
+        return Shots(self.cameras, self.camera_size, self.pictures)
 
     def header(self) -> dict:
         """Attributes of the file."""
-        task, (height, width) = self.task, self.camera_size
+        task = self.task
         versions = {name: metadata.version(name) for name in ("mujoco", "robosuite", "h5py")}
         return make_header(
             problem_name=task.problem.name,
             language=task.language,
             bddl_name=f"{task.suite}/{task.name}.bddl",
             bddl_text=task.bddl_text,
-            env_kwargs=_env_kwargs(height, width),
+            env_kwargs=_env_kwargs(self.shots),
             pairing=self.pairing,
             seed=self.seed,
-            camera_size=[height, width],
             generator=GENERATOR,
             disturbed=self.disturb,
             model_digest=model_digest(task),
             versions=json.dumps(versions),
+            **self.shots.header(),
+            **self.variation.header(),
         )
 
 
-def record_chunk(recipe: Recipe, path: Path, numbers: list[int]) -> int:
-    """Record these demonstrations as parts of a file; returns how many.
+@dataclass(frozen=True)
+class Take(Attempt):
+    """An attempt, and where the fixtures stood, (nfixtures, 7)."""
+
+    fixtures: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+
+
+@dataclass
+class Tally:
+    """What came of demonstrations that were asked for.
+
+    Attributes:
+        recorded: how many there are now.
+        attempts: at them, failed ones included.
+        reasons: why attempts failed -> how often.
+        error: why some cannot be made, or "".
+    """
+
+    recorded: int = 0
+    attempts: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    error: str = ""
+
+    def add(self, other: "Tally") -> None:
+        """Count another tally in."""
+        self.recorded += other.recorded
+        self.attempts += other.attempts
+        self.reasons += other.reasons
+        self.error = self.error or other.error
+
+
+def record_chunk(recipe: Recipe, path: Path, numbers: list[int]) -> Tally:
+    """Record these demonstrations as parts of a file.
+
+    Where the expert knows no way to the goal, or fails ten times on one demonstration, the tally's `error` says so.
 
     Raises:
-        DemoError: the expert failed ten times on the same one, or a part cannot be written.
+        DemoError: a part cannot be written.
     """
-    writer = DemoWriter(path, recipe.header())
+    writer, tally = DemoWriter(path, recipe.header()), Tally()
     studio = _studio(recipe)
     failures = dict.fromkeys(numbers, 0)
     while failures:
-        for k, attempt in studio.attempt(list(failures.items())):
-            if attempt.success:
-                writer.write(
-                    k, studio.film(attempt, {"seed": recipe.seed, "failed_attempts": failures.pop(k)})
-                )
+        try:
+            takes = studio.attempt(list(failures.items()))
+        except UnsupportedGoalError as error:
+            tally.error = f"the expert cannot do this task: {error}"
+            break
+        for k, take in takes:
+            tally.attempts += 1
+            if take.success:
+                attrs = {"seed": recipe.seed, "failed_attempts": failures.pop(k)}
+                writer.write(k, studio.film(take, attrs))
+                tally.recorded += 1
                 continue
+            tally.reasons[take.reason] += 1
             failures[k] += 1
             if failures[k] == MAX_ATTEMPTS:
-                raise DemoError(
-                    f"{recipe.task_id}: the expert failed {MAX_ATTEMPTS} times on demonstration {k}, "
-                    f"last {attempt.reason}"
+                del failures[k]
+                tally.error = (
+                    f"the expert failed {MAX_ATTEMPTS} times on demonstration {k}, last {take.reason}"
                 )
-    return len(numbers)
+    return tally
 
 
 class Studio:
@@ -96,59 +170,74 @@ class Studio:
     def __init__(self, recipe: Recipe):
         self.recipe, self.task = recipe, recipe.task
         self.stage = BatchEnv(self.task, BATCH, num_threads=1, cameras=(), horizon=MAX_STEPS)
-        self.camera = LiberoEnv(self.task, camera_size=recipe.camera_size)
+        self.filmer = Filmer(self.task, recipe.shots)
         self.shapes = Shapes(self.stage.world.scene)
-        self.hand = self.stage.world.scene.model.body("robot0_right_hand").id
 
-    def attempt(self, numbers: list[tuple[int, int]]) -> list[tuple[int, Attempt]]:
-        """Attempts at demonstrations (k, how many attempts failed before), at most `BATCH` of them."""
-        experts, noise = [], []
+    def attempt(self, numbers: list[tuple[int, int]]) -> list[tuple[int, Take]]:
+        """Attempts at demonstrations (k, how many attempts failed before), at most `BATCH` of them.
+
+        Raises:
+            UnsupportedGoalError: the expert has no skill for the goal.
+        """
+        variation, experts, noise = self.recipe.variation, [], []
         placed: list[int] = []
-        failed: list[tuple[int, Attempt]] = []
+        failed: list[tuple[int, Take]] = []
         for k, before in numbers[:BATCH]:
             start, manner, pushes = self._seeds(k, before)
-            slot = len(placed)
             try:
-                seeds = [int(start.generate_state(1)[0]) if i == slot else None for i in range(BATCH)]
-                self.stage.reset(seed=seeds, options={"reset_mask": np.arange(BATCH) == slot})
+                self._place(len(placed), k, start)
             except PlacementError as error:
                 empty = np.zeros((0, 7))
-                failed.append((k, Attempt(False, empty, empty, empty, 0, str(error))))
+                failed.append((k, Take(False, empty, empty, empty, 0, f"placement: {error}")))
                 continue
             placed.append(k)
-            experts.append(Expert(self.task, np.random.default_rng(manner), shapes=self.shapes))
-            noise.append(Disturbance(np.random.default_rng(pushes)) if self.recipe.disturb else None)
-        return failed + list(
-            zip(placed, run_experts(self.stage, experts, noise, max_steps=MAX_STEPS), strict=True)
-        )
+            style = None if variation.style else Style()
+            experts.append(Expert(self.task, np.random.default_rng(manner), shapes=self.shapes, style=style))
+            disturbance = Disturbance(np.random.default_rng(pushes), variation.noise, variation.push_rate)
+            noise.append(disturbance if self.recipe.disturb else None)
+        fixtures = self.stage.world.simulations.fixtures.copy()
+        attempts = run_experts(self.stage, experts, noise, max_steps=MAX_STEPS)
+        takes = [Take(**vars(attempt), fixtures=fixtures[slot]) for slot, attempt in enumerate(attempts)]
+        return failed + list(zip(placed, takes, strict=True))
 
-    def film(self, attempt: Attempt, attrs: dict) -> Episode:
+    def film(self, take: Take, attrs: dict) -> Episode:
         """The attempt with its observations."""
-        steps = len(attempt)
-        shown = attempt.states[:-1] if self.recipe.pairing == "aligned" else attempt.states[1:]
-        seen, quats = [], []
-        for state in shown:
-            seen.append(self.camera.set_state(state))
-            quats.append(self.camera.world.simulations.fields["xquat"][0, self.hand][[1, 2, 3, 0]])
-        obs = {key: np.stack([frame[key] for frame in seen]) for key in seen[0]}
-        robot = np.concatenate([obs["gripper_states"], obs["ee_pos"], np.array(quats)], axis=1)
-        wanted = attempt.expert_actions if self.recipe.disturb else None
-        more = {**attrs, "model_file": _model_file(self.task), "retries": attempt.retries}
-        return Episode(attempt.actions, attempt.states[:steps], robot, obs, wanted, True, more)
+        shown = take.states[:-1] if self.recipe.pairing == "aligned" else take.states[1:]
+        obs, robot = self.filmer.film(shown, take.fixtures)
+        wanted = take.expert_actions if self.recipe.disturb else None
+        xml = model_file(self.task, tuple(self.filmer.scene.fixtures), take.fixtures)
+        more = {**attrs, "model_file": xml, "fixtures": take.fixtures, "retries": take.retries}
+        return Episode(take.actions, take.states[: len(take)], robot, obs, wanted, True, more)
 
     def close(self) -> None:
         """Free simulations and GL context."""
         self.stage.close()
-        self.camera.close()
+        self.filmer.close()
+
+    def _place(self, slot: int, k: int, seeds: np.random.SeedSequence) -> None:
+        """Put one simulation at its start; the others stay as they are."""
+        mask = np.arange(BATCH) == slot
+        if self.recipe.variation.reserved:
+            self.stage.reset(options={"reset_mask": mask, "init_state": k % NUM_INIT_STATES})
+        else:
+            seed = int(seeds.generate_state(1)[0])
+            self.stage.reset(seed=[seed if here else None for here in mask], options={"reset_mask": mask})
 
     def _seeds(self, k: int, before: int) -> list[np.random.SeedSequence]:
         name = zlib.crc32(self.task.name.encode())
         return np.random.SeedSequence([self.recipe.seed, name, k, before]).spawn(3)
 
 
-@lru_cache(maxsize=1)
+_open: list[Studio] = []
+
+
 def _studio(recipe: Recipe) -> Studio:
-    return Studio(recipe)
+    """The studio of a recipe; the last one stays open, since a task's chunks follow each other."""
+    if not _open or _open[0].recipe != recipe:
+        while _open:
+            _open.pop().close()
+        _open.append(Studio(recipe))
+    return _open[0]
 
 
 @lru_cache(maxsize=16)
@@ -160,20 +249,9 @@ def model_digest(task: Task) -> str:
     return hashlib.sha256(buffer).hexdigest()[:16]
 
 
-@lru_cache(maxsize=4)
-def _model_file(task: Task) -> str:
-    """The scene as MJCF, whole but for its textures, which are made in memory; the robot's meshes by their path."""
-    spec = scene_spec(task.problem)
-    for material in spec.materials:
-        material.textures = [""] * len(list(material.textures))
-    for texture in list(spec.textures):
-        delete(spec, texture)
-    spec.compile()
-    return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', spec.to_xml())
-
-
-def _env_kwargs(height: int, width: int) -> dict:
+def _env_kwargs(shots: Shots) -> dict:
     """What the original's environment would be made with."""
+    height, width = shots.size
     controller = {
         "type": "OSC_POSE",
         "input_max": 1,
@@ -191,10 +269,10 @@ def _env_kwargs(height: int, width: int) -> dict:
         "robots": ["Panda"],
         "controller_configs": controller,
         "control_freq": CONTROL_HZ,
-        "camera_names": ["robot0_eye_in_hand", "agentview"],
+        "camera_names": sorted(shots.cameras, reverse=True),
         "camera_heights": height,
         "camera_widths": width,
-        "camera_depths": False,
+        "camera_depths": "depth" in shots.pictures,
         "use_camera_obs": True,
         "has_renderer": False,
         "has_offscreen_renderer": True,

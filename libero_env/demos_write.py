@@ -11,25 +11,30 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import h5py
 import numpy as np
 
 from libero_env.demos import (
-    DEPTH_KEYS,
-    IMAGE_KEYS,
     LOW_DIM_KEYS,
     BrokenDemoError,
     check_demo,
     demo_files,
     demo_names,
+    is_picture,
     opened,
 )
 from libero_env.errors import DemoError
 
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
+# What demonstrations of one file have in common.
+_MADE_WITH = (
+    "bddl_file_name", "bddl_file_content", "seed", "camera_size", "cameras", "pictures", "pairing", "generator",
+    "disturbed", "variation", "model_digest", "filter",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Episode:
 
     actions: np.ndarray  # (T, 7)
     states: np.ndarray  # (T, 1 + nq + nv), before each action
-    robot_states: np.ndarray  # (T, 9)
+    robot_states: np.ndarray | None  # (T, 9)
     obs: Mapping[str, np.ndarray] = field(repr=False)  # agentview_rgb, ..., joint_states, ee_pos, ee_ori, ...
     expert_actions: np.ndarray | None = None  # (T, 7) where the executed ones were disturbed
     success: bool = True
@@ -144,21 +149,11 @@ class DemoWriter:
                 yield file, name
 
     def _check_header(self, file: Path, found: Mapping[str, Any]) -> None:
-        for key in (
-            "bddl_file_name",
-            "seed",
-            "camera_size",
-            "pairing",
-            "generator",
-            "disturbed",
-            "model_digest",
-        ):
-            here = (
-                found[key].tolist() if isinstance(found.get(key), np.generic | np.ndarray) else found.get(key)
-            )
-            if key in self.header and here != self.header[key]:
+        for key in _MADE_WITH if self.header else ():
+            here, wanted = (_plain(values.get(key)) for values in (found, self.header))
+            if here != wanted:
                 raise DemoError(
-                    f"{file}: was recorded with {key} = {here!r}, not {self.header[key]!r}; "
+                    f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not {shorten(repr(wanted), 80)}; "
                     f"choose another file or remove this one"
                 )
 
@@ -171,12 +166,13 @@ class DemoWriter:
         if episode.expert_actions is not None:
             put("expert_actions", data=np.asarray(episode.expert_actions, np.float64))
         put("states", data=np.asarray(episode.states, np.float64))
-        put("robot_states", data=np.asarray(episode.robot_states, np.float64))
+        if episode.robot_states is not None:
+            put("robot_states", data=np.asarray(episode.robot_states, np.float64))
         put("rewards", data=ends)
         put("dones", data=ends)
         obs = group.create_group("obs")
         for key, values in _with_ee_states(episode.obs).items():
-            if key in (*IMAGE_KEYS, *DEPTH_KEYS):
+            if is_picture(key):
                 obs.create_dataset(
                     key, data=values[:, ::-1], chunks=(min(FRAMES_PER_CHUNK, steps), *values.shape[1:]),
                     compression=self.compression, compression_opts=1 if self.compression == "gzip" else None,
@@ -240,6 +236,10 @@ def _with_ee_states(obs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     if "ee_pos" in obs and "ee_ori" in obs:
         return {**obs, "ee_states": np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=1)}
     return dict(obs)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _sync(path: Path) -> None:

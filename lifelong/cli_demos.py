@@ -1,24 +1,35 @@
 """`libero demos`: record demonstrations, say what there is, check files."""
 
 import argparse
+import re
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lifelong import cli_demos_tools
+
+if TYPE_CHECKING:
+    from libero_env.demos_studio import Recipe, Tally, Variation
+
+VARIATIONS = ("style", "noise", "pushes")
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+SHOWN_REASONS = 3  # of failed attempts at a task
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
-    """`libero demos generate|info|check`"""
-    parser = subparsers.add_parser("demos", help="record demonstrations, list and check them")
+    """`libero demos generate|info|check|replay|rerender|filter|export`"""
+    parser = subparsers.add_parser("demos", help="record demonstrations, look at them, convert them")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _register_generate(commands)
+    places = "files or folders (default: where demonstrations are kept)"
     info = commands.add_parser("info", help="the demonstration files in a folder")
-    info.add_argument(
-        "paths", nargs="*", type=Path, help="files or folders (default: where demonstrations are kept)"
-    )
+    info.add_argument("paths", nargs="*", type=Path, help=places)
     info.set_defaults(run=run_info)
-    check = commands.add_parser("check", help="read demonstrations whole and say what is broken")
-    check.add_argument(
-        "paths", nargs="*", type=Path, help="files or folders (default: where demonstrations are kept)"
-    )
+    check = commands.add_parser("check", help="read demonstrations whole and say what is in them or broken")
+    check.add_argument("paths", nargs="*", type=Path, help=places)
     check.set_defaults(run=run_check)
+    cli_demos_tools.register(commands)
 
 
 def _register_generate(commands: "argparse._SubParsersAction") -> None:
@@ -27,16 +38,25 @@ def _register_generate(commands: "argparse._SubParsersAction") -> None:
     )
     what = generate.add_mutually_exclusive_group(required=True)
     what.add_argument("--benchmark", "--suite", help="all tasks of a suite, such as libero_object")
-    what.add_argument("--task", help="one task, such as libero_object/3")
-    generate.add_argument("--n", type=positive, default=50, help="demonstrations of each task (default: 50)")
-    generate.add_argument(
-        "--size", type=positive, default=128, help="height and width of the pictures (default: 128)"
-    )
-    generate.add_argument("--seed", type=int, default=0, help="of starts and manners (default: 0)")
-    generate.add_argument("--workers", type=int, default=0, help="processes (default: one for each core)")
-    generate.add_argument(
-        "--folder", type=Path, help="where to keep them (default: LIBERO_DEMOS, or in the cache)"
-    )
+    what.add_argument("--task", help="one task, such as libero_goal/3")
+    what.add_argument("--bddl", type=Path, help="a task file of your own")
+    add = generate.add_argument
+    add("--n", type=positive, default=50, help="demonstrations of each task (default: 50)")
+    add("--size", type=size, default=(128, 128), help="of the pictures, 128 or 120x160 (default: 128)")
+    add("--cameras", nargs="+", default=CAMERAS, help=f"what is drawn (default: {' '.join(CAMERAS)})")
+    add("--depth", action="store_true", help="record depth too, in metres")
+    add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
+    add("--seed", type=int, default=0, help="of starts and manners (default: 0)")
+    add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
+    add(
+        "--variation", nargs="+", choices=(*VARIATIONS, "none"), default=VARIATIONS,
+        help="of the manner and of the executed actions (default: all)",
+    )  # fmt: skip
+    add("--noise", type=float, help="standard deviation of the noise on actions (default: 0.12)")
+    add("--pairing", choices=("aligned", "libero"), default="aligned",
+        help="observations before their action, or after it as in the original (default: aligned)")  # fmt: skip
+    add("--workers", type=int, default=0, help="processes (default: one for each core)")
+    add("--folder", type=Path, help="where to keep them (default: LIBERO_DEMOS, or in the cache)")
     generate.set_defaults(run=run_generate)
 
 
@@ -48,18 +68,89 @@ def positive(text: str) -> int:
     return value
 
 
-def run_generate(args: argparse.Namespace) -> None:
-    """Record what is missing, then list the files."""
-    from libero_env.demos_generate import ensure_demos
-    from libero_env.tasks import get_suite, get_task
+def size(text: str) -> tuple[int, int]:
+    """`128` or `120x160`: (height, width), for argparse."""
+    numbers = [positive(part) for part in text.split("x")]
+    if len(numbers) > 2:
+        raise argparse.ArgumentTypeError(f"{text} is neither N nor HEIGHTxWIDTH")
+    return numbers[0], numbers[-1]
 
-    tasks = get_suite(args.benchmark).tasks if args.benchmark else (get_task(args.task),)
-    size = (args.size, args.size)
-    paths = ensure_demos(
-        tasks, args.n, camera_size=size, seed=args.seed, root=args.folder, workers=args.workers
+
+def pictures(args: argparse.Namespace) -> tuple[str, ...]:
+    """Kinds of picture that the options ask for."""
+    depth = ("depth",) if args.depth else ()
+    return ("rgb", *depth, *((f"segmentation_{args.segmentation}",) if args.segmentation else ()))
+
+
+def run_generate(args: argparse.Namespace) -> int:
+    """Record what is missing, then list the files and what failed; 1 where a task is not complete."""
+    from libero_env.demos_generate import demo_path, make_demos
+    from libero_env.paths import demos_dir
+
+    root = args.folder or demos_dir()
+    jobs = [(recipe, demo_path(root, recipe)) for recipe in recipes(args)]
+    tallies = make_demos(jobs, args.n, workers=args.workers, replace=True)
+    for path, tally in tallies.items():
+        print(describe(path) if path.is_file() else f"{path}: not complete")
+        for line in report(tally):
+            print(f"    {line}")
+    if len(tallies) > 1:
+        print(summary(tallies, args.n))
+    return int(any(tally.error for tally in tallies.values()))
+
+
+def recipes(args: argparse.Namespace) -> "list[Recipe]":
+    """What the options of `generate` ask for."""
+    from libero_env.demos_studio import Recipe
+    from libero_env.tasks import get_suite, get_task, read_task
+
+    if args.benchmark:
+        tasks = get_suite(args.benchmark).tasks
+    else:
+        tasks = (read_task(args.bddl) if args.bddl else get_task(args.task),)
+    disturb, varied = bool({"noise", "pushes"} & set(args.variation)), variation(args)
+    return [
+        Recipe(task, args.size, args.seed, args.pairing, disturb, varied, tuple(args.cameras), pictures(args))
+        for task in tasks
+    ]
+
+
+def variation(args: argparse.Namespace) -> "Variation":
+    """How demonstrations differ from each other."""
+    from libero_env.demos_studio import Variation
+
+    usual = Variation()
+    noise = usual.noise if args.noise is None else args.noise
+    return Variation(
+        style="style" in args.variation,
+        noise=noise if "noise" in args.variation else 0.0,
+        push_rate=usual.push_rate if "pushes" in args.variation else 0.0,
+        reserved=args.reserved,
     )
-    for path in paths:
-        print(describe(path))
+
+
+def report(tally: "Tally") -> list[str]:
+    """What came of one task: the share of attempts that succeeded, and why others failed."""
+    if not tally.attempts:
+        return [tally.error] if tally.error else []
+    failed = tally.reasons.total()
+    share = f"{tally.attempts - failed} of {tally.attempts} attempts successful"
+    lines = [f"{share} ({100 * (1 - failed / tally.attempts):.0f} %)"]
+    # reasons that differ in numbers alone are the same
+    alike: Counter[str] = Counter()
+    for reason, count in tally.reasons.items():
+        alike[re.sub(r"(?<!\w)\d+(\.\d+)?", "N", reason)] += count
+    lines += [f"{count} x {reason}" for reason, count in alike.most_common(SHOWN_REASONS)]
+    return lines + ([f"ERROR {tally.error}"] if tally.error else [])
+
+
+def summary(tallies: "Mapping[Path, Tally]", n: int) -> str:
+    """One line about all tasks."""
+    done = sum(not tally.error and tally.recorded >= n for tally in tallies.values())
+    attempts = sum(tally.attempts for tally in tallies.values())
+    failed = sum(tally.reasons.total() for tally in tallies.values())
+    share = f", {100 * (1 - failed / attempts):.1f} % of {attempts} attempts successful" if attempts else ""
+    return f"{done} of {len(tallies)} tasks complete{share}"
 
 
 def run_info(args: argparse.Namespace) -> None:
@@ -70,16 +161,22 @@ def run_info(args: argparse.Namespace) -> None:
 
 def run_check(args: argparse.Namespace) -> int:
     """Read every file whole; 1 where one is broken."""
-    from libero_env.demos import read_demos
+    from libero_env.demos_tools import examine
     from libero_env.errors import DemoError
 
     broken = 0
     for path in find_files(args.paths):
         try:
-            print(f"ok    {path}: {len(read_demos(path))} demonstrations")
+            stats = examine(path)
         except DemoError as error:
             broken += 1
             print(f"FAIL  {error}")
+            continue
+        for fault in stats.faults:
+            print(f"FAIL  {path}: {fault}")
+        broken += bool(stats.faults)
+        if not stats.faults:
+            print(f"ok    {path}: {len(stats.lengths)} demonstrations, {stats}")
     return int(broken > 0)
 
 
@@ -118,9 +215,11 @@ def describe(path: Path) -> str:
     with opened(path) as handle:
         names = demo_names(handle, path)
         data = handle["data"]
-        steps = [int(data[name].attrs.get("num_samples", 0)) for name in names]
-        picture = data[names[0]].get("obs/agentview_rgb") if names else None
-        size = "no pictures" if picture is None else "{}x{} pixels".format(*picture.shape[1:3])
+        steps = [len(data[name]["actions"]) if "actions" in data[name] else 0 for name in names]
+        obs = data[names[0]].get("obs", {}) if names else {}
+        colours = [key for key in obs if key.endswith("_rgb")]
+        seen = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no pictures"
         failed = data.attrs.get("num_failed_attempts", "unknown")
-    parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", size, f"failed attempts: {failed}")
-    return f"{path}: {', '.join(parts)}, {show_bytes(path.stat().st_size)}"
+        pairing = data.attrs.get("pairing", "libero")
+    parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", seen, f"failed attempts: {failed}")
+    return f"{path}: {', '.join(parts)}, pairing: {pairing}, {show_bytes(path.stat().st_size)}"
