@@ -1,0 +1,271 @@
+"""Opening, closing and turning what a joint moves: drawers, doors and knobs."""
+
+from typing import Literal
+
+import numpy as np
+
+from libero_env.control import SUBSTEPS
+from libero_env.expert.geometry import Pose
+from libero_env.expert.grasp import TIP_BELOW, GraspError
+from libero_env.expert.handles import (
+    Hold,
+    Part,
+    find_handle,
+    handle_hold,
+    is_knob,
+    knob_hold,
+    surroundings,
+)
+from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
+from libero_env.expert.style import Style
+from libero_env.predicates import StateView, evaluate
+from libero_env.problem import Atom
+from libero_env.scene import TIMESTEP
+
+State = Literal["open", "close", "turnon", "turnoff"]
+Phase = Literal["reach", "close", "move", "release", "withdraw", "rest"]
+
+CONTROL_HZ = 1.0 / (SUBSTEPS * TIMESTEP)
+ATTEMPTS = 5
+ARRIVED, ARRIVED_TURN = 0.008, 0.15  # m and rad, to where the fingers close
+BACK = 0.08  # m, that the hand comes from along its approach
+LEAD = 0.06  # m, of the goal ahead of the hand while it moves the part
+SLIPPED = 0.035  # m, between the hand and the hold
+AWAY = 0.06  # m, from the handle, where the hand counts as withdrawn
+AROUND = 0.07  # m, within which things count as in the way
+STUCK = 90  # steps of one phase
+
+
+class MoveJoint:
+    """Brings the joints of a fixture, or of one of its parts, into a state.
+
+    To open, it takes the handle and draws; to close, it pushes with closed fingers; a knob is taken from above and
+    turned. The hand withdraws when the state holds with a margin, and begins again after a slip.
+
+    Args:
+        address: fixture, or region of its part.
+        state: of the joint, by the names of `ObjectModel.articulation`.
+        style: the manner.
+
+    Attributes:
+        phase: what it is doing.
+        retries: how often it had to begin again.
+        trouble: why it cannot go on, or "".
+    """
+
+    def __init__(self, address: str, state: State, *, style: Style | None = None):
+        self.address, self.state = address, state
+        self.style = style or Style()
+        self.phase: Phase = "reach"
+        self.retries, self.trouble = 0, ""
+        self._part: Part | None = None
+        self._hold: Hold | None = None  # in the frame of the part
+        self._around = np.zeros((0, 3))
+        self._before: np.ndarray | None = None
+        self._velocity = np.zeros(3)
+        self._steps, self._still = 0, 0
+        self._opening, self._value = 0.0, 0.0
+        self._left: Pose | None = None  # where the hand let go
+
+    @property
+    def steadiness(self) -> float:
+        """How much disturbance the moment bears, in [0, 1]."""
+        return {"reach": 1.0, "withdraw": 0.7, "move": 0.4}.get(self.phase, 0.0)
+
+    def done(self, view: StateView) -> bool:
+        """Whether the state holds with a margin and the hand is away."""
+        return self._moved(view) and (self._hold is None or self.phase == "rest")
+
+    def act(self, view: StateView) -> np.ndarray:
+        """The next action, (7,) in [-1, 1]."""
+        pos = view.eef_pos
+        self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
+        self._before = pos
+        self._steps += 1
+        if self.trouble or self.phase == "rest" and self._moved(view):
+            return self._stay()
+        if self.phase == "rest":
+            self._again()
+        if self._hold is None and not self._plan(view):
+            return self._stay()
+        if self._steps > STUCK:
+            return self._retreat(view)
+        return getattr(self, f"_{self.phase}")(view)
+
+    def _plan(self, view: StateView) -> bool:
+        """Choose the joint and the hold; False where nothing is to do or to take."""
+        model = view.scene.model
+        parts = [Part.of(model, joint) for joint in view.scene.joints.get(self.address, ())]
+        if not parts:
+            self.trouble = f"{self.address} has no joint to {self.state}"
+            return False
+        gaps = [abs(self._goal(view, part) - part.value(view)) for part in parts]
+        # one joint is enough to open, all have to be closed
+        choose = np.argmin if self.state in ("open", "turnon") else np.argmax
+        part = parts[int(choose(gaps))]
+        delta = self._goal(view, part) - part.value(view)
+        if self._moved(view):
+            self._enter("rest")
+            return False
+        grips = self.state not in ("close",)
+        try:
+            if is_knob(view, part):
+                hold = knob_hold(view, part, delta)
+            else:
+                way = np.sign(delta) * (1.0 if grips else -1.0)
+                handle = find_handle(view, part, way)
+                hold = handle_hold(view, part, handle, delta, grips)
+        except GraspError as error:
+            self.trouble = str(error)
+            return False
+        self._part = part
+        self._around = surroundings(view, part.body, hold.held.pos)
+        self._hold = Hold(_within(part.pose(view), hold.ready), _within(part.pose(view), hold.held), hold.grips)
+        self._enter("reach")
+        return True
+
+    def _limits(self, view: StateView) -> tuple[float, float, float, float]:
+        """(threshold, end, margin, upwards) of the state, m or rad."""
+        owner = view.scene.owner(self.address)
+        ranges = view.scene.things[owner].articulation
+        low, high = sorted(ranges[self.state])
+        opposite = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}[self.state]
+        upwards = opposite not in ranges or low + high > sum(ranges[opposite])
+        return (low, high, high - low, 1.0) if upwards else (high, low, high - low, -1.0)
+
+    def _goal(self, view: StateView, part: Part) -> float:
+        """Where the joint is brought: well into the state, or against its stop."""
+        threshold, end, width, way = self._limits(view)
+        if self.state in ("open", "turnon"):
+            return threshold + way * min(0.5 * width, 0.25)
+        stop = view.scene.model.jnt_range[part.joint][1 if way > 0 else 0]
+        return float(max(end, stop) if way > 0 else min(end, stop))
+
+    def _moved(self, view: StateView) -> bool:
+        """Whether the predicate holds with a margin."""
+        name = self.state.capitalize()
+        if not evaluate(Atom(name, (self.address,)), view):
+            return False
+        if self.state in ("close", "turnoff"):
+            return True
+        threshold, _, width, way = self._limits(view)
+        values = view.joint_positions(self.address).values()
+        return any(way * (value - threshold) > min(0.25 * width, 0.12) for value in values)
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase, self._steps, self._still = phase, 0, 0
+
+    def _again(self) -> None:
+        self.retries += 1
+        self._hold = None
+        if self.retries > ATTEMPTS:
+            self.trouble = f"{self.address} did not get to {self.state} in {self.retries} attempts"
+        self._enter("reach")
+
+    def _reach(self, view: StateView) -> np.ndarray:
+        ready = self._part.pose(view)
+        goal = _placed(ready, self._hold.ready)
+        approach = goal.mat[:, 2]
+        error = goal.pos - view.eef_pos
+        aside = float(np.linalg.norm(error - (error @ approach) * approach))
+        turn = float(np.linalg.norm(rotation_between(view.eef_mat, goal.mat)))
+        if np.linalg.norm(error) < ARRIVED and turn < ARRIVED_TURN:
+            self._enter("close" if self._hold.grips else "move")
+            return getattr(self, f"_{self.phase}")(view)
+        back = np.clip(self.style.slope * (aside - 0.006) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, BACK)
+        target = goal.pos - back * approach
+        flat = float(np.linalg.norm((target - view.eef_pos)[:2]))
+        if flat > 0.08:
+            target[2] = max(target[2], self._in_the_way(view, target) + 0.04 + TIP_BELOW)
+        lateral = np.clip(1.0 - (target[2] - view.eef_pos[2] - 0.03) / 0.05, 0.0, 1.0) if flat > 0.08 else 1.0
+        return self._toward(view, target, goal.mat, OPEN if self._hold.grips else CLOSE, lateral)
+
+    def _close(self, view: StateView) -> np.ndarray:
+        goal = _placed(self._part.pose(view), self._hold.held)
+        opening = float(np.abs(view.finger_pos).sum())
+        still = abs(opening - self._opening) < 4e-4
+        self._opening = opening
+        if self._steps > 4 + self.style.pause and still or self._steps > 16:
+            if opening < 0.004:
+                return self._retreat(view)
+            self._value = self._part.value(view)
+            self._enter("move")
+            return self._move(view)
+        return self._toward(view, goal.pos, goal.mat, CLOSE)
+
+    def _move(self, view: StateView) -> np.ndarray:
+        part, value = self._part, self._part.value(view)
+        left = self._goal(view, part) - value
+        hold = _placed(part.pose(view), self._hold.held)
+        slip = view.eef_pos - hold.pos
+        there = abs(left) < (0.003 if part.slides else 0.03) or self._moved(view)
+        if there:
+            self._enter("release")
+            return self._release(view)
+        if self._hold.grips and np.linalg.norm(slip) > SLIPPED:
+            return self._retreat(view)
+        arm = 1.0 if part.slides else max(np.linalg.norm(np.cross(hold.pos - part.axis(view)[0], part.axis(view)[1])), 0.02)
+        lead = min(LEAD / arm, 0.5)
+        ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
+        goal = part.moved(view, hold, ahead)
+        return self._toward(view, goal.pos, goal.mat, CLOSE)
+
+    def _release(self, view: StateView) -> np.ndarray:
+        if self._left is None or self._steps <= 1:
+            self._left = Pose(view.eef_pos, view.eef_mat)
+        if not self._hold.grips or self._steps > 9:
+            self._enter("withdraw")
+            return self._withdraw(view)
+        return self._toward(view, self._left.pos, self._left.mat, OPEN)
+
+    def _withdraw(self, view: StateView) -> np.ndarray:
+        left = self._left
+        back = -left.mat[:, 2]
+        away = float((view.eef_pos - left.pos) @ back)
+        if away > AWAY:
+            self._enter("rest")
+            if not self._moved(view):
+                self._again()
+            return self._stay()
+        return self._toward(view, left.pos + (AWAY + 0.05) * back, left.mat, OPEN if self._hold.grips else CLOSE)
+
+    def _retreat(self, view: StateView) -> np.ndarray:
+        """Let go, withdraw, and begin again."""
+        self._left = None
+        self._enter("release")
+        return self._release(view)
+
+    def _rest(self, view: StateView) -> np.ndarray:
+        return self._stay()
+
+    def _stay(self) -> np.ndarray:
+        return np.array([0.0] * 6 + [OPEN])
+
+    def _toward(
+        self, view: StateView, pos: np.ndarray, mat: np.ndarray, gripper: float, lateral: float = 1.0
+    ) -> np.ndarray:
+        style = self.style
+        return action_toward(
+            view.eef_pos, view.eef_mat, pos, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
+            speed=style.speed, lateral=lateral,
+        )  # fmt: skip
+
+    def _in_the_way(self, view: StateView, goal: np.ndarray) -> float:
+        """Height of the highest thing near the next decimetre of the way, m."""
+        start = view.eef_pos[:2]
+        way = goal[:2] - start
+        way = way * min(1.0, 0.10 / max(float(np.linalg.norm(way)), 1e-9))
+        offset = self._around[:, :2] - start
+        along = np.clip(offset @ way / max(way @ way, 1e-12), 0.0, 1.0)
+        near = np.linalg.norm(offset - along[:, None] * way, axis=1) < AROUND
+        return float(self._around[near, 2].max(initial=view.scene.workspace.surface_height))
+
+
+def _within(frame: Pose, pose: Pose) -> Pose:
+    """A pose of the world in a frame."""
+    return Pose(frame.invert(pose.pos), frame.mat.T @ pose.mat)
+
+
+def _placed(frame: Pose, pose: Pose) -> Pose:
+    """A pose of a frame in the world."""
+    return Pose(frame.mat @ pose.pos + frame.pos, frame.mat @ pose.mat)

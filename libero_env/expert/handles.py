@@ -1,0 +1,272 @@
+"""Parts that a joint moves, where to take hold of them, and where to push them; all from the model."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import mujoco
+import numpy as np
+
+from libero_env.expert.geometry import Pose, surface_points
+from libero_env.expert.grasp import FINGER_HALF_WIDTH, GraspError, choose_grasp
+from libero_env.expert.motion import downward, finger_axis, rotation_between
+from libero_env.predicates import StateView
+
+UP = np.array([0.0, 0.0, 1.0])
+KNOB_RADIUS = 0.08  # m, from its axis; what is wider swings like a door
+TAKES = 0.06  # m, widest handle that is taken between the fingers
+OPEN_HALF = 0.04  # m, of an open finger from the middle
+TIP = 0.0145  # m, thickness of a finger at its tip, which reaches TIP_BELOW beyond the grip site
+TIP_BELOW = 0.0095
+_WIDENS = 0.41  # m of thickness for each m further up
+_NEAR = 0.45  # m, around the handle: what lies further away is not looked at
+_BEHIND = 0.008  # m without points: the space behind a handle's bar
+_TILTS = np.radians([90, 75, 65, 55, 45, 35, 25])  # of the approach below the horizontal
+_ASIDE = (0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026)  # m, of the open hand from the middle of the bar
+_FORTH = (0.0, -0.005)  # m, of the grip site beyond the middle of the bar
+_SPARE = 0.003  # m, around the hand
+_BASE_X = -0.66  # m, of the arm's base; it decides how far the wrist is turned
+_WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
+
+
+@dataclass(frozen=True)
+class Part:
+    """A body that one joint moves."""
+
+    joint: int
+    body: int
+    slides: bool
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joint: int) -> "Part":
+        """The part of a joint."""
+        slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        return cls(joint, int(model.jnt_bodyid[joint]), bool(slides))
+
+    def value(self, view: StateView) -> float:
+        """Position of the joint, m or rad."""
+        return float(_field(view, "qpos")[view.scene.model.jnt_qposadr[self.joint]])
+
+    def axis(self, view: StateView) -> tuple[np.ndarray, np.ndarray]:
+        """Point on the joint's axis and its direction, world frame, (3,) each."""
+        return _field(view, "xanchor")[self.joint].copy(), _field(view, "xaxis")[self.joint].copy()
+
+    def pose(self, view: StateView) -> Pose:
+        """Pose of the body."""
+        return _body_pose(view, self.body)
+
+    def moved(self, view: StateView, pose: Pose, delta: float) -> Pose:
+        """Where what is fixed to the part comes to when the joint moves by `delta`, m or rad."""
+        anchor, axis = self.axis(view)
+        if self.slides:
+            return Pose(pose.pos + delta * axis, pose.mat)
+        turn = _turn(axis, delta)
+        return Pose(anchor + turn @ (pose.pos - anchor), turn @ pose.mat)
+
+
+@dataclass(frozen=True)
+class Handle:
+    """The bar that sticks out of a part, or its edge. World frame, m."""
+
+    pos: np.ndarray  # (3,) middle of the bar
+    along: np.ndarray  # (3,) unit, its long direction
+    out: np.ndarray  # (3,) unit, where it goes when the part opens
+    half: float  # m, half its length
+    depth: float  # m, of the bar along `out`
+    points: np.ndarray  # (N, 3) on it
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Poses of the grip site to take hold, or to begin to push."""
+
+    ready: Pose  # fingers around the handle and not yet closed, or in front of it
+    held: Pose
+    grips: bool
+
+
+def find_handle(view: StateView, part: Part, way: float) -> Handle:
+    """What sticks out furthest where the part opens.
+
+    Args:
+        view: the state.
+        part: what moves.
+        way: sign of the joint's motion that opens.
+    """
+    points = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.004))
+    out = opening_direction(view, part, way, points)
+    front = points @ out
+    slab = points[front > front.max() - 0.003]
+    middle = 0.5 * (slab.min(axis=0) + slab.max(axis=0))
+    sideways = np.cross(UP, out)
+    spans = [np.ptp(slab @ axis) for axis in (sideways, UP)]
+    along, across = (sideways, UP) if spans[0] >= spans[1] else (UP, sideways)
+    core = np.abs((points - middle) @ along) < 0.012
+    core &= np.abs((points - middle) @ across) < 0.5 * min(spans) + 0.012
+    depths = np.sort(front.max() - front[core])
+    gaps = np.flatnonzero(np.diff(depths) > _BEHIND)
+    depth = float(depths[gaps[0]]) if len(gaps) else min(float(depths[-1]), 0.02)
+    mask = (front > front.max() - depth - 0.002) & (np.abs((points - middle) @ across) < 0.5 * min(spans) + 0.012)
+    middle = middle + out * (front.max() - middle @ out - 0.5 * depth)
+    return Handle(middle, along, out, 0.5 * max(spans), depth, points[mask])
+
+
+def opening_direction(view: StateView, part: Part, way: float, points: np.ndarray) -> np.ndarray:
+    """Where the outer end of a part goes when its joint moves in the direction `way`, (3,) unit."""
+    anchor, axis = part.axis(view)
+    if part.slides:
+        return way * axis
+    arms = points - anchor
+    arms -= np.outer(arms @ axis, axis)
+    reach = np.linalg.norm(arms, axis=1)
+    arm = arms[reach > 0.5 * reach.max()].mean(axis=0)
+    out = way * np.cross(axis, arm)
+    return out / np.linalg.norm(out)
+
+
+def is_knob(view: StateView, part: Part) -> bool:
+    """Whether a part turns about itself under the hand: its axis is upright and all of it is close to that."""
+    if part.slides:
+        return False
+    anchor, axis = part.axis(view)
+    arms = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.01)) - anchor
+    return bool(abs(axis[2]) > 0.9 and np.linalg.norm(np.cross(arms, axis), axis=1).max() < KNOB_RADIUS)
+
+
+def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
+    """How to take a knob from above in order to turn it by `delta`, rad.
+
+    Raises:
+        GraspError: it is too thick for the fingers.
+    """
+    cloud = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.004))
+    high = cloud[cloud[:, 2] > cloud[:, 2].max() - 0.03]
+    around = surroundings(view, part.body, cloud.mean(axis=0))
+    grasp = choose_grasp(high, around, cloud[:, 2].min(), finger_axis(view.eef_mat), "knob")
+    mats = [downward(grasp.yaw, sign * np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0])) for sign in (1, -1)]
+    poses = [Pose(grasp.pos_world, mat) for mat in mats]
+    best = min(poses, key=lambda pose: strain(pose) ** 2 + strain(part.moved(view, pose, delta)) ** 2)
+    return Hold(best, best, True)
+
+
+def handle_hold(view: StateView, part: Part, handle: Handle, delta: float, grips: bool) -> Hold:
+    """How to take a handle, or to push against it, in order to move the joint by `delta`, m or rad.
+
+    Of all approaches it is the one that keeps the hand out of everything, with little turning of the hand.
+
+    Raises:
+        GraspError: the handle is thicker than the fingers take, or there is no room for them anywhere.
+    """
+    fixed = surroundings(view, part.body, handle.pos)
+    own = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.008))
+    free = np.array([np.abs(handle.points - p).max(axis=1).min() for p in own]) > 0.004 if len(own) else []
+    floor = view.scene.workspace.surface_height
+    best: tuple[float, Hold] | None = None
+    for cost, hold in _candidates(handle, grips):
+        depth = crowding(own[free] if grips else own, hold.ready, grips)
+        for share in (0.0, 0.5, 1.0):
+            pose = part.moved(view, hold.ready, share * delta)
+            depth = max(depth, crowding(fixed, pose, grips), under(floor, pose, grips))
+        for pose in (hold.ready, part.moved(view, hold.held, delta)):
+            cost += 0.12 * strain(pose) ** 2
+        cost += 0.1 * float(np.linalg.norm(rotation_between(view.eef_mat, hold.ready.mat)))
+        cost += 60.0 * depth + 0.5 * (depth > 0.002)
+        if best is None or cost < best[0]:
+            best = cost, hold
+    if best is None:
+        raise GraspError(f"no way to take the handle: it is more than {100 * TAKES:.0f} cm thick")
+    return best[1]
+
+
+def _candidates(handle: Handle, grips: bool) -> Iterator[tuple[float, Hold]]:
+    """(cost, hold) for each approach, what is around not yet considered."""
+    upright = abs(handle.along[2]) > 0.7
+    reach = max(handle.half - 0.012, 0.0)
+    shifts = (reach, 0.5 * reach, 0.0, -0.5 * reach) if upright else (0.0, 0.4 * reach, -0.4 * reach)
+    for tilt, shift, sign in product(_TILTS, shifts, (1.0, -1.0)):
+        approach = -np.cos(tilt) * handle.out - np.sin(tilt) * UP
+        fingers = sign * np.cross(handle.along, -handle.out if upright else approach)
+        mat = np.column_stack([fingers, np.cross(approach, fingers), approach])
+        pos = handle.pos + shift * handle.along
+        away = 0.5 * abs(shift)
+        if not grips:
+            thick = TIP if not upright else FINGER_HALF_WIDTH
+            before = 0.5 * handle.depth + 0.012 + thick * np.sin(tilt) + TIP_BELOW * np.cos(tilt)
+            ready = Pose(pos + before * handle.out, mat)
+            yield away + 0.2 * abs(tilt - np.radians(65)), Hold(ready, ready, False)
+            continue
+        width = float(np.ptp(handle.points[np.abs((handle.points - pos) @ handle.along) < 0.01] @ fingers))
+        if width > TAKES:
+            continue
+        for aside, forth in product(_ASIDE, _FORTH):
+            if abs(aside) + 0.5 * width + 0.004 < OPEN_HALF:
+                held = Pose(pos + forth * approach, mat)
+                ready = Pose(held.pos + aside * fingers, mat)
+                yield away + 2.0 * abs(aside) + 4.0 * abs(forth), Hold(ready, held, True)
+
+
+def crowding(points: np.ndarray, pose: Pose, opened: bool) -> float:
+    """How deep points (N, 3) reach into a hand at a pose of its grip site, m; 0 where it is free."""
+    x, y, z = ((points - pose.pos) @ pose.mat).T
+    x, y = np.abs(x), np.abs(y)
+    inner = OPEN_HALF if opened else 0.0
+    outer = inner + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
+    finger = np.minimum.reduce([outer - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z])
+    finger = np.where(z > -0.04, finger, 0.0)
+    half = np.clip(0.0175 - 0.22 * (z + 0.031), 0.0, 0.032) + _SPARE  # of the palm, which is thinner in front
+    palm = np.minimum.reduce([0.104 + _SPARE - x, half - y, -0.031 + _SPARE - z, z + 0.13])
+    wrist = np.minimum.reduce([0.06 - x, 0.06 - y, -0.12 - z, z + 0.3])
+    return float(max(finger.max(initial=0.0), palm.max(initial=0.0), wrist.max(initial=0.0)))
+
+
+def under(floor: float, pose: Pose, opened: bool) -> float:
+    """How deep a hand reaches under a height, m."""
+    wide = (OPEN_HALF if opened else 0.0) + TIP
+    corners = [(s * w, t * h, z) for s in (1, -1) for t in (1, -1)
+               for w, h, z in ((wide, FINGER_HALF_WIDTH, TIP_BELOW), (0.104, 0.018, -0.031), (0.104, 0.032, -0.1))]  # fmt: skip
+    return max(0.0, floor + 0.004 - float(pose.apply(np.array(corners))[:, 2].min()))
+
+
+def strain(pose: Pose) -> float:
+    """How far a hand is turned from where the wrist's joints are in the middle, rad."""
+    yaw = _WRIST_MIDDLE + np.arctan2(pose.pos[1], pose.pos[0] - _BASE_X)
+    neutral = downward(yaw, np.array([np.cos(yaw), np.sin(yaw), 0.0]))
+    return float(np.linalg.norm(rotation_between(neutral, pose.mat)))
+
+
+def surroundings(view: StateView, body: int, centre: np.ndarray, spacing: float = 0.012) -> np.ndarray:
+    """Points near `centre` on all objects and fixtures but one body of them, world frame, (N, 3)."""
+    model, clouds = view.scene.model, [np.zeros((0, 3))]
+    for name in view.scene.things:
+        for b in view.scene.bodies[name]:
+            if b != body:
+                clouds.append(_body_pose(view, int(b)).apply(_own_points(model, int(b), spacing)))
+    points = np.concatenate(clouds)
+    return points[np.linalg.norm(points - centre, axis=1) < _NEAR]
+
+
+def _own_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray:
+    """Points on the geoms of a body alone; those of a whole tree begin with them."""
+    if not model.body_geomnum[body]:
+        return np.zeros((0, 3))
+    children = np.flatnonzero(model.body_parentid == body)
+    below = sum(len(surface_points(model, int(child), spacing)) for child in children if child != body)
+    points = surface_points(model, body, spacing)
+    return points[: len(points) - below]
+
+
+def _body_pose(view: StateView, body: int) -> Pose:
+    mat = np.zeros(9)
+    mujoco.mju_quat2Mat(mat, _field(view, "xquat")[body])
+    return Pose(_field(view, "xpos")[body].copy(), mat.reshape(3, 3))
+
+
+def _field(view: StateView, name: str) -> np.ndarray:
+    return view.simulations.fields[name][view.index]
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    quat, mat = np.zeros(4), np.zeros(9)
+    mujoco.mju_axisAngle2Quat(quat, axis, angle)
+    mujoco.mju_quat2Mat(mat, quat)
+    return mat.reshape(3, 3)
