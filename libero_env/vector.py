@@ -72,6 +72,12 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         self._steps = np.zeros(num_envs, np.int64)
         self._running = np.zeros(num_envs, bool)
         self._success = np.zeros(num_envs, bool)
+        self._progress = np.zeros((num_envs, len(self.world.atoms)), bool)
+
+    @property
+    def atoms(self) -> tuple[str, ...]:
+        """The parts of the goal, as infos' `progress` has them: `(On plate_1 stove_1)`."""
+        return tuple(f"({a.predicate} {' '.join(a.args)})" for a in self.world.atoms)
 
     @property
     def running(self) -> np.ndarray:
@@ -105,6 +111,7 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         else:
             self.world.reset_random(ids, [self._generators[i] for i in ids])
         self._steps[ids], self._running[ids], self._success[ids] = 0, True, False
+        self._judge(ids)
         return self._observe(ids), self._info()
 
     def step(
@@ -113,8 +120,9 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         """Act for 50 ms in every simulation that is in an episode; actions (num_envs, 7).
 
         Returns:
-            Observations, rewards (num_envs,), terminations, truncations, and infos with `success` (num_envs,) bool,
-            which keeps the outcome of episodes that are over.
+            Observations, rewards (num_envs,), terminations, truncations, and infos: `success` (num_envs,) bool and
+            `progress` (num_envs, natoms) bool, the truth of each of the goal's `atoms`. Both keep the outcome of
+            episodes that are over.
 
         Raises:
             ActionError: wrong shape or not finite; nothing has moved.
@@ -163,15 +171,12 @@ class BatchEnv(gymnasium.vector.VectorEnv):
 
     def _judge(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whether the goal holds in each of the simulations, and its reward."""
-        if self.reward.kind == "sparse":
-            reached = self.world.goal_reached(ids)
-            return reached, self.reward.scale * reached
-        judged = [self.world.judge(i) for i in ids]
-        rewards = [
-            self.reward(self.world.views[i], reached, self.world.atoms, list(progress.values()))
-            for i, (reached, progress) in zip(ids, judged, strict=True)
-        ]
-        return np.array([reached for reached, _ in judged]), np.array(rewards)
+        reached, rewards = np.zeros(len(ids), bool), np.zeros(len(ids))
+        for k, i in enumerate(ids):
+            reached[k], progress = self.world.judge(i)
+            self._progress[i] = list(progress.values())
+            rewards[k] = self.reward(self.world.views[i], bool(reached[k]), self.world.atoms, self._progress[i])
+        return reached, rewards
 
     def _observe(self, drawn: np.ndarray) -> dict[str, np.ndarray]:
         if self.draw:
@@ -179,4 +184,4 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         return {**{k: v.copy() for k, v in self._frames.items()}, **self.world.proprioception()}
 
     def _info(self) -> dict[str, Any]:
-        return {"success": self._success.copy()}
+        return {"success": self._success.copy(), "progress": self._progress.copy()}

@@ -225,3 +225,18 @@ def test_a_task_of_ones_own_gets_initial_states_of_its_own(tmp_path, monkeypatch
     made = load_init_states(task, scene)
     monkeypatch.setattr(init_states, "generate_init_states", None)  # found again, not made again
     np.testing.assert_array_equal(load_init_states(task, scene), made)
+
+
+def test_a_batch_tells_the_progress_of_each_atom():
+    env = BatchEnv("libero_10/3", 2, cameras=())
+    _, info = env.reset(options={"init_state": [0, 1]})
+    drawer = "white_cabinet_1_bottom_region"
+    assert env.atoms == (f"(Close {drawer})", f"(In akita_black_bowl_1 {drawer})")
+    np.testing.assert_array_equal(info["progress"], [[False, False], [False, False]])
+    state = env.get_state(0)
+    qpos = env.world.scene.model.joint("white_cabinet_1_bottom_level").qposadr[0]
+    state[1 + qpos] = 0.0015  # pushed in, empty
+    env.set_state(0, state)
+    info = env.step(np.zeros((2, 7)))[-1]
+    np.testing.assert_array_equal(info["progress"], [[True, False], [False, False]])
+    env.close()
