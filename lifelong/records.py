@@ -166,14 +166,16 @@ def utc_now() -> str:
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of Python, this package, and what a result depends on."""
+    """Versions of Python, this package and what a result depends on; `models` says whose objects were simulated."""
+    from libero_env.assets import select_pack
+
     versions = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in VERSIONED_PACKAGES:
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return versions
+    return {**versions, "models": select_pack().name}
 
 
 def source_commit() -> str | None:

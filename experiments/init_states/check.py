@@ -53,7 +53,7 @@ def main() -> None:
         if faults:
             print(f"{task.id} {task.name}: {'; '.join(sorted(set(faults)))}", flush=True)
     print(f"{describe(args, pack)}: {len(tasks)} tasks, {states} states, {faulty} tasks with faults; "
-          f"the farthest that anything moves in {IDLE_STEPS} idle steps: {1000 * worst:.1f} mm")  # fmt: skip
+          f"the farthest that anything moves in {IDLE_STEPS} idle steps: {1000 * worst:.2f} mm")  # fmt: skip
 
 
 def describe(args: argparse.Namespace, pack: Pack) -> str:
