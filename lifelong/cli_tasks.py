@@ -2,13 +2,17 @@
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from libero_env.certify import Certificate
+    from libero_env.lint_report import Finding
     from libero_env.tasks import Task
+
+
+LEVELS = ("error", "warning", "info")
 
 
 def register(commands: "argparse._SubParsersAction") -> None:
@@ -28,6 +32,17 @@ def register(commands: "argparse._SubParsersAction") -> None:
     certify.add_argument("--disturb", action="store_true", help="disturb the actions as demonstrations do")
     certify.add_argument("--again", action="store_true", help="run what is in the folder too")
     certify.set_defaults(run=run_certify)
+    lint = commands.add_parser(
+        "lint", help="what is wrong or doubtful in the design of tasks, and how to mend it"
+    )
+    _add_tasks(lint)
+    lint.add_argument(
+        "--level", choices=LEVELS, default="warning", help="the least that is told (default: warning)"
+    )
+    lint.add_argument(
+        "--starts", type=int, default=5, help="starts to look at; 0 simulates nothing (default: 5)"
+    )
+    lint.set_defaults(run=run_lint)
 
 
 def _add_tasks(parser: argparse.ArgumentParser) -> None:
@@ -137,10 +152,43 @@ def draw(certificates: Sequence["Certificate"], path: Path, title: str) -> None:
     image = axes.imshow(
         np.ma.masked_invalid(steps), cmap=colours, aspect="auto", interpolation="nearest", vmin=0
     )
-    labels = [f"{c.name.replace('_', ' ')[:60]}  {100 * c.rate:.0f} %" for c in certificates]
+    labels = [f"{_label(c)}  {100 * c.rate:.0f} %" for c in certificates]
     axes.set_yticks(range(len(labels)), labels, fontsize=6)
     axes.set_xlabel("initial state; red where the goal was not reached", fontsize=7)
     axes.tick_params(axis="x", labelsize=6)
     axes.set_title(title, fontsize=8)
     figure.colorbar(image, ax=axes, shrink=min(1.0, 20 / len(certificates))).ax.tick_params(labelsize=6)
     figure.savefig(path)
+
+
+def _label(certificate: "Certificate") -> str:
+    words = certificate.name.replace("_", " ")
+    return f"{certificate.task.rpartition('/')[2]}  {words if len(words) <= 64 else words[:63] + '…'}"
+
+
+def run_lint(args: argparse.Namespace) -> int:
+    """One line for each finding, and how many there are; 1 where one is an error."""
+    from collections import Counter
+
+    counts, number = Counter[str](), 0
+    for findings in _lint(args):
+        number += 1
+        counts.update(finding.level for finding in findings)
+        for finding in findings:
+            if LEVELS.index(finding.level) <= LEVELS.index(args.level):
+                print(finding, flush=True)
+    print(f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes")
+    return int(counts["error"] > 0)
+
+
+def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
+    """The findings of each task."""
+    from libero_env.assets import select_pack
+    from libero_env.lint import lint_file, lint_task
+
+    pack = select_pack(args.assets)
+    for name in dict.fromkeys(args.tasks):
+        if name.endswith(".bddl"):
+            yield lint_file(name, pack, starts=args.starts)
+        else:
+            yield from (lint_task(task, pack, starts=args.starts) for task in find_tasks([name]))
