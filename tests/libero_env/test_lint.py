@@ -1,0 +1,236 @@
+"""The linter: every fault put into a sound task is found, on its line; the benchmark's own tasks have none."""
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from libero_env.arena import WORKSPACES, load_workspace
+from libero_env.lint import KINDS, Finding, lint_file, lint_task, lint_text
+from libero_env.lint_scene import reach, stretched
+from libero_env.predicates import PREDICATES
+from libero_env.scene import build_scene
+from libero_env.tasks import get_suite, get_task, suite_names
+from lifelong import cli
+
+SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
+GOAL = "(And (In akita_black_bowl_1 wooden_cabinet_1_top_region))"
+TASKS = {task.id: task for name in suite_names() for task in get_suite(name).tasks}
+
+
+def mutated(old: str, new: str, text: str = SOUND) -> tuple[str, int]:
+    """The task with a part replaced, and the line that it is on."""
+    assert text.count(old) == 1, old
+    return text.replace(old, new), text[: text.index(old)].count("\n") + 1
+
+
+def found(text: str, rule: str, starts: int = 0) -> Finding:
+    hits = [finding for finding in lint_text(text, "mine.bddl", starts=starts) if finding.rule == rule]
+    assert len(hits) == 1, lint_text(text, "mine.bddl", starts=starts)
+    return hits[0]
+
+
+# what is replaced, by what; rule and level, and what the finding or its remedy says
+FAULTS = [
+    ("plate_1 - plate", "plate_1 - plat", "unknown-category", "error", "did you mean plate"),
+    ("main_table - table", "main_table - tabel", "unknown-category", "error", "did you mean .*table"),
+    ("(On plate_1 main", "(Onto plate_1 main", "unknown-predicate", "error", "On"),
+    ("(On plate_1 main_table_plate_region)", "(On plate_1)", "arity", "error", "On takes 2"),
+    (GOAL, "(And (In akita_black_bowl_1 plate_1))", "kind", "error", "name a region there"),
+    ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table)", "kind", "error", "main_table is a workspace"),
+    ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plat_region)", "unknown-name", "error",
+     "did you mean main_table_plate_region"),
+    ("    (On plate_1 main_table_plate_region)\n", "", "not-placed", "error", r"\(On plate_1 REGION\)"),
+    ("    (On flat_stove_1 main_table_stove_region)\n", "", "not-placed", "warning", "middle of the workspace"),
+    ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plate_region) (On plate_1 flat_stove_1)",
+     "placed-twice", "error", "plate_1 is placed 2 times"),
+    ("(On flat_stove_1 main_table_stove_region)", "(On flat_stove_1 plate_1)", "kind", "error", "workspace"),
+    (GOAL, "(And)", "empty-goal", "error", "always true"),
+    (GOAL, "(ForAll (?x - milk) (In ?x wooden_cabinet_1_top_region))", "empty-goal", "error", "no object is a milk"),
+    (" (:ranges ((0.04 -0.03 0.060000000000000005 -0.01)))", "", "region-ranges", "error", "no extent"),
+    ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1) (:ranges ((0 0 1 1))))",
+     "region-ranges", "error", "workspace only"),
+    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "region-ranges", "warning", "X0 < X1"),
+    ("(-0.060000000000000005 0.12000000000000001 -0.04 0.14)", "(0.04 -0.03 0.060000000000000005 -0.01)",
+     "duplicate-region", "warning", "same place as main_table_plate_region"),
+    ("    akita_black_bowl_1\n    wooden_cabinet_1_top_region", "    akita_bowl_1", "unknown-name", "warning",
+     "did you mean akita_black_bowl_1"),
+    ("LIBERO_Tabletop", "LIBERO_Kitchen_Tabletop", "problem-name", "warning", "kitchen_table"),
+    ("Open the top layer of the drawer and put the bowl inside", "put the cream cheese in the top drawer",
+     "instruction", "warning", "names akita_black_bowl_1"),
+    ("Open the top layer of the drawer and put the bowl inside", "put the bowl with the ketchup in the top drawer",
+     "instruction", "warning", "names a ketchup, and there is none"),
+    ("Open the top layer of the drawer and put the bowl inside", "put the bowl in the bottom drawer",
+     "instruction", "warning", "says bottom, and the goal top"),
+    ("main_table - table", "main_table - table\n    other_table - table", "workspace", "error", "2 workspaces"),
+    ("(:init", "(:inti", "syntax", "error", "unknown section ':inti'"),
+]  # fmt: skip
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(("old", "new", "rule", "level", "says"), FAULTS, ids=lambda value: str(value)[:30])
+def test_a_fault_is_found_and_told(old, new, rule, level, says):
+    text, line = mutated(old, new)
+    finding = found(text, rule)
+    assert finding.level == level and finding.remedy and re.search(says, f"{finding.what} {finding.remedy}")
+    if new and rule not in ("not-placed", "placed-twice", "workspace") and finding.what.count("wooden") == 0:
+        assert abs(finding.line - line) <= 1  # the first line of what was replaced
+    assert str(finding).startswith(f"mine.bddl:{finding.line}: {level}: ")
+
+
+@pytest.mark.unit
+def test_every_undeclared_name_is_told_at_once():
+    text = SOUND.replace("(On plate_1 main", "(On plat_1 main").replace(GOAL, "(And (In bowl_9 nowhere))")
+    findings = [f for f in lint_text(text, "mine.bddl", starts=0) if f.rule == "unknown-name"]
+    assert [f.what.split()[0] for f in findings] == ["plat_1", "bowl_9", "nowhere"]
+    assert text.splitlines()[findings[0].line - 1].strip().startswith("(On plat_1")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("text", ["", "(define", "hello", "(define (problem p))", SOUND[:300], "\x00"])
+def test_what_is_no_task_has_one_error_and_a_line(text):
+    (finding,) = lint_text(text, "mine.bddl")
+    assert finding.level == "error" and finding.rule == "syntax" and finding.line >= 1
+
+
+@pytest.mark.unit
+def test_a_file_that_is_no_text_is_told(tmp_path):
+    path = tmp_path / "mine.bddl"
+    path.write_bytes(b"(define\n\xff)")
+    (finding,) = lint_file(path)
+    assert (finding.line, finding.rule) == (2, "syntax") and "UTF-8" in finding.remedy
+
+
+@pytest.mark.unit
+def test_a_file_named_by_something_else_than_its_instruction_is_noted(tmp_path):
+    path = tmp_path / "my_task.bddl"
+    path.write_text(SOUND)
+    (finding,) = [f for f in lint_file(path, starts=0) if f.rule == "language"]
+    assert finding.level == "info" and "'my task'" in finding.what
+
+
+@pytest.mark.unit
+def test_every_predicate_has_its_kinds():
+    assert set(PREDICATES) - set(KINDS) == {"True", "False"}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_the_texts_of_the_benchmark_have_neither_errors_nor_warnings(task):
+    findings = lint_task(task, starts=0)
+    assert [str(f) for f in findings if f.level != "info"] == []
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("category", WORKSPACES)
+def test_the_reach_is_a_ring_before_the_robot(category):
+    workspace = load_workspace(category)
+    near, far = reach(workspace)
+    assert 0.2 < near < 0.32 and 0.74 < far < 0.82 and far < stretched(workspace) < 1.0
+
+
+@pytest.mark.sim
+def test_the_figures_of_the_arm_are_those_of_its_model():
+    from libero_env import lint_scene
+
+    model = build_scene(get_task("libero_object/0").problem).model
+    data = mujoco.MjData(model)
+    data.qpos[:7] = [0, 0, 0, -lint_scene._BEND, 0, 1.0, 0]  # any bend of the elbow, by the law of cosines
+    mujoco.mj_kinematics(model, data)
+    shoulder, wrist, hand = data.xanchor[1], data.xanchor[5], data.xanchor[6]
+    assert shoulder[2] == pytest.approx(lint_scene._SHOULDER, abs=1e-3)
+    for angle in (-3.0718, -2.0, -1.0):
+        data.qpos[3] = angle
+        mujoco.mj_kinematics(model, data)
+        upper, forearm = lint_scene._UPPER, lint_scene._FOREARM
+        at_elbow = 2 * math.pi - (math.pi - math.atan2(0.0825, 0.316) - math.atan2(0.0825, 0.384) - angle)
+        expected = math.sqrt(upper**2 + forearm**2 - 2 * upper * forearm * math.cos(at_elbow))
+        assert np.linalg.norm(wrist - shoulder) == pytest.approx(expected, abs=1e-3)
+        if angle == -3.0718:
+            assert at_elbow == pytest.approx(lint_scene._BEND)
+    axis = data.xaxis[6]
+    offset = hand - wrist
+    assert np.linalg.norm(offset - axis * (axis @ offset)) == pytest.approx(lint_scene._WRIST_OUT, abs=1e-3)
+    grip = data.site_xpos[model.site("gripper0_grip_site").id]
+    assert abs(axis @ (grip - wrist)) == pytest.approx(lint_scene._HAND, abs=0.01)
+
+
+PLACES = [
+    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.7 -0.03 0.72 -0.01)", "off-table", "error", "not all on the table"),
+    ("(-0.09999999999999999 -0.01 -0.08 0.01)", "(0.44 -0.01 0.46 0.01)", "out-of-reach", "error", "m from the robot"),
+    ("(-0.09999999999999999 -0.01 -0.08 0.01)", "(0.0 0.48 0.2 0.58)", "out-of-reach", "warning", "m from the robot"),
+    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.4 0.5 0.42 0.52)", "out-of-reach", "info", "m from the robot"),
+    ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1))\n (lid (:target plate_1))",
+     "unused-region", "info", "plate_1_lid"),
+    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(-0.1 -0.01 -0.08 0.01)", "placement", "error", "still collide"),
+    (GOAL, "(And (Open plate_1))", "no-joint", "error", "no joint"),
+    (GOAL, "(And (Turnon wooden_cabinet_1_top_region))", "no-joint", "error", "'turnon'"),
+    (GOAL, "(And (On plate_1 main_table_plate_region))", "goal-at-start", "error", "5 of 5|3 of 3"),
+    (GOAL, "(And (On plate_1 main_table_plate_region) (Open wooden_cabinet_1_top_region))", "goal-at-start", "info",
+     "plate_region\\) holds from the beginning"),
+]  # fmt: skip
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(("old", "new", "rule", "level", "says"), PLACES, ids=lambda value: str(value)[:30])
+def test_a_fault_of_the_scene_is_found(old, new, rule, level, says):
+    text, _ = mutated(old, new)
+    hits = [f for f in lint_text(text, "mine.bddl", starts=3) if f.rule == rule and re.search(says, str(f))]
+    assert level in [f.level for f in hits], [str(f) for f in lint_text(text, "mine.bddl", starts=3)]
+
+
+@pytest.mark.sim
+def test_a_place_that_the_model_lacks_is_told_with_those_it_has():
+    text = SOUND.replace(
+        "(top_region (:target wooden_cabinet_1))", "(upper_region (:target wooden_cabinet_1))"
+    )
+    text = text.replace("wooden_cabinet_1_top_region", "wooden_cabinet_1_upper_region")
+    (finding,) = [f for f in lint_text(text, "mine.bddl", starts=1) if f.level == "error"]
+    assert finding.rule == "no-site" and "top_region" in finding.remedy
+    assert "(upper_region" in text.splitlines()[finding.line - 1]
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("key", ["libero_goal/3", "libero_object/0", "libero_90/86", "libero_spatial/5"])
+def test_tasks_of_the_benchmark_are_sound(key):
+    assert [str(f) for f in lint_task(get_task(key), starts=2) if f.level != "info"] == []
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_no_task_of_the_benchmark_has_an_error():
+    findings = [f for task in TASKS.values() for f in lint_task(task, starts=1)]
+    assert [str(f) for f in findings if f.level == "error"] == []
+    assert {f.rule for f in findings if f.level == "warning"} <= {"out-of-reach"}
+
+
+@pytest.mark.unit
+def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, capsys):
+    good, bad = tmp_path / "good.bddl", tmp_path / "bad.bddl"
+    good.write_text(SOUND)
+    bad.write_text(SOUND.replace("plate_1 - plate", "plate_1 - plat"))
+    assert cli.main(["tasks", "lint", str(good), "libero_object/0", "--starts", "0"]) == 0
+    assert "2 tasks: 0 errors, 0 warnings, " in capsys.readouterr().out
+    assert cli.main(["tasks", "lint", str(good), str(bad), "--starts", "0", "--level", "error"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and lines[0].startswith(f"{bad}:") and "[unknown-category]" in lines[0]
+    assert cli.main(["tasks", "lint", "libero_objet/1"]) == 2
+    assert cli.main(["tasks", "lint", str(tmp_path / "none.bddl")]) == 2
+
+
+@pytest.mark.unit
+def test_linting_texts_needs_no_torch():
+    code = "import sys, libero_env.lint, libero_env.certify; print('torch' in sys.modules, 'matplotlib' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["False", "False"]
