@@ -66,6 +66,7 @@ class MoveJoint:
         self._steps, self._still = 0, 0
         self._opening, self._value = 0.0, 0.0
         self._left: Pose | None = None  # where the hand let go
+        self._failed: list[Pose] = []  # holds of earlier attempts
 
     @property
     def steadiness(self) -> float:
@@ -114,13 +115,17 @@ class MoveJoint:
             else:
                 way = np.sign(delta) * (1.0 if grips else -1.0)
                 handle = find_handle(view, part, way)
-                hold = handle_hold(view, part, handle, delta, grips)
+                hold = handle_hold(view, part, handle, delta, grips, self._failed)
         except GraspError as error:
             self.trouble = str(error)
             return False
         self._part = part
-        self._around = surroundings(view, part.body, hold.held.pos)
-        self._hold = Hold(_within(part.pose(view), hold.ready), _within(part.pose(view), hold.held), hold.grips)
+        self._around = surroundings(view, part.body, hold.held.pos, view.scene.things)
+        frame = part.pose(view)
+        self._hold = Hold(
+            _within(frame, hold.ready), _within(frame, hold.held), frame.mat.T @ hold.back, hold.grips
+        )
+        self._failed.append(hold.ready)
         self._enter("reach")
         return True
 
@@ -138,6 +143,8 @@ class MoveJoint:
         threshold, end, width, way = self._limits(view)
         if self.state in ("open", "turnon"):
             return threshold + way * min(0.5 * width, 0.25)
+        if self.state == "turnoff":
+            return 0.5 * (threshold + end)
         stop = view.scene.model.jnt_range[part.joint][1 if way > 0 else 0]
         return float(max(end, stop) if way > 0 else min(end, stop))
 
@@ -163,21 +170,26 @@ class MoveJoint:
         self._enter("reach")
 
     def _reach(self, view: StateView) -> np.ndarray:
-        ready = self._part.pose(view)
-        goal = _placed(ready, self._hold.ready)
-        approach = goal.mat[:, 2]
+        frame = self._part.pose(view)
+        goal, way = _placed(frame, self._hold.ready), frame.mat @ self._hold.back
         error = goal.pos - view.eef_pos
-        aside = float(np.linalg.norm(error - (error @ approach) * approach))
+        aside = float(np.linalg.norm(error - (error @ way) * way))
+        away = float(np.linalg.norm(error))
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, goal.mat)))
-        if np.linalg.norm(error) < ARRIVED and turn < ARRIVED_TURN:
+        self._still = self._still + 1 if np.linalg.norm(self._velocity) < 0.01 and self._steps > 5 else 0
+        touching = self._still > 4 and away < 0.025 and turn < 2 * ARRIVED_TURN
+        if away < ARRIVED and turn < ARRIVED_TURN or touching:
             self._enter("close" if self._hold.grips else "move")
             return getattr(self, f"_{self.phase}")(view)
+        if self._still > 8:
+            return self._retreat(view)
         back = np.clip(self.style.slope * (aside - 0.006) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, BACK)
-        target = goal.pos - back * approach
+        target = goal.pos + back * way
         flat = float(np.linalg.norm((target - view.eef_pos)[:2]))
+        lateral = 1.0
         if flat > 0.08:
             target[2] = max(target[2], self._in_the_way(view, target) + 0.04 + TIP_BELOW)
-        lateral = np.clip(1.0 - (target[2] - view.eef_pos[2] - 0.03) / 0.05, 0.0, 1.0) if flat > 0.08 else 1.0
+            lateral = np.clip(1.0 - (target[2] - view.eef_pos[2] - 0.03) / 0.05, 0.0, 1.0)
         return self._toward(view, target, goal.mat, OPEN if self._hold.grips else CLOSE, lateral)
 
     def _close(self, view: StateView) -> np.ndarray:
@@ -197,16 +209,19 @@ class MoveJoint:
         part, value = self._part, self._part.value(view)
         left = self._goal(view, part) - value
         hold = _placed(part.pose(view), self._hold.held)
-        slip = view.eef_pos - hold.pos
-        there = abs(left) < (0.003 if part.slides else 0.03) or self._moved(view)
-        if there:
+        anchor, axis = part.axis(view)
+        arm = 1.0 if part.slides else max(float(np.linalg.norm(np.cross(hold.pos - anchor, axis))), 0.03)
+        slow = abs(value - self._value) * arm < 5e-4
+        self._value = value
+        self._still = self._still + 1 if slow and self._steps > 5 else 0
+        if self._moved(view) and (slow or self.state in ("open", "turnon")) or self._still > 25:
             self._enter("release")
             return self._release(view)
-        if self._hold.grips and np.linalg.norm(slip) > SLIPPED:
+        if self._hold.grips and np.linalg.norm(view.eef_pos - hold.pos) > SLIPPED:
             return self._retreat(view)
-        arm = 1.0 if part.slides else max(np.linalg.norm(np.cross(hold.pos - part.axis(view)[0], part.axis(view)[1])), 0.02)
         lead = min(LEAD / arm, 0.5)
-        ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
+        extra = 0.02 if self.state == "turnoff" else 0.5 * lead  # beyond it, as the hand gives way
+        ahead = np.sign(left) * min(abs(left) + extra, lead)
         goal = part.moved(view, hold, ahead)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
 
@@ -219,10 +234,8 @@ class MoveJoint:
         return self._toward(view, self._left.pos, self._left.mat, OPEN)
 
     def _withdraw(self, view: StateView) -> np.ndarray:
-        left = self._left
-        back = -left.mat[:, 2]
-        away = float((view.eef_pos - left.pos) @ back)
-        if away > AWAY:
+        left, back = self._left, self._part.pose(view).mat @ self._hold.back
+        if (view.eef_pos - left.pos) @ back > AWAY or self._steps > 25:
             self._enter("rest")
             if not self._moved(view):
                 self._again()
@@ -231,8 +244,8 @@ class MoveJoint:
 
     def _retreat(self, view: StateView) -> np.ndarray:
         """Let go, withdraw, and begin again."""
-        self._left = None
         self._enter("release")
+        self._left = None
         return self._release(view)
 
     def _rest(self, view: StateView) -> np.ndarray:

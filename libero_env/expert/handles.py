@@ -1,6 +1,6 @@
 """Parts that a joint moves, where to take hold of them, and where to push them; all from the model."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -19,12 +19,13 @@ OPEN_HALF = 0.04  # m, of an open finger from the middle
 TIP = 0.0145  # m, thickness of a finger at its tip, which reaches TIP_BELOW beyond the grip site
 TIP_BELOW = 0.0095
 _WIDENS = 0.41  # m of thickness for each m further up
-_NEAR = 0.45  # m, around the handle: what lies further away is not looked at
+_NEAR = 0.35  # m, around the handle: what lies further away is not looked at
 _BEHIND = 0.008  # m without points: the space behind a handle's bar
 _TILTS = np.radians([90, 75, 65, 55, 45, 35, 25])  # of the approach below the horizontal
+_ROLLS = (0.0, 0.8, -0.8)  # rad, of the fingers from across a level bar
 _ASIDE = (0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026)  # m, of the open hand from the middle of the bar
 _FORTH = (0.0, -0.005)  # m, of the grip site beyond the middle of the bar
-_SPARE = 0.003  # m, around the hand
+_SPARE = 0.002  # m, around the hand
 _BASE_X = -0.66  # m, of the arm's base; it decides how far the wrist is turned
 _WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
 
@@ -74,14 +75,16 @@ class Handle:
     half: float  # m, half its length
     depth: float  # m, of the bar along `out`
     points: np.ndarray  # (N, 3) on it
+    part: np.ndarray  # (M, 3) on all of the part
 
 
 @dataclass(frozen=True)
 class Hold:
     """Poses of the grip site to take hold, or to begin to push."""
 
-    ready: Pose  # fingers around the handle and not yet closed, or in front of it
+    ready: Pose  # fingers around the handle and not yet closed, or just in front of it
     held: Pose
+    back: np.ndarray  # (3,) unit, where the hand comes from and withdraws to
     grips: bool
 
 
@@ -108,7 +111,7 @@ def find_handle(view: StateView, part: Part, way: float) -> Handle:
     depth = float(depths[gaps[0]]) if len(gaps) else min(float(depths[-1]), 0.02)
     mask = (front > front.max() - depth - 0.002) & (np.abs((points - middle) @ across) < 0.5 * min(spans) + 0.012)
     middle = middle + out * (front.max() - middle @ out - 0.5 * depth)
-    return Handle(middle, along, out, 0.5 * max(spans), depth, points[mask])
+    return Handle(middle, along, out, 0.5 * max(spans), depth, points[mask], points)
 
 
 def opening_direction(view: StateView, part: Part, way: float, points: np.ndarray) -> np.ndarray:
@@ -141,36 +144,54 @@ def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
     """
     cloud = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.004))
     high = cloud[cloud[:, 2] > cloud[:, 2].max() - 0.03]
-    around = surroundings(view, part.body, cloud.mean(axis=0))
+    around = surroundings(view, part.body, cloud.mean(axis=0), view.scene.things)
     grasp = choose_grasp(high, around, cloud[:, 2].min(), finger_axis(view.eef_mat), "knob")
     mats = [downward(grasp.yaw, sign * np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0])) for sign in (1, -1)]
     poses = [Pose(grasp.pos_world, mat) for mat in mats]
     best = min(poses, key=lambda pose: strain(pose) ** 2 + strain(part.moved(view, pose, delta)) ** 2)
-    return Hold(best, best, True)
+    return Hold(best, best, UP, True)
 
 
-def handle_hold(view: StateView, part: Part, handle: Handle, delta: float, grips: bool) -> Hold:
+def handle_hold(
+    view: StateView, part: Part, handle: Handle, delta: float, grips: bool, failed: Sequence[Pose] = ()
+) -> Hold:
     """How to take a handle, or to push against it, in order to move the joint by `delta`, m or rad.
 
     Of all approaches it is the one that keeps the hand out of everything, with little turning of the hand.
 
+    Args:
+        view: the state.
+        part: what moves.
+        handle: of the part.
+        delta: of the joint, m or rad.
+        grips: take the handle between the fingers, or push it with closed ones.
+        failed: grip site's poses that did not work before.
+
     Raises:
-        GraspError: the handle is thicker than the fingers take, or there is no room for them anywhere.
+        GraspError: the handle is thicker than the fingers take.
     """
-    fixed = surroundings(view, part.body, handle.pos)
-    own = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.008))
-    free = np.array([np.abs(handle.points - p).max(axis=1).min() for p in own]) > 0.004 if len(own) else []
-    floor = view.scene.workspace.surface_height
-    best: tuple[float, Hold] | None = None
+    fixed = surroundings(view, part.body, handle.pos, view.scene.fixtures)
+    loose = surroundings(view, part.body, handle.pos, view.scene.objects)
+    own, floor = handle.part[::2], view.scene.workspace.surface_height
+    ranked = []
     for cost, hold in _candidates(handle, grips):
-        depth = crowding(own[free] if grips else own, hold.ready, grips)
-        for share in (0.0, 0.5, 1.0):
-            pose = part.moved(view, hold.ready, share * delta)
-            depth = max(depth, crowding(fixed, pose, grips), under(floor, pose, grips))
-        for pose in (hold.ready, part.moved(view, hold.held, delta)):
-            cost += 0.12 * strain(pose) ** 2
+        cost += sum(0.12 * strain(pose) ** 2 for pose in (hold.ready, part.moved(view, hold.held, delta)))
         cost += 0.1 * float(np.linalg.norm(rotation_between(view.eef_mat, hold.ready.mat)))
-        cost += 60.0 * depth + 0.5 * (depth > 0.002)
+        cost += sum(0.5 * _alike(hold.ready, pose) for pose in failed)
+        ranked.append((cost, hold))
+    best: tuple[float, Hold] | None = None
+    for cost, hold in sorted(ranked, key=lambda pair: pair[0]):
+        if best is not None and cost >= best[0]:
+            break
+        ready = hold.ready
+        here = np.concatenate([own, fixed, loose])
+        depth = max(crowding(here, ready, grips), under(floor, ready, grips))
+        for back in (0.03, 0.07):
+            depth = max(depth, crowding(here, Pose(ready.pos + back * hold.back, ready.mat), grips))
+        for share in (0.5, 1.0):
+            pose = part.moved(view, hold.held, share * delta)
+            depth = max(depth, crowding(fixed, pose, False), under(floor, pose, False))
+        cost += 60.0 * depth + 0.4 * (depth > 0.002)
         if best is None or cost < best[0]:
             best = cost, hold
     if best is None:
@@ -178,31 +199,58 @@ def handle_hold(view: StateView, part: Part, handle: Handle, delta: float, grips
     return best[1]
 
 
+def _alike(pose: Pose, other: Pose) -> bool:
+    return bool(np.linalg.norm(pose.pos - other.pos) < 0.012 and np.trace(pose.mat.T @ other.mat) > 2.9)
+
+
 def _candidates(handle: Handle, grips: bool) -> Iterator[tuple[float, Hold]]:
     """(cost, hold) for each approach, what is around not yet considered."""
     upright = abs(handle.along[2]) > 0.7
-    reach = max(handle.half - 0.012, 0.0)
-    shifts = (reach, 0.5 * reach, 0.0, -0.5 * reach) if upright else (0.0, 0.4 * reach, -0.4 * reach)
-    for tilt, shift, sign in product(_TILTS, shifts, (1.0, -1.0)):
+    for tilt, roll, sign in product(_TILTS, (0.0,) if upright else _ROLLS, (1.0, -1.0)):
         approach = -np.cos(tilt) * handle.out - np.sin(tilt) * UP
-        fingers = sign * np.cross(handle.along, -handle.out if upright else approach)
+        fingers = np.cross(handle.along, -handle.out if upright else approach)
+        fingers = sign * (np.cos(roll) * fingers + np.sin(roll) * handle.along)
         mat = np.column_stack([fingers, np.cross(approach, fingers), approach])
+        for cost, hold in (_grips if grips else _pushes)(handle, mat):
+            yield cost + 0.3 * abs(roll), hold
+
+
+def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
+    fingers, across, approach = mat.T
+    upright = abs(handle.along[2]) > 0.7
+    reach = max(handle.half - 0.012, 0.0)
+    for shift in (reach, 0.5 * reach, 0.0, -0.5 * reach) if upright else (0.0, 0.3 * reach, -0.3 * reach):
         pos = handle.pos + shift * handle.along
-        away = 0.5 * abs(shift)
-        if not grips:
-            thick = TIP if not upright else FINGER_HALF_WIDTH
-            before = 0.5 * handle.depth + 0.012 + thick * np.sin(tilt) + TIP_BELOW * np.cos(tilt)
-            ready = Pose(pos + before * handle.out, mat)
-            yield away + 0.2 * abs(tilt - np.radians(65)), Hold(ready, ready, False)
-            continue
-        width = float(np.ptp(handle.points[np.abs((handle.points - pos) @ handle.along) < 0.01] @ fingers))
+        strip = handle.points[np.abs((handle.points - pos) @ across) < 0.01] @ fingers
+        width = float(np.ptp(strip)) if len(strip) else 1.0
         if width > TAKES:
             continue
-        for aside, forth in product(_ASIDE, _FORTH):
-            if abs(aside) + 0.5 * width + 0.004 < OPEN_HALF:
+        backs = {0.0: -approach, 0.02: handle.out}
+        for aside, forth, (extra, back) in product(_ASIDE, _FORTH, backs.items()):
+            if abs(aside) + 0.5 * width + 0.003 < OPEN_HALF:
                 held = Pose(pos + forth * approach, mat)
                 ready = Pose(held.pos + aside * fingers, mat)
-                yield away + 2.0 * abs(aside) + 4.0 * abs(forth), Hold(ready, held, True)
+                yield 0.5 * abs(shift) + 2.0 * abs(aside) + 4.0 * abs(forth) + extra, Hold(ready, held, back, True)
+
+
+def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
+    """Closed fingers against the bar, or against the front beside it."""
+    fingers, across, approach = mat.T
+    offset = handle.part - handle.pos
+    beside = np.cross(handle.along, handle.out)
+    tip = np.array([s * TIP * fingers + t * FINGER_HALF_WIDTH * across + TIP_BELOW * approach
+                    for s in (1, -1) for t in (1, -1)])  # fmt: skip
+    forward = float((-tip @ handle.out).max())
+    low, high = (offset @ handle.along).min() + 0.02, (offset @ handle.along).max() - 0.02
+    for shift in sorted({0.0, *np.linspace(low, high, 7)}, key=abs):
+        near = (np.abs(offset @ handle.along - shift) < 0.012) & (np.abs(offset @ beside) < 0.012)
+        if not near.any():
+            continue
+        front = float((offset[near] @ handle.out).max())
+        pos = handle.pos + shift * handle.along + (front + forward + 0.004) * handle.out
+        tilt = np.arcsin(np.clip(-approach[2], -1, 1))
+        hold = Pose(pos, mat)
+        yield 0.5 * abs(shift) + 0.2 * abs(tilt - np.radians(65)), Hold(hold, hold, -approach, False)
 
 
 def crowding(points: np.ndarray, pose: Pose, opened: bool) -> float:
@@ -234,10 +282,12 @@ def strain(pose: Pose) -> float:
     return float(np.linalg.norm(rotation_between(neutral, pose.mat)))
 
 
-def surroundings(view: StateView, body: int, centre: np.ndarray, spacing: float = 0.012) -> np.ndarray:
-    """Points near `centre` on all objects and fixtures but one body of them, world frame, (N, 3)."""
+def surroundings(
+    view: StateView, body: int, centre: np.ndarray, names: Iterable[str], spacing: float = 0.012
+) -> np.ndarray:
+    """Points near `centre` on objects and fixtures but one body of them, world frame, (N, 3)."""
     model, clouds = view.scene.model, [np.zeros((0, 3))]
-    for name in view.scene.things:
+    for name in names:
         for b in view.scene.bodies[name]:
             if b != body:
                 clouds.append(_body_pose(view, int(b)).apply(_own_points(model, int(b), spacing)))
