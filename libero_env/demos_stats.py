@@ -1,0 +1,62 @@
+"""Statistics that add up over episodes: of numbers, and of the colours of pictures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+_NAMES = tuple(f"q{round(100 * q):02d}" for q in QUANTILES)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Statistics of numbers, over the first axis."""
+
+    samples: tuple[np.ndarray, ...]  # each (N, D) float64
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> "Moments":
+        """Of values (N,) or (N, D)."""
+        return cls((values.reshape(len(values), -1).astype(np.float64),))
+
+    def __add__(self, other: "Moments") -> "Moments":
+        return Moments(self.samples + other.samples)
+
+    def values(self) -> dict[str, list]:
+        """Name -> D numbers; `count` is one."""
+        x = np.concatenate(self.samples)
+        found = {"min": x.min(axis=0), "max": x.max(axis=0), "mean": x.mean(axis=0), "std": x.std(axis=0)}
+        found |= dict(zip(_NAMES, np.quantile(x, QUANTILES, axis=0), strict=True))
+        return {**{key: value.tolist() for key, value in found.items()}, "count": [len(x)]}
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How often each channel of pictures has each of the 256 values, which says all there is to say, exactly."""
+
+    counts: np.ndarray  # (3, 256) int64
+    frames: int
+
+    @classmethod
+    def of(cls, frames: np.ndarray) -> "Histogram":
+        """Of frames (T, H, W, 3) uint8."""
+        counts = [np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)]
+        return cls(np.array(counts, np.int64), len(frames))
+
+    def __add__(self, other: "Histogram") -> "Histogram":
+        return Histogram(self.counts + other.counts, self.frames + other.frames)
+
+    def values(self) -> dict[str, list]:
+        """Name -> (3, 1, 1) nested, colours in [0, 1]; `count` is the number of frames."""
+        levels, total = np.arange(256) / 255.0, self.counts.sum(axis=1)
+        below = np.cumsum(self.counts, axis=1)
+        mean = self.counts @ levels / total
+        std = np.sqrt(np.maximum(self.counts @ levels**2 / total - mean**2, 0.0))
+        found = {"min": levels[(self.counts > 0).argmax(axis=1)], "mean": mean, "std": std}
+        found["max"] = levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)]
+        for name, q in zip(_NAMES, QUANTILES, strict=True):
+            found[name] = levels[(below >= q * total[:, None]).argmax(axis=1)]
+        return {
+            **{key: value.reshape(3, 1, 1).tolist() for key, value in found.items()},
+            "count": [self.frames],
+        }
