@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 
 from libero_env.arena import Workspace
-from libero_env.assets import Pack
+from libero_env.assets import BUILTIN, Pack
+from libero_env.env import CONTROL_HZ
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.init_states import load_init_states, settle, split_row, start_faults
 from libero_env.lint_report import Report, spell
@@ -166,16 +167,19 @@ def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
 def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None:
     """Some starts: they can be made, they rest, their atoms hold, and the goal does not."""
     simulations = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies.tolist())
-    view, faults, made = StateView(scene, simulations), Counter[tuple[str, str]](), 0
+    view, faults, looked = StateView(scene, simulations), Counter[tuple[str, str]](), False
     try:
-        for start in _starts(task, scene, simulations, starts, faults):
-            made += 1
-            simulations.reset([0], start[0][None], np.zeros((1, scene.model.nv)), fixtures=start[1][None])
+        for i in range(starts):
+            try:
+                _put_start(task, scene, simulations, i, faults)
+            except PlacementError as error:
+                faults["placement", str(error)] += 1
+                continue
             faults.update(("start", fault) for fault in start_faults(view))
-            if made == 1:
+            if not looked:
                 _check_parts(report, scene, view)
                 _check_goal_reach(report, scene, view)
-            faults.update(("unstable-start", name) for name in _moving(scene, simulations, view))
+            looked = True
     except LiberoError as error:
         report.error(report.lines.section(":init"), "start", str(error), "mend what it names")
     finally:
@@ -184,24 +188,32 @@ def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None
         _tell_start(report, scene, rule, what, count, starts)
 
 
-def _starts(
-    task: Task, scene: Scene, simulations: LoopSimulations, count: int, faults: Counter[tuple[str, str]]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Positions (nq,) and poses of fixtures (n, 7): stored ones of the suites, newly drawn ones of a file."""
-    if task.suite != "file":
-        qpos, _, fixtures = split_row(scene.model, load_init_states(task, scene)[:count])
-        yield from zip(qpos, fixtures, strict=True)
-        return
-    for i in range(count):
-        try:
-            start = sample_start(scene, np.random.default_rng(i))
-            yield settle(simulations, 0, start.qpos, scene.nq_robot, start.fixtures), start.fixtures
-        except PlacementError as error:
-            faults["placement", str(error)] += 1
+def _put_start(
+    task: Task, scene: Scene, simulations: LoopSimulations, i: int, faults: Counter[tuple[str, str]]
+) -> None:
+    """Put start i into the simulation: a stored one of a suite's task, else a newly drawn one after it came to rest.
+
+    Counts the objects that move while it waits as it was first put.
+
+    Raises:
+        PlacementError: it cannot be drawn, or does not come to rest.
+    """
+    stored, still = task.suite != "file" and scene.pack.name == BUILTIN, np.zeros((1, scene.model.nv))
+    if stored:
+        qpos, _, (fixtures,) = split_row(scene.model, load_init_states(task, scene)[i : i + 1])
+    else:
+        start = sample_start(scene, np.random.default_rng(i))
+        qpos, fixtures = start.qpos[None], start.fixtures
+    simulations.reset([0], qpos, still, fixtures=fixtures[None])
+    faults.update(("unstable-start", name) for name in _moving(scene, simulations))
+    if not stored:
+        qpos = settle(simulations, 0, qpos[0], scene.nq_robot, fixtures)[None]
+    simulations.reset([0], qpos, still, fixtures=fixtures[None])
 
 
-def _moving(scene: Scene, simulations: LoopSimulations, view: StateView) -> list[str]:
+def _moving(scene: Scene, simulations: LoopSimulations) -> list[str]:
     """Objects that move while the arm waits."""
+    view = StateView(scene, simulations)
     before = {name: view.body_pos(name) for name in scene.objects}
     for _ in range(_IDLE):
         simulations.step([0], np.zeros((1, 7)))
@@ -209,26 +221,23 @@ def _moving(scene: Scene, simulations: LoopSimulations, view: StateView) -> list
 
 
 def _tell_start(report: Report, scene: Scene, rule: str, what: str, count: int, starts: int) -> None:
-    often = f"in {count} of {starts} starts"
+    """One fault of the starts: an error where all have it; they are drawn again where some have."""
     tell = report.error if count == starts else report.warning
-    atoms = {spell(atom): line for atom, line in zip(scene.problem.init, report.lines.init, strict=True)}
-    line = next((at for text, at in atoms.items() if text in what), report.lines.section(":init"))
+    atoms = list(zip(scene.problem.init, report.lines.init, strict=True))
+    line = next((at for atom, at in atoms if spell(atom) in what), report.lines.section(":init"))
     if rule == "unstable-start":
-        what = f"{what} moves by more than {1000 * _MOVED:.0f} mm while nothing happens"
-        line = next((at for text, at in atoms.items() if what.split()[0] in text), line)
-        remedy = "place it on something flat that it is not too large for"
+        tell = report.warning
+        line = next((at for atom, at in atoms if atom.args[0] == what), line)
+        what = f"{what} moves by more than {1000 * _MOVED:.0f} mm in the first {_IDLE / CONTROL_HZ:g} s"
+        remedy = "place it where it is flat and wide enough to carry it"
     elif rule == "placement":
-        remedy = "do what it says, or move the regions apart"
+        remedy = "do what it says"
     elif "goal" in what:
-        line, rule, remedy = (
-            report.lines.section(":goal"),
-            "goal-at-start",
-            "start from where something is to be done",
-        )
-        tell = report.error
+        tell, rule, line = report.error, "goal-at-start", report.lines.section(":goal")
+        remedy = "start from where something is left to do"
     else:
         remedy = "place it where it stays, or leave the atom out"
-    tell(line, rule, f"{what}, {often}", remedy)
+    tell(line, rule, f"{what}, in {count} of {starts} starts", remedy)
 
 
 def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
