@@ -29,7 +29,7 @@ def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -
 
     Bodies below that are moved by joints of their own are taken where the model has them.
     """
-    clouds = [np.zeros((0, 3))]
+    clouds = []
     poses = {body: (np.zeros(3), np.eye(3))}
     for b in range(body, model.nbody):
         if b != body:
@@ -39,12 +39,17 @@ def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -
             local = _matrix(model.body_quat[b])
             poses[b] = (parent[0] + parent[1] @ model.body_pos[b], parent[1] @ local)
         pos, mat = poses[b]
-        for g in np.flatnonzero(model.geom_bodyid == b):
-            if model.geom_contype[g] or model.geom_conaffinity[g]:
-                points = (
-                    _geom_points(model, int(g), spacing) @ _matrix(model.geom_quat[g]).T + model.geom_pos[g]
-                )
-                clouds.append(points @ mat.T + pos)
+        clouds.append(body_points(model, b, spacing) @ mat.T + pos)
+    return np.concatenate(clouds)
+
+
+def body_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -> np.ndarray:
+    """Points on the collision geoms of one body alone, in its frame; (N, 3), m."""
+    clouds = [np.zeros((0, 3))]
+    for g in np.flatnonzero(model.geom_bodyid == body):
+        if model.geom_contype[g] or model.geom_conaffinity[g]:
+            points = _geom_points(model, int(g), spacing)
+            clouds.append(points @ _matrix(model.geom_quat[g]).T + model.geom_pos[g])
     return np.concatenate(clouds)
 
 

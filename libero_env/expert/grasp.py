@@ -1,4 +1,4 @@
-"""Where to take hold of something: a top-down grasp chosen from the shape of the body alone."""
+"""Where to take hold of something: around it, or by a wall that leaves room for a finger on either side."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.errors import LiberoError
+from libero_env.expert.motion import downward
 
 # The Panda gripper, measured from the grip site along the fingers, m.
 MAX_OPENING = 0.08
@@ -19,6 +20,10 @@ HAND_HALF_LENGTH, HAND_HALF_WIDTH = 0.105, 0.035  # of the palm, along and acros
 _YAWS = 18
 _HEIGHTS = 4
 _SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03)  # of the hold along the jaws, m
+WALL = 0.5  # cost of a hold by a wall, over one around the whole body
+_WALL_STEP = 0.012  # m between such holds
+_THICKEST = 0.045  # m, of a wall
+_TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
 _SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
 
 
@@ -28,60 +33,82 @@ class GraspError(LiberoError):
 
 @dataclass(frozen=True)
 class Grasp:
-    """The fingers close along `yaw` (rad, from the world's x axis, modulo pi) around `pos_world` (3,), m."""
+    """The hand at `pos_world` (3,), m, turned by `mat` (3, 3), closes on something `width` m thick."""
 
     pos_world: np.ndarray
-    yaw: float
+    mat: np.ndarray
     width: float  # m between the fingers
+    cost: float  # of the hold alone
+
+    @property
+    def yaw(self) -> float:
+        """Direction in which the fingers close over the ground, rad from the world's x axis, modulo pi."""
+        return float(np.arctan2(self.mat[1, 0], self.mat[0, 0]))
+
+
+def grasps(
+    cloud: np.ndarray, floor: float, finger_axis: np.ndarray, *, tilt: np.ndarray | None = None, name: str = "body"
+) -> list[Grasp]:
+    """All holds from one side, the best first; the same input gives the same list.
+
+    Feasible is what fits between the open fingers, is not too low for the finger tips nor too high for the palm. The
+    order prefers little turning of the hand, a narrow hold (a wide one forgives no error), and a height near the
+    middle of the body. Walls, such as the rim of a bowl, come after holds around the whole body.
+
+    Args:
+        cloud: points on the body, world frame, (N, 3).
+        floor: height of what the body stands on, m.
+        finger_axis: direction in which the fingers open now, world frame, (3,).
+        tilt: rotation (3, 3) from straight down to the direction of the approach; None for straight down.
+        name: for messages.
+
+    Raises:
+        GraspError: nothing is narrow enough.
+    """
+    turn = np.eye(3) if tilt is None else tilt
+    points = cloud @ turn
+    axis = finger_axis @ turn
+    now = float(np.arctan2(axis[1], axis[0]))
+    low = floor if tilt is None else -np.inf
+    narrowest, found = np.inf, []
+    for cost, pos, yaw, width in _candidates(points, low, now):
+        narrowest = min(narrowest, width)
+        if width <= WIDEST:
+            found.append(Grasp(turn @ pos, turn @ downward(yaw, axis), width, cost))
+    if not found:
+        raise GraspError(
+            f"{name} cannot be grasped from above: its narrowest part is {100 * narrowest:.1f} cm wide, "
+            f"the gripper opens {100 * MAX_OPENING:.0f} cm and takes {100 * WIDEST:.1f} cm"
+        )
+    return sorted(found, key=lambda grasp: grasp.cost)
 
 
 def choose_grasp(
     cloud: np.ndarray, obstacles: np.ndarray, floor: float, finger_axis: np.ndarray, name: str = "body"
 ) -> Grasp:
-    """The best top-down grasp; the same input gives the same grasp.
-
-    Feasible is what fits between the open fingers, is not too low for the finger tips nor too high for the palm, and
-    keeps fingers and palm out of the obstacles. Among those the choice is for little turning of the hand, a narrow
-    hold (a wide one forgives no error), and a height near the middle of the body.
-
-    Args:
-        cloud: points on the body, world frame, (N, 3).
-        obstacles: points on everything else, world frame, (M, 3).
-        floor: height of what the body stands on, m.
-        finger_axis: direction in which the fingers open now, world frame, (3,).
-        name: for messages.
+    """The best hold from straight above that keeps fingers and palm out of the obstacles (M, 3); else as `grasps`.
 
     Raises:
-        GraspError: no grasp is feasible.
+        GraspError: nothing is narrow enough.
     """
-    now = np.arctan2(finger_axis[1], finger_axis[0])
-    candidates = sorted(_candidates(cloud, floor, now), key=lambda candidate: candidate[0])
     best: tuple[float, Grasp] | None = None
-    for cost, grasp in candidates:
-        if grasp.width > WIDEST:
-            continue
-        if best is not None and cost >= best[0]:
+    for grasp in grasps(cloud, floor, finger_axis, name=name):
+        if best is not None and grasp.cost >= best[0]:
             break
         crowd = _crowding(obstacles, grasp)
-        cost += 20.0 * crowd + 0.3 * (crowd > 0)
+        cost = grasp.cost + 20.0 * crowd + 0.3 * (crowd > 0)
         if best is None or cost < best[0]:
             best = cost, grasp
-    if best is None:
-        narrowest = min((grasp.width for _, grasp in candidates), default=np.inf)
-        raise GraspError(
-            f"{name} cannot be grasped from above: its narrowest part is {100 * narrowest:.1f} cm wide, "
-            f"the gripper opens {100 * MAX_OPENING:.0f} cm and takes {100 * WIDEST:.1f} cm"
-        )
+    assert best is not None
     return best[1]
 
 
-def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[float, Grasp]]:
-    """(cost, grasp) of all holds within reach of fingers and palm, obstacles not yet considered."""
+def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[float, np.ndarray, float, float]]:
+    """(cost, position, yaw, width) of all holds within reach of fingers and palm."""
     bottom, top = cloud[:, 2].min(), cloud[:, 2].max()
     lowest = max(floor + TIP_BELOW + 0.004, top - PALM_ABOVE)
     for height in np.linspace(lowest, max(lowest, top - 0.006), _HEIGHTS):
-        slab = cloud[(cloud[:, 2] > height - PAD_BELOW) & (cloud[:, 2] < height + PAD_ABOVE), :2]
-        slab = np.unique(np.round(slab, 3), axis=0)
+        slab = _slab(cloud, height - PAD_BELOW, height + PAD_ABOVE)
         if len(slab) < 4:
             continue
         aligned = _aligned_yaws(slab, now)
@@ -89,10 +116,57 @@ def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[f
         for yaw in aligned + [now + np.pi * k / _YAWS for k in range(_YAWS)]:
             askew = min((_turn(yaw, other) for other in aligned), default=0.0)
             for center, width, shift in _holds(slab, yaw):
-                cost = (
-                    0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
-                )
-                yield cost, Grasp(np.array([*center, height]), float(yaw), width)
+                cost = 0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                yield cost, np.array([*center, height]), float(yaw), width
+        column = _slab(cloud, height - TIP_BELOW, np.inf)
+        for yaw in [now + np.pi * k / _YAWS for k in range(_YAWS)]:
+            for center, width, badness in _walls(slab, column, yaw):
+                deep = 6.0 * max(top - height - 0.016, 0.0) + 20.0 * max(0.012 - top + height, 0.0)
+                cost = WALL + 0.25 * _turn(yaw, now) + badness + deep
+                yield cost, np.array([*center, height]), float(yaw), width
+
+
+def _slab(cloud: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Ground plan (N, 2) of what lies between two heights."""
+    return np.unique(np.round(cloud[(cloud[:, 2] > low) & (cloud[:, 2] < high), :2], 3), axis=0)
+
+
+def _walls(slab: np.ndarray, column: np.ndarray, yaw: float) -> Iterator[tuple[np.ndarray, float, float]]:
+    """(centre (2,), thickness, badness) of walls across the fingers with room for both of them.
+
+    Args:
+        slab: what the pads would touch, (N, 2).
+        column: what is beside fingers that reach down to the hold, (M, 2).
+        yaw: of the fingers.
+    """
+    along, across = _axes(yaw)
+    u, v = slab @ along, slab @ across
+    column_u, column_v = column @ along, column @ across
+    for middle in np.arange(v.min() + 0.01, v.max() - 0.009, _WALL_STEP):
+        strip = np.abs(v - middle) < FINGER_HALF_WIDTH
+        beside = np.sort(column_u[np.abs(column_v - middle) < FINGER_HALF_WIDTH + 0.003])
+        if strip.sum() < 2:
+            continue
+        inner = np.sort(u[strip])
+        for wall in np.split(inner, np.flatnonzero(np.diff(inner) > 0.012) + 1):
+            width = float(wall[-1] - wall[0])
+            if width > _THICKEST or len(wall) < 2:
+                continue
+            own = strip & (u >= wall[0]) & (u <= wall[-1])
+            slope = float(np.polyfit(v[own] - middle, u[own], 1)[0]) if np.ptp(v[own]) > 0.008 else 0.0
+            side = 0.5 * (MAX_OPENING - width) - _SPARE
+            for aside in (0.0, 0.5 * side, -0.5 * side, side, -side):
+                center = 0.5 * (wall[0] + wall[-1]) + aside
+                if _room(beside, center, wall[0] - 0.008, wall[-1] + 0.008):
+                    yield center * along + middle * across, width, 3.0 * abs(aside) + abs(slope) + 2.0 * width
+                    break
+
+
+def _room(beside: np.ndarray, center: float, low: float, high: float) -> bool:
+    """Whether open fingers around `center` meet nothing, and hold between them only what is in [low, high]."""
+    reach = 0.5 * MAX_OPENING + _TIP_THICKNESS
+    near = beside[np.abs(beside - center) < reach]
+    return bool(((near > low) & (near < high)).all())
 
 
 def _turn(yaw: float, other: float) -> float:

@@ -1,16 +1,20 @@
-"""From a goal to the skills that reach it, and the shapes they need to know."""
+"""From a goal and a state to the next thing to do."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.expert.geometry import Pose, surface_points
-from libero_env.predicates import StateView, atoms_of
-from libero_env.problem import Expression
+from libero_env.expert.shapes import Shapes, pose_of
+from libero_env.predicates import StateView, _boxes, _inside, evaluate
+from libero_env.problem import And, Atom, Expression, ForAll, Not, Or
 from libero_env.scene import Scene
+
+__all__ = ["Shapes", "Step", "UnsupportedGoalError", "plan_goal", "pose_of"]
+
+JOINT_STATES = {"Open": "open", "Close": "close", "Turnon": "turnon", "Turnoff": "turnoff"}
+PLACES = ("On", "In", "Stack")
+OPPOSITES = {"Open": "Close", "Close": "Open", "Turnon": "Turnoff", "Turnoff": "Turnon"}
 
 
 class UnsupportedGoalError(LiberoError):
@@ -18,78 +22,123 @@ class UnsupportedGoalError(LiberoError):
 
 
 @dataclass(frozen=True)
-class PickPlace:
-    """Take an object and put it into a region (the site of a container)."""
+class Step:
+    """One skill's work: an atom to make true."""
 
-    thing: str
-    site: str
-    container: str
+    atom: Atom
+    share: tuple[int, int] = (0, 1)  # which of how many things that go to the same place
 
 
-def plan_goal(goal: Expression, scene: Scene) -> tuple[PickPlace, ...]:
-    """The skills for a goal, one for each of its atoms.
+def plan_goal(goal: Expression, view: StateView) -> tuple[Step, ...]:
+    """The steps that are left, in the order in which they are safe; empty where the goal holds.
+
+    First what is to be closed and receives nothing is closed, so that it is not in the way; then joints are turned and
+    opened, those that a place or an object needs included; then things are put, what carries before what it carries;
+    then what received something is closed.
 
     Raises:
-        UnsupportedGoalError: an atom other than (In object site-of-an-object).
+        UnsupportedGoalError: an atom that no skill reaches.
     """
-    skills = []
-    for atom in atoms_of(goal):
-        container = _container(atom.args[-1], scene) if len(atom.args) == 2 else None
-        if atom.predicate != "In" or container is None or atom.args[0] not in scene.objects:
-            text = f"({atom.predicate} {' '.join(atom.args)})"
-            raise UnsupportedGoalError(
-                f"no skill reaches {text}; there is one for (In OBJECT SITE_OF_A_CONTAINER)"
-            )
-        skills.append(PickPlace(atom.args[0], atom.args[1], container))
-    return tuple(skills)
+    scene = view.scene
+    atoms = _wanted(goal, view)
+    for atom in atoms:
+        _check(atom, scene)
+    places = [atom for atom in atoms if atom.predicate in PLACES]
+    shares = {atom: _share(atom, places) for atom in places}
+    left = [atom for atom in atoms if not evaluate(atom, view)]
+    putting = _carriers_first([atom for atom in left if atom.predicate in PLACES])
+    needed = [need for atom in putting for need in _needs(atom, view)]
+    receiving = {_joint_owner(atom.args[1], scene) for atom in putting} | {need.args[0] for need in needed}
+    closing = [atom for atom in left if atom.predicate == "Close"]
+    early = [atom for atom in closing if atom.args[0] not in receiving]
+    turning = [atom for atom in left if atom.predicate in ("Turnon", "Turnoff", "Open") and atom not in needed]
+    late = [atom for atom in closing if atom not in early]
+    opening = [need for need in dict.fromkeys(needed) if not evaluate(need, view)]
+    order = [*early, *turning, *opening, *putting, *late]
+    return tuple(Step(atom, shares.get(atom, (0, 1))) for atom in dict.fromkeys(order))
 
 
-def _container(address: str, scene: Scene) -> str | None:
-    region = scene.problem.region(address)
+def _wanted(goal: Expression, view: StateView) -> list[Atom]:
+    """The atoms that shall hold, of each choice the one with the least to do."""
+    match goal:
+        case Atom("Up" | "True" | "Printjointstate" | "Incontact"):
+            if evaluate(goal, view):
+                return []
+            raise UnsupportedGoalError(_refusal(goal))
+        case Atom():
+            return [goal]
+        case And(parts):
+            return list(dict.fromkeys(atom for part in parts for atom in _wanted(part, view)))
+        case Or(parts):
+            choices = [_wanted(part, view) for part in parts]
+            return min(choices, key=lambda atoms: sum(not evaluate(atom, view) for atom in atoms))
+        case Not(Atom(predicate, args)) if predicate in OPPOSITES:
+            return [Atom(OPPOSITES[predicate], args)]
+        case Not() | ForAll():
+            if evaluate(goal, view):
+                return []
+            raise UnsupportedGoalError(f"no skill reaches {goal}; state what shall hold instead of what shall not")
+    raise TypeError(f"not a goal: {goal!r}")
+
+
+def _check(atom: Atom, scene: Scene) -> None:
+    joint = atom.predicate in JOINT_STATES and scene.owner(atom.args[0]) is not None
+    place = atom.predicate in PLACES and len(atom.args) == 2 and atom.args[0] in scene.objects
+    if not joint and not place:
+        raise UnsupportedGoalError(_refusal(atom))
+
+
+def _refusal(atom: Atom) -> str:
     return (
-        region.target if region is not None and not region.ranges and region.target in scene.objects else None
+        f"no skill reaches ({atom.predicate} {' '.join(atom.args)}); there are some for (On OBJECT PLACE), "
+        "(In OBJECT REGION), (Stack OBJECT PLACE), and (Open PART), (Close PART), (Turnon THING), (Turnoff THING)"
     )
 
 
-class Shapes:
-    """Points on the collision geoms of every object of a scene, each in its body's frame; computed once."""
-
-    def __init__(self, scene: Scene):
-        self._scene = scene
-
-    @cached_property
-    def fine(self) -> dict[str, np.ndarray]:
-        """Name -> (N, 3), m; dense enough to measure widths."""
-        return {name: self._points(name, 0.004) for name in self._scene.objects}
-
-    @cached_property
-    def coarse(self) -> dict[str, np.ndarray]:
-        """Name -> (N, 3), m; enough to keep away from."""
-        return {name: self._points(name, 0.02) for name in self._scene.objects}
-
-    def cloud(self, view: StateView, name: str) -> np.ndarray:
-        """Points on an object, world frame, (N, 3)."""
-        return pose_of(view, name).apply(self.fine[name])
-
-    def span(self, view: StateView, name: str) -> tuple[float, float]:
-        """Lowest and highest point of an object, m."""
-        pose = pose_of(view, name)
-        heights = self.coarse[name] @ pose.mat[2] + pose.pos[2]
-        return float(heights.min()), float(heights.max())
-
-    def others(self, view: StateView, *names: str) -> np.ndarray:
-        """Points on all objects but these, world frame, (M, 3)."""
-        clouds = [
-            pose_of(view, name).apply(points) for name, points in self.coarse.items() if name not in names
-        ]
-        return np.concatenate(clouds) if clouds else np.zeros((0, 3))
-
-    def _points(self, name: str, spacing: float) -> np.ndarray:
-        return surface_points(self._scene.model, self._scene.model.body(f"{name}_main").id, spacing)
+def _share(atom: Atom, places: list[Atom]) -> tuple[int, int]:
+    same = [other for other in places if other.args[1] == atom.args[1]]
+    return same.index(atom), len(same)
 
 
-def pose_of(view: StateView, name: str) -> Pose:
-    """Pose of an object's root body."""
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, view.body_quat(name))
-    return Pose(view.body_pos(name).copy(), mat.reshape(3, 3))
+def _carriers_first(atoms: list[Atom]) -> list[Atom]:
+    """What other things are put on or into comes before them."""
+    order: list[Atom] = []
+    waiting = list(atoms)
+    while waiting:
+        moved = {atom.args[0] for atom in waiting}
+        ready = [atom for atom in waiting if not any(_belongs(atom.args[1], name) for name in moved - {atom.args[0]})]
+        order += ready or waiting  # in a circle as they are written
+        waiting = [atom for atom in waiting if atom not in order]
+    return order
+
+
+def _belongs(place: str, name: str) -> bool:
+    return place == name or place.startswith(f"{name}_") and not place.removeprefix(f"{name}_")[:1].isdigit()
+
+
+def _joint_owner(place: str, scene: Scene) -> str | None:
+    """The address whose joints give access to a region: its own part's, else those of the whole thing."""
+    owner = scene.owner(place)
+    if owner is None or owner not in scene.fixtures or "open" not in scene.things[owner].articulation:
+        return None
+    return place if scene.joints.get(place) else owner
+
+
+def _needs(atom: Atom, view: StateView) -> list[Atom]:
+    """Parts that must be open to put something there, and to take it from where it is."""
+    scene, thing = view.scene, atom.args[0]
+    found = []
+    address = _joint_owner(atom.args[1], scene)
+    if atom.predicate == "In" and address is not None:
+        found.append(address)
+    for region in scene.problem.regions:
+        part = None if region.ranges else _joint_owner(region.address, scene)
+        if part is not None and region.address in scene.joints and not region.address.endswith("_side"):
+            if any(_inside(_larger(box), view.body_pos(thing)) for box in _boxes(view, region.address)):
+                found.append(part)
+    return [Atom("Open", (part,)) for part in found if scene.joints.get(part)]
+
+
+def _larger(box):
+    centre, mat, size = box
+    return centre, mat, size + np.array([0.0, 0.0, 0.0])

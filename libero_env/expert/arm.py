@@ -1,0 +1,62 @@
+"""What the arm can reach: the pose that the controller would end in, by inverse kinematics."""
+
+import mujoco
+import numpy as np
+
+from libero_env.expert.motion import rotation_between
+from libero_env.robot import REST_QPOS
+
+_STEPS, _GAIN, _REST = 60, 0.5, 0.03
+_POS, _TURN = 0.006, 0.06  # m and rad, what counts as reached
+_MARGIN = 0.06  # rad, kept from the limits of a joint
+_SITE = "gripper0_grip_site"
+
+
+class Arm:
+    """Inverse kinematics that pulls towards the rest posture, as the controller does."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model, self._data = model, mujoco.MjData(model)
+        self._site = model.site(_SITE).id
+        joints = [model.joint(f"robot0_joint{k}") for k in range(1, 8)]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._dof = np.array([joint.dofadr[0] for joint in joints])
+        self._range = np.array([joint.range for joint in joints])
+
+    def follow(self, start: np.ndarray, poses: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float]:
+        """Go through poses of the grip site one after the other.
+
+        Args:
+            start: the seven joint angles to start from, rad.
+            poses: (position (3,), orientation (3, 3)) each.
+
+        Returns:
+            The last joint angles, and by how much the worst of the poses is missed: 0 where all are reached.
+        """
+        angles, worst = start, 0.0
+        for pos, mat in poses:
+            angles, miss = self.reach(angles, pos, mat)
+            worst = max(worst, miss)
+        return angles, worst
+
+    def reach(self, start: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> tuple[np.ndarray, float]:
+        """Joint angles (7,) near a pose, and by how much it is missed (m, and radians tenfold less)."""
+        model, data, angles = self._model, self._data, start.copy()
+        jac = np.zeros((6, model.nv))
+        low, high = self._range[:, 0] + _MARGIN, self._range[:, 1] - _MARGIN
+        for _ in range(_STEPS):
+            data.qpos[self._qpos] = angles
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            away = pos - data.site_xpos[self._site]
+            turn = rotation_between(data.site_xmat[self._site].reshape(3, 3), mat)
+            if np.linalg.norm(away) < 0.3 * _POS and np.linalg.norm(turn) < 0.3 * _TURN:
+                break
+            mujoco.mj_jacSite(model, data, jac[:3], jac[3:], self._site)
+            own = jac[:, self._dof]
+            inverse = own.T @ np.linalg.inv(own @ own.T + 1e-3 * np.eye(6))
+            step = inverse @ np.concatenate([away, turn])
+            step += _REST * (np.eye(7) - inverse @ own) @ (np.array(REST_QPOS) - angles)
+            angles = np.clip(angles + _GAIN * np.clip(step, -0.5, 0.5), low, high)
+        miss = max(np.linalg.norm(away) - _POS, 0.0) + 0.1 * max(np.linalg.norm(turn) - _TURN, 0.0)
+        return angles, float(miss)

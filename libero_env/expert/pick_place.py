@@ -1,0 +1,275 @@
+"""Taking an object and putting it where an atom of the goal wants it."""
+
+from typing import Literal
+
+import numpy as np
+
+from libero_env.control import SUBSTEPS
+from libero_env.errors import LiberoError
+from libero_env.expert.approach import Approach, choose_approach
+from libero_env.expert.clearance import obstacle_height
+from libero_env.expert.geometry import Pose
+from libero_env.expert.grasp import TIP_BELOW
+from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
+from libero_env.expert.shapes import Shapes, pose_of
+from libero_env.expert.style import Style
+from libero_env.predicates import StateView, evaluate
+from libero_env.problem import Atom
+from libero_env.scene import TIMESTEP
+
+Phase = Literal["reach", "close", "carry", "release", "withdraw", "rest"]
+
+CONTROL_HZ = 1.0 / (SUBSTEPS * TIMESTEP)
+ATTEMPTS = 6
+ARRIVED = 0.012  # m; wide, so that the moment to close is passed in motion and not approached for ever by a clone
+ARRIVED_TURN = 0.12  # rad
+STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
+FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
+AROUND = 0.08  # m, within which bodies count as in the way
+SLIPPED = 0.03  # m, that a body may move between the fingers
+GENTLE = 0.005  # m, over what carries it, where a body is let go
+ASIDE = 0.16  # m, before a place that is entered from a side
+STUCK = 130  # steps of one phase
+
+
+class PickPlace:
+    """Makes an (On thing place) or (In thing place) true.
+
+    It moves in phases: reach (down a funnel along the hand's approach), close, carry (up, over, and in along the
+    place's entry), release, withdraw. An object that slipped, tipped or fell beside its place is taken again.
+
+    Args:
+        atom: what shall hold.
+        style: the manner.
+        shapes: of the scene.
+        share: which of how many things that go to the same place.
+
+    Attributes:
+        phase: what it is doing.
+        retries: how often it had to begin again.
+        trouble: why it cannot go on, or "".
+    """
+
+    def __init__(self, atom: Atom, *, style: Style, shapes: Shapes, share: tuple[int, int] = (0, 1)):
+        self.atom, self.style, self.shapes, self.share = atom, style, shapes, share
+        self.phase: Phase = "reach"
+        self.retries, self.trouble = 0, ""
+        self._thing = atom.args[0]
+        self._way: Approach | None = None
+        self._rise = 0.0  # m, back along the approach, where the fingers are clear of the object
+        self._hold: Pose | None = None  # pose to keep while the fingers move
+        self._offset = np.zeros(3)  # of the object from the grip site when it was taken, in the hand's frame
+        self._steps, self._opening = 0, 0.0
+        self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
+        self._inside = False  # on the last stretch of a way in from the side
+        self._before: np.ndarray | None = None  # where the grip site was one step ago
+        self._velocity = np.zeros(3)
+
+    @property
+    def steadiness(self) -> float:
+        """How much disturbance the moment bears, in [0, 1]: none while the fingers move."""
+        return {"reach": 1.0, "carry": 0.7, "withdraw": 0.7}.get(self.phase, 0.0)
+
+    def done(self, view: StateView) -> bool:
+        """Whether the atom holds and the hand is away from the object."""
+        return self.phase in ("reach", "rest") and evaluate(self.atom, view)
+
+    def act(self, view: StateView) -> np.ndarray:
+        """The next action, (7,) in [-1, 1]."""
+        pos = view.eef_pos
+        self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
+        self._before = pos
+        self._steps += 1
+        if self.phase in ("reach", "rest") and not self._plan(view):
+            return np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, OPEN])
+        if self._steps > STUCK:
+            self._hold = Pose(pos, view.eef_mat)
+            self._enter("release")
+        return getattr(self, f"_{self.phase}")(view)
+
+    def _plan(self, view: StateView) -> bool:
+        """Choose hold and place, again when the object moved by itself; False where there are none."""
+        now = pose_of(view, self._thing)
+        if self._way is not None:
+            then = self._way.pose
+            moved = np.linalg.norm(now.pos - then.pos) > 0.01
+            if moved or np.linalg.norm(rotation_between(then.mat, now.mat)) > 0.1:
+                self._way = None
+        if self._way is None:
+            try:
+                self._way = choose_approach(view, self.shapes, self.atom, self.share, self.retries)
+            except LiberoError as error:
+                self.trouble = str(error)
+                return False
+            grasp = self._way.grasp
+            depth = (self.shapes.cloud(view, self._thing) - grasp.pos_world) @ -grasp.mat[:, 2]
+            self._rise = float(depth.max()) + TIP_BELOW
+        return True
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase, self._steps = phase, 0
+        self._pressed, self._backing, self._inside = 0, False, False
+
+    def _again(self) -> None:
+        self.retries += 1
+        self._way = None
+        if self.retries > ATTEMPTS:
+            self.trouble = f"{self.atom.args} not reached in {self.retries} attempts"
+        self._enter("reach")
+
+    def _reach(self, view: StateView) -> np.ndarray:
+        pos, style = view.eef_pos, self.style
+        goal, mat = self._grasp_pose(view)
+        back = -mat[:, 2]
+        error = goal - pos
+        aside = float(np.linalg.norm(error - (error @ back) * back))
+        turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
+        if aside < ARRIVED and abs(error @ back) < ARRIVED and turn < ARRIVED_TURN:
+            self._hold = Pose(goal, mat)
+            self._enter("close")
+            return self._close(view)
+        lift = style.slope * (aside - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
+        lift = self._backed_off(aside, -float(error @ back), np.clip(lift, 0.0, self._rise + style.hover))
+        over = goal + lift * back
+        lateral = 1.0
+        if aside > 0.05:
+            way = self._in_the_way(view, over, AROUND)
+            over[2] = max(over[2], way + FINGER_CLEARANCE + TIP_BELOW)
+        if aside > 0.05 or back[2] > 0.9:
+            lateral = np.clip(1.0 - (over[2] - pos[2] - 0.02) / 0.04, 0.0, 1.0)
+        return self._toward(view, over, mat, OPEN, lateral)
+
+    def _backed_off(self, aside: float, height: float, lift: float) -> float:
+        """The lift, or all of it while a finger that came to stand on something goes back and to the middle."""
+        standing = height > lift + STANDING and np.linalg.norm(self._velocity) < STILL
+        self._pressed = self._pressed + 1 if standing and self._steps > 5 else 0
+        if self._pressed >= 3:
+            self._backing = True
+        if aside < 0.006 and height > self._rise - TIP_BELOW + 0.01:
+            self._backing = False
+        return self._rise + self.style.hover if self._backing else lift
+
+    def _close(self, view: StateView) -> np.ndarray:
+        opening = float(np.abs(view.finger_pos).sum())
+        still = abs(opening - self._opening) < 4e-4
+        self._opening = opening
+        if self._steps > 4 + self.style.pause and still or self._steps > 15:
+            if opening < 0.002:
+                self._again()
+                return self._toward(view, view.eef_pos + [0, 0, 0.05], self._hold.mat, OPEN)
+            self._offset = view.eef_mat.T @ (view.body_pos(self._thing) - view.eef_pos)
+            self._enter("carry")
+            return self._carry(view)
+        return self._toward(view, self._hold.pos, self._hold.mat, CLOSE)
+
+    def _carry(self, view: StateView) -> np.ndarray:
+        pos, style, way = view.eef_pos, self.style, self._way
+        offset = view.eef_mat.T @ (view.body_pos(self._thing) - pos)
+        if np.linalg.norm(offset - self._offset) > SLIPPED + 0.3 * np.linalg.norm(self._offset):
+            self._again()
+            return self._toward(view, pos, self._hold.mat, OPEN)
+        mat, entry = way.hand_mat, way.place.entry
+        goal = way.place.pos + [0, 0, way.lift + GENTLE] - mat @ offset
+        goal[:2] += (1.0 if way.lift > 0.06 else 0.2) * np.array(style.place_xy)
+        low = self.shapes.span(view, self._thing)[0]
+        hang = max(pos[2] - low, TIP_BELOW)
+        if entry[2] > -0.5:
+            return self._carry_aside(view, goal, mat, entry, hang)
+        away = float(np.linalg.norm(goal[:2] - pos[:2]))
+        turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
+        near = 0.03 if way.lift > 0.06 else 0.012
+        arrived = away < (0.025 if way.lift > 0.06 else 0.014) and turn < 0.2
+        slow = self._steps > 20 and np.linalg.norm(self._velocity) < 0.01
+        self._pressed = self._pressed + 1 if slow and away < 0.04 else 0
+        if arrived and pos[2] < goal[2] + (0.02 if way.lift > 0.06 else 0.006) or self._pressed > 6:
+            self._hold = Pose(np.array([*goal[:2], min(goal[2], pos[2])]) if arrived else pos, mat)
+            self._enter("release")
+            return self._release(view)
+        over = goal.copy()
+        # a funnel over the place
+        funnel = style.slope * (away - near) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
+        over[2] += np.clip(funnel, 0.0, 0.04)
+        if away > 0.03 or turn > 0.4:
+            high = self._in_the_way(view, goal, self._radius(view)) + hang + 0.7 * style.margin
+            there = obstacle_height(self._others(view), goal, goal, 0.05, self._floor(view)) + hang + style.margin
+            over[2] = max(over[2], high, there)
+        lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0)
+        return self._toward(view, over, mat, CLOSE, lateral, slow=pos[2] - goal[2] < 0.04 and away < 0.05)
+
+    def _carry_aside(self, view: StateView, goal: np.ndarray, mat: np.ndarray, entry: np.ndarray, hang: float):
+        """Up, over to a point before the place, down, and in along the entry."""
+        pos = view.eef_pos
+        pre = goal - ASIDE * entry
+        turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
+        if not self._inside:
+            away = float(np.linalg.norm(pre[:2] - pos[:2]))
+            if np.linalg.norm(pre - pos) < 0.02 and turn < 0.2:
+                self._inside = True
+            over = pre.copy()
+            if away > 0.04 or turn > 0.4:
+                high = self._in_the_way(view, pre, self._radius(view)) + hang + 0.7 * self.style.margin
+                over[2] = max(over[2], high)
+            lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0)
+            return self._toward(view, over, mat, CLOSE, lateral)
+        left = float((goal - pos) @ entry)
+        slow = np.linalg.norm(self._velocity) < 0.01
+        self._pressed = self._pressed + 1 if slow and self._steps > 20 else 0
+        if left < 0.012 and np.linalg.norm(goal - pos) < 0.03 or self._pressed > 8:
+            self._hold = Pose(pos, mat)
+            self._enter("release")
+            return self._release(view)
+        return self._toward(view, goal - max(left - 0.06, 0.0) * entry, mat, CLOSE)
+
+    def _release(self, view: StateView) -> np.ndarray:
+        if self._steps <= self.style.pause:
+            return self._toward(view, self._hold.pos, self._hold.mat, CLOSE)
+        if self._steps > 10:
+            self._enter("withdraw")
+        return self._toward(view, self._hold.pos, self._hold.mat, OPEN)
+
+    def _withdraw(self, view: StateView) -> np.ndarray:
+        back = -self._hold.mat[:, 2]
+        if (view.eef_pos - self._hold.pos) @ back > 0.07 or self._steps > 20:
+            if evaluate(self.atom, view):
+                self._enter("rest")
+            else:
+                self._again()
+        return self._toward(view, self._hold.pos + 0.10 * back, self._hold.mat, OPEN)
+
+    def _rest(self, view: StateView) -> np.ndarray:
+        return np.array([0.0] * 6 + [OPEN])
+
+    def _toward(
+        self, view: StateView, goal: np.ndarray, mat: np.ndarray, gripper: float, lateral: float = 1.0, slow: bool = False
+    ) -> np.ndarray:
+        style = self.style
+        return action_toward(
+            view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
+            speed=0.35 * style.speed if slow else style.speed, lateral=lateral,
+        )  # fmt: skip
+
+    def _grasp_pose(self, view: StateView) -> tuple[np.ndarray, np.ndarray]:
+        """Where the grip site must be to take the object, following it when it moves a little."""
+        grasp, then = self._way.grasp, self._way.pose
+        shift = view.body_pos(self._thing) - then.pos
+        along = grasp.mat[:, 1] * self.style.grasp_along
+        return grasp.pos_world + shift + along, _about(grasp.mat[:, 2], -self.style.yaw) @ grasp.mat
+
+    def _others(self, view: StateView) -> np.ndarray:
+        return self.shapes.others(view, self._thing)
+
+    def _floor(self, view: StateView) -> float:
+        return view.scene.workspace.surface_height
+
+    def _radius(self, view: StateView) -> float:
+        points = self.shapes.points(view, self._thing, 0.02)
+        return max(AROUND, float(np.linalg.norm(points[:, :2] - view.eef_pos[:2], axis=1).max()) + 0.01)
+
+    def _in_the_way(self, view: StateView, goal: np.ndarray, radius: float) -> float:
+        return obstacle_height(self._others(view), view.eef_pos, goal, radius, self._floor(view))
+
+
+def _about(axis: np.ndarray, angle: float) -> np.ndarray:
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

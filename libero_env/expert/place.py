@@ -1,0 +1,155 @@
+"""Where to put something: poses of a body that make a goal's atom true, found by letting its shape down there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from libero_env.errors import LiberoError
+from libero_env.expert.clearance import Voxels, underside
+from libero_env.expert.geometry import Pose
+from libero_env.expert.shapes import pose_of
+from libero_env.predicates import Box, StateView, _boxes, _inside, _over
+from libero_env.problem import Atom
+
+DOWN = np.array([0.0, 0.0, -1.0])
+_YAWS = 12
+_GRID = 9  # spots along each side of a region
+_LIFT = 0.008  # m, off what carries it when a body is tested for room
+_UPWARDS = (0.05, 0.10, 0.16, 0.24)  # m, of the way in from above that must be free
+_SIDEWAYS = (0.06, 0.12, 0.18, 0.24, 0.30)  # m, and from a side
+_NEAR = 0.024  # m, between the origins of things that stand on one another
+_ENOUGH = 120  # points of a body that are tested
+
+
+class PlaceError(LiberoError):
+    """A body has no room where the goal wants it."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """The body's origin at `pos` (3,), m, turned by `mat` (3, 3); it comes there along `entry` (3,)."""
+
+    pos: np.ndarray
+    mat: np.ndarray
+    entry: np.ndarray
+    cost: float
+
+
+def places(
+    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, atom: Atom, share: tuple[int, int] = (0, 1)
+) -> list[Place]:
+    """Poses at which the atom would hold, the best first; upright as the body is now, turned about the vertical.
+
+    Args:
+        view: the state.
+        voxels: of everything but the body.
+        cloud: points on the body, world frame, (N, 3).
+        pose: of the body.
+        atom: (On thing place) or (In thing place).
+        share: which of how many things that go to this place, so that each leaves room for the others.
+
+    Raises:
+        PlaceError: it fits nowhere.
+    """
+    found: list[Place] = []
+    step = max(1, len(cloud) // _ENOUGH)
+    frame = _directions(view, atom.args[1])
+    for k in range(_YAWS):
+        angle = 2 * np.pi * k / _YAWS
+        turn = _about_vertical(angle)
+        body = (cloud - pose.pos) @ turn.T
+        turning = 0.1 * min(angle, 2 * np.pi - angle)
+        for spots, costs, below, holds in _regions(view, atom, body, share):
+            heights = voxels.drop(underside(body), spots, below)
+            keep = [i for i, (xy, z) in enumerate(zip(spots, heights, strict=True)) if holds(np.array([*xy, z + 0.003]))]
+            if not keep:
+                continue
+            origins = np.column_stack([spots, heights])[keep]
+            entries, crowd = _ways_in(voxels, body[::step], origins, frame)
+            for pos, cost, entry, full in zip(origins, costs[keep], entries, crowd, strict=True):
+                if entry is not None:
+                    sideways = 0.5 * (entry[2] > -0.5)
+                    found.append(Place(pos, turn @ pose.mat, entry, cost + turning + 3.0 * full + sideways))
+    if not found:
+        raise PlaceError(f"({atom.predicate} {' '.join(atom.args)}): there is no room for {atom.args[0]}")
+    return sorted(found, key=lambda place: place.cost)
+
+
+def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, int]):
+    """(spots (S, 2), costs (S,), height below which things carry, test of an origin) for each part of a place."""
+    target = atom.args[1]
+    if view.is_thing(target):
+        xy = view.body_pos(target)[:2]
+        offsets = np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)])
+        yield (
+            xy + offsets, 8.0 * np.linalg.norm(offsets, axis=1), np.inf,
+            lambda origin: bool(np.linalg.norm(origin[:2] - xy) < _NEAR),
+        )  # fmt: skip
+        return
+    test = _inside if atom.predicate == "In" else _over
+    for box in _boxes(view, target):
+        centre, mat, size = box
+        half = np.abs(mat @ size)
+        u, v = (np.linspace(-0.9, 0.9, _GRID) * h for h in half[:2])
+        offsets = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+        costs = 4.0 * np.linalg.norm(offsets - _wanted(half, share), axis=1)
+        below = centre[2] + (0.5 * half[2] if atom.predicate == "In" else 0.06)
+        if _flat_region(view, target):
+            below = view.scene.workspace.surface_height + 0.02
+        yield centre[:2] + offsets, costs, below, lambda origin, box=box: test(_smaller(box), origin)
+
+
+def _wanted(half: np.ndarray, share: tuple[int, int]) -> np.ndarray:
+    """Where in a region one of several things should stand: along its longer side, (2,) from the middle."""
+    which, number = share
+    offset = np.zeros(2)
+    if number > 1:
+        axis = int(half[1] > half[0])
+        offset[axis] = 0.62 * half[axis] * (2 * which / (number - 1) - 1)
+    return offset
+
+
+def _flat_region(view: StateView, address: str) -> bool:
+    region = view.scene.problem.region(address)
+    return region is not None and bool(region.ranges)
+
+
+def _smaller(box: Box) -> Box:
+    centre, mat, size = box
+    half = np.abs(mat @ size)
+    return centre, mat, np.where(np.abs(size) > 0.012, np.maximum(size - 0.1 * half.min(), 0.7 * size), size)
+
+
+def _directions(view: StateView, target: str) -> list[np.ndarray]:
+    """The four horizontal directions along the sides of what a place belongs to."""
+    owner = view.scene.owner(target)
+    x = pose_of(view, owner).mat[:, 0] if owner is not None else np.array([1.0, 0.0, 0.0])
+    x = np.array([x[0], x[1], 0.0]) / max(float(np.hypot(x[0], x[1])), 1e-9)
+    y = np.array([-x[1], x[0], 0.0])
+    return [x, -x, y, -y]
+
+
+def _ways_in(
+    voxels: Voxels, body: np.ndarray, origins: np.ndarray, directions: list[np.ndarray]
+) -> tuple[list[np.ndarray | None], np.ndarray]:
+    """For each origin (S, 3) the direction along which the body comes in, None for none; and the share in walls."""
+    standing = origins[:, None] + body[None] + [0, 0, _LIFT]
+    crowd = voxels.hits(standing) / len(body)
+    allowed = np.maximum(crowd * len(body), 0.03 * len(body))
+    entries: list[np.ndarray | None] = [None] * len(origins)
+    for entry, lengths in [(DOWN, _UPWARDS), *((d, _SIDEWAYS) for d in directions)]:
+        open_ = [i for i in range(len(origins)) if entries[i] is None and crowd[i] < 0.12]
+        if not open_:
+            break
+        free = np.ones(len(open_), bool)
+        for length in lengths:
+            free &= voxels.hits(standing[open_] - length * entry) <= allowed[open_]
+        for i, good in zip(open_, free, strict=True):
+            if good:
+                entries[i] = entry
+    return entries, crowd
+
+
+def _about_vertical(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
