@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from typing import Any
 
 import mujoco
-import yaml
 
 from libero_env.arena_furniture import add_furniture, add_visual_mesh, furniture, solid
 from libero_env.arena_styles import add_material, furniture_of, styles_of
+from libero_env.data_files import read_yaml
 from libero_env.errors import UnknownNameError
 from libero_env.mjspec import delete
 from libero_env.objects.builtin.mesh import Mesh, merge
@@ -205,7 +204,7 @@ def _from_above(table: Mapping[str, Any]) -> Mesh:
 
 @cache
 def _read(name: str) -> Mapping[str, Any]:
-    return yaml.safe_load(resources.files("libero_env").joinpath(f"workspaces/{name}.yaml").read_text())
+    return read_yaml(f"workspaces/{name}.yaml")
 
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,14 +5,13 @@ A whole room is one geom, so that drawing it costs one call.
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from importlib import resources
 from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 
 from libero_env.arena_styles import add_texture
+from libero_env.data_files import read_yaml
 from libero_env.objects.builtin.mesh import Mesh, Ring, box, loft, merge, quad
 
 _CELLS = 8  # colours along a side of the picture
@@ -128,4 +127,4 @@ def _cell(colour: str) -> tuple[float, float]:
 
 @cache
 def _listed() -> Mapping[str, Any]:
-    return yaml.safe_load(resources.files("libero_env").joinpath("workspaces/furniture.yaml").read_text())
+    return read_yaml("workspaces/furniture.yaml")

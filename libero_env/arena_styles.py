@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import resources
 from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 
+from libero_env.data_files import read_yaml
 from libero_env.errors import UnknownNameError
 
 _SIZE = 128  # pixels, side of a texture unless the style says otherwise
@@ -17,7 +16,7 @@ _SIZE = 128  # pixels, side of a texture unless the style says otherwise
 @cache
 def load_styles() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
     """kind (`floor`, `wall`, `scene`) -> name -> figures."""
-    return yaml.safe_load(resources.files("libero_env").joinpath("workspaces/styles.yaml").read_text())
+    return read_yaml("workspaces/styles.yaml")
 
 
 def styles_of(own: Mapping[str, str], scene_properties: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:

@@ -26,9 +26,8 @@ from importlib import resources
 from string import Template
 from typing import Any
 
-import yaml
-
 from libero_env import bddl
+from libero_env.data_files import parse_yaml
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.problem import And, Atom, Expression, ForAll, Not, Problem, Region
 from libero_env.sexpr import number
@@ -46,8 +45,6 @@ KEYS = (
     "goal",
 )
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
-
 
 @cache
 def load_data(name: str) -> Any:
@@ -60,7 +57,7 @@ def load_data(name: str) -> Any:
     file = folder.joinpath(*name.split("/"))
     if not file.is_file():
         raise UnknownNameError("task file", name, (entry.name for entry in folder.iterdir()))
-    return yaml.load(file.read_text(encoding="utf-8"), _LOADER)
+    return parse_yaml(file.read_text(encoding="utf-8"))
 
 
 def load_scene(name: str) -> Mapping[str, Any]:

@@ -1,5 +1,6 @@
 """Measured figures of the builtin objects, read from the YAML files in `figures/`."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -7,7 +8,7 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
-import yaml
+from libero_env.data_files import parse_yaml
 
 Vector = tuple[float, ...]
 
@@ -103,7 +104,7 @@ _OF_PART = ("mass", "com", "inertia", "boxes", "sites")
 @cache
 def load_facts(category: str) -> Facts:
     """Figures of a builtin category."""
-    raw = dict(_all_facts()[category])
+    raw = parse_yaml(_texts()[category])[category]
     root = _part({key: raw.pop(key) for key in _OF_PART if key in raw})
     parts = {name: _part(part) for name, part in raw.pop("parts", {}).items()}
     for key in ("rotation", "articulation"):
@@ -121,13 +122,12 @@ def _part(raw: Mapping[str, Any]) -> Part:
 
 
 @cache
-def _all_facts() -> dict[str, dict]:
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+def _texts() -> dict[str, str]:
+    """Category -> its part of the files, unread: a scene needs a few of many."""
     folder = files(__package__) / "figures"
-    texts = [
-        entry.read_text(encoding="utf-8") for entry in folder.iterdir() if entry.name.endswith(".yaml")
-    ]
-    return {name: facts for text in texts for name, facts in yaml.load(text, Loader=loader).items()}
+    texts = [file.read_text(encoding="utf-8") for file in folder.iterdir() if file.name.endswith(".yaml")]
+    parts = [part for text in texts for part in re.split(r"^(?=\w+:\n)", text, flags=re.M)]
+    return {part.split(":", 1)[0]: part for part in parts if not part.startswith("#")}
 
 
 def _tuples(mapping: Mapping[str, Any]) -> dict[str, Any]:

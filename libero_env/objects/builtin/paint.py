@@ -77,5 +77,5 @@ class Canvas:
 def png(pixels: np.ndarray) -> bytes:
     """A picture (H, W, 3) uint8, first row on top, encoded for MuJoCo, whose v = 0 is a file's first row."""
     stream = io.BytesIO()
-    Image.fromarray(pixels[::-1]).save(stream, "png")
+    Image.fromarray(pixels[::-1]).save(stream, "png", compress_level=1)
     return stream.getvalue()
