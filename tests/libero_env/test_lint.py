@@ -168,7 +168,7 @@ PLACES = [
     ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1))\n (lid (:target plate_1))",
      "unused-region", "info", "plate_1_lid"),
     ("(0.04 -0.03 0.060000000000000005 -0.01)", "(-0.1 -0.01 -0.08 0.01)", "placement", "error", "still collide"),
-    ("(On plate_1 main_table_plate_region)", "(On plate_1 wine_bottle_1)", "unstable-start", "warning", "more than 5 mm"),
+    ("(On plate_1 main_table_plate_region)", "(On plate_1 wine_bottle_1)", "unstable-start", "warning", "than 5 mm"),
     (GOAL, "(And (Open plate_1))", "no-joint", "error", "no joint"),
     (GOAL, "(And (Turnon wooden_cabinet_1_top_region))", "no-joint", "error", "'turnon'"),
     (GOAL, "(And (On plate_1 main_table_plate_region))", "goal-at-start", "error", "5 of 5|3 of 3"),
