@@ -12,6 +12,7 @@ from libero_env.expert.handles import (
     Part,
     find_handle,
     handle_hold,
+    inner_side,
     is_knob,
     knob_hold,
     surroundings,
@@ -33,6 +34,7 @@ LEAD = 0.06  # m, of the goal ahead of the hand while it moves the part
 SLIPPED = 0.035  # m, between the hand and the hold
 AWAY = 0.06  # m, from the handle, where the hand counts as withdrawn
 AROUND = 0.07  # m, within which things count as in the way
+AJAR, PULLED = 0.5, 0.85  # rad; a door is drawn until it is that far open, and beyond AJAR pushed
 STUCK = 90  # steps of one phase
 
 
@@ -64,7 +66,8 @@ class MoveJoint:
         self._before: np.ndarray | None = None
         self._velocity = np.zeros(3)
         self._steps, self._still = 0, 0
-        self._opening, self._value = 0.0, 0.0
+        self._opening, self._value, self._aim = 0.0, 0.0, 0.0
+        self._drawn = False  # a door, as far as by its handle
         self._left: Pose | None = None  # where the hand let go
         self._failed: list[Pose] = []  # holds of earlier attempts
 
@@ -104,28 +107,35 @@ class MoveJoint:
         # one joint is enough to open, all have to be closed
         choose = np.argmin if self.state in ("open", "turnon") else np.argmax
         part = parts[int(choose(gaps))]
-        delta = self._goal(view, part) - part.value(view)
         if self._moved(view):
             self._enter("rest")
             return False
-        grips = self.state not in ("close",)
+        value, self._aim = part.value(view), self._goal(view, part)
+        way = float(np.sign(self._aim - value))
         try:
             if is_knob(view, part):
-                hold = knob_hold(view, part, delta)
-            else:
-                way = np.sign(delta) * (1.0 if grips else -1.0)
+                hold = knob_hold(view, part, self._aim - value)
+            elif self.state in ("close", "turnoff"):
+                handle = find_handle(view, part, -way)
+                hold = handle_hold(view, part, handle, self._aim - value, False, self._failed)
+            elif part.slides or abs(value - self._shut(view, part, way)) < AJAR:
+                if not part.slides:
+                    self._aim = value + way * min(PULLED, abs(self._aim - value))
                 handle = find_handle(view, part, way)
-                hold = handle_hold(view, part, handle, delta, grips, self._failed)
+                hold = handle_hold(view, part, handle, self._aim - value, True, self._failed)
+            else:
+                hold = handle_hold(view, part, inner_side(view, part, way), self._aim - value, False, self._failed)
         except GraspError as error:
             self.trouble = str(error)
             return False
         self._part = part
-        self._around = surroundings(view, part.body, hold.held.pos, view.scene.things)
+        self._around = surroundings(view, -1, hold.held.pos, view.scene.things)
         frame = part.pose(view)
         self._hold = Hold(
             _within(frame, hold.ready), _within(frame, hold.held), frame.mat.T @ hold.back, hold.grips
         )
         self._failed.append(hold.ready)
+        self._drawn = False
         self._enter("reach")
         return True
 
@@ -147,6 +157,10 @@ class MoveJoint:
             return 0.5 * (threshold + end)
         stop = view.scene.model.jnt_range[part.joint][1 if way > 0 else 0]
         return float(max(end, stop) if way > 0 else min(end, stop))
+
+    def _shut(self, view: StateView, part: Part, way: float) -> float:
+        """Where the joint is when it is closed, by the range that it is moved away from."""
+        return float(view.scene.model.jnt_range[part.joint][0 if way > 0 else 1])
 
     def _moved(self, view: StateView) -> bool:
         """Whether the predicate holds with a margin."""
@@ -207,14 +221,15 @@ class MoveJoint:
 
     def _move(self, view: StateView) -> np.ndarray:
         part, value = self._part, self._part.value(view)
-        left = self._goal(view, part) - value
+        left = self._aim - value
         hold = _placed(part.pose(view), self._hold.held)
         anchor, axis = part.axis(view)
         arm = 1.0 if part.slides else max(float(np.linalg.norm(np.cross(hold.pos - anchor, axis))), 0.03)
         slow = abs(value - self._value) * arm < 5e-4
         self._value = value
         self._still = self._still + 1 if slow and self._steps > 5 else 0
-        if self._moved(view) and (slow or self.state in ("open", "turnon")) or self._still > 25:
+        if self._moved(view) and (slow or self.state in ("open", "turnon")) or self._still > 25 or self._stage(left):
+            self._drawn = self._stage(left)
             self._enter("release")
             return self._release(view)
         if self._hold.grips and np.linalg.norm(view.eef_pos - hold.pos) > SLIPPED:
@@ -224,6 +239,10 @@ class MoveJoint:
         ahead = np.sign(left) * min(abs(left) + extra, lead)
         goal = part.moved(view, hold, ahead)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
+
+    def _stage(self, left: float) -> bool:
+        """Whether a door is as far open as it is drawn; the rest of the way it is pushed."""
+        return self.state == "open" and not self._part.slides and self._hold.grips and abs(left) < 0.05
 
     def _release(self, view: StateView) -> np.ndarray:
         if self._left is None or self._steps <= 1:
@@ -239,6 +258,7 @@ class MoveJoint:
             self._enter("rest")
             if not self._moved(view):
                 self._again()
+                self.retries -= self._drawn
             return self._stay()
         return self._toward(view, left.pos + (AWAY + 0.05) * back, left.mat, OPEN if self._hold.grips else CLOSE)
 

@@ -26,7 +26,9 @@ _ROLLS = (0.0, 0.8, -0.8)  # rad, of the fingers from across a level bar
 _ASIDE = (0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026)  # m, of the open hand from the middle of the bar
 _FORTH = (0.0, -0.005)  # m, of the grip site beyond the middle of the bar
 _SPARE = 0.002  # m, around the hand
-_BASE_X = -0.66  # m, of the arm's base; it decides how far the wrist is turned
+_SHOULDER = np.array([-0.66, 0.0, 0.333])  # m, of the arm, height above its base
+_HAND_LENGTH = 0.21  # m, from the flange to the grip site
+_REACH = 0.74  # m, from the shoulder to the flange, without stretching
 _WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
 
 
@@ -114,6 +116,20 @@ def find_handle(view: StateView, part: Part, way: float) -> Handle:
     return Handle(middle, along, out, 0.5 * max(spans), depth, points[mask], points)
 
 
+def inner_side(view: StateView, part: Part, way: float) -> Handle:
+    """The side of a door that is pushed to open it further, near its upper edge."""
+    points = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.005))
+    anchor, axis = part.axis(view)
+    inward = -opening_direction(view, part, way, points)
+    outer = np.cross(inward, axis) if np.cross(inward, axis) @ (points.mean(axis=0) - anchor) > 0 else np.cross(axis, inward)
+    radius = (points - anchor) @ outer
+    at = anchor + 0.6 * radius.max() * outer
+    at = at + (points[:, 2].max() - 0.03 - at[2]) * UP
+    near = (np.abs((points - at) @ outer) < 0.015) & (np.abs(points[:, 2] - at[2]) < 0.015)
+    at = at + ((points[near] - at) @ inward).max() * inward
+    return Handle(at, outer, inward, 0.3 * radius.max(), 0.0, points[near], points)
+
+
 def opening_direction(view: StateView, part: Part, way: float, points: np.ndarray) -> np.ndarray:
     """Where the outer end of a part goes when its joint moves in the direction `way`, (3,) unit."""
     anchor, axis = part.axis(view)
@@ -172,10 +188,12 @@ def handle_hold(
     """
     fixed = surroundings(view, part.body, handle.pos, view.scene.fixtures)
     loose = surroundings(view, part.body, handle.pos, view.scene.objects)
-    own, floor = handle.part[::2], view.scene.workspace.surface_height
-    ranked = []
+    own = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.01))
+    here, floor = np.concatenate([own, fixed, loose]), view.scene.workspace.surface_height
+    base, ranked = view.scene.workspace.robot_base_pos[2], []
     for cost, hold in _candidates(handle, grips):
-        cost += sum(0.12 * strain(pose) ** 2 for pose in (hold.ready, part.moved(view, hold.held, delta)))
+        for pose in (hold.ready, part.moved(view, hold.held, delta)):
+            cost += 0.12 * strain(pose) ** 2 + 20.0 * stretch(pose, base)
         cost += 0.1 * float(np.linalg.norm(rotation_between(view.eef_mat, hold.ready.mat)))
         cost += sum(0.5 * _alike(hold.ready, pose) for pose in failed)
         ranked.append((cost, hold))
@@ -183,20 +201,25 @@ def handle_hold(
     for cost, hold in sorted(ranked, key=lambda pair: pair[0]):
         if best is not None and cost >= best[0]:
             break
-        ready = hold.ready
-        here = np.concatenate([own, fixed, loose])
-        depth = max(crowding(here, ready, grips), under(floor, ready, grips))
-        for back in (0.03, 0.07):
-            depth = max(depth, crowding(here, Pose(ready.pos + back * hold.back, ready.mat), grips))
-        for share in (0.5, 1.0):
-            pose = part.moved(view, hold.held, share * delta)
-            depth = max(depth, crowding(fixed, pose, False), under(floor, pose, False))
-        cost += 60.0 * depth + 0.4 * (depth > 0.002)
+        ready, worst = hold.ready, np.inf if best is None else best[0]
+        moved = [part.moved(view, hold.held, share * delta) for share in (0.5, 1.0)]
+        backs = [Pose(ready.pos + back * hold.back, ready.mat) for back in (0.0, 0.03, 0.07)]
+        depth = max(under(floor, pose, grips) for pose in (ready, *moved))
+        for points, pose, opened in [(here, p, grips) for p in backs] + [(fixed, p, False) for p in moved]:
+            if cost + _blocked(depth) >= worst:
+                break
+            depth = max(depth, crowding(points, pose, opened))
+        cost += _blocked(depth)
         if best is None or cost < best[0]:
             best = cost, hold
     if best is None:
         raise GraspError(f"no way to take the handle: it is more than {100 * TAKES:.0f} cm thick")
     return best[1]
+
+
+def _blocked(depth: float) -> float:
+    """Cost of a hand that is so deep in something, m."""
+    return 150.0 * depth + 0.5 * (depth > 0.002)
 
 
 def _alike(pose: Pose, other: Pose) -> bool:
@@ -255,7 +278,8 @@ def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
 
 def crowding(points: np.ndarray, pose: Pose, opened: bool) -> float:
     """How deep points (N, 3) reach into a hand at a pose of its grip site, m; 0 where it is free."""
-    x, y, z = ((points - pose.pos) @ pose.mat).T
+    offset = points - pose.pos
+    x, y, z = (offset[np.abs(offset).max(axis=1) < 0.15] @ pose.mat).T  # fingers and palm
     x, y = np.abs(x), np.abs(y)
     inner = OPEN_HALF if opened else 0.0
     outer = inner + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
@@ -263,7 +287,8 @@ def crowding(points: np.ndarray, pose: Pose, opened: bool) -> float:
     finger = np.where(z > -0.04, finger, 0.0)
     half = np.clip(0.0175 - 0.22 * (z + 0.031), 0.0, 0.032) + _SPARE  # of the palm, which is thinner in front
     palm = np.minimum.reduce([0.104 + _SPARE - x, half - y, -0.031 + _SPARE - z, z + 0.13])
-    wrist = np.minimum.reduce([0.06 - x, 0.06 - y, -0.12 - z, z + 0.3])
+    x, y, z = (offset @ pose.mat).T
+    wrist = np.minimum.reduce([0.06 - np.abs(x), 0.06 - np.abs(y), -0.12 - z, z + 0.3])
     return float(max(finger.max(initial=0.0), palm.max(initial=0.0), wrist.max(initial=0.0)))
 
 
@@ -277,9 +302,16 @@ def under(floor: float, pose: Pose, opened: bool) -> float:
 
 def strain(pose: Pose) -> float:
     """How far a hand is turned from where the wrist's joints are in the middle, rad."""
-    yaw = _WRIST_MIDDLE + np.arctan2(pose.pos[1], pose.pos[0] - _BASE_X)
-    neutral = downward(yaw, np.array([np.cos(yaw), np.sin(yaw), 0.0]))
-    return float(np.linalg.norm(rotation_between(neutral, pose.mat)))
+    yaw = _WRIST_MIDDLE + np.arctan2(pose.pos[1], pose.pos[0] - _SHOULDER[0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    trace = np.sum(pose.mat * [[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])  # of the turn from fingers along yaw
+    return float(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
+
+
+def stretch(pose: Pose, base_height: float) -> float:
+    """How far a hand is beyond easy reach, m."""
+    offset = pose.pos - _HAND_LENGTH * pose.mat[:, 2] - _SHOULDER - [0.0, 0.0, base_height]
+    return max(0.0, float(np.linalg.norm(offset)) - _REACH)
 
 
 def surroundings(
