@@ -132,7 +132,8 @@ def examine(file: Path, *, threshold: float = NOOP) -> DemoStats:
         lengths.append(len(episode.actions))
         successes += episode.success
         still += int(noops(_labels(episode), threshold).sum())
-        arrays = {"actions": episode.actions, "states": episode.states, **episode.obs}
+        arrays = {"actions": episode.actions, "states": episode.states}
+        arrays |= {f"obs/{key}": values for key, values in episode.obs.items()}
         for key, values in arrays.items():
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 faults.append(f"{name}/{key} has values that are not finite")

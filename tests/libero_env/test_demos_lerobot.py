@@ -1,0 +1,161 @@
+"""The LeRobot data set: its tables agree with each other, its videos with the pictures, and both with the files."""
+
+import json
+
+import numpy as np
+import pytest
+
+from libero_env.demos import read_demos
+from libero_env.demos_lerobot import export
+from libero_env.errors import DemoError, LiberoError
+from tests.libero_env.test_demos import episode
+from tests.libero_env.test_demos_tools import write
+
+av = pytest.importorskip("av")
+parquet = pytest.importorskip("pyarrow.parquet")
+pytestmark = pytest.mark.unit
+STEPS, SIZE = (9, 14, 11), 32
+
+
+def smooth(seed, steps, size=SIZE):
+    """An episode whose pictures are as calm as a film, so that H.264 keeps them."""
+    one = episode(seed, steps, size)
+    ramp = np.linspace(0, 200, size)[:, None] * np.ones((1, size))
+    for k, key in enumerate(("agentview_rgb", "eye_in_hand_rgb")):
+        film = np.stack([ramp + 4 * t + 10 * seed + 5 * k for t in range(steps)]) % 256
+        one.obs[key] = np.repeat(np.minimum(film, 255).astype(np.uint8)[..., None], 3, axis=3)
+    return one
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demos")
+    first = write(folder / "a.hdf5", [smooth(0, STEPS[0]), smooth(1, STEPS[1])])
+    info = json.dumps({"language_instruction": "do something else"})
+    return [first, write(folder / "b.hdf5", [smooth(2, STEPS[2])], problem_info=info)]
+
+
+@pytest.fixture(scope="module")
+def root(files, tmp_path_factory):
+    out = tmp_path_factory.mktemp("lerobot") / "set"
+    assert export(files, out, progress=False) == (3, sum(STEPS))
+    return out
+
+
+@pytest.fixture(scope="module")
+def info(root):
+    return json.loads((root / "meta/info.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def episodes(root):
+    return parquet.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+
+
+def test_the_numbers_are_those_of_the_files(root, files):
+    table = parquet.read_table(root / "data/chunk-000/file-000.parquet")
+    demos = [demo for file in files for demo in read_demos(file)]
+    action = np.array(table["action"].to_pylist())
+    np.testing.assert_allclose(action, np.concatenate([demo.actions for demo in demos]), atol=1e-6)
+    state = np.array(table["observation.state"].to_pylist())
+    keys = ("ee_pos", "ee_ori", "gripper_states")
+    whole = np.concatenate([np.concatenate([demo.obs[key] for key in keys], axis=1) for demo in demos])
+    np.testing.assert_allclose(state, whole, atol=1e-6)
+    assert table["index"].to_pylist() == list(range(sum(STEPS)))
+    assert table["frame_index"].to_pylist() == [t for n in STEPS for t in range(n)]
+    assert table["task_index"].to_pylist() == [0] * (STEPS[0] + STEPS[1]) + [1] * STEPS[2]
+    assert sum(table["next.done"].to_pylist()) == 3
+    np.testing.assert_allclose(table["timestamp"].to_numpy(), table["frame_index"].to_numpy() / 20, atol=1e-6)
+
+
+def test_every_column_is_declared_and_every_declared_column_is_there(root, info):
+    schema = parquet.read_schema(root / "data/chunk-000/file-000.parquet")
+    declared = {key: f for key, f in info["features"].items() if f["dtype"] != "video"}
+    assert set(schema.names) == declared.keys()
+    for key, feature in declared.items():
+        kind, shape = schema.field(key).type, feature["shape"]
+        inner = kind.value_type if shape != [1] else kind
+        assert str(inner).replace("float", "float32").replace("float3232", "float32") == feature["dtype"]
+        assert shape == [1] or kind.list_size == shape[0]
+        assert feature["names"] is None or len(feature["names"]) == shape[0]
+
+
+def test_the_whole_is_counted(info, episodes):
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 20
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, sum(STEPS), 2)
+    assert [e["length"] for e in episodes] == list(STEPS) and info["splits"] == {"train": "0:3"}
+    ends = [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes]
+    assert ends == [(0, 9), (9, 23), (23, 34)]
+
+
+def test_frames_are_found_where_the_episodes_say(root, info, episodes, files):
+    demos = [demo for file in files for demo in read_demos(file)]
+    for feature, key in (
+        ("observation.images.image", "agentview_rgb"),
+        ("observation.images.image2", "eye_in_hand_rgb"),
+    ):
+        assert info["features"][feature]["shape"] == [SIZE, SIZE, 3]
+        for one, demo in zip(episodes, demos, strict=True):
+            where = {k: one[f"videos/{feature}/{k}"] for k in ("chunk_index", "file_index")}
+            with av.open(str(root / info["video_path"].format(video_key=feature, **where))) as video:
+                frames = {round(f.time, 6): f.to_ndarray(format="rgb24") for f in video.decode(video=0)}
+            start = one[f"videos/{feature}/from_timestamp"]
+            assert one[f"videos/{feature}/to_timestamp"] == pytest.approx(start + len(demo) / 20)
+            for t in range(len(demo)):
+                frame = frames[round(start + t / 20, 6)]
+                assert np.abs(frame.astype(int) - demo.obs[key][t]).mean() < 4.0
+
+
+def test_a_full_video_goes_on_in_the_next_file(files, tmp_path):
+    export(files, tmp_path / "set", video_mb=0.0, progress=False)
+    videos = sorted(p.name for p in (tmp_path / "set/videos/observation.images.image/chunk-000").iterdir())
+    rows = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    indices = [row["videos/observation.images.image/file_index"] for row in rows]
+    assert videos == [f"file-{i:03d}.mp4" for i in sorted(set(indices))] and len(videos) > 1
+    for i in set(indices):
+        firsts = [r["videos/observation.images.image/from_timestamp"] for r in rows
+                  if r["videos/observation.images.image/file_index"] == i]  # fmt: skip
+        assert firsts[0] == 0.0 and firsts == sorted(firsts)
+
+
+def test_statistics_cover_every_feature(root, info, episodes):
+    stats = json.loads((root / "meta/stats.json").read_text())
+    assert stats.keys() == info["features"].keys()
+    for key, found in stats.items():
+        per_episode = {name for name in episodes[0] if name.startswith(f"stats/{key}/")}
+        assert per_episode == {f"stats/{key}/{name}" for name in found}
+        assert found["count"] == [sum(STEPS)]
+    table = parquet.read_table(root / "data/chunk-000/file-000.parquet")
+    np.testing.assert_allclose(
+        stats["action"]["mean"], np.mean(table["action"].to_pylist(), axis=0), atol=1e-6
+    )
+
+
+def test_pandas_sees_tasks_as_the_index(root):
+    pandas = pytest.importorskip("pandas")
+    tasks = pandas.read_parquet(root / "meta/tasks.parquet")
+    assert tasks.loc["do something else"].task_index == 1 and tasks.index.name == "task"
+
+
+def test_the_original_pairing_is_shifted(tmp_path):
+    file = write(tmp_path / "c.hdf5", [smooth(0, 9)], pairing="libero")
+    assert export([file], tmp_path / "set", labels="executed", progress=False) == (1, 8)
+    table = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    one = episode(0, 9, SIZE)
+    np.testing.assert_allclose(table["action"].to_pylist(), one.actions[1:], atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(table["observation.state"].to_pylist())[:, :3], one.obs["ee_pos"][:-1], atol=1e-6
+    )
+
+
+def test_what_does_not_fit_leaves_nothing(files, tmp_path):
+    other = write(tmp_path / "other.hdf5", [smooth(0, 5, 16)])
+    with pytest.raises(DemoError, match=r"other.hdf5: demo_0 has pictures .*16"):
+        export([files[0], other], tmp_path / "set", progress=False)
+    assert not (tmp_path / "set").exists()
+    odd = write(tmp_path / "odd.hdf5", [smooth(0, 5, 15)])
+    with pytest.raises(LiberoError, match="15x15"):
+        export([odd], tmp_path / "set", progress=False)
+    (tmp_path / "set").mkdir()
+    with pytest.raises(DemoError, match="exists"):
+        export(files, tmp_path / "set", progress=False)

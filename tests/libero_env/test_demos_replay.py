@@ -1,0 +1,251 @@
+"""Going through recordings again: fixtures stand where they stood, and states lead to the same pictures."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from libero_env.demos import read_demos
+from libero_env.demos_film import Filmer, Shots, fixtures_of
+from libero_env.demos_generate import generate, make_demos
+from libero_env.demos_lerobot import export
+from libero_env.demos_replay import replay, rerender
+from libero_env.demos_studio import Recipe, Variation
+from libero_env.demos_tools import examine, read_episodes, task_of
+from libero_env.demos_write import Episode
+from libero_env.env import LiberoEnv
+from libero_env.errors import DemoError
+from libero_env.expert import UnsupportedGoalError
+from libero_env.expert.driver import Attempt
+from libero_env.tasks import get_task
+
+pytestmark = pytest.mark.sim
+TASK, SIZE, STEPS = "libero_goal/3", (24, 32), 12
+
+
+def wander(stage, experts, noise, max_steps):
+    """Instead of the experts: a random walk of the arm, said to be a success."""
+    rng = np.random.default_rng(5)
+    states, actions = [[] for _ in experts], [[] for _ in experts]
+    for _ in range(STEPS):
+        action = rng.uniform(-1, 1, (stage.num_envs, 7))
+        for i in range(len(experts)):
+            states[i].append(stage.world.physics_state(i))
+            actions[i].append(action[i])
+        stage.step(action)
+    for i, rows in enumerate(states):
+        rows.append(stage.world.physics_state(i))
+    return [
+        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "")
+        for s, a in zip(states, actions, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """Two recordings of a scene with fixtures, without an expert."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("libero_env.demos_studio.run_experts", wander)
+        out = tmp_path_factory.mktemp("demos") / "goal.hdf5"
+        return generate(TASK, 2, path=out, camera_size=SIZE, workers=1, progress=False)
+
+
+def test_fixtures_are_recorded_where_they_stood(path):
+    scene = LiberoEnv(TASK, cameras=()).world.scene
+    episodes = [episode for _, episode in read_episodes(path)]
+    poses = [episode.attrs["fixtures"] for episode in episodes]
+    assert not np.allclose(poses[0], poses[1], atol=1e-6)  # they differ from start to start
+    for episode, pose in zip(episodes, poses, strict=True):
+        rounded = {"model_file": episode.attrs["model_file"]}
+        np.testing.assert_allclose(fixtures_of(rounded, scene, ""), pose, atol=1e-5)
+    np.testing.assert_array_equal(fixtures_of({}, scene, ""), scene.fixture_poses)
+    with pytest.raises(DemoError, match="no XML"):
+        fixtures_of({"model_file": "<mujoco"}, scene, "x")
+    with pytest.raises(DemoError, match="no body"):
+        fixtures_of({"model_file": "<mujoco/>"}, scene, "x")
+
+
+def test_actions_replay_to_the_same_states(path):
+    for result in replay(path, by="action"):
+        assert result.steps == STEPS and result.drift.shape == (STEPS,)
+        assert result.drift.max() < 1e-9 and result.arm_drift.max() < 1e-9
+        assert result.recorded and not result.success  # a random walk reaches nothing
+
+
+def test_with_fixtures_elsewhere_it_would_not_be_the_same_scene(path, tmp_path):
+    """Pictures depend on where fixtures stand, so that it is seen when they are forgotten."""
+    filmer = Filmer(get_task(TASK), Shots(("agentview",), SIZE))
+    _, episode = next(read_episodes(path))
+    seen, _ = filmer.film(episode.states[:1], episode.attrs["fixtures"])
+    moved, _ = filmer.film(episode.states[:1], episode.attrs["fixtures"] + [0.1, 0, 0, 0, 0, 0, 0])
+    filmer.close()
+    np.testing.assert_array_equal(seen["agentview_rgb"][0], episode.obs["agentview_rgb"][0])
+    assert np.abs(seen["agentview_rgb"].astype(int) - moved["agentview_rgb"]).mean() > 1.0
+
+
+def test_states_replay_with_a_film(path):
+    results = list(
+        replay(path, by="state", demos=["demo_1"], cameras=("agentview", "frontview"), size=(16, 24))
+    )
+    assert [result.name for result in results] == ["demo_1"] and results[0].drift.max() < 1e-12
+    assert results[0].frames.shape == (STEPS, 16, 48, 3) and results[0].frames.std() > 1.0
+    with pytest.raises(DemoError, match="no demonstration demo_7"):
+        list(replay(path, demos=["demo_7"]))
+    with pytest.raises(DemoError, match="valid: state, action"):
+        list(replay(path, by="magic"))
+
+
+def test_rendering_anew_gives_the_same_where_nothing_is_changed(path, tmp_path):
+    out = rerender(path, tmp_path / "same.hdf5", Shots(size=SIZE), progress=False)
+    for a, b in zip(read_demos(path), read_demos(out), strict=True):
+        assert a.name == b.name and a.obs.keys() == b.obs.keys()
+        for key in a.obs:
+            np.testing.assert_array_equal(a.obs[key], b.obs[key], err_msg=key)
+
+
+def test_rendering_anew_with_other_cameras_depth_and_segmentation(path, tmp_path):
+    shots = Shots(("agentview", "frontview"), (16, 20), ("rgb", "depth", "segmentation_instance"))
+    out = rerender(path, tmp_path / "other.hdf5", shots, progress=False)
+    demo = read_demos(out)[0]
+    assert {"frontview_rgb", "frontview_depth", "agentview_segmentation"} <= demo.obs.keys()
+    assert (
+        demo.obs["frontview_depth"].shape == (STEPS, 16, 20)
+        and demo.obs["frontview_depth"].dtype == np.float32
+    )
+    assert len(np.unique(demo.obs["agentview_segmentation"])) > 3
+    frame = Filmer(get_task(TASK), shots)
+    _, episode = next(read_episodes(path))
+    seen, _ = frame.film(episode.states[:1], episode.attrs["fixtures"])
+    frame.close()
+    for key in ("frontview_depth", "agentview_segmentation"):
+        np.testing.assert_array_equal(demo.obs[key][0], seen[key][0])  # upright again when it is read
+    with pytest.raises(DemoError, match="was recorded with camera_size"):
+        rerender(path, out, Shots(size=(8, 8)), progress=False)
+    with pytest.raises(DemoError, match="choose another name"):
+        rerender(path, path, Shots(), progress=False)
+
+
+def test_states_of_another_scene_are_refused(path, tmp_path):
+    copy = tmp_path / "short.hdf5"
+    copy.write_bytes(path.read_bytes())
+    with h5py.File(copy, "r+") as handle:
+        states = handle["data/demo_1/states"][:, :-2]
+        del handle["data/demo_1/states"]
+        handle["data/demo_1/states"] = states
+    with pytest.raises(DemoError, match=r"short.hdf5: demo_1/states is .*; expected \(T, "):
+        list(replay(copy, by="state"))
+
+
+def original(source, out):
+    """A file as the original writes it, from recorded states: observations after their action, a path of its own."""
+    task = get_task(TASK)
+    filmer = Filmer(task, Shots(size=SIZE))
+    with h5py.File(out, "w") as handle:
+        data = handle.create_group("data")
+        data.attrs["env_name"] = "Libero_Tabletop_Manipulation"
+        data.attrs["problem_info"] = json.dumps({"language_instruction": task.language})
+        data.attrs["bddl_file_name"] = f"chiliocosm/bddl_files/libero_goal/{task.name}.bddl"
+        data.attrs["bddl_file_content"] = task.bddl_text
+        data.attrs["macros_image_convention"], data.attrs["tag"] = "opengl", "libero-v1"
+        data.attrs["num_demos"], data.attrs["total"] = 1, STEPS - 1
+        episode: Episode = next(read_episodes(source))[1]
+        model, fixtures = filmer.scene.model, episode.attrs["fixtures"]
+        obs, robot = filmer.film(episode.states[1:], fixtures)
+        demo = data.create_group("demo_0")
+        demo["actions"], demo["states"] = episode.actions[:-1], episode.states[:-1]
+        demo["robot_states"] = robot
+        demo["rewards"] = demo["dones"] = np.eye(STEPS - 1, dtype=np.uint8)[-1]
+        for key, values in obs.items():
+            demo[f"obs/{key}"] = values[:, ::-1] if key.endswith("_rgb") else values
+        demo.attrs["num_samples"], demo.attrs["init_state"] = STEPS - 1, episode.states[0]
+        bodies = [
+            f'<body name="{model.body(body).name}" pos="{" ".join(map(str, pose[:3]))}" '
+            f'quat="{" ".join(map(str, pose[3:]))}"/>'
+            for body, pose in zip(filmer.scene.fixture_bodies, fixtures, strict=True)
+        ]
+        demo.attrs["model_file"] = f"<mujoco><worldbody>{''.join(bodies)}</worldbody></mujoco>"
+    filmer.close()
+    return out
+
+
+def test_files_of_the_original_work_with_every_tool(path, tmp_path):
+    file = original(path, tmp_path / "human_demo.hdf5")
+    assert task_of(file) is get_task(TASK) and examine(file).lengths == (STEPS - 1,)
+    (result,) = replay(file, by="action")
+    assert result.drift.max() < 1e-9 and result.arm_drift.max() < 1e-9
+    (ours,) = read_demos(path, limit=1)
+    (theirs,) = read_demos(file)
+    np.testing.assert_array_equal(
+        theirs.obs["agentview_rgb"], ours.obs["agentview_rgb"][1:]
+    )  # upright, one later
+    again = rerender(file, tmp_path / "aligned.hdf5", Shots(size=SIZE), progress=False)
+    (anew,) = read_demos(again)
+    assert anew.pairing == "aligned"
+    np.testing.assert_array_equal(anew.obs["agentview_rgb"], ours.obs["agentview_rgb"][:-1])
+    pytest.importorskip("av")
+    pytest.importorskip("pyarrow")
+    assert export([file], tmp_path / "set", progress=False) == (1, STEPS - 2)
+
+
+def test_recorded_models_have_the_joints_of_the_states(path):
+    _, episode = next(read_episodes(path))
+    model = LiberoEnv(TASK, cameras=()).world.scene.model
+    assert all(f'name="{model.joint(j).name}"' in episode.attrs["model_file"] for j in range(model.njnt))
+
+
+def test_a_task_beyond_the_expert_stops_no_other(tmp_path, monkeypatch):
+    class Choosy:
+        def __init__(self, task, *args, **kwargs):
+            if task.id == TASK:
+                raise UnsupportedGoalError("no skill for that")
+
+    monkeypatch.setattr("libero_env.demos_studio.Expert", Choosy)
+    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    jobs = [
+        (Recipe(t, (8, 8)), tmp_path / f"{t[-6:].replace('/', '')}.hdf5") for t in (TASK, "libero_goal/4")
+    ]
+    tallies = list(make_demos(jobs, 2, workers=1, progress=False).values())
+    assert "no skill for that" in tallies[0].error and tallies[0].recorded == 0 and not jobs[0][1].exists()
+    assert not tallies[1].error and tallies[1].recorded == tallies[1].attempts == 2
+    assert len(read_demos(jobs[1][1])) == 2
+    with pytest.raises(DemoError, match=r"1 of 1 files are not complete.*no skill for that"):
+        generate(TASK, 1, path=tmp_path / "again.hdf5", camera_size=(8, 8), workers=1, progress=False)
+
+
+def test_an_expert_that_always_fails_is_given_up(tmp_path, monkeypatch):
+    def idle(stage, experts, noise, max_steps):
+        return [
+            Attempt(False, np.zeros((1, 9)), *[np.zeros((0, 7))] * 2, 0, "it did nothing") for _ in experts
+        ]
+
+    monkeypatch.setattr("libero_env.demos_studio.run_experts", idle)
+    jobs = [(Recipe(TASK, (8, 8), variation=Variation(reserved=True)), tmp_path / "a.hdf5")]
+    (tally,) = make_demos(jobs, 2, workers=1, progress=False).values()
+    assert (
+        tally.attempts == 20 and tally.reasons == {"it did nothing": 20} and "failed 10 times" in tally.error
+    )
+
+
+def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    recipe = Recipe(TASK, (8, 8), variation=Variation(reserved=True))
+    make_demos([(recipe, tmp_path / "a.hdf5")], 2, workers=1, progress=False)
+    env = LiberoEnv(TASK, cameras=())
+    for i, (_, episode) in enumerate(read_episodes(tmp_path / "a.hdf5")):
+        env.reset(options={"init_state": i})
+        np.testing.assert_array_equal(episode.states[0], env.world.physics_state(0))
+        np.testing.assert_array_equal(episode.attrs["fixtures"], env.world.simulations.fixtures[0])
+
+
+def test_a_task_file_of_ones_own_is_recorded(tmp_path, monkeypatch):
+    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    file = tmp_path / "my_task.bddl"
+    file.write_text(get_task("libero_object/9").bddl_text)
+    path = generate(str(file), 1, path=tmp_path / "a.hdf5", camera_size=(8, 8), workers=1, progress=False)
+    task = task_of(path)
+    assert task.name == "my_task" and task.id == "file/0" and examine(path).lengths == (STEPS,)
+    changed = file.read_text().replace("(:language ", "(:language Kindly ")
+    file.write_text(changed)
+    with pytest.raises(DemoError, match="bddl_file_content"):
+        generate(str(file), 2, path=path, camera_size=(8, 8), workers=1, progress=False)

@@ -1,0 +1,156 @@
+"""What is done with whole files: the task they name, what is counted, what is left out, and other readers."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from libero_env.demos import read_demos
+from libero_env.demos_stats import QUANTILES, Histogram, Moments
+from libero_env.demos_tools import examine, filter_demos, noops, read_episodes, task_of
+from libero_env.demos_write import DemoWriter
+from libero_env.errors import DemoError
+from libero_env.tasks import get_task
+from tests.libero_env.test_demos import episode, header
+
+pytestmark = pytest.mark.unit
+
+
+def write(path, episodes, **more):
+    writer = DemoWriter(path, header(**more))
+    for i, one in enumerate(episodes):
+        writer.write(i, one)
+    return writer.finish()
+
+
+def with_noops(seed):
+    """An episode whose steps 3 and 4 want nothing; the fingers begin to close in step 7, where nothing moves."""
+    one = episode(seed)
+    one.expert_actions[:, 6] = -1.0
+    one.expert_actions[7:, 6] = 1.0
+    one.expert_actions[[3, 4, 7], :6] = 0.0
+    return one
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "a_demo.hdf5", [with_noops(0), replace(episode(1), success=False), with_noops(2)])
+
+
+def test_a_no_op_neither_moves_nor_grips():
+    actions = with_noops(0).expert_actions
+    assert np.flatnonzero(noops(actions)).tolist() == [3, 4]
+    assert noops(actions, threshold=2.0).sum() == len(actions) - 1  # the one that grips is left
+
+
+def test_files_are_counted(path):
+    stats = examine(path)
+    assert stats.lengths == (11, 11, 11) and stats.successes == 2 and stats.noops == 4 and not stats.faults
+    assert "2 of 3 successful" in str(stats) and f"{100 * 4 / 33:.1f} % no-ops" in str(stats)
+
+
+def test_what_is_odd_is_named(path):
+    with h5py.File(path, "r+") as handle:
+        handle["data/demo_1/actions"][0, 0] = 3.0
+        handle["data/demo_2/obs/ee_pos"][4] = np.nan
+        del handle["data/demo_2/obs/joint_states"]
+        handle["data"].attrs["total"] = 7
+    faults = "\n".join(examine(path).faults)
+    for words in (
+        "demo_1/actions reach 3.00",
+        "demo_2/obs/ee_pos has values that are not finite",
+        "demo_2 has no obs/joint_states",
+        "total is 7; expected 33",
+    ):
+        assert words in faults, faults
+
+
+def test_filtering_keeps_what_is_wanted_as_it_was(path, tmp_path):
+    stats = filter_demos(path, tmp_path / "b.hdf5", success_only=True, without_noops=True)
+    assert stats.lengths == (9, 9) and stats.successes == 2 and stats.noops == 0
+    kept, whole = read_demos(tmp_path / "b.hdf5"), read_demos(path)
+    steps = np.setdiff1d(np.arange(11), [3, 4])
+    for demo, source in zip(kept, (whole[0], whole[2]), strict=True):
+        np.testing.assert_array_equal(demo.actions, source.actions[steps])
+        np.testing.assert_array_equal(demo.states, source.states[steps])
+        for key, values in source.obs.items():
+            np.testing.assert_array_equal(demo.obs[key], values[steps])
+    with h5py.File(tmp_path / "b.hdf5") as handle:
+        assert [handle[f"data/demo_{i}"].attrs["source_demo"] for i in range(2)] == ["demo_0", "demo_2"]
+
+
+def test_filtering_nothing_changes_nothing(path, tmp_path):
+    filter_demos(path, tmp_path / "b.hdf5")
+    for (name, a), (_, b) in zip(read_episodes(path), read_episodes(tmp_path / "b.hdf5"), strict=True):
+        for key in ("actions", "states", "robot_states", "expert_actions"):
+            np.testing.assert_array_equal(getattr(a, key), getattr(b, key), err_msg=name)
+        assert a.obs.keys() == b.obs.keys() and a.success == b.success
+        assert all(np.array_equal(a.obs[key], b.obs[key]) for key in a.obs)
+
+
+def test_nothing_is_overwritten_nor_written_empty(path, tmp_path):
+    with pytest.raises(DemoError, match="exists"):
+        filter_demos(path, path)
+    failed = write(tmp_path / "failures.hdf5", [replace(episode(1), success=False)])
+    with pytest.raises(DemoError, match="no demonstration is successful"):
+        filter_demos(failed, tmp_path / "c.hdf5", success_only=True)
+    assert not (tmp_path / "c.hdf5").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "words"), [("states", "demo_1/states is missing"), ("actions", "demo_1/actions is missing")]
+)
+def test_what_is_missing_is_named(path, key, words):
+    with h5py.File(path, "r+") as handle:
+        del handle[f"data/demo_1/{key}"]
+    with pytest.raises(DemoError, match=words) as caught:
+        examine(path)
+    assert path.name in str(caught.value) and "expected" in str(caught.value)
+
+
+def test_the_task_is_found_by_name_and_by_text(tmp_path):
+    task = get_task("libero_goal/3")
+    names = {"bddl_file_name": f"somewhere/bddl_files/libero_goal/{task.name}.bddl"}
+    known = write(tmp_path / "known.hdf5", [episode(0)], **names, bddl_file_content=task.bddl_text)
+    assert task_of(known) is task
+    bare = write(tmp_path / "bare.hdf5", [episode(0)], **names, bddl_file_content="")
+    assert task_of(bare) is task
+    other = task.bddl_text.replace("(:language ", "(:language Please ")
+    own = task_of(write(tmp_path / "own.hdf5", [episode(0)], **names, bddl_file_content=other))
+    assert own.id == "file/0" and own.name == task.name and own.problem.objects == task.problem.objects
+    nameless = write(tmp_path / "no.hdf5", [episode(0)], bddl_file_name="x.bddl", bddl_file_content="")
+    with pytest.raises(DemoError, match="bddl_file_name"):
+        task_of(nameless)
+
+
+def test_statistics_add_up():
+    """Those of parts together are those of the whole, and those of a histogram those of the pixels."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(90, 3))
+    whole = (Moments.of(values[:40]) + Moments.of(values[40:])).values()
+    np.testing.assert_allclose(whole["std"], values.std(axis=0))
+    np.testing.assert_allclose(whole["q10"], np.quantile(values, 0.1, axis=0))
+    frames = np.clip(rng.normal(100, 60, (20, 8, 8, 3)), 0, 255).astype(np.uint8)
+    found = (Histogram.of(frames[:7]) + Histogram.of(frames[7:])).values()
+    pixels = frames.reshape(-1, 3) / 255.0
+    quantiles = np.quantile(pixels, QUANTILES, axis=0, method="inverted_cdf")
+    for name, wanted in {"min": pixels.min(0), "max": pixels.max(0), "mean": pixels.mean(0), "std": pixels.std(0),
+                         "q01": quantiles[0], "q50": quantiles[2], "q99": quantiles[4]}.items():  # fmt: skip
+        np.testing.assert_allclose(np.ravel(found[name]), wanted, atol=1e-9, err_msg=name)
+        assert np.shape(found[name]) == (3, 1, 1)
+    assert found["count"] == [20]
+
+
+def test_robomimic_reads_the_files(path):
+    dataset = pytest.importorskip("robomimic.utils.dataset")
+    obs_utils = pytest.importorskip("robomimic.utils.obs_utils")
+    obs_utils.initialize_obs_utils_with_obs_specs(
+        {"obs": {"low_dim": ["joint_states"], "rgb": ["agentview_rgb"]}}
+    )
+    windows = dataset.SequenceDataset(
+        str(path), obs_keys=("joint_states", "agentview_rgb"), dataset_keys=("actions", "rewards", "dones"),
+        load_next_obs=False, frame_stack=1, seq_length=4, hdf5_cache_mode=None,
+    )  # fmt: skip
+    assert windows.n_demos == 3 and len(windows) == 33
+    np.testing.assert_array_equal(windows[0]["actions"], episode(0).actions[:4])

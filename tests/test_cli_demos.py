@@ -1,0 +1,118 @@
+"""`libero demos`: options mean what they say, and every tool runs on what was recorded."""
+
+import argparse
+from pathlib import Path
+
+import h5py
+import pytest
+
+from libero_env.demos import read_demos
+from libero_env.demos_studio import Tally
+from lifelong import cli, cli_demos
+from tests.libero_env.test_demos_replay import wander
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("demos")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("libero_env.demos_studio.run_experts", wander)
+        argv = [
+            "demos",
+            "generate",
+            "--task",
+            "libero_goal/3",
+            "--n",
+            "2",
+            "--size",
+            "16x24",
+            "--depth",
+            "--workers",
+            "1",
+        ]
+        assert cli.main([*argv, "--folder", str(root), "--cameras", "agentview", "--variation", "none"]) == 0
+    return root
+
+
+@pytest.fixture
+def file(folder):
+    (file,) = folder.rglob("*.hdf5")
+    return file
+
+
+def test_options_are_recorded(file):
+    with h5py.File(file) as handle:
+        attrs, demo = handle["data"].attrs, handle["data/demo_0"]
+        assert attrs["camera_size"].tolist() == [16, 24] and not attrs["disturbed"]
+        assert '"style": false' in attrs["variation"] and "expert_actions" not in demo
+        assert demo["obs/agentview_depth"].shape[1:] == (16, 24) and "eye_in_hand_rgb" not in demo["obs"]
+
+
+def test_every_tool_runs(file, tmp_path, capsys):
+    def ran(*argv, status=0):
+        assert cli.main(["demos", *map(str, argv)]) == status
+        return capsys.readouterr().out
+
+    assert "2 demonstrations, 24 steps, 16x24 pixels" in ran("info", file)
+    assert "12-12 steps (mean 12), 2 of 2 successful" in ran("check", file)
+    told = ran("replay", file, "--demo", 1, "--video", tmp_path / "film.gif", "--size", 32, status=1)
+    assert (
+        "demo_1: no success after 12 steps, largest drift: objects 0.00 mm" in told
+    )  # said to be one, and is none
+    assert (tmp_path / "film.gif").stat().st_size > 1000
+    assert "16x16 pixels" in ran("rerender", file, tmp_path / "new.hdf5", "--size", 16)
+    assert set(read_demos(tmp_path / "new.hdf5")[0].obs) >= {"agentview_rgb", "eye_in_hand_rgb"}
+    assert "12-12 steps" in ran("filter", file, tmp_path / "kept.hdf5", "--success", "--no-ops")
+    pytest.importorskip("av")
+    pytest.importorskip("pyarrow")
+    assert "2 episodes, 24 frames" in ran("export", file, "--out", tmp_path / "set")
+
+
+def test_failures_are_counted_by_kind():
+    tally = Tally(recorded=2, attempts=8)
+    tally.reasons.update(
+        {"in phase reach after 250 steps": 2, "in phase reach after 91 steps": 3, "mug_1 tipped": 1}
+    )
+    lines = cli_demos.report(tally)
+    assert lines == [
+        "2 of 8 attempts successful (25 %)",
+        "5 x in phase reach after N steps",
+        "1 x mug_1 tipped",
+    ]
+    tally.error = "it gave up"
+    assert cli_demos.report(tally)[-1] == "ERROR it gave up"
+    assert cli_demos.summary({Path("a"): Tally(3), Path("b"): tally}, 3) == (
+        "1 of 2 tasks complete, 25.0 % of 8 attempts successful"
+    )
+
+
+def test_sizes_are_one_number_or_two():
+    assert cli_demos.size("64") == (64, 64) and cli_demos.size("48x64") == (48, 64)
+    for wrong in ("0", "1x2x3", "4x"):
+        with pytest.raises((argparse.ArgumentTypeError, ValueError)):
+            cli_demos.size(wrong)
+
+
+@pytest.mark.parametrize(
+    ("argv", "hint"),
+    [
+        (["generate", "--task", "libero_goal/99", "--n", "1"], "index of libero_goal"),
+        (
+            ["generate", "--task", "libero_goal/3", "--n", "1", "--cameras", "agentveiw"],
+            "Did you mean 'agentview'?",
+        ),
+        (["generate", "--bddl", "nowhere.bddl", "--n", "1"], "nowhere.bddl"),
+        (["replay", "nowhere.hdf5"], "nowhere.hdf5"),
+        (["filter", "nowhere.hdf5", "b.hdf5"], "nowhere.hdf5"),
+        (["export", "nowhere.hdf5", "--out", "set"], "nowhere.hdf5"),
+    ],
+)
+def test_wrong_input_is_one_line_and_a_status(argv, hint, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))
+    assert cli.main(["demos", *argv]) == 2
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("libero: error:")]
+    assert len(lines) == 1 and hint in lines[0]
