@@ -28,7 +28,7 @@ from libero_env.demos_lerobot_files import (
     import_arrow,
 )
 from libero_env.demos_stats import Histogram, Moments
-from libero_env.demos_tools import header_of, read_episodes, select, task_of
+from libero_env.demos_tools import header_of, read_episodes, task_of
 from libero_env.demos_video import PIXELS, import_av
 from libero_env.demos_write import Episode
 from libero_env.env import CONTROL_HZ
@@ -70,13 +70,15 @@ def export(
     dataset = _Dataset(partial, video_mb)
     try:
         for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
-            language = _language(file)
+            language, pairing = _language(file), header_of(file).get("pairing", "libero")
             for name, episode in read_episodes(file):
-                dataset.add(_row(file, name, episode, labels), language)
+                dataset.add(_row(f"{file}: {name}", episode, pairing, labels), language)
+        dataset.close()
+        counts = dataset.finish()
+        partial.rename(root)
     finally:
         dataset.close()
-    counts = dataset.finish()
-    partial.rename(root)
+        shutil.rmtree(partial, ignore_errors=True)
     return counts
 
 
@@ -99,22 +101,21 @@ def _language(file: Path) -> str:
         return task_of(file).language
 
 
-def _row(file: Path, name: str, episode: Episode, labels: str) -> _Row:
-    pairing = header_of(file).get("pairing", "libero")
-    wanted = (
-        episode.expert_actions
-        if labels == "expert" and episode.expert_actions is not None
-        else episode.actions
-    )
+def _row(where: str, episode: Episode, pairing: str, labels: str) -> _Row:
+    wanted = episode.actions
+    if labels == "expert" and episode.expert_actions is not None:
+        wanted = episode.expert_actions
     obs = episode.obs
     for key in ("ee_pos", "ee_ori", "gripper_states"):
         if key not in obs:
-            raise BrokenDemoError(f"{file}: {name}/obs/{key} is missing; expected it beside {', '.join(obs)}")
+            raise BrokenDemoError(f"{where}/obs/{key} is missing; expected it beside {', '.join(obs)}")
     if pairing == "libero":  # the observation before action t + 1 is the one after action t
-        obs, wanted = select(episode, slice(None, -1)).obs, wanted[1:]
+        obs, wanted = {key: values[:-1] for key, values in obs.items()}, wanted[1:]
+    if not len(wanted):
+        raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
     state = np.concatenate([obs["ee_pos"], obs["ee_ori"], obs["gripper_states"]], axis=1).astype(np.float32)
     pictures = {feature_of(key): values for key, values in obs.items() if key.endswith("_rgb")}
-    return _Row(state, wanted.astype(np.float32), episode.success, pictures, f"{file}: {name}")
+    return _Row(state, wanted.astype(np.float32), episode.success, pictures, where)
 
 
 def feature_of(key: str) -> str:
@@ -136,7 +137,7 @@ class _Dataset:
         self._videos: dict[str, Video] = {}
         self._video_mb = video_mb
         self._data = Table(root)
-        self._stats: dict[str, Moments | Histogram] = {}
+        self._stats: dict[str, Any] = {}  # Moments or Histogram
 
     def add(self, row: _Row, language: str) -> None:
         """Append an episode."""
@@ -169,7 +170,7 @@ class _Dataset:
 
     def _measure(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> dict[str, Any]:
         """Statistics of an episode, which are counted into those of all."""
-        own: dict[str, Moments | Histogram] = {key: Moments.of(values) for key, values in columns.items()}
+        own: dict[str, Any] = {key: Moments.of(values) for key, values in columns.items()}
         own |= {key: Histogram.of(frames) for key, frames in pictures.items()}
         for key, stats in own.items():
             self._stats[key] = stats if key not in self._stats else self._stats[key] + stats

@@ -199,12 +199,15 @@ def filter_demos(
 
 
 def select(episode: Episode, keep: np.ndarray) -> Episode:
-    """Some of the steps of a demonstration, by a mask (T,) or a slice."""
-    cut = {k: None if (v := getattr(episode, k)) is None else v[keep] for k in _ARRAYS}
-    return replace(episode, **cut, obs={key: values[keep] for key, values in episode.obs.items()})
+    """Some of the steps of a demonstration, by a mask (T,)."""
 
+    def cut(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[keep]
 
-_ARRAYS = ("actions", "states", "robot_states", "expert_actions")
+    return replace(
+        episode, actions=episode.actions[keep], states=episode.states[keep], robot_states=cut(episode.robot_states),
+        expert_actions=cut(episode.expert_actions), obs={key: values[keep] for key, values in episode.obs.items()},
+    )  # fmt: skip
 
 
 def _labels(episode: Episode) -> np.ndarray:

@@ -3,6 +3,7 @@
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -40,7 +41,7 @@ class Mp4:
         self._av, self.path, self.frames = import_av(), path, 0
         self._fps, self._crf = fps, crf
         self._container = self._av.open(str(path), "w")
-        self._stream = None
+        self._stream: Any = None
 
     def add(self, frames: np.ndarray) -> None:
         """Append frames (T, H, W, 3) uint8.
@@ -70,7 +71,7 @@ class Mp4:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, height: int, width: int):
+    def _open(self, height: int, width: int) -> Any:
         if height % 2 or width % 2:
             raise LiberoError(
                 f"{self.path}: frames of {height}x{width} pixels; MP4 needs even numbers, or write a .gif"
