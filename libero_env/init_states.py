@@ -137,7 +137,8 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
                 f"make them anew: libero tasks init-states {task.suite}"
             )
         return shipped[1]
-    path = cache_dir() / "init_states" / f"{task.name[:80]}-{digest}.npz"
+    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[:16]  # regions and atoms, which the digest knows not
+    path = cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{said}.npz"
     if path.exists():
         with np.load(path, allow_pickle=False) as stored:
             return stored["states"]

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from libero_env import init_states
 from libero_env.assets import select_pack
 from libero_env.init_states import load_init_states, split_row, start_faults
 from libero_env.original_states import read_states
@@ -12,13 +13,14 @@ from libero_env.predicates import StateView, evaluate
 from libero_env.problem import Atom
 from libero_env.scene import build_scene
 from libero_env.simulation import LoopSimulations
-from libero_env.tasks import get_suite, get_task, suite_names
+from libero_env.tasks import get_suite, get_task, read_task, suite_names
 
 pytestmark = pytest.mark.sim
 
 TASKS = sorted({task.id for name in suite_names() for task in get_suite(name).tasks})
 PREDICATE_RECORDINGS = (
-    "libero_10-03", "libero_10-08", "libero_90-01", "libero_90-70", "libero_goal-01", "libero_object-00", "libero_spatial-02",
+    "libero_10-03", "libero_10-08", "libero_90-01", "libero_90-70", "libero_goal-01", "libero_object-00",
+    "libero_spatial-02",
 )  # fmt: skip
 MOTION_RECORDINGS = (
     "libero_10-00-grasp", "libero_10-04-grasp", "libero_10-09-random", "libero_90-20-random", "libero_90-60-grasp",
@@ -123,3 +125,22 @@ def test_free_motion_is_that_of_the_recordings(shared, recording):
     for t in range(free):
         simulations.step([0], commands[t : t + 1])
         np.testing.assert_allclose(simulations.fields["qpos"][0, :9], states[t + 1, 1:10], atol=1e-6, rtol=0)
+
+
+def test_starts_of_a_file_follow_its_regions(tmp_path, monkeypatch):
+    """States that are made on demand are kept for the text they were made for."""
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    monkeypatch.setattr(init_states, "NUM_INIT_STATES", 2)
+    monkeypatch.setattr(init_states.generate_init_states, "__defaults__", (2,))
+    text = get_task("libero_goal/8").bddl_text
+    region = "(0.04 -0.03 0.060000000000000005 -0.01)"
+    assert region in text
+    found = []
+    for where in (region, "(0.14 -0.03 0.16 -0.01)"):
+        file = tmp_path / "plate.bddl"
+        file.write_text(text.replace(region, where))
+        task = read_task(file)
+        scene = build_scene(task.problem)
+        qpos, _, _ = split_row(scene.model, load_init_states(task, scene))
+        found.append(qpos[0, scene.model.joint("plate_1_joint0").qposadr[0]])
+    assert found[1] - found[0] > 0.07
