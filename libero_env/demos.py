@@ -98,9 +98,9 @@ def aligned(demo: Demo) -> Demo:
     """The demonstration with each action beside the observation before it; a "libero" one loses its first action."""
     if demo.pairing == "aligned":
         return demo
-    later = [None if x is None else x[1:] for x in (demo.states, demo.rewards, demo.dones)]
+    states, rewards, dones = (None if x is None else x[1:] for x in (demo.states, demo.rewards, demo.dones))
     obs = {key: value[:-1] for key, value in demo.obs.items()}
-    return Demo(demo.name, demo.actions[1:], obs, *later, success=demo.success, pairing="aligned")
+    return Demo(demo.name, demo.actions[1:], obs, states, rewards, dones, demo.success, "aligned")
 
 
 def demo_files(path: str | Path) -> list[Path]:
@@ -233,9 +233,7 @@ def _check_shape(
 def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str) -> Demo:
     group = data[name]
 
-    def read(key: str) -> np.ndarray | None:
-        if key not in group:
-            return None
+    def read(key: str) -> np.ndarray:
         try:
             return group[key][()]
         except OSError as error:
@@ -253,7 +251,7 @@ def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str)
         raise BrokenDemoError(
             f"{file}: {name}/{wanted} has values that are not finite; expected numbers in [-1, 1]"
         )
-    states, rewards, dones = read("states"), read("rewards"), read("dones")
+    states, rewards, dones = (read(key) if key in group else None for key in ("states", "rewards", "dones"))
     ends = [x[-1] for x in (rewards, dones) if x is not None]
     success = bool(group.attrs.get("success", any(end > 0 for end in ends) if ends else True))
     return Demo(name, actions, obs, states, rewards, dones, success, data.attrs.get("pairing", "libero"))

@@ -57,7 +57,7 @@ def generate(
     Raises:
         DemoError: the file there was made otherwise, cannot be written, or the expert cannot do the task.
     """
-    recipe = Recipe(Recipe(task).task, tuple(camera_size), seed, pairing, disturb)
+    recipe = Recipe(Recipe(task).task, (camera_size[0], camera_size[1]), seed, pairing, disturb)
     path = Path(path)
     _refuse_failures(make_demos([(recipe, path)], n, workers=workers, progress=progress))
     return path
@@ -89,7 +89,9 @@ def ensure_demos(
     """
     tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
     root = demos_dir() if root is None else Path(root)
-    jobs = [(r, demo_path(root, r)) for r in (Recipe(t, tuple(camera_size), seed) for t in tasks)]
+    jobs = [
+        (r, demo_path(root, r)) for r in (Recipe(t, (camera_size[0], camera_size[1]), seed) for t in tasks)
+    ]
     _refuse_failures(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
     return [path for _, path in jobs]
 
@@ -213,13 +215,14 @@ def _run(
 def _die_with_parent() -> None:
     """End this process when its parent is gone: the workers of a killed recording would wait for ever."""
     parent = multiprocessing.parent_process()
+    if parent is None:
+        return
 
     def watch() -> None:
         connection.wait([parent.sentinel])
         os._exit(1)
 
-    if parent is not None:
-        threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def cores() -> int:

@@ -246,7 +246,7 @@ def model_digest(task: Task) -> str:
     model = build_scene(task.problem).model
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
-    return hashlib.sha256(buffer).hexdigest()[:16]
+    return hashlib.sha256(buffer.tobytes()).hexdigest()[:16]
 
 
 def _env_kwargs(shots: Shots) -> dict:
