@@ -154,7 +154,7 @@ class MoveJoint:
         if self.state in ("open", "turnon"):
             return threshold + way * min(0.5 * width, 0.25)
         if self.state == "turnoff":
-            return 0.5 * (threshold + end)
+            return end
         stop = view.scene.model.jnt_range[part.joint][1 if way > 0 else 0]
         return float(max(end, stop) if way > 0 else min(end, stop))
 
@@ -225,18 +225,22 @@ class MoveJoint:
         hold = _placed(part.pose(view), self._hold.held)
         anchor, axis = part.axis(view)
         arm = 1.0 if part.slides else max(float(np.linalg.norm(np.cross(hold.pos - anchor, axis))), 0.03)
-        slow = abs(value - self._value) * arm < 5e-4
+        speed = np.sign(left) * (value - self._value) * CONTROL_HZ
+        slow = abs(speed) * arm < 0.01
         self._value = value
         self._still = self._still + 1 if slow and self._steps > 5 else 0
-        if self._moved(view) and (slow or self.state in ("open", "turnon")) or self._still > 25 or self._stage(left):
+        settled = slow or self.state in ("open", "turnon")
+        if self._moved(view) and settled or self._still > 25 or self._stage(left):
             self._drawn = self._stage(left)
             self._enter("release")
             return self._release(view)
         if self._hold.grips and np.linalg.norm(view.eef_pos - hold.pos) > SLIPPED:
             return self._retreat(view)
         lead = min(LEAD / arm, 0.5)
-        extra = 0.02 if self.state == "turnoff" else 0.5 * lead  # beyond it, as the hand gives way
-        ahead = np.sign(left) * min(abs(left) + extra, lead)
+        if self.state == "turnoff":  # a knob is heavy, and its stop throws it back
+            ahead = np.sign(left) * np.clip(min(2.0 * abs(left) + 0.02, 1.2) - speed, -lead, lead)
+        else:
+            ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
         goal = part.moved(view, hold, ahead)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
 

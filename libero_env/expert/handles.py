@@ -19,7 +19,7 @@ OPEN_HALF = 0.04  # m, of an open finger from the middle
 TIP = 0.0145  # m, thickness of a finger at its tip, which reaches TIP_BELOW beyond the grip site
 TIP_BELOW = 0.0095
 _WIDENS = 0.41  # m of thickness for each m further up
-_NEAR = 0.35  # m, around the handle: what lies further away is not looked at
+_FINE, _NEAR = 0.11, 0.32  # m, around the handle: looked at closely, and at all
 _BEHIND = 0.008  # m without points: the space behind a handle's bar
 _TILTS = np.radians([90, 75, 65, 55, 45, 35, 25])  # of the approach below the horizontal
 _ROLLS = (0.0, 0.8, -0.8)  # rad, of the fingers from across a level bar
@@ -28,7 +28,7 @@ _FORTH = (0.0, -0.005)  # m, of the grip site beyond the middle of the bar
 _SPARE = 0.002  # m, around the hand
 _SHOULDER = np.array([-0.66, 0.0, 0.333])  # m, of the arm, height above its base
 _HAND_LENGTH = 0.21  # m, from the flange to the grip site
-_REACH = 0.74  # m, from the shoulder to the flange, without stretching
+_REACH = 0.42, 0.74  # m, from the shoulder to the flange, without folding or stretching the arm
 _WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
 
 
@@ -188,15 +188,16 @@ def handle_hold(
     """
     fixed = surroundings(view, part.body, handle.pos, view.scene.fixtures)
     loose = surroundings(view, part.body, handle.pos, view.scene.objects)
-    own = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.01))
-    here, floor = np.concatenate([own, fixed, loose]), view.scene.workspace.surface_height
+    own = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.012))
+    floor, half = view.scene.workspace.surface_height, OPEN_HALF if grips else 0.0
+    spans = [(own, (half, half)), (np.concatenate([fixed, loose]), (0.0, half))]
     base, ranked = view.scene.workspace.robot_base_pos[2], []
     for cost, hold in _candidates(handle, grips):
         for pose in (hold.ready, part.moved(view, hold.held, delta)):
             cost += 0.12 * strain(pose) ** 2 + 20.0 * stretch(pose, base)
-        cost += 0.1 * float(np.linalg.norm(rotation_between(view.eef_mat, hold.ready.mat)))
-        cost += sum(0.5 * _alike(hold.ready, pose) for pose in failed)
-        ranked.append((cost, hold))
+        turn = 0.5 * (np.sum(view.eef_mat * hold.ready.mat) - 1.0)
+        cost += 0.1 * float(np.arccos(np.clip(turn, -1.0, 1.0)))
+        ranked.append((cost + sum(0.5 * _alike(hold.ready, pose) for pose in failed), hold))
     best: tuple[float, Hold] | None = None
     for cost, hold in sorted(ranked, key=lambda pair: pair[0]):
         if best is not None and cost >= best[0]:
@@ -205,10 +206,11 @@ def handle_hold(
         moved = [part.moved(view, hold.held, share * delta) for share in (0.5, 1.0)]
         backs = [Pose(ready.pos + back * hold.back, ready.mat) for back in (0.0, 0.03, 0.07)]
         depth = max(under(floor, pose, grips) for pose in (ready, *moved))
-        for points, pose, opened in [(here, p, grips) for p in backs] + [(fixed, p, False) for p in moved]:
+        checks = [(points, pose, *span) for pose in backs for points, span in spans]
+        for points, pose, *span in checks + [(fixed, pose, 0.0, 0.0) for pose in moved]:
             if cost + _blocked(depth) >= worst:
                 break
-            depth = max(depth, crowding(points, pose, opened))
+            depth = max(depth, crowding(points, pose, *span))
         cost += _blocked(depth)
         if best is None or cost < best[0]:
             best = cost, hold
@@ -219,7 +221,7 @@ def handle_hold(
 
 def _blocked(depth: float) -> float:
     """Cost of a hand that is so deep in something, m."""
-    return 150.0 * depth + 0.5 * (depth > 0.002)
+    return 150.0 * depth + 0.8 * (depth > 0.001)
 
 
 def _alike(pose: Pose, other: Pose) -> bool:
@@ -234,8 +236,9 @@ def _candidates(handle: Handle, grips: bool) -> Iterator[tuple[float, Hold]]:
         fingers = np.cross(handle.along, -handle.out if upright else approach)
         fingers = sign * (np.cos(roll) * fingers + np.sin(roll) * handle.along)
         mat = np.column_stack([fingers, np.cross(approach, fingers), approach])
-        for cost, hold in (_grips if grips else _pushes)(handle, mat):
-            yield cost + 0.3 * abs(roll), hold
+        if strain(Pose(handle.pos, mat)) < 0.5 * np.pi + 0.4:
+            for cost, hold in (_grips if grips else _pushes)(handle, mat):
+                yield cost + 0.3 * abs(roll), hold
 
 
 def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
@@ -264,30 +267,39 @@ def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
     tip = np.array([s * TIP * fingers + t * FINGER_HALF_WIDTH * across + TIP_BELOW * approach
                     for s in (1, -1) for t in (1, -1)])  # fmt: skip
     forward = float((-tip @ handle.out).max())
-    low, high = (offset @ handle.along).min() + 0.02, (offset @ handle.along).max() - 0.02
-    for shift in sorted({0.0, *np.linspace(low, high, 7)}, key=abs):
-        near = (np.abs(offset @ handle.along - shift) < 0.012) & (np.abs(offset @ beside) < 0.012)
+    upright = abs(handle.along[2]) > 0.7
+    tilt = np.arcsin(np.clip(-approach[2], -1, 1))
+    sides = _spread(offset @ beside, 5) if upright else [0.0]
+    for shift, side in product(_spread(offset @ handle.along, 7), sides):
+        near = (np.abs(offset @ handle.along - shift) < 0.012) & (np.abs(offset @ beside - side) < 0.012)
         if not near.any():
             continue
         front = float((offset[near] @ handle.out).max())
-        pos = handle.pos + shift * handle.along + (front + forward + 0.004) * handle.out
-        tilt = np.arcsin(np.clip(-approach[2], -1, 1))
+        pos = handle.pos + shift * handle.along + side * beside + (front + forward + 0.004) * handle.out
         hold = Pose(pos, mat)
-        yield 0.5 * abs(shift) + 0.2 * abs(tilt - np.radians(65)), Hold(hold, hold, -approach, False)
+        yield 0.5 * (abs(shift) + abs(side)) + 0.2 * abs(tilt - np.radians(65)), Hold(hold, hold, -approach, False)
 
 
-def crowding(points: np.ndarray, pose: Pose, opened: bool) -> float:
-    """How deep points (N, 3) reach into a hand at a pose of its grip site, m; 0 where it is free."""
+def _spread(values: np.ndarray, number: int) -> list[float]:
+    """0 and values between the ends of a range, m."""
+    return [0.0, *np.linspace(values.min() + 0.02, values.max() - 0.02, number)]
+
+
+def crowding(points: np.ndarray, pose: Pose, inner: float, outer: float) -> float:
+    """How deep points (N, 3) reach into a hand at a pose of its grip site, m; 0 where it is free.
+
+    Its fingers take what is from `inner` to `outer` on both sides, m, and their thickness beyond.
+    """
     offset = points - pose.pos
-    x, y, z = (offset[np.abs(offset).max(axis=1) < 0.15] @ pose.mat).T  # fingers and palm
+    near = offset[(offset * offset) @ np.ones(3) < 0.17**2]
+    x, y, z = (near @ pose.mat).T  # fingers and palm
     x, y = np.abs(x), np.abs(y)
-    inner = OPEN_HALF if opened else 0.0
-    outer = inner + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
-    finger = np.minimum.reduce([outer - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z])
+    sides = outer + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
+    finger = np.minimum.reduce([sides - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z])
     finger = np.where(z > -0.04, finger, 0.0)
     half = np.clip(0.0175 - 0.22 * (z + 0.031), 0.0, 0.032) + _SPARE  # of the palm, which is thinner in front
     palm = np.minimum.reduce([0.104 + _SPARE - x, half - y, -0.031 + _SPARE - z, z + 0.13])
-    x, y, z = (offset @ pose.mat).T
+    x, y, z = (offset[::3] @ pose.mat).T
     wrist = np.minimum.reduce([0.06 - np.abs(x), 0.06 - np.abs(y), -0.12 - z, z + 0.3])
     return float(max(finger.max(initial=0.0), palm.max(initial=0.0), wrist.max(initial=0.0)))
 
@@ -309,22 +321,21 @@ def strain(pose: Pose) -> float:
 
 
 def stretch(pose: Pose, base_height: float) -> float:
-    """How far a hand is beyond easy reach, m."""
+    """How far a hand is out of easy reach, m."""
     offset = pose.pos - _HAND_LENGTH * pose.mat[:, 2] - _SHOULDER - [0.0, 0.0, base_height]
-    return max(0.0, float(np.linalg.norm(offset)) - _REACH)
+    distance = float(np.linalg.norm(offset))
+    return max(0.0, distance - _REACH[1], _REACH[0] - distance)
 
 
-def surroundings(
-    view: StateView, body: int, centre: np.ndarray, names: Iterable[str], spacing: float = 0.012
-) -> np.ndarray:
-    """Points near `centre` on objects and fixtures but one body of them, world frame, (N, 3)."""
+def surroundings(view: StateView, body: int, centre: np.ndarray, names: Iterable[str]) -> np.ndarray:
+    """Points near `centre` on objects and fixtures but one body of them, world frame, (N, 3); fewer further away."""
     model, clouds = view.scene.model, [np.zeros((0, 3))]
-    for name in names:
-        for b in view.scene.bodies[name]:
-            if b != body:
-                clouds.append(_body_pose(view, int(b)).apply(_own_points(model, int(b), spacing)))
-    points = np.concatenate(clouds)
-    return points[np.linalg.norm(points - centre, axis=1) < _NEAR]
+    bodies = [int(b) for name in names for b in view.scene.bodies[name] if b != body]
+    for b, (spacing, low, high) in product(bodies, ((0.009, 0.0, _FINE), (0.02, _FINE, _NEAR))):
+        points = _body_pose(view, b).apply(_own_points(model, b, spacing))
+        distance = np.linalg.norm(points - centre, axis=1)
+        clouds.append(points[(distance >= low) & (distance < high)])
+    return np.concatenate(clouds)
 
 
 def _own_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray:
