@@ -1,6 +1,6 @@
 """How to take and put something together: the pair of a hold and a place that leaves the hand room at both."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,11 +14,11 @@ from libero_env.predicates import StateView
 from libero_env.problem import Atom
 
 _HAND = hand_points()
-_GRASPS, _PLACES, _TRIED = 30, 40, 24
+_GRASPS, _PLACES, _TRIED = 20, 24, 24
 _LIFTS = np.array([0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18])  # m, over the place, from which a body is let fall
-_BEFORE = 0.06  # m, before a hold, where the hand must have room too
-_AZIMUTHS, _TILTS = 8, (0.5, 1.0, 1.45)  # of approaches that are not straight down, rad
-CLEAR = 0.30  # m, before a place that is entered from the side
+_BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room too
+_TILTS = (0.5, 1.0, 1.45)  # rad, of approaches that are not straight down
+_SIDES = 4  # directions of such approaches that are tried
 
 
 @dataclass(frozen=True)
@@ -64,52 +64,61 @@ def choose_approach(
     floor = view.scene.workspace.surface_height
     voxels = Voxels(shapes.others(view, thing, spacing=DENSE), floor, pose.pos)
     spots = places(view, voxels, cloud, pose, atom, share)
-    holds = _free_holds(view, voxels, cloud, thing, sideways=spots[0].entry[2] > -0.5)
+    sides = [pose.mat @ spot.mat.T @ spot.entry for spot in spots[:_PLACES] if spot.entry[2] > -0.5]
+    holds = _free_holds(view, voxels, cloud, thing, _tilts(sides))
     pairs = _pairs(voxels, holds, spots[:_PLACES], pose)
     return _reachable(view, shapes, pairs[skip % len(pairs) :])
 
 
-def _free_holds(view: StateView, voxels: Voxels, cloud: np.ndarray, thing: str, sideways: bool) -> list[Grasp]:
-    """Holds from above, and from the side where the place asks for it, those in the way of others last."""
+def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
+    """Whether something of a body fits between the fingers from above."""
+    try:
+        grasps(shapes.cloud(view, thing), view.scene.workspace.surface_height, finger_axis(view.eef_mat), number=1)
+    except GraspError:
+        return False
+    return True
+
+
+def _free_holds(
+    view: StateView, voxels: Voxels, cloud: np.ndarray, thing: str, tilts: list[np.ndarray]
+) -> list[Grasp]:
+    """Holds from above and along other approaches, those in the way of others last."""
     axis, error, found = finger_axis(view.eef_mat), None, []
-    for tilt in [None, *(_tilts() if sideways else ())]:
+    for tilt in [None, *tilts]:
         try:
             lean = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
-            own = grasps(cloud, voxels.floor, axis, tilt=tilt, name=thing)
+            number = _GRASPS if tilt is None else 6
+            own = grasps(cloud, voxels.floor, axis, tilt=tilt, name=thing, number=number, apart=0.015)
         except GraspError as problem:
             error = error or problem
             continue
-        found += [Grasp(g.pos_world, g.mat, g.width, g.cost + lean) for g in _varied(own, _GRASPS if tilt is None else 6)]
+        found += [replace(g, cost=g.cost + lean) for g in own]
     if not found:
         raise error or GraspError(f"{thing} cannot be grasped")
-    crowd = np.array([voxels.hits(_hand_at(g.pos_world, g.mat)) for g in found])
-    before = np.array([voxels.hits(_hand_at(g.pos_world - _BEFORE * g.mat[:, 2], g.mat)) for g in found])
+    crowd = np.array([voxels.touched(_hand_at(g.pos_world, g.mat)) for g in found])
+    before = np.array(
+        [sum(voxels.touched(_hand_at(g.pos_world - back * g.mat[:, 2], g.mat)) for back in _BEFORE) for g in found]
+    )
     total = [
-        Grasp(g.pos_world, g.mat, g.width, g.cost + 0.03 * a + 0.03 * b + 0.3 * (a > 0))
+        replace(g, cost=g.cost + 0.01 * a + 0.01 * b + 0.3 * (a > 0) + 0.2 * (b > 0))
         for g, a, b in zip(found, crowd, before, strict=True)
     ]
-    return sorted(total, key=lambda g: g.cost)[: 3 * _GRASPS if sideways else _GRASPS]
+    return sorted(total, key=lambda g: g.cost)[: 2 * _GRASPS if tilts else _GRASPS]
 
 
-def _varied(own: list[Grasp], number: int) -> list[Grasp]:
-    """The best, each unlike those before it."""
-    kept: dict[tuple, Grasp] = {}
-    for grasp in own:
-        key = (*np.round(grasp.pos_world / 0.015).astype(int), round(grasp.yaw / 0.35))
-        kept.setdefault(key, grasp)
-        if len(kept) == number:
-            break
-    return list(kept.values())
-
-
-def _tilts() -> list[np.ndarray]:
-    """Rotations (3, 3) from straight down to approaches that come in from the side."""
-    turns = []
-    for k in range(_AZIMUTHS):
-        c, s = np.cos(2 * np.pi * k / _AZIMUTHS), np.sin(2 * np.pi * k / _AZIMUTHS)
+def _tilts(sides: list[np.ndarray]) -> list[np.ndarray]:
+    """Rotations (3, 3) from straight down to approaches that lean towards horizontal directions, each once."""
+    turns, seen = [], set()
+    for side in sides:
+        angle = float(np.arctan2(side[1], side[0]))
+        key = round(angle / (np.pi / 6)) % 12
+        if key in seen or len(seen) == _SIDES:
+            continue
+        seen.add(key)
+        c, s = np.cos(angle), np.sin(angle)
         about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        for angle in _TILTS:
-            c1, s1 = np.cos(angle), np.sin(angle)
+        for tilt in _TILTS:
+            c1, s1 = np.cos(tilt), np.sin(tilt)
             lean = np.array([[c1, 0.0, -s1], [0.0, 1.0, 0.0], [s1, 0.0, c1]])  # takes down to (s1, 0, -c1)
             turns.append(about @ lean @ about.T)
     return turns
@@ -128,15 +137,20 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
         mats = turns @ grasp.mat
         origins = np.stack([spot.pos for spot in spots]) + turns @ (grasp.pos_world - pose.pos)
         hand = origins[:, None] + np.einsum("nk,pik->pni", _HAND, mats)
-        hits = np.stack([voxels.hits(hand + [0, 0, lift + 0.006]) for lift in _LIFTS], axis=1)  # (P, L)
-        price = 0.03 * hits + 0.3 * (hits > 0) + 4.0 * _LIFTS
-        price[~down, 1:] = np.inf
+        hits = np.full((len(spots), len(_LIFTS)), 1e6)
+        wanting = np.ones(len(spots), bool)
+        for k, lift in enumerate(_LIFTS):
+            hits[wanting, k] = voxels.touched(hand[wanting] + [0, 0, lift + 0.008])
+            wanting &= (hits[:, k] > 0) & down
+            if not wanting.any():
+                break
+        price = 0.01 * hits + 0.3 * (hits > 0) + 4.0 * _LIFTS
         best = price.argmin(axis=1)
         for i, spot in enumerate(spots):
             outside = 0.0
             if not down[i]:
-                back = voxels.hits(hand[i] - 0.08 * spot.entry) + voxels.hits(hand[i] - 0.16 * spot.entry)
-                outside = 0.03 * float(back)
+                back = voxels.touched(hand[i] - 0.08 * spot.entry) + voxels.touched(hand[i] - 0.16 * spot.entry)
+                outside = 0.01 * float(back)
             cost = grasp.cost + spot.cost + float(price[i, best[i]]) + outside
             found.append(Approach(grasp, spot, pose, float(_LIFTS[best[i]]), cost))
     return sorted(found, key=lambda approach: approach.cost)

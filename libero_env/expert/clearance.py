@@ -6,7 +6,7 @@ from libero_env.expert.grasp import (
     FINGER_HALF_WIDTH, FINGER_THICKNESS, HAND_HALF_LENGTH, HAND_HALF_WIDTH, MAX_OPENING, PALM_ABOVE, TIP_BELOW,
 )  # fmt: skip
 
-_CELL = 0.006  # m
+_CELL, _COARSE = 0.006, 0.012  # m, for what stands close to others, and for the hand
 _HALF = np.array([0.75, 0.9, 0.5])  # m, of the space that is looked at
 
 
@@ -20,12 +20,23 @@ class Voxels:
         self._full = np.zeros(self._shape, bool)
         cells, inside = self._cells(points)
         self._full[tuple(cells[inside].T)] = True
+        self._coarse = np.zeros(self._shape // 2 + 1, bool)
+        self._coarse[tuple(cells[inside].T // 2)] = True
 
     def hits(self, points: np.ndarray) -> np.ndarray:
         """How many of the points (..., N, 3) lie in something, (...)."""
         cells, inside = self._cells(points)
         cells = np.where(inside[..., None], cells, 0)
         full = self._full[cells[..., 0], cells[..., 1], cells[..., 2]] & inside
+        return (full | (points[..., 2] < self.floor)).sum(axis=-1)
+
+    def touched(self, points: np.ndarray) -> np.ndarray:
+        """How many of the points (..., N, 3), a centimetre apart, come near something, (...)."""
+        cells = np.floor((points - self._low) * (1 / _COARSE)).astype(np.int32)
+        shape = np.array(self._coarse.shape, np.int32)
+        inside = ((cells >= 0) & (cells < shape)).all(axis=-1)
+        flat = (cells[..., 0] * shape[1] + cells[..., 1]) * shape[2] + cells[..., 2]
+        full = self._coarse.ravel()[np.where(inside, flat, 0)] & inside
         return (full | (points[..., 2] < self.floor)).sum(axis=-1)
 
     def drop(self, profile: np.ndarray, xy: np.ndarray, below: float) -> np.ndarray:
@@ -40,6 +51,11 @@ class Voxels:
         where = xy[:, None] + profile[None, :, :2]  # (S, N, 2)
         cells = np.clip(((where - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
         return (heights[cells[..., 0], cells[..., 1]] - profile[:, 2]).max(axis=1)
+
+    def roofed(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points (..., 3) have something over them, (...) bool."""
+        cells = np.clip(np.floor((points - self._low) / _CELL).astype(int), 0, self._shape - 1)
+        return self._heights(np.inf)[cells[..., 0], cells[..., 1]] > points[..., 2] + 2 * _CELL
 
     def _heights(self, below: float) -> np.ndarray:
         cells, inside = self._cells(self.points)
@@ -67,15 +83,17 @@ def hand_points(opening: float = MAX_OPENING) -> np.ndarray:
     blocks = [
         finger,
         finger * [-1, 1, 1],
-        _block((-HAND_HALF_LENGTH, HAND_HALF_LENGTH), (-HAND_HALF_WIDTH, HAND_HALF_WIDTH), (-0.12, -PALM_ABOVE), 0.02),
-        _block((-0.06, 0.06), (-0.06, 0.06), (-0.28, -0.13), 0.04),
+        _block((-HAND_HALF_LENGTH, HAND_HALF_LENGTH), (-HAND_HALF_WIDTH, HAND_HALF_WIDTH), (-0.12, -PALM_ABOVE)),
+        _block((-0.06, 0.06), (-0.06, 0.06), (-0.28, -0.13), 0.03),
     ]
     return np.concatenate(blocks)
 
 
-def _block(x: tuple, y: tuple, z: tuple, spacing: float = 0.011) -> np.ndarray:
+def _block(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE) -> np.ndarray:
     axes = [np.linspace(a, b, max(2, int(np.ceil((b - a) / spacing)) + 1)) for a, b in (x, y, z)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    low, high = np.array([x, y, z], float).T
+    return points[(np.isclose(points, low) | np.isclose(points, high)).any(axis=1)]
 
 
 def obstacle_height(points: np.ndarray, start: np.ndarray, goal: np.ndarray, radius: float, floor: float) -> float:

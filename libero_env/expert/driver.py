@@ -9,7 +9,7 @@ from libero_env.expert.expert import Expert
 from libero_env.expert.style import Disturbance
 from libero_env.vector import BatchEnv
 
-MAX_STEPS = 250
+MAX_STEPS = 600
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def run_experts(
     *,
     max_steps: int = MAX_STEPS,
 ) -> list[Attempt]:
-    """Let each expert act in the simulation of the same index until the goal holds or the steps are used up.
+    """Let each expert act in the simulation of the same index until the goal holds, it gives up or the steps are over.
 
     What happens in a simulation depends on its own start, expert and disturbance alone.
 
@@ -51,7 +51,7 @@ def run_experts(
     wanted: list[list[np.ndarray]] = [[] for _ in experts]
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
-        live = [i for i in np.flatnonzero(env.running) if i < len(experts)]
+        live = [i for i in np.flatnonzero(env.running) if i < len(experts) and not experts[i].trouble]
         if not live:
             break
         actions = np.zeros((env.num_envs, 7))

@@ -4,7 +4,9 @@ from typing import Protocol
 
 import numpy as np
 
+from libero_env.expert.approach import takeable
 from libero_env.expert.articulated import MoveJoint
+from libero_env.expert.drag import Drag
 from libero_env.expert.motion import OPEN
 from libero_env.expert.pick_place import PickPlace
 from libero_env.expert.plan import JOINT_STATES, Shapes, Step, plan_goal
@@ -90,13 +92,15 @@ class Expert:
         if self.skill is None or self.skill.done(view):
             self._retries = self.retries
             steps = plan_goal(self.task.problem.goal, view)
-            self.skill = self._skill_for(steps[0]) if steps else None
+            self.skill = self._skill_for(steps[0], view) if steps else None
         if self.skill is None:
             return np.array([0.0] * 6 + [OPEN])
         return self.skill.act(view)
 
-    def _skill_for(self, step: Step) -> Skill:
+    def _skill_for(self, step: Step, view: StateView) -> Skill:
         state = JOINT_STATES.get(step.atom.predicate)
         if state is not None:
             return MoveJoint(step.atom.args[0], state, style=self.style)
+        if Drag.suits(view, self.shapes, step.atom) and not takeable(view, self.shapes, step.atom.args[0]):
+            return Drag(step.atom, style=self.style, shapes=self.shapes)
         return PickPlace(step.atom, style=self.style, shapes=self.shapes, share=step.share)

@@ -22,6 +22,7 @@ _HEIGHTS = 4
 _SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03)  # of the hold along the jaws, m
 WALL = 0.5  # cost of a hold by a wall, over one around the whole body
 _WALL_STEP = 0.012  # m between such holds
+_LEAST = 0.005  # m, that a wall must reach up between the pads
 _THICKEST = 0.045  # m, of a wall
 _TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
 _SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
@@ -47,8 +48,9 @@ class Grasp:
 
 
 def grasps(
-    cloud: np.ndarray, floor: float, finger_axis: np.ndarray, *, tilt: np.ndarray | None = None, name: str = "body"
-) -> list[Grasp]:
+    cloud: np.ndarray, floor: float, finger_axis: np.ndarray, *, tilt: np.ndarray | None = None, name: str = "body",
+    number: int = 10_000, apart: float = 0.0,
+) -> list[Grasp]:  # fmt: skip
     """All holds from one side, the best first; the same input gives the same list.
 
     Feasible is what fits between the open fingers, is not too low for the finger tips nor too high for the palm. The
@@ -61,6 +63,8 @@ def grasps(
         finger_axis: direction in which the fingers open now, world frame, (3,).
         tilt: rotation (3, 3) from straight down to the direction of the approach; None for straight down.
         name: for messages.
+        number: at most so many.
+        apart: m, of holds that count as unlike each other; 0 for all.
 
     Raises:
         GraspError: nothing is narrow enough.
@@ -69,18 +73,22 @@ def grasps(
     points = cloud @ turn
     axis = finger_axis @ turn
     now = float(np.arctan2(axis[1], axis[0]))
-    low = floor if tilt is None else -np.inf
-    narrowest, found = np.inf, []
-    for cost, pos, yaw, width in _candidates(points, low, now):
-        narrowest = min(narrowest, width)
-        if width <= WIDEST:
-            found.append(Grasp(turn @ pos, turn @ downward(yaw, axis), width, cost))
-    if not found:
+    candidates = list(_candidates(points, floor if tilt is None else -np.inf, now, _YAWS if tilt is None else 8))
+    narrow = sorted((c for c in candidates if c[3] <= WIDEST), key=lambda candidate: candidate[0])
+    if not narrow:
+        narrowest = min((c[3] for c in candidates), default=np.inf)
         raise GraspError(
             f"{name} cannot be grasped from above: its narrowest part is {100 * narrowest:.1f} cm wide, "
             f"the gripper opens {100 * MAX_OPENING:.0f} cm and takes {100 * WIDEST:.1f} cm"
         )
-    return sorted(found, key=lambda grasp: grasp.cost)
+    kept: dict[tuple, Grasp] = {}
+    for cost, pos, yaw, width in narrow:
+        key = (*np.round(pos / apart).astype(int), round(yaw / 0.35)) if apart else (len(kept),)
+        if key not in kept:
+            kept[key] = Grasp(turn @ pos, turn @ downward(yaw, axis), width, cost)
+        if len(kept) == number:
+            break
+    return list(kept.values())
 
 
 def choose_grasp(
@@ -103,7 +111,9 @@ def choose_grasp(
     return best[1]
 
 
-def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[float, np.ndarray, float, float]]:
+def _candidates(
+    cloud: np.ndarray, floor: float, now: float, yaws: int = _YAWS
+) -> Iterator[tuple[float, np.ndarray, float, float]]:
     """(cost, position, yaw, width) of all holds within reach of fingers and palm."""
     bottom, top = cloud[:, 2].min(), cloud[:, 2].max()
     lowest = max(floor + TIP_BELOW + 0.004, top - PALM_ABOVE)
@@ -112,18 +122,16 @@ def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[f
         if len(slab) < 4:
             continue
         aligned = _aligned_yaws(slab, now)
-        away_from_middle = abs(height - 0.5 * (bottom + top))
-        for yaw in aligned + [now + np.pi * k / _YAWS for k in range(_YAWS)]:
+        away_from_middle = abs(height - 0.5 * (bottom + top)) + 5.0 * max(0.010 - top + height, 0.0)
+        for yaw in aligned + [now + np.pi * k / yaws for k in range(yaws)]:
             askew = min((_turn(yaw, other) for other in aligned), default=0.0)
             for center, width, shift in _holds(slab, yaw):
                 cost = 0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
                 yield cost, np.array([*center, height]), float(yaw), width
-        column = _slab(cloud, height - TIP_BELOW, np.inf)
-        for yaw in [now + np.pi * k / _YAWS for k in range(_YAWS)]:
-            for center, width, badness in _walls(slab, column, yaw):
-                deep = 6.0 * max(top - height - 0.016, 0.0) + 20.0 * max(0.012 - top + height, 0.0)
-                cost = WALL + 0.25 * _turn(yaw, now) + badness + deep
-                yield cost, np.array([*center, height]), float(yaw), width
+        column = _thinned(cloud[cloud[:, 2] > height - TIP_BELOW])
+        for yaw in [now + np.pi * k / yaws for k in range(yaws)]:
+            for center, width, badness in _walls(slab, column, height, yaw):
+                yield WALL + 0.25 * _turn(yaw, now) + badness, np.array([*center, height]), float(yaw), width
 
 
 def _slab(cloud: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -131,20 +139,29 @@ def _slab(cloud: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.unique(np.round(cloud[(cloud[:, 2] > low) & (cloud[:, 2] < high), :2], 3), axis=0)
 
 
-def _walls(slab: np.ndarray, column: np.ndarray, yaw: float) -> Iterator[tuple[np.ndarray, float, float]]:
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """The highest point (x, y, z) of each 4 mm of the ground plan; what is below makes no difference to fingers."""
+    order = points[np.argsort(-points[:, 2])]
+    _, first = np.unique(np.round(order[:, :2] / 0.004), axis=0, return_index=True)
+    return order[first]
+
+
+def _walls(slab: np.ndarray, column: np.ndarray, height: float, yaw: float) -> Iterator[tuple[np.ndarray, float, float]]:
     """(centre (2,), thickness, badness) of walls across the fingers with room for both of them.
 
     Args:
         slab: what the pads would touch, (N, 2).
-        column: what is beside fingers that reach down to the hold, (M, 2).
+        column: what is beside fingers that reach down to the hold, (M, 3).
+        height: of the hold.
         yaw: of the fingers.
     """
     along, across = _axes(yaw)
     u, v = slab @ along, slab @ across
-    column_u, column_v = column @ along, column @ across
+    column_u, column_v = column[:, :2] @ along, column[:, :2] @ across
     for middle in np.arange(v.min() + 0.01, v.max() - 0.009, _WALL_STEP):
         strip = np.abs(v - middle) < FINGER_HALF_WIDTH
-        beside = np.sort(column_u[np.abs(column_v - middle) < FINGER_HALF_WIDTH + 0.003])
+        here = np.abs(column_v - middle) < FINGER_HALF_WIDTH + 0.003
+        beside, heights = column_u[here], column[here, 2]
         if strip.sum() < 2:
             continue
         inner = np.sort(u[strip])
@@ -152,14 +169,24 @@ def _walls(slab: np.ndarray, column: np.ndarray, yaw: float) -> Iterator[tuple[n
             width = float(wall[-1] - wall[0])
             if width > _THICKEST or len(wall) < 2:
                 continue
-            own = strip & (u >= wall[0]) & (u <= wall[-1])
-            slope = float(np.polyfit(v[own] - middle, u[own], 1)[0]) if np.ptp(v[own]) > 0.008 else 0.0
+            top = heights[(beside > wall[0] - 0.008) & (beside < wall[-1] + 0.008)].max() - height
+            if top < _LEAST:
+                continue
             side = 0.5 * (MAX_OPENING - width) - _SPARE
             for aside in (0.0, 0.5 * side, -0.5 * side, side, -side):
                 center = 0.5 * (wall[0] + wall[-1]) + aside
                 if _room(beside, center, wall[0] - 0.008, wall[-1] + 0.008):
-                    yield center * along + middle * across, width, 3.0 * abs(aside) + abs(slope) + 2.0 * width
+                    own = strip & (u >= wall[0]) & (u <= wall[-1])
+                    badness = 2.0 * width + 40.0 * max(0.012 - top, 0.0) + 6.0 * max(top - 0.02, 0.0)
+                    badness += 3.0 * abs(aside) + _slope(v[own], u[own])
+                    yield center * along + middle * across, width, badness
                     break
+
+
+def _slope(v: np.ndarray, u: np.ndarray) -> float:
+    """How much a wall leans against the direction of the jaws, 0 where they meet it squarely."""
+    v, u = v - v.mean(), u - u.mean()
+    return float(abs(v @ u) / (v @ v)) if np.ptp(v) > 0.008 else 0.0
 
 
 def _room(beside: np.ndarray, center: float, low: float, high: float) -> bool:

@@ -61,6 +61,7 @@ class PickPlace:
         self._offset = np.zeros(3)  # of the object from the grip site when it was taken, in the hand's frame
         self._steps, self._opening = 0, 0.0
         self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
+        self._stuck = 0  # steps without motion
         self._inside = False  # on the last stretch of a way in from the side
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
@@ -80,7 +81,7 @@ class PickPlace:
         self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
         self._before = pos
         self._steps += 1
-        if self.phase in ("reach", "rest") and not self._plan(view):
+        if self.trouble or self.phase in ("reach", "rest") and not self._plan(view):
             return np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, OPEN])
         if self._steps > STUCK:
             self._hold = Pose(pos, view.eef_mat)
@@ -108,7 +109,7 @@ class PickPlace:
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._steps = phase, 0
-        self._pressed, self._backing, self._inside = 0, False, False
+        self._pressed, self._backing, self._inside, self._stuck = 0, False, False, 0
 
     def _again(self) -> None:
         self.retries += 1
@@ -128,6 +129,10 @@ class PickPlace:
             self._hold = Pose(goal, mat)
             self._enter("close")
             return self._close(view)
+        self._stuck = self._stuck + 1 if np.linalg.norm(self._velocity) < 0.008 and self._steps > 12 else 0
+        if self._stuck > 14:
+            self._again()
+            return self._toward(view, pos + 0.08 * back, view.eef_mat, OPEN)
         lift = style.slope * (aside - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
         lift = self._backed_off(aside, -float(error @ back), np.clip(lift, 0.0, self._rise + style.hover))
         over = goal + lift * back

@@ -1,6 +1,6 @@
 """Where to put something: poses of a body that make a goal's atom true, found by letting its shape down there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,12 +13,12 @@ from libero_env.problem import Atom
 
 DOWN = np.array([0.0, 0.0, -1.0])
 _YAWS = 12
-_GRID = 9  # spots along each side of a region
+_GRID = 7  # spots along each side of a region
 _LIFT = 0.008  # m, off what carries it when a body is tested for room
-_UPWARDS = (0.05, 0.10, 0.16, 0.24)  # m, of the way in from above that must be free
-_SIDEWAYS = (0.06, 0.12, 0.18, 0.24, 0.30)  # m, and from a side
+_SIDEWAYS = tuple(np.arange(0.02, 0.29, 0.025))  # m, of the way in from a side that must be free
 _NEAR = 0.024  # m, between the origins of things that stand on one another
-_ENOUGH = 120  # points of a body that are tested
+_CROWDED = 0.08  # share of a body's points that may seem to lie in others, as voxels are coarse
+_ENOUGH = 80  # points of a body that are tested
 
 
 class PlaceError(LiberoError):
@@ -69,10 +69,12 @@ def places(
             for pos, cost, entry, full in zip(origins, costs[keep], entries, crowd, strict=True):
                 if entry is not None:
                     sideways = 0.5 * (entry[2] > -0.5)
-                    found.append(Place(pos, turn @ pose.mat, entry, cost + turning + 3.0 * full + sideways))
+                    found.append(Place(pos, turn @ pose.mat, entry, cost + turning + 8.0 * full + sideways))
     if not found:
         raise PlaceError(f"({atom.predicate} {' '.join(atom.args)}): there is no room for {atom.args[0]}")
-    return sorted(found, key=lambda place: place.cost)
+    lowest = min(place.pos[2] for place in found)
+    deep = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
+    return sorted(deep, key=lambda place: place.cost)
 
 
 def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, int]):
@@ -135,15 +137,17 @@ def _ways_in(
     """For each origin (S, 3) the direction along which the body comes in, None for none; and the share in walls."""
     standing = origins[:, None] + body[None] + [0, 0, _LIFT]
     crowd = voxels.hits(standing) / len(body)
-    allowed = np.maximum(crowd * len(body), 0.03 * len(body))
     entries: list[np.ndarray | None] = [None] * len(origins)
-    for entry, lengths in [(DOWN, _UPWARDS), *((d, _SIDEWAYS) for d in directions)]:
-        open_ = [i for i in range(len(origins)) if entries[i] is None and crowd[i] < 0.12]
+    roofed = voxels.roofed(standing).mean(axis=1)
+    for i in np.flatnonzero((crowd < _CROWDED) & (roofed <= np.maximum(crowd, 0.03))):
+        entries[i] = DOWN
+    for entry in () if any(entry is not None for entry in entries) else directions:
+        open_ = [i for i in range(len(origins)) if entries[i] is None and crowd[i] < _CROWDED]
         if not open_:
             break
         free = np.ones(len(open_), bool)
-        for length in lengths:
-            free &= voxels.hits(standing[open_] - length * entry) <= allowed[open_]
+        for length in _SIDEWAYS:
+            free &= voxels.hits(standing[open_] - length * entry) <= np.maximum(crowd[open_], 0.03) * len(body)
         for i, good in zip(open_, free, strict=True):
             if good:
                 entries[i] = entry
