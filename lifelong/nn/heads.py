@@ -30,6 +30,10 @@ class ActionHead(nn.Module, ABC):
         """The most likely action (..., A)."""
 
     @abstractmethod
+    def mean(self, params: dict[str, Tensor]) -> Tensor:
+        """The mean of the distribution (..., A), with gradients."""
+
+    @abstractmethod
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
         """A random action (..., A)."""
 
@@ -110,6 +114,10 @@ class GMMHead(ActionHead):
         """Mean of the heaviest component, (..., A)."""
         return _take_mode(params["means"], params["logits"].argmax(-1))
 
+    def mean(self, params: dict[str, Tensor]) -> Tensor:
+        """Mean of the mixture, sum_k w_k mean_k; unlike the heaviest component's it is smooth in the parameters."""
+        return (params["logits"].softmax(-1).unsqueeze(-1) * params["means"]).sum(-2)
+
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
         """A draw from the mixture, (..., A)."""
         weights = params["logits"].softmax(-1)
@@ -152,6 +160,10 @@ class DeterministicHead(ActionHead):
         return (actions.float() - params["means"]).abs().mean(-1)
 
     def mode(self, params: dict[str, Tensor]) -> Tensor:
+        """The action itself."""
+        return params["means"]
+
+    def mean(self, params: dict[str, Tensor]) -> Tensor:
         """The action itself."""
         return params["means"]
 

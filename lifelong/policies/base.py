@@ -16,7 +16,7 @@ from lifelong.types import Batch, Observation, PolicySpec
 class Policy(nn.Module, ABC):
     """A network that is trained on windows and acts step by step.
 
-    A subclass gives `window_losses`, `reset` and `_act`. What it computes on a window in training and what it
+    A subclass gives `window_losses`, `reset` and `_act`, and `predict` for algorithms that distil. What it computes on a window in training and what it
     computes when the same frames come one by one must be the same. It never changes a batch.
     """
 
@@ -31,6 +31,20 @@ class Policy(nn.Module, ABC):
     def loss(self, batch: Batch) -> Tensor:
         """Mean of `window_losses`, a scalar."""
         return self.window_losses(batch).mean()
+
+    def predict(self, batch: Batch) -> Tensor:
+        """The policy's own answer at every step of each window, (B, T, A) float32, with gradients.
+
+        The mean of its action distribution: what distillation compares, and nothing random beyond dropout. Only the
+        observations of the batch are read.
+
+        Raises:
+            PolicyError: the policy does not give it.
+        """
+        raise PolicyError(
+            f"{type(self).__name__} has no predict(batch), which algorithms that distil need: "
+            "give it one, or choose another algorithm"
+        )
 
     @abstractmethod
     def reset(self, num_envs: int) -> None:

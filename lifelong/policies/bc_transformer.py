@@ -145,6 +145,10 @@ class BCTransformer(Policy):
         """See `Policy`."""
         return self.head.losses(self.distribution(batch.observation), batch.actions).mean(-1)
 
+    def predict(self, batch: Batch) -> Tensor:
+        """See `Policy`."""
+        return self.head.mean(self.distribution(batch.observation))
+
     def reset(self, num_envs: int) -> None:
         """See `Policy`."""
         self._history, self._num_envs = None, num_envs
