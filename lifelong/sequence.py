@@ -5,7 +5,7 @@ the same bits, because all randomness is derived from the seed and the place in 
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from lifelong import checkpoints
-from lifelong.algorithms.base import Algorithm, Phase, WindowDataset
+from lifelong.algorithms.base import Algorithm, JoinedWindows, Phase, WindowDataset
 from lifelong.evaluation import EnvPool, EvalSettings, rollout, save_animation
 from lifelong.policies.base import Policy
 from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
@@ -49,12 +49,13 @@ class Parts:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Where in the sequence training stands: a phase of a task."""
+    """Where in the sequence training stands: a phase of a task, or of tasks that are learned together."""
 
-    task: int
+    task: int  # the last, if there are several
     number: int
     phase: Phase
     epochs: int
+    steps_per_epoch: int | None
     offset: int  # epochs of the task's earlier phases
 
 
@@ -68,37 +69,40 @@ class TaskSequence:
 
     def run(self) -> None:
         """Learn and evaluate whatever is not done yet."""
-        first = self._restore()
-        if first:
-            self._finish(first - 1)
-        for task in range(first, len(self.parts.instructions)):
-            self._learn(task)
-            self._finish(task)
+        stages = self.parts.algorithm.stages(len(self.parts.instructions))
+        done = self._restore(stages)
+        if done:
+            self._finish(stages[done - 1])
+        for stage in stages[done:]:
+            self._learn(stage)
+            self._finish(stage)
 
-    def _restore(self) -> int:
-        """Take up the state after the last task that was learned; the position of the next."""
-        p, last = self.parts, self.parts.directory.last_task()
-        if last >= 0:
-            path = p.directory.task_path(last)
+    def _restore(self, stages: Sequence[Sequence[int]]) -> int:
+        """Take up the state after the last stage that was learned; how many are."""
+        p, done = self.parts, 0
+        while done < len(stages) and p.directory.task_path(stages[done][-1]).exists():
+            done += 1
+        if done:
+            path = p.directory.task_path(stages[done - 1][-1])
             self._take_up(checkpoints.load(path, p.device), str(path))
-        return last + 1
+        return done
 
     def _take_up(self, state: Mapping[str, Any], source: str) -> None:
         if state.get("policy") is not None:
             checkpoints.load_weights(self.parts.policy, state["policy"], source)
         self.parts.algorithm.load_state_dict(state["algorithm"], self.parts.datasets)
 
-    def _learn(self, task: int) -> None:
-        """Train on a task, from its beginning or from what is saved of it, and write its checkpoint."""
-        p = self.parts
-        dataset, saved = p.datasets[task], p.directory.progress(task, p.device)
-        self._say(f"Task {task + 1}/{len(p.instructions)}: {p.instructions[task]} ({len(dataset)} windows)")
+    def _learn(self, stage: Sequence[int]) -> None:
+        """Train on a stage, from its beginning or from what is saved of it, and write its checkpoint."""
+        p, task = self.parts, stage[-1]
+        dataset, saved = self._windows(stage), p.directory.progress(task, p.device)
+        what = p.instructions[task] if len(stage) == 1 else f"the last of {len(stage)} learned together"
+        self._say(f"Task {task + 1}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
         if saved is None:
             p.algorithm.begin_task(task, dataset, p.policy)
         else:
             self._take_up(saved, str(p.directory.progress_path))
-        stretches = self._stretches(task)
-        for stretch in stretches:
+        for stretch in self._stretches(stage):
             if saved is not None and stretch.number < saved["phase"]:
                 continue
             resume = saved["fit"] if saved is not None and stretch.number == saved["phase"] else None
@@ -109,11 +113,17 @@ class TaskSequence:
         state = {"task": task, "policy": p.policy.state_dict(), "algorithm": p.algorithm.state_dict()}
         checkpoints.save(p.directory.task_path(task), state)
 
-    def _stretches(self, task: int) -> list[Stretch]:
+    def _windows(self, stage: Sequence[int]) -> WindowDataset:
+        datasets = [self.parts.datasets[task] for task in stage]
+        return datasets[0] if len(datasets) == 1 else JoinedWindows(datasets)
+
+    def _stretches(self, stage: Sequence[int]) -> list[Stretch]:
         stretches, offset = [], 0
+        steps = self.parts.fit.steps_per_epoch
+        steps = steps and steps * len(stage)  # as many for each task, together or not
         for number, phase in enumerate(self.parts.algorithm.phases()):
             epochs = max(1, round(self.parts.fit.epochs * phase.share))
-            stretches.append(Stretch(task, number, phase, epochs, offset))
+            stretches.append(Stretch(stage[-1], number, phase, epochs, steps, offset))
             offset += epochs
         return stretches
 
@@ -126,7 +136,7 @@ class TaskSequence:
             p.policy,
             dataset,
             p.algorithm,
-            settings=replace(p.fit, epochs=stretch.epochs),
+            settings=replace(p.fit, epochs=stretch.epochs, steps_per_epoch=stretch.steps_per_epoch),
             seed=(p.seed, FIT, stretch.task, stretch.number),
             device=p.device,
             augment=p.augment,
@@ -185,10 +195,10 @@ class TaskSequence:
         checkpoints.save(p.directory.progress_path, state)
         self._saved = time.monotonic()
 
-    def _finish(self, task: int) -> None:
+    def _finish(self, stage: Sequence[int]) -> None:
         """Evaluate all tasks so far, unless that is done."""
-        p, results = self.parts, self.log.read()
-        first = self._stretches(task)[0]
+        p, task, results = self.parts, stage[-1], self.log.read()
+        first = self._stretches(stage)[0]
         best = self._best_epoch(first, first.epochs) if self._selects(first) else first.epochs
         row = [self._evaluate("matrix", task, other, best) for other in range(task + 1)]
         if results.task_end(task) is None:
@@ -201,9 +211,7 @@ class TaskSequence:
         text = f"  learned: success {row[-1].rate:.0%} on it, {mean:.0%} over {task + 1} so far"
         self._say(text + self._left(task))
 
-    def _evaluate(
-        self, phase: Literal["curve", "matrix"], learned: int, task: int, epoch: int
-    ) -> EvalRecord:
+    def _evaluate(self, phase: Literal["curve", "matrix"], learned: int, task: int, epoch: int) -> EvalRecord:
         """Rollouts on a task, or their record if they were done before."""
         p = self.parts
         found = self.log.read().evaluation(phase, learned, task, epoch if phase == "curve" else None)

@@ -196,10 +196,11 @@ class _Step:
         batch = batch.to(self.device)
         with autocast(self.device, self.settings.precision):
             loss = self.policy.loss(batch)
-        penalty = self.algorithm.penalty(self.policy)
+            penalty = self.algorithm.penalty(self.policy)
         self.optimizer.zero_grad(set_to_none=True)
         (loss if penalty is None else loss + penalty).backward()
-        self.algorithm.after_backward(self.policy)
+        with autocast(self.device, self.settings.precision):
+            self.algorithm.after_backward(self.policy)
         if self.settings.grad_clip:
             nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.grad_clip)
         for group in self.optimizer.param_groups:
@@ -231,8 +232,7 @@ def _epoch(
     loss = torch.stack(losses).float().mean().item()
     if not math.isfinite(loss):
         raise TrainingError(
-            f"the loss is {loss}: lower train.lr or algo.strength, or set "
-            "train.precision=fp32"
+            f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
         )
     bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
     return loss, torch.stack(penalties).float().mean().item()

@@ -1,9 +1,19 @@
 """Lifelong-learning algorithms: what each adds to the one training loop, one class per file."""
 
+from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.algorithms.derpp import DERpp
 from lifelong.algorithms.er import ER
 from lifelong.algorithms.ewc import EWC
+from lifelong.algorithms.lwf import LwF
+from lifelong.algorithms.mas import MAS
+from lifelong.algorithms.multitask import Multitask
 from lifelong.algorithms.packnet import PackNet
 from lifelong.algorithms.sequential import Sequential
+from lifelong.algorithms.si import SI
+from lifelong.algorithms.single_task import SingleTask
 
-__all__ = ["ER", "EWC", "Algorithm", "PackNet", "Phase", "Sequential"]
+__all__ = [
+    "AGEM", "ER", "EWC", "MAS", "SI", "Algorithm", "DERpp", "LwF", "Multitask", "PackNet", "Phase",
+    "Sequential", "SingleTask",
+]  # fmt: skip

@@ -1,6 +1,6 @@
 """The hooks through which an algorithm acts on training; the defaults are plain fine-tuning.
 
-The order in which they are called, for every task:
+The order in which they are called, for every task (or every stage of `stages`):
 
     begin_task
       for each of phases():  begin_phase
@@ -10,9 +10,10 @@ The order in which they are called, for every task:
     policy_for                                  around every rollout
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, Protocol
 
 import torch
@@ -30,6 +31,26 @@ class WindowDataset(Protocol):
     def batch(self, indices: Tensor) -> Batch:
         """The windows of these indices ((B,) int64), as one batch."""
         ...
+
+
+class JoinedWindows:
+    """The windows of several tasks as one dataset."""
+
+    def __init__(self, datasets: Sequence[WindowDataset]):
+        self.datasets = tuple(datasets)
+
+    def __len__(self) -> int:
+        return sum(len(d) for d in self.datasets)
+
+    def batch(self, indices: Tensor) -> Batch:
+        """The windows of these indices ((B,) int64, counted through all datasets), one task's after another's."""
+        parts, start = [], 0
+        for dataset in self.datasets:
+            mine = indices[(indices >= start) & (indices < start + len(dataset))] - start
+            start += len(dataset)
+            if len(mine):
+                parts.append(dataset.batch(mine))
+        return reduce(Batch.join, parts)
 
 
 @dataclass(frozen=True)
@@ -50,6 +71,13 @@ class Phase:
 class Algorithm:
     """Sequential fine-tuning; a base for algorithms, which override the hooks they need."""
 
+    def stages(self, tasks: int) -> tuple[tuple[int, ...], ...]:
+        """Which tasks are learned together, stage after stage: by default one at a time.
+
+        Elsewhere (in the other hooks, in records and file names) a stage goes by its last task.
+        """
+        return tuple((task,) for task in range(tasks))
+
     def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
         """Before the first step on a task (position `task_index` in the sequence)."""
 
@@ -69,11 +97,11 @@ class Algorithm:
         return batch
 
     def penalty(self, policy: Policy) -> Tensor | None:
-        """A scalar added to the loss, or None."""
+        """A scalar added to the loss, or None; computed in the precision of the loss."""
         return None
 
     def after_backward(self, policy: Policy) -> None:
-        """With gradients in place, before they are clipped."""
+        """With gradients in place, before they are clipped; in the precision of the loss."""
 
     def after_step(self, policy: Policy) -> None:
         """After the optimiser moved the weights."""

@@ -93,7 +93,7 @@ def test_settings_at_the_top_are_read():
 def test_an_algorithm_is_named_like_its_file(file):
     target = composed(f"algo={file.stem}").algo["_target_"]
     assert target.startswith(f"lifelong.algorithms.{file.stem}.")
-    assert target.rpartition(".")[2].lower() == file.stem
+    assert target.rpartition(".")[2].lower() == file.stem.replace("_", "")
 
 
 @pytest.mark.parametrize("preset", ["laptop", "smoke", "paper"])

@@ -1,0 +1,59 @@
+"""A policy of its own for each task: no transfer, no forgetting."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from torch import Tensor
+
+from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.policies.base import Policy
+
+
+class SingleTask(Algorithm):
+    """Train every task from the weights the run began with, and act on it with what that gave.
+
+    The reference of what a task yields by itself: zero-shot success on the diagonal is that of an untrained
+    policy, and columns of the success matrix are constant. All tasks' weights are kept, one policy for each,
+    in memory and in every checkpoint.
+    """
+
+    def __init__(self) -> None:
+        self._initial: dict[str, Tensor] | None = None
+        self._learned: dict[int, dict[str, Tensor]] = {}  # position -> weights and buffers
+
+    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+        """Put the first weights back; at the first task, note them."""
+        if self._initial is None:
+            self._initial = _copy(policy)
+        policy.load_state_dict(self._initial)
+
+    def end_task(self, task_index: int, dataset: WindowDataset, policy: Policy, generator: Any) -> None:
+        """Keep the task's weights."""
+        self._learned[task_index] = _copy(policy)
+
+    @contextmanager
+    def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
+        """The policy with the task's own weights, or as it is while the task is not learned."""
+        if task_index not in self._learned:
+            yield policy
+            return
+        present = _copy(policy)
+        policy.load_state_dict(self._learned[task_index])
+        try:
+            yield policy
+        finally:
+            policy.load_state_dict(present)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The first weights and those of every task learned."""
+        return {"initial": self._initial, "learned": dict(self._learned)}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+        """Take up what `state_dict` gave."""
+        self._initial = state["initial"]
+        self._learned = dict(state["learned"])
+
+
+def _copy(policy: Policy) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in policy.state_dict().items()}

@@ -1,0 +1,383 @@
+"""What A-GEM, DER++, LwF, MAS, SI, SingleTask and Multitask promise, as properties."""
+
+import copy
+
+import pytest
+import torch
+
+from lifelong import checkpoints
+from lifelong.algorithms import AGEM, MAS, SI, DERpp, LwF, Multitask, SingleTask
+from lifelong.algorithms.agem import project
+from lifelong.algorithms.base import JoinedWindows
+from lifelong.policies import BCTransformer
+from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.rundir import RunDirectory
+from lifelong.sequence import TaskSequence
+from lifelong.training import FitSettings, fit, generator
+from tests.lifelong import test_sequence as walk
+from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
+from tests.lifelong.test_algorithms import SETTINGS, learn
+
+ALL = {
+    "agem": lambda: AGEM(budget=25),
+    "derpp": lambda: DERpp(budget=25, alpha=0.5),
+    "lwf": LwF,
+    "mas": MAS,
+    "multitask": Multitask,
+    "si": SI,
+    "single_task": SingleTask,
+}
+
+
+class Linear(LinearPolicy):
+    """A linear policy that also says what it would do; it listens to the instruction."""
+
+    def __init__(self):
+        super().__init__()
+        self.unused = torch.nn.Parameter(torch.ones(2))
+
+    def predict(self, batch):
+        return self.linear(batch.observation.proprio["x"]) + batch.observation.language[:, None]
+
+
+class Deep(DeepPolicy):
+    def predict(self, batch):
+        return self.forward(batch.observation.proprio["x"])
+
+
+def everything(task: int, size: int = 20):
+    return Windows(task, size=size).batch(torch.arange(size))
+
+
+# --- all of them
+
+
+@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
+def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+    torch.manual_seed(1)
+    policy, algorithm = Deep(), make()
+    for task in (0, 1):
+        learn(algorithm, policy, task)
+    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
+    learn(algorithm, policy, 2)
+
+    state = checkpoints.load(tmp_path / "s")
+    other_policy, other = Deep(), make()
+    other_policy.load_state_dict(state["policy"])
+    other.load_state_dict(state["algorithm"], {0: Windows(0), 1: Windows(1)})
+    learn(other, other_policy, 2)
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, other_policy.state_dict()[name]), name
+    walk.assert_same(other.state_dict(), algorithm.state_dict())
+
+
+@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
+def test_the_first_task_is_learned_as_by_fine_tuning(make):
+    torch.manual_seed(0)
+    plain, policy, algorithm = Deep(), Deep(), make()
+    policy.load_state_dict(plain.state_dict())
+    fit(plain, Windows(0), walk.Sequential(), settings=SETTINGS, seed=(0, 0))
+    learn(algorithm, policy, 0)
+    for name, value in plain.state_dict().items():
+        assert torch.equal(value, policy.state_dict()[name]), name
+
+
+@pytest.fixture
+def walks(monkeypatch):
+    """The walk of test_sequence.py with these algorithms."""
+    monkeypatch.setattr(walk, "ALGORITHMS", ALL)
+    predict = lambda self, batch: self.head.mode(self.distribution(batch.observation))  # noqa: E731
+    if not hasattr(BCTransformer, "predict"):
+        monkeypatch.setattr(BCTransformer, "predict", predict, raising=False)
+    return walk
+
+
+def killed_again_and_again(path, algo, monkeypatch):
+    """Walks through the sequence, killed in the second write of every process; how many were needed."""
+    starts, writes = 0, 1
+    while True:
+        starts += 1
+        assert starts < 100
+        with monkeypatch.context() as patch:
+            p = walk.parts(path, algo)
+            killer = walk.Killer(patch, writes)
+            patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
+            try:
+                TaskSequence(p).run()
+                return starts, p
+            except walk.Killed:
+                writes = 2 + starts % 3
+
+
+@pytest.mark.parametrize("algo", ALL)
+def test_killed_and_resumed_equals_uninterrupted(walks, tmp_path, algo, monkeypatch):
+    TaskSequence(p := walks.parts(tmp_path / "whole", algo)).run()
+    records, state = walks.outcome(tmp_path / "whole", p.directory.log)
+    starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
+    assert starts > 2
+    again, end = walks.outcome(tmp_path / "killed", p.directory.log)
+    assert again == records
+    walks.assert_same(end, state)
+
+
+# --- SingleTask
+
+
+def test_single_task_begins_every_task_with_the_same_weights_and_acts_with_its_own():
+    policy, algorithm = Deep(), SingleTask()
+    first, kept = copy.deepcopy(policy.state_dict()), {}
+    for task in range(3):
+        algorithm.begin_task(task, Windows(task), policy)
+        assert all(torch.equal(v, first[n]) for n, v in policy.state_dict().items())
+        learn(algorithm, policy, task)
+        kept[task] = copy.deepcopy(policy.state_dict())
+    for task, weights in kept.items():
+        with algorithm.policy_for(task, policy) as acting:
+            assert all(torch.equal(v, weights[n]) for n, v in acting.state_dict().items())
+        assert all(torch.equal(v, kept[2][n]) for n, v in policy.state_dict().items())
+
+
+# --- Multitask
+
+
+def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(walks, tmp_path):
+    TaskSequence(p := walks.parts(tmp_path, "multitask")).run()
+    results, last = p.directory.log.read(), walks.TASKS - 1
+    assert [r.task for r in results.of(TaskEndRecord)] == [last]
+    cells = [(r.phase, r.learned, r.task) for r in results.of(EvalRecord)]
+    assert cells == [("matrix", last, task) for task in range(walks.TASKS)]
+    assert [(r.task, r.epoch) for r in results.of(LossRecord)] == [(last, 1), (last, 2)]
+    assert not RunDirectory(tmp_path).best_path.exists()
+
+
+def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(walks, tmp_path):
+    p = walks.parts(tmp_path, "multitask")
+    object.__setattr__(p, "fit", FitSettings(epochs=2, steps_per_epoch=3, precision="fp32"))
+    sequence = TaskSequence(p)
+    assert [s.steps_per_epoch for s in sequence._stretches((0, 1, 2))] == [9]
+    assert [s.steps_per_epoch for s in sequence._stretches((1,))] == [3]
+
+
+def test_joined_windows_are_those_of_all_tasks_once_each():
+    joined = JoinedWindows([Windows(0, size=5), Windows(1, size=7), Windows(2, size=1)])
+    assert len(joined) == 13
+    batch = joined.batch(torch.randperm(13))
+    pairs = sorted(zip(batch.task_ids.tolist(), batch.window_ids.tolist(), strict=True))
+    assert pairs == [(t, w) for t, size in enumerate((5, 7, 1)) for w in range(size)]
+    some = joined.batch(torch.tensor([12, 6, 0]))
+    assert torch.equal(some.actions[1], Windows(1, size=7).batch(torch.tensor([1])).actions[0])
+
+
+# --- A-GEM
+
+
+def gradients(values) -> list[torch.Tensor]:
+    """Parameters with these gradients; None: without one."""
+    params = []
+    for value in values:
+        params.append(torch.zeros(3, dtype=torch.float64))
+        params[-1].grad = None if value is None else torch.tensor(value, dtype=torch.float64)
+    return params
+
+
+def test_agem_projects_onto_the_half_space_and_to_its_nearest_point():
+    draws = generator(0)
+    changed = 0
+    for _ in range(50):
+        g, reference = (torch.randn(2, 3, generator=draws, dtype=torch.float64) for _ in range(2))
+        params = gradients(g.tolist())
+        before = (g * reference).sum()
+        project(params, tuple(reference))
+        after = torch.stack([p.grad for p in params])
+        assert (after * reference).sum() >= -1e-12
+        if before >= 0:
+            assert torch.equal(after, g)
+        else:  # what was taken out is along the reference, and no more than needed
+            changed += 1
+            torch.testing.assert_close((after * reference).sum(), torch.zeros((), dtype=torch.float64))
+            taken = (g - after).flatten()
+            cosine = torch.nn.functional.cosine_similarity(taken, reference.flatten(), dim=0)
+            assert cosine.item() == pytest.approx(-1)
+    assert 10 < changed < 40
+
+
+def test_agem_counts_missing_gradients_as_zero():
+    reference = (torch.tensor([1.0, 0, 0]).double(), torch.tensor([0, 2.0, 0]).double(), None)
+    params = gradients([[-5.0, 1, 1], None, [1.0, 1, 1]])
+    project(params, reference)  # share: -5 / (1 + 4)
+    assert params[0].grad.tolist() == [-4, 1, 1]
+    assert params[1].grad.tolist() == [0, 2, 0]
+    assert params[2].grad.tolist() == [1, 1, 1]
+    agreeing = gradients([[5.0, 0, 0], None, None])
+    project(agreeing, reference)
+    assert [None if p.grad is None else p.grad.tolist() for p in agreeing] == [[5, 0, 0], None, None]
+    nothing = gradients([None, None])
+    project(nothing, (None, None))
+    assert all(p.grad is None for p in nothing)
+
+
+def test_agem_steps_do_not_raise_the_loss_on_the_reference_to_first_order():
+    policy, algorithm, draws = Linear(), AGEM(budget=20), generator(0)
+    torch.nn.init.zeros_(policy.linear.weight)
+    torch.nn.init.zeros_(policy.linear.bias)
+    algorithm.end_task(0, Windows(0), policy, draws)
+    batch = Windows(0).batch(torch.arange(20))
+    batch.actions.neg_().add_(0.3)  # nearly the contrary of what the memory says
+    assert algorithm.mix(batch, draws) is batch
+    policy.loss(batch).backward()
+    old = torch.autograd.grad(policy.loss(everything(0)), [policy.linear.weight, policy.linear.bias])
+    product = lambda: sum(  # noqa: E731
+        (p.grad * r).sum() for p, r in zip(policy.linear.parameters(), old, strict=True)
+    )
+    assert product() < 0
+    algorithm.after_backward(policy)
+    assert product().item() == pytest.approx(0, abs=1e-5)
+    assert policy.linear.bias.grad.abs().max() > 0
+    assert policy.unused.grad is None
+
+
+# --- DER++
+
+
+def test_derpp_keeps_what_the_policy_answered_when_each_task_ended():
+    torch.manual_seed(0)
+    policy, algorithm = Deep(), DERpp(budget=25)
+    answers = {}
+    for task in range(4):
+        learn(algorithm, policy, task)
+        with torch.no_grad():
+            answers[task] = policy.eval().predict(everything(task))
+        assert len(algorithm.memory) <= 25
+        batch = algorithm.memory.sample(100, generator(task))
+        then = torch.stack(
+            [answers[t][w] for t, w in zip(batch.task_ids.tolist(), batch.window_ids, strict=True)]
+        )
+        torch.testing.assert_close(algorithm.recall(batch), then)
+    assert sum(len(z) for z in algorithm.state_dict()["outputs"].values()) == len(algorithm.memory)
+
+
+def test_derpp_asks_for_nothing_as_long_as_the_answers_are_the_same():
+    policy, algorithm, draws = Linear(), DERpp(budget=25, alpha=2.0), generator(0)
+    batch = everything(1, 8)
+    assert algorithm.mix(batch, draws) is batch and algorithm.penalty(policy) is None
+    learn(algorithm, policy, 0)
+    mixed = algorithm.mix(batch, draws)
+    assert len(mixed) == 16 and set(mixed.task_ids[8:].tolist()) == {0}
+    assert algorithm.penalty(policy).item() == pytest.approx(0, abs=1e-10)
+    with torch.no_grad():
+        policy.linear.bias += torch.tensor([0.5, 0.0])
+    algorithm.mix(batch, draws)
+    assert algorithm.penalty(policy).item() == pytest.approx(2.0 * 0.25)
+    assert algorithm.penalty(policy) is None  # the draw of one step is not used in another
+
+
+# --- LwF
+
+
+def test_lwf_holds_the_answers_to_old_instructions_on_new_windows():
+    policy, algorithm, draws = Linear(), LwF(strength=3.0), generator(0)
+    batch = everything(1)
+    batch.observation.language.fill_(7.0)
+    assert algorithm.mix(batch, draws) is batch and algorithm.penalty(policy) is None
+    for task in (0, 1):
+        learn(algorithm, policy, task)
+    assert algorithm.mix(batch, draws) is batch
+    assert algorithm._asked.observation.language.abs().max() == 0  # those of the fake tasks
+    assert torch.equal(algorithm._asked.observation.proprio["x"], batch.observation.proprio["x"])
+    assert algorithm.penalty(policy).item() == 0
+    with torch.no_grad():
+        policy.linear.bias += torch.tensor([0.5, 0.0])
+    algorithm.mix(batch, draws)
+    policy.zero_grad()
+    penalty = algorithm.penalty(policy)
+    assert penalty.item() == pytest.approx(3.0 * 0.25)
+    penalty.backward()
+    assert policy.linear.bias.grad.tolist() == pytest.approx([3.0, 0.0])
+
+
+def test_lwf_teacher_stands_still_while_the_policy_learns():
+    torch.manual_seed(0)
+    policy, algorithm = Deep(), LwF()
+    learn(algorithm, policy, 0)
+    with torch.no_grad():
+        before = algorithm._teach(policy).predict(everything(0))
+    fit(policy, Windows(1), algorithm, settings=SETTINGS, seed=(1, 0))
+    teacher = algorithm._teach(policy)
+    assert not teacher.training and not any(p.requires_grad for p in teacher.parameters())
+    assert all(p.requires_grad for p in policy.parameters())
+    assert torch.equal(teacher.predict(everything(0)), before)
+
+
+# --- SI
+
+
+def test_si_collects_the_descent_of_the_loss_along_the_path():
+    """Under small plain steps the sum of omega is what the loss fell by (Zenke et al., eq. 1 to 3)."""
+    policy, algorithm, batch = Linear(), SI(damping=0.5), everything(0)
+    algorithm.begin_task(0, Windows(0), policy)
+    start = copy.deepcopy(policy.state_dict())
+    first = policy.loss(batch).item()
+    for _ in range(400):
+        policy.zero_grad()
+        policy.loss(batch).backward()
+        algorithm.after_backward(policy)
+        with torch.no_grad():
+            for p in policy.linear.parameters():
+                p -= 1e-3 * p.grad
+        algorithm.after_step(policy)
+    omega = algorithm.state_dict()["omega"]
+    fallen = first - policy.loss(batch).item()
+    assert sum(v.sum().item() for v in omega.values()) == pytest.approx(fallen, rel=0.02)
+    assert "unused" not in omega
+    algorithm.end_task(0, Windows(0), policy, generator(0))
+    way = policy.linear.weight.detach() - start["linear.weight"]
+    expected = omega["linear.weight"].clamp_min(0) / (way.square() + 0.5)
+    torch.testing.assert_close(algorithm.anchor.importance["linear.weight"], expected, rtol=1e-3, atol=1e-6)
+
+
+def test_si_omega_leaves_the_pull_of_the_penalty_out():
+    torch.manual_seed(0)
+    policy, algorithm = Linear(), SI(strength=5.0)
+    learn(algorithm, policy, 0)
+    with torch.no_grad():
+        policy.linear.weight += 0.3
+    loss, penalty = policy.loss(everything(1)), algorithm.penalty(policy)
+    alone = torch.autograd.grad(loss, policy.linear.weight, retain_graph=True)[0]
+    policy.zero_grad()
+    (loss + penalty).backward()
+    assert not torch.allclose(policy.linear.weight.grad, alone)
+    algorithm.after_backward(policy)
+    torch.testing.assert_close(algorithm._step["linear.weight"][0], alone, rtol=1e-4, atol=1e-5)
+
+
+# --- MAS
+
+
+def test_mas_importance_is_the_mean_size_of_single_windows_gradients():
+    policy, data = Linear(), Windows(size=7)
+    policy.train()
+    importance = MAS(windows=0).estimate(data, policy, generator(0))
+    out = data.features @ policy.linear.weight.T + policy.linear.bias  # (N, A); |out|^2 by W: 2 out x^T
+    by_hand = 2 * (out[:, :, None] * data.features[:, None, :]).abs().mean(0)
+    torch.testing.assert_close(importance["linear.weight"], by_hand)
+    torch.testing.assert_close(importance["linear.bias"], 2 * out.abs().mean(0))
+    assert not importance["unused"].any()
+    assert policy.training and all(p.grad is None for p in policy.parameters())
+
+
+@pytest.mark.parametrize("make", [SI, MAS])
+def test_importance_adds_up_and_the_penalty_is_zero_at_the_anchor_only(make):
+    torch.manual_seed(0)
+    policy, algorithm = Linear(), make()
+    assert algorithm.penalty(policy) is None
+    older = None
+    for task in range(3):
+        learn(algorithm, policy, task)
+        assert algorithm.penalty(policy).item() == 0
+        now = algorithm.anchor.importance["linear.weight"]
+        assert (now >= (0 if older is None else older)).all() and now.max() > 0
+        older = now
+    with torch.no_grad():
+        policy.linear.weight += 0.1
+    expected = algorithm.strength * (older * 0.01).sum().item()
+    assert algorithm.penalty(policy).item() == pytest.approx(expected, rel=1e-4)
