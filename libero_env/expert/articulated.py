@@ -35,6 +35,7 @@ SLIPPED = 0.035  # m, between the hand and the hold
 AWAY = 0.06  # m, from the handle, where the hand counts as withdrawn
 AROUND = 0.07  # m, within which things count as in the way
 AJAR, PULLED = 0.5, 0.85  # rad; a door is drawn until it is that far open, and beyond AJAR pushed
+KNOB = 0.3, 0.8  # rad, of the hand ahead of a knob at its stop; what is left of that a step later
 STUCK = 90  # steps of one phase
 
 
@@ -67,6 +68,7 @@ class MoveJoint:
         self._velocity = np.zeros(3)
         self._steps, self._still = 0, 0
         self._opening, self._value, self._aim = 0.0, 0.0, 0.0
+        self._wind = 0.0  # rad, of the hand ahead of a knob
         self._drawn = False  # a door, as far as by its handle
         self._left: Pose | None = None  # where the hand let go
         self._failed: list[Pose] = []  # holds of earlier attempts
@@ -124,7 +126,9 @@ class MoveJoint:
                 handle = find_handle(view, part, way)
                 hold = handle_hold(view, part, handle, self._aim - value, True, self._failed)
             else:
-                hold = handle_hold(view, part, inner_side(view, part, way), self._aim - value, False, self._failed)
+                hold = handle_hold(
+                    view, part, inner_side(view, part, way), self._aim - value, False, self._failed
+                )
         except GraspError as error:
             self.trouble = str(error)
             return False
@@ -152,9 +156,9 @@ class MoveJoint:
         """Where the joint is brought: well into the state, or against its stop."""
         threshold, end, width, way = self._limits(view)
         if self.state in ("open", "turnon"):
-            return threshold + way * min(0.5 * width, 0.25)
+            return threshold + way * min(0.6 * width, 0.25)
         if self.state == "turnoff":
-            return end
+            return end + way * 0.02
         stop = view.scene.model.jnt_range[part.joint][1 if way > 0 else 0]
         return float(max(end, stop) if way > 0 else min(end, stop))
 
@@ -171,7 +175,7 @@ class MoveJoint:
             return True
         threshold, _, width, way = self._limits(view)
         values = view.joint_positions(self.address).values()
-        return any(way * (value - threshold) > min(0.25 * width, 0.12) for value in values)
+        return any(way * (value - threshold) > min(0.15 * width, 0.12) for value in values)
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._steps, self._still = phase, 0, 0
@@ -214,7 +218,7 @@ class MoveJoint:
         if self._steps > 4 + self.style.pause and still or self._steps > 16:
             if opening < 0.004:
                 return self._retreat(view)
-            self._value = self._part.value(view)
+            self._value, self._wind = self._part.value(view), 0.0
             self._enter("move")
             return self._move(view)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
@@ -226,11 +230,15 @@ class MoveJoint:
         anchor, axis = part.axis(view)
         arm = 1.0 if part.slides else max(float(np.linalg.norm(np.cross(hold.pos - anchor, axis))), 0.03)
         speed = np.sign(left) * (value - self._value) * CONTROL_HZ
-        slow = abs(speed) * arm < 0.01
+        slow = abs(speed) * max(arm, 0.2) < 0.01
         self._value = value
         self._still = self._still + 1 if slow and self._steps > 5 else 0
-        settled = slow or self.state in ("open", "turnon")
-        if self._moved(view) and settled or self._still > 25 or self._stage(left):
+        settled = slow
+        if self.state in ("open", "turnon"):
+            settled = abs(left) < (0.003 if part.slides else 0.05) or self._still > 3
+        if self.state == "turnoff":
+            settled = self._wind < 0.02 and abs(speed) < 0.005
+        if self._moved(view) and settled or self._still > 30 or self._stage(left):
             self._drawn = self._stage(left)
             self._enter("release")
             return self._release(view)
@@ -238,7 +246,9 @@ class MoveJoint:
             return self._retreat(view)
         lead = min(LEAD / arm, 0.5)
         if self.state == "turnoff":  # a knob is heavy, and its stop throws it back
-            ahead = np.sign(left) * np.clip(min(2.0 * abs(left) + 0.02, 1.2) - speed, -lead, lead)
+            quiet = self._moved(view) and abs(speed) < 0.02
+            self._wind = self._wind * KNOB[1] if quiet else min(self._wind + 0.03, KNOB[0])
+            ahead = np.sign(left or -1.0) * self._wind
         else:
             ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
         goal = part.moved(view, hold, ahead)
@@ -264,7 +274,9 @@ class MoveJoint:
                 self._again()
                 self.retries -= self._drawn
             return self._stay()
-        return self._toward(view, left.pos + (AWAY + 0.05) * back, left.mat, OPEN if self._hold.grips else CLOSE)
+        return self._toward(
+            view, left.pos + (AWAY + 0.05) * back, left.mat, OPEN if self._hold.grips else CLOSE
+        )
 
     def _retreat(self, view: StateView) -> np.ndarray:
         """Let go, withdraw, and begin again."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from libero_env.expert.geometry import Pose, surface_points
 from libero_env.expert.grasp import FINGER_HALF_WIDTH, GraspError, choose_grasp
-from libero_env.expert.motion import downward, finger_axis, rotation_between
+from libero_env.expert.motion import downward, finger_axis
 from libero_env.predicates import StateView
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -111,7 +111,9 @@ def find_handle(view: StateView, part: Part, way: float) -> Handle:
     depths = np.sort(front.max() - front[core])
     gaps = np.flatnonzero(np.diff(depths) > _BEHIND)
     depth = float(depths[gaps[0]]) if len(gaps) else min(float(depths[-1]), 0.02)
-    mask = (front > front.max() - depth - 0.002) & (np.abs((points - middle) @ across) < 0.5 * min(spans) + 0.012)
+    mask = (front > front.max() - depth - 0.002) & (
+        np.abs((points - middle) @ across) < 0.5 * min(spans) + 0.012
+    )
     middle = middle + out * (front.max() - middle @ out - 0.5 * depth)
     return Handle(middle, along, out, 0.5 * max(spans), depth, points[mask], points)
 
@@ -121,7 +123,11 @@ def inner_side(view: StateView, part: Part, way: float) -> Handle:
     points = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.005))
     anchor, axis = part.axis(view)
     inward = -opening_direction(view, part, way, points)
-    outer = np.cross(inward, axis) if np.cross(inward, axis) @ (points.mean(axis=0) - anchor) > 0 else np.cross(axis, inward)
+    outer = (
+        np.cross(inward, axis)
+        if np.cross(inward, axis) @ (points.mean(axis=0) - anchor) > 0
+        else np.cross(axis, inward)
+    )
     radius = (points - anchor) @ outer
     at = anchor + 0.6 * radius.max() * outer
     at = at + (points[:, 2].max() - 0.03 - at[2]) * UP
@@ -162,7 +168,9 @@ def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
     high = cloud[cloud[:, 2] > cloud[:, 2].max() - 0.03]
     around = surroundings(view, part.body, cloud.mean(axis=0), view.scene.things)
     grasp = choose_grasp(high, around, cloud[:, 2].min(), finger_axis(view.eef_mat), "knob")
-    mats = [downward(grasp.yaw, sign * np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0])) for sign in (1, -1)]
+    mats = [
+        downward(grasp.yaw, sign * np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0])) for sign in (1, -1)
+    ]
     poses = [Pose(grasp.pos_world, mat) for mat in mats]
     best = min(poses, key=lambda pose: strain(pose) ** 2 + strain(part.moved(view, pose, delta)) ** 2)
     return Hold(best, best, UP, True)
@@ -256,7 +264,10 @@ def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
             if abs(aside) + 0.5 * width + 0.003 < OPEN_HALF:
                 held = Pose(pos + forth * approach, mat)
                 ready = Pose(held.pos + aside * fingers, mat)
-                yield 0.5 * abs(shift) + 2.0 * abs(aside) + 4.0 * abs(forth) + extra, Hold(ready, held, back, True)
+                yield (
+                    0.5 * abs(shift) + 2.0 * abs(aside) + 4.0 * abs(forth) + extra,
+                    Hold(ready, held, back, True),
+                )
 
 
 def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
@@ -277,7 +288,10 @@ def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
         front = float((offset[near] @ handle.out).max())
         pos = handle.pos + shift * handle.along + side * beside + (front + forward + 0.004) * handle.out
         hold = Pose(pos, mat)
-        yield 0.5 * (abs(shift) + abs(side)) + 0.2 * abs(tilt - np.radians(65)), Hold(hold, hold, -approach, False)
+        yield (
+            0.5 * (abs(shift) + abs(side)) + 0.2 * abs(tilt - np.radians(65)),
+            Hold(hold, hold, -approach, False),
+        )
 
 
 def _spread(values: np.ndarray, number: int) -> list[float]:
@@ -295,7 +309,9 @@ def crowding(points: np.ndarray, pose: Pose, inner: float, outer: float) -> floa
     x, y, z = (near @ pose.mat).T  # fingers and palm
     x, y = np.abs(x), np.abs(y)
     sides = outer + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
-    finger = np.minimum.reduce([sides - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z])
+    finger = np.minimum.reduce(
+        [sides - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z]
+    )
     finger = np.where(z > -0.04, finger, 0.0)
     half = np.clip(0.0175 - 0.22 * (z + 0.031), 0.0, 0.032) + _SPARE  # of the palm, which is thinner in front
     palm = np.minimum.reduce([0.104 + _SPARE - x, half - y, -0.031 + _SPARE - z, z + 0.13])
@@ -316,7 +332,9 @@ def strain(pose: Pose) -> float:
     """How far a hand is turned from where the wrist's joints are in the middle, rad."""
     yaw = _WRIST_MIDDLE + np.arctan2(pose.pos[1], pose.pos[0] - _SHOULDER[0])
     c, s = np.cos(yaw), np.sin(yaw)
-    trace = np.sum(pose.mat * [[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])  # of the turn from fingers along yaw
+    trace = np.sum(
+        pose.mat * [[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]]
+    )  # of the turn from fingers along yaw
     return float(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
 
 
