@@ -96,8 +96,10 @@ class TaskSequence:
         """Train on a stage, from its beginning or from what is saved of it, and write its checkpoint."""
         p, task = self.parts, stage[-1]
         dataset, saved = self._windows(stage), p.directory.progress(task, p.device)
-        what = p.instructions[task] if len(stage) == 1 else f"the last of {len(stage)} learned together"
-        self._say(f"Task {task + 1}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
+        numbers, what = f"Task {task + 1}", p.instructions[task]
+        if len(stage) > 1:
+            numbers, what = f"Tasks {stage[0] + 1}-{task + 1}", "together"
+        self._say(f"{numbers}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
         if saved is None:
             p.algorithm.begin_task(task, dataset, p.policy)
         else:
