@@ -1,6 +1,7 @@
 """Network parts that policies are made of: vision, tokens, transformer over time, action heads, augmentation."""
 
 from lifelong.nn.augmentation import Augmentation, ColorJitter, Compose, RandomShift
+from lifelong.nn.flow import FlowHead
 from lifelong.nn.heads import ActionHead, DeterministicHead, GMMHead
 from lifelong.nn.tokens import LanguageToken, ProprioTokens
 from lifelong.nn.transformer import TemporalTransformer
@@ -13,6 +14,7 @@ __all__ = [
     "Compose",
     "DeterministicHead",
     "FiLM",
+    "FlowHead",
     "GMMHead",
     "LanguageToken",
     "ProprioTokens",

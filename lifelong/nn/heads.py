@@ -5,6 +5,7 @@ Shape legend: B batch, T time, E latent, K modes, A action.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +15,11 @@ from torch.nn import functional
 class ActionHead(nn.Module, ABC):
     """From latents (..., E) to actions in [-1, 1]^A.
 
-    `forward` gives the parameters of a distribution; the other methods read them.
+    `forward` gives the parameters of a distribution; the other methods read them. `chunk` is the number of actions
+    a latent answers for: its own step's and the following ones'.
     """
+
+    chunk: int = 1
 
     @abstractmethod
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
@@ -36,6 +40,25 @@ class ActionHead(nn.Module, ABC):
     @abstractmethod
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
         """A random action (..., A)."""
+
+    def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
+        """The actions to execute before the next latent is asked.
+
+        Args:
+            params: of one latent per environment, (B, E).
+            generators: one CPU generator per environment to draw with; None: the most likely actions.
+
+        Returns:
+            (B, n, A), n the same for all.
+        """
+        if generators is None:
+            return self.mode(params)[:, None]
+        draws = [
+            self.sample({k: v[i : i + 1].cpu() for k, v in params.items()}, generator)
+            for i, generator in enumerate(generators)
+        ]
+        device = next(iter(params.values())).device
+        return torch.stack(draws).to(device)
 
 
 def _trunk(in_dim: int, hidden: int, layers: int, norm: bool) -> nn.Sequential:

@@ -18,24 +18,20 @@ _CENTRE_AND_SCALE: dict[str, tuple[tuple[float, ...], float]] = {
 }
 
 
-class ProprioTokens(nn.Module):
-    """One token per modality: a linear map of the (scaled) reading.
+class ProprioScaling(nn.Module):
+    """Readings brought to order one, and in training some of them hidden.
 
     Args:
         proprio: name -> D, in order.
-        dim: E.
-        normalise: bring known modalities to order one first (the original feeds raw radians and metres, in
-            which the gripper's 0.04 m all but vanish).
+        normalise: bring known modalities to order one (the original feeds raw radians and metres, in which the
+            gripper's 0.04 m all but vanish).
         dropout: chance, in training, that a whole modality of a whole window is zeroed, so that the policy
             does not learn to read the action off the arm's pose alone.
     """
 
-    def __init__(
-        self, *, proprio: Mapping[str, int], dim: int, normalise: bool = True, dropout: float = 0.0
-    ) -> None:
+    def __init__(self, *, proprio: Mapping[str, int], normalise: bool = True, dropout: float = 0.0) -> None:
         super().__init__()
-        self.dropout = dropout
-        self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
+        self.names, self.dropout = tuple(proprio), dropout
         for name, size in proprio.items():
             centre, scale = _CENTRE_AND_SCALE.get(name, ((0.0,) * size, 1.0))
             if not normalise or len(centre) != size:
@@ -43,15 +39,37 @@ class ProprioTokens(nn.Module):
             self.register_buffer(f"centre_{name}", torch.tensor(centre), persistent=False)
             self.register_buffer(f"scale_{name}", torch.tensor(scale), persistent=False)
 
-    def forward(self, proprio: Mapping[str, Tensor]) -> Tensor:
-        """name -> (B, T, D) to (B, T, number of modalities, E)."""
-        tokens = []
-        for name, linear in self.linears.items():
+    def forward(self, proprio: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """name -> (B, T, D) to the same, scaled, in order."""
+        scaled = {}
+        for name in self.names:
             x = (proprio[name] - getattr(self, f"centre_{name}")) / getattr(self, f"scale_{name}")
             if self.training and self.dropout > 0:
                 x = x * (torch.rand(x.shape[0], 1, 1, device=x.device) >= self.dropout)
-            tokens.append(linear(x))
-        return torch.stack(tokens, dim=2)
+            scaled[name] = x
+        return scaled
+
+
+class ProprioTokens(nn.Module):
+    """One token per modality: a linear map of the scaled reading.
+
+    Args:
+        proprio: name -> D, in order.
+        dim: E.
+        normalise, dropout: see `ProprioScaling`.
+    """
+
+    def __init__(
+        self, *, proprio: Mapping[str, int], dim: int, normalise: bool = True, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        self.scaling = ProprioScaling(proprio=proprio, normalise=normalise, dropout=dropout)
+        self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
+
+    def forward(self, proprio: Mapping[str, Tensor]) -> Tensor:
+        """name -> (B, T, D) to (B, T, number of modalities, E)."""
+        scaled = self.scaling(proprio)
+        return torch.stack([linear(scaled[name]) for name, linear in self.linears.items()], dim=2)
 
 
 class LanguageToken(nn.Module):

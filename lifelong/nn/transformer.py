@@ -47,8 +47,8 @@ class TransformerLayer(nn.Module):
             nn.Dropout(dropout),
         )
 
-    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, S, E), mask (S, S) -> (B, S, E)."""
+    def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
+        """(B, S, E), mask (S, S) -> (B, S, E); without a mask every token sees every other."""
         b, s, _ = x.shape
         qkv = self.qkv(self.attention_norm(x)).view(b, s, 3, self.heads, self.head_dim)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, S, head_dim)

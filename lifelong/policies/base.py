@@ -16,8 +16,9 @@ from lifelong.types import Batch, Observation, PolicySpec
 class Policy(nn.Module, ABC):
     """A network that is trained on windows and acts step by step.
 
-    A subclass gives `window_losses`, `reset` and `_act`, and `predict` for algorithms that distil. What it computes on a window in training and what it
-    computes when the same frames come one by one must be the same. It never changes a batch.
+    A subclass gives `window_losses`, `reset` and `_act`, and `predict` for algorithms that distil. What it computes
+    on a window in training and what it computes when the same frames come one by one must be the same. It never
+    changes a batch.
     """
 
     def __init__(self, spec: PolicySpec) -> None:

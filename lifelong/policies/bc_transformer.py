@@ -8,16 +8,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from lifelong.errors import PolicyError
-from lifelong.nn.heads import DeterministicHead, GMMHead
 from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.base import Policy
-from lifelong.types import Batch, Observation, PolicySpec
+from lifelong.policies.history import HistoryPolicy, make_head
+from lifelong.types import Observation, PolicySpec
 
 
-class BCTransformer(Policy):
+class BCTransformer(HistoryPolicy):
     """Behaviour cloning with LIBERO's ResNet-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, one per camera. All
@@ -31,8 +29,9 @@ class BCTransformer(Policy):
         image_width, stage_blocks, stem_kernel, stem_stride, stem_pool, keypoints, keypoint_temperature, readout, norm:
             image encoder, see `ResNetFiLMEncoder`. Each camera has its own.
         layers, heads, head_dim, mlp_dim, dropout: transformer, see `TemporalTransformer`.
-        head: `gmm` or `deterministic`.
+        head: `gmm`, `deterministic` or `flow`.
         head_hidden, head_layers, head_norm, modes, min_std, low_eval_noise: see `GMMHead`.
+        chunk, execute, flow_steps: of the `flow` head, see `FlowHead`, which takes hidden and layers as well.
         stochastic: sample actions instead of taking the most likely one; needs generators to act.
         normalise_proprio, proprio_dropout: see `ProprioTokens`.
         standardise_language: bring embeddings to mean 0 and variance 1, so that unit vectors of sentence
@@ -68,13 +67,16 @@ class BCTransformer(Policy):
         modes: int = 5,
         min_std: float = 1e-4,
         low_eval_noise: bool = False,
+        chunk: int = 5,
+        execute: int = 3,
+        flow_steps: int = 10,
         stochastic: bool = False,
         normalise_proprio: bool = True,
         proprio_dropout: float = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(spec)
-        self.stochastic, self.standardise_language = stochastic, standardise_language
+        super().__init__(spec, stochastic=stochastic)
+        self.standardise_language = standardise_language
         self.encoders = nn.ModuleDict(
             {
                 view: ResNetFiLMEncoder(
@@ -107,21 +109,20 @@ class BCTransformer(Policy):
             dropout=dropout,
             max_length=spec.seq_len,
         )
-        sizes = {
-            "in_dim": embed_dim,
-            "action_dim": spec.action_dim,
-            "hidden": head_hidden,
-            "layers": head_layers,
-            "norm": head_norm,
-        }
-        if head == "gmm":
-            self.head = GMMHead(**sizes, modes=modes, min_std=min_std, low_eval_noise=low_eval_noise)
-        elif head == "deterministic":
-            self.head = DeterministicHead(**sizes)
-        else:
-            raise PolicyError(f"unknown head {head!r}. Valid: deterministic, gmm")
-        self._history: Tensor | None = None  # (B, <= seq_len, M, E)
-        self._num_envs: int | None = None
+        self.head = make_head(
+            head,
+            spec=spec,
+            in_dim=embed_dim,
+            hidden=head_hidden,
+            layers=head_layers,
+            norm=head_norm,
+            modes=modes,
+            min_std=min_std,
+            low_eval_noise=low_eval_noise,
+            chunk=chunk,
+            execute=execute,
+            flow_steps=flow_steps,
+        )
 
     def encode(self, observation: Observation) -> Tensor:
         """The tokens of every time step, (B, T, M, E); each step by itself."""
@@ -137,45 +138,6 @@ class BCTransformer(Policy):
             tokens.append(latent.view(b, t, 1, -1))
         return torch.cat(tokens, dim=2)
 
-    def distribution(self, observation: Observation) -> dict[str, Tensor]:
-        """Parameters of the action distribution at every step of a window; see the head."""
-        return self.head(self.transformer(self.encode(observation))[:, :, 0])
-
-    def window_losses(self, batch: Batch) -> Tensor:
-        """See `Policy`."""
-        return self.head.losses(self.distribution(batch.observation), batch.actions).mean(-1)
-
-    def predict(self, batch: Batch) -> Tensor:
-        """See `Policy`."""
-        return self.head.mean(self.distribution(batch.observation))
-
-    def reset(self, num_envs: int) -> None:
-        """See `Policy`."""
-        self._history, self._num_envs = None, num_envs
-
-    def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
-        params = self._step(observation)
-        if not self.stochastic:
-            return self.head.mode(params)
-        if generators is None or len(generators) != self._num_envs:
-            raise PolicyError(
-                "a stochastic policy needs one generator per environment: act(..., generators=[...])"
-            )
-        draws = [
-            self.head.sample({k: v[i : i + 1].cpu() for k, v in params.items()}, generator)
-            for i, generator in enumerate(generators)
-        ]
-        return torch.cat(draws).to(observation.images.device)
-
-    def _step(self, observation: Observation) -> dict[str, Tensor]:
-        """Appends a step to the history; the parameters of the distribution of the next action."""
-        if self._num_envs != len(observation.images):
-            raise PolicyError(
-                f"reset announced {self._num_envs} environments, the observation has {len(observation.images)}; "
-                "call reset(num_envs) at the start of an episode"
-            )
-        tokens = self.encode(observation)
-        if self._history is not None:
-            tokens = torch.cat([self._history[:, 1 - self.spec.seq_len :], tokens], dim=1)
-        self._history = tokens[:, -self.spec.seq_len :]
-        return self.head(self.transformer(self._history)[:, -1, 0])
+    def over_time(self, features: Tensor) -> Tensor:
+        """Tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
+        return self.transformer(features)[:, :, 0]

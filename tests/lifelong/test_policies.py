@@ -199,5 +199,5 @@ def test_wrong_use_is_refused() -> None:
         policy.act(batch.observation)
     with pytest.raises(PolicyError, match="lacks"):
         policy.act(Observation(step.images, {"joint_states": step.proprio["joint_states"]}, step.language))
-    with pytest.raises(PolicyError, match="Valid: deterministic, gmm"):
+    with pytest.raises(PolicyError, match="Valid: deterministic, flow, gmm"):
         make_policy(head="diffusion")

@@ -1,0 +1,188 @@
+"""Flow matching: a chunk of actions from noise, by integrating a learned velocity.
+
+Shape legend: B batch, T time, H chunk, E latent, A action, N latents (any leading shape, flattened).
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lifelong.errors import PolicyError
+from lifelong.nn.heads import ActionHead
+
+_EVAL_SEED = 0
+_OCTAVES = 6  # of the code of the time
+
+
+class FlowHead(ActionHead):
+    """Chunks of H actions by flow matching (Lipman et al., ICLR 2023; for robots: Black et al., pi0, 2024).
+
+    Between noise e and a chunk a the path is straight, x(s) = (1 - s) e + s a for s in [0, 1], and a network learns
+    its velocity a - e (Lipman et al., eq. 23 with no noise left at the end). Actions come from integrating the
+    network's velocity from s = 0 to 1 by Euler steps.
+
+    A window holds actions only up to its end. The chunk of its step t therefore has min(H, T - t) of its slots
+    filled; the network is told which, the others are zero and count in no loss. Whole chunks are learned at the first
+    T - H + 1 steps of a window only: a policy that acts must not look back further than that.
+
+    In training, noise and times come from torch's default generator, as dropout's do. In eval mode they are the same
+    for every window, so that a window's loss depends neither on chance nor on its batch.
+
+    Args:
+        in_dim: E.
+        action_dim: A.
+        chunk: H.
+        execute: actions of a chunk that are carried out before the next one is asked for.
+        steps: of Euler's method.
+        hidden, layers: width and residual blocks of the network.
+
+    Raises:
+        PolicyError: not 1 <= execute <= chunk, or no step.
+    """
+
+    def __init__(
+        self,
+        *,
+        in_dim: int,
+        action_dim: int,
+        chunk: int = 5,
+        execute: int = 3,
+        steps: int = 10,
+        hidden: int = 1024,
+        layers: int = 2,
+    ) -> None:
+        super().__init__()
+        if not 1 <= execute <= chunk or steps < 1:
+            raise PolicyError(
+                f"a flow head with chunk {chunk}, execute {execute}, flow_steps {steps}; valid: "
+                "1 <= execute <= chunk and flow_steps >= 1"
+            )
+        self.chunk, self.execute, self.steps, self.action_dim = chunk, execute, steps, action_dim
+        self.velocity = VelocityField(
+            in_dim=in_dim, action_dim=action_dim, chunk=chunk, hidden=hidden, layers=layers
+        )
+
+    def forward(self, latent: Tensor) -> dict[str, Tensor]:
+        """Latents of windows (B, T, E) or of single steps (B, E), for which nothing ends.
+
+        Returns:
+            `latent` as given, and `slots` (B, T, H) or (B, H) float32: 1 where an action of the chunk exists.
+        """
+        slots = latent.new_ones(*latent.shape[:-1], self.chunk, dtype=torch.float32)
+        if latent.dim() == 3:
+            t = latent.shape[1]
+            step = torch.arange(t, device=latent.device)[:, None]
+            slots = slots * (step + torch.arange(self.chunk, device=latent.device) < t)
+        return {"latent": latent, "slots": slots}
+
+    def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """Squared error of the velocity at one random time, mean over what a chunk holds; (B, T, A) -> (B, T)."""
+        latent, slots = params["latent"], params["slots"]
+        chunks = self._chunks(actions.float())
+        noise, time = self._draw(chunks)
+        here = time[..., None, None]
+        velocity = self.velocity((1 - here) * noise + here * chunks, time, latent, slots)
+        error = (velocity - (chunks - noise)).square().mean(-1) * slots
+        return error.sum(-1) / slots.sum(-1)
+
+    def _chunks(self, actions: Tensor) -> Tensor:
+        """(B, T, A) -> (B, T, H, A): each step's action and those after it; beyond the window whatever is last."""
+        t = actions.shape[1]
+        step = torch.arange(t, device=actions.device)[:, None]
+        index = (step + torch.arange(self.chunk, device=actions.device)).clamp(max=t - 1)
+        return actions[:, index]
+
+    def _draw(self, chunks: Tensor) -> tuple[Tensor, Tensor]:
+        """Noise (B, T, H, A) and times (B, T) in [0, 1)."""
+        if self.training:
+            return torch.randn_like(chunks), torch.rand(chunks.shape[:2], device=chunks.device)
+        draws = torch.Generator().manual_seed(_EVAL_SEED)
+        noise = torch.randn(chunks.shape[1:], generator=draws).to(chunks.device).expand_as(chunks)
+        return noise, torch.rand(chunks.shape[1], generator=draws).to(chunks.device).expand(chunks.shape[:2])
+
+    def integrate(self, params: dict[str, Tensor], noise: Tensor) -> Tensor:
+        """The chunk that the flow carries `noise` (..., H, A) to; same shape, float32, with gradients."""
+        x = noise
+        for k in range(self.steps):
+            time = x.new_full(x.shape[:-2], k / self.steps)
+            x = x + self.velocity(x, time, params["latent"], params["slots"]) / self.steps
+        return x
+
+    def mode(self, params: dict[str, Tensor]) -> Tensor:
+        """The first action of the chunk that no noise leads to: the exact mean where actions are Gaussian."""
+        return self.mean(params)
+
+    def mean(self, params: dict[str, Tensor]) -> Tensor:
+        """The first action of the chunk that no noise leads to, (..., A), with gradients through all steps.
+
+        One evaluation at s = 0 would be the distribution's exact mean, but it lies between the choices where there
+        are several, and distilling it would hold the network at s = 0 only, not along the way actions take.
+        """
+        return self.integrate(params, torch.zeros_like(self._empty(params)))[..., 0, :]
+
+    def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
+        """The first action of a random chunk, (..., A)."""
+        shape, device = self._empty(params).shape, params["latent"].device
+        noise = torch.randn(shape, generator=generator).to(device)
+        return self.integrate(params, noise)[..., 0, :]
+
+    def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
+        """See `ActionHead`; the first `execute` actions of a chunk, (B, execute, A)."""
+        noise = torch.zeros_like(self._empty(params))
+        if generators is not None:
+            draws = [torch.randn(noise.shape[1:], generator=generator) for generator in generators]
+            noise = torch.stack(draws).to(noise.device)
+        return self.integrate(params, noise)[:, : self.execute]
+
+    def _empty(self, params: dict[str, Tensor]) -> Tensor:
+        """Uninitialised chunks, (..., H, A) float32."""
+        slots = params["slots"]
+        return slots.new_empty(*slots.shape, self.action_dim)
+
+
+class VelocityField(nn.Module):
+    """The velocity of a chunk on its way from noise, given the latent: residual blocks, normalised first.
+
+    Args:
+        in_dim: E.
+        action_dim: A.
+        chunk: H.
+        hidden, layers: width and number of blocks.
+    """
+
+    def __init__(self, *, in_dim: int, action_dim: int, chunk: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        self.enter = nn.Linear(in_dim + chunk * (action_dim + 1) + 2 * _OCTAVES, hidden)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                nn.LayerNorm(hidden), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, hidden)
+            )
+            for _ in range(layers)
+        )
+        self.leave = nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, chunk * action_dim))
+
+    def forward(self, x: Tensor, time: Tensor, latent: Tensor, slots: Tensor) -> Tensor:
+        """The velocity at `x`.
+
+        Args:
+            x: (..., H, A).
+            time: (...) in [0, 1].
+            latent: (..., E).
+            slots: (..., H), 1 where an action exists.
+
+        Returns:
+            (..., H, A) float32, zero where no action exists.
+        """
+        flat = (x * slots[..., None]).flatten(-2)
+        h = self.enter(torch.cat([latent.float(), flat, slots, _time_code(time)], dim=-1))
+        for block in self.blocks:
+            h = h + block(h)
+        return self.leave(h).float().view(x.shape) * slots[..., None]
+
+
+def _time_code(time: Tensor) -> Tensor:
+    """(...) in [0, 1] -> (..., 2 octaves): sine and cosine of a quarter turn and its doublings."""
+    angle = time[..., None] * (0.5 * math.pi * 2.0 ** torch.arange(_OCTAVES, device=time.device))
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
