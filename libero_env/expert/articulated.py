@@ -7,16 +7,8 @@ import numpy as np
 from libero_env.control import SUBSTEPS
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import TIP_BELOW, GraspError
-from libero_env.expert.handles import (
-    Hold,
-    Part,
-    find_handle,
-    handle_hold,
-    inner_side,
-    is_knob,
-    knob_hold,
-    surroundings,
-)
+from libero_env.expert.handles import Part, find_handle, inner_side, is_knob, surroundings
+from libero_env.expert.holds import Hold, handle_hold, knob_hold
 from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
 from libero_env.expert.style import Style
 from libero_env.predicates import StateView, evaluate

@@ -1,0 +1,145 @@
+"""Drawers, doors and knobs: every kind of fixture is opened, closed and turned, and stays so."""
+
+import numpy as np
+import pytest
+
+from libero_env.expert.articulated import MoveJoint
+from libero_env.expert.handles import Part, find_handle
+from libero_env.expert.style import Style
+from libero_env.predicates import evaluate
+from libero_env.problem import Atom
+from libero_env.tasks import read_task
+from libero_env.vector import BatchEnv
+
+pytestmark = pytest.mark.sim
+
+SEEDS = 10
+STEPS = 260
+BACK, FRONT = (
+    3.14159,
+    0.0,
+)  # rad, yaw of a fixture whose front faces the middle from the right and from the left
+CASES = [  # category, region of the part or "", state, begins as, place (x, y) m, yaw rad
+    ("wooden_cabinet", "top_region", "open", None, (0.0, -0.28), BACK),
+    ("wooden_cabinet", "middle_region", "open", None, (0.0, -0.28), BACK),
+    ("wooden_cabinet", "bottom_region", "open", None, (0.0, -0.28), BACK),
+    ("wooden_cabinet", "top_region", "close", "Open", (0.0, -0.28), BACK),
+    ("white_cabinet", "top_region", "open", None, (0.0, 0.28), FRONT),
+    ("white_cabinet", "bottom_region", "close", "Open", (0.0, 0.28), FRONT),
+    ("microwave", "", "open", "Close", (0.0, -0.25), BACK),
+    ("microwave", "", "close", "Open", (0.0, 0.34), FRONT),
+    ("short_cabinet", "middle_region", "open", None, (0.0, -0.28), BACK),
+    ("short_cabinet", "middle_region", "close", "Open", (0.0, -0.28), BACK),
+    ("short_fridge", "", "close", "Open", (0.0, 0.3), FRONT),
+    ("short_fridge", "", "open", None, (0.0, 0.3), FRONT),
+    ("flat_stove", "", "turnon", None, (-0.2, 0.2), FRONT),
+    ("flat_stove", "", "turnoff", "Turnon", (-0.2, -0.2), FRONT),
+]
+
+PROBLEM = """
+(define (problem LIBERO_Kitchen_Tabletop_Manipulation)
+  (:domain robosuite)
+  (:language {state} it)
+  (:regions
+    (place (:target kitchen_table) (:ranges (({x0} {y0} {x1} {y1}))) (:yaw_rotation (({yaw} {yaw}))))
+    {part}
+  )
+  (:fixtures kitchen_table - kitchen_table thing_1 - {category})
+  (:objects)
+  (:obj_of_interest)
+  (:init (On thing_1 kitchen_table_place) {begin})
+  (:goal (And ({goal} {address})))
+)
+"""
+
+
+def make_task(tmp_path, category, region, state, begin, place, yaw):
+    x, y = place
+    address = f"thing_1_{region}" if region else "thing_1"
+    text = PROBLEM.format(
+        category=category, state=state, goal=state.capitalize(), address=address, yaw=yaw,
+        part=f"({region} (:target thing_1))" if region else "", begin=f"({begin} {address})" if begin else "",
+        x0=x - 0.01, y0=y - 0.01, x1=x + 0.01, y1=y + 0.01,
+    )  # fmt: skip
+    file = tmp_path / f"{category}_{region}_{state}.bddl"
+    file.write_text(text)
+    return read_task(file), address
+
+
+def run(env, skills, steps=STEPS):
+    """Each skill acts in its simulation; the actions taken (steps, num, 7), and who is done."""
+    views, rest, taken = env.world.views, np.array([0.0] * 6 + [-1.0]), []
+    for _ in range(steps):
+        done = [skill.done(view) for skill, view in zip(skills, views, strict=True)]
+        if all(done):
+            break
+        actions = [rest if d else s.act(v) for d, s, v in zip(done, skills, views, strict=True)]
+        env.world.step(np.arange(len(skills)), np.array(actions))
+        taken.append(actions)
+    return np.array(taken), np.array(done)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(filter(None, case[:3])))
+def test_it_moves_and_stays(tmp_path, case):
+    task, address = make_task(tmp_path, *case)
+    env = BatchEnv(task, SEEDS, num_threads=1, cameras=())
+    env.reset(seed=0)
+    atom = Atom(case[2].capitalize(), (address,))
+    assert not any(evaluate(atom, view) for view in env.world.views)
+    skills = [MoveJoint(address, case[2], style=Style.draw(np.random.default_rng(i))) for i in range(SEEDS)]
+    actions, _ = run(env, skills)
+    assert np.abs(actions).max() <= 1.0
+    rest = np.tile([0.0] * 6 + [-1.0], (SEEDS, 1))
+    for _ in range(10):
+        env.world.step(np.arange(SEEDS), rest)
+    held = sum(evaluate(atom, view) for view in env.world.views)
+    env.close()
+    assert held >= 0.9 * SEEDS, [(skill.phase, skill.trouble) for skill in skills]
+
+
+def test_the_same_manner_gives_the_same_actions(tmp_path):
+    task, address = make_task(tmp_path, *CASES[0])
+    taken = []
+    for _ in range(2):
+        env = BatchEnv(task, 1, num_threads=1, cameras=())
+        env.reset(seed=3)
+        taken.append(run(env, [MoveJoint(address, "open", style=Style(gain=1.5))], 60)[0])
+        env.close()
+    np.testing.assert_array_equal(*taken)
+
+
+def test_what_is_done_already_needs_no_hand(tmp_path):
+    task, address = make_task(tmp_path, *CASES[3])
+    env = BatchEnv(task, 1, num_threads=1, cameras=())
+    env.reset(seed=0)
+    skill = MoveJoint(address, "open")
+    assert skill.done(env.world.views[0]) and skill.retries == 0
+    env.close()
+
+
+def test_a_fixture_without_the_joint_is_said(tmp_path):
+    task, _ = make_task(tmp_path, *CASES[0])
+    env = BatchEnv(task, 1, num_threads=1, cameras=())
+    env.reset(seed=0)
+    skill = MoveJoint("thing_1_top_side", "open")
+    np.testing.assert_array_equal(skill.act(env.world.views[0])[:6], 0.0)
+    assert "thing_1_top_side" in skill.trouble
+    env.close()
+
+
+@pytest.mark.parametrize("case", [CASES[0], CASES[6]], ids=["bar that lies", "bar that stands"])
+def test_the_handle_is_in_front(tmp_path, case):
+    task, address = make_task(tmp_path, *case)
+    env = BatchEnv(task, 1, num_threads=1, cameras=())
+    env.reset(seed=0)
+    view = env.world.views[0]
+    part = Part.of(view.scene.model, view.scene.joints[address][0])
+    handle = find_handle(view, part, -1.0)
+    assert np.linalg.norm(handle.out) == pytest.approx(1.0) and abs(handle.out @ handle.along) < 1e-6
+    assert handle.out[1] > 0.9  # towards the middle of the table
+    assert (abs(handle.along[2]) > 0.9) == (case[0] == "microwave")
+    assert handle.half > 0.03 and handle.depth < 0.03
+    assert (handle.part @ handle.out).max() == pytest.approx(
+        handle.pos @ handle.out + 0.5 * handle.depth, abs=1e-3
+    )
+    env.close()
