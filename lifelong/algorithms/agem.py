@@ -1,12 +1,13 @@
 """Averaged gradient episodic memory."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.memory import ReplayMemory
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -50,7 +51,7 @@ class AGEM(Algorithm):
         self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
     ) -> None:
         """Take the task's windows in; the earlier tasks' shares shrink."""
-        self.memory.add(dataset, generator)
+        self.memory.add(cast(SequenceVLDataset, dataset), generator)
 
     def state_dict(self) -> dict[str, Any]:
         """Which windows are kept; their frames are read again from the demonstrations."""
@@ -58,7 +59,7 @@ class AGEM(Algorithm):
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
         """Take up what `state_dict` gave; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], datasets)
+        self.memory.load_state_dict(state["memory"], cast(Mapping[int, SequenceVLDataset], datasets))
 
 
 @torch.no_grad()

@@ -1,12 +1,13 @@
 """Dark experience replay, with labels: DER++."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.memory import ReplayMemory
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -28,14 +29,15 @@ class DERpp(Algorithm):
       augmented there: z was not.
     """
 
-    def __init__(self, *, budget: int = 10_000, ratio: float = 1.0, alpha: float = 50.0):
+    def __init__(self, *, budget: int = 10_000, ratio: float = 1.0, alpha: float = 3.0):
         """Make the algorithm.
 
         Args:
             budget: Largest number of windows kept over all tasks.
             ratio: Windows replayed for each window of the present task, and again as many for the outputs.
-            alpha: Weight of the outputs. 50 = 1 / (2 * 0.1^2): the term is then the divergence, in nats like
-                the likelihoods, of two Gaussians of deviation 0.1, about what a trained policy is sure of.
+            alpha: Weight of the outputs. 3 weighs errors of 0.05 as the absolute error of a deterministic head
+                does (3 * 7 * 0.05^2 = 0.05); for the likelihoods of a mixture about 50, as 1 / (2 * 0.1^2)
+                makes the term the divergence of two Gaussians of deviation 0.1.
         """
         self.ratio, self.alpha = ratio, alpha
         self.memory = ReplayMemory(budget)
@@ -72,7 +74,7 @@ class DERpp(Algorithm):
         self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
     ) -> None:
         """Take the task's windows in with what the policy answers on them."""
-        self.memory.add(dataset, generator)
+        self.memory.add(cast(SequenceVLDataset, dataset), generator)
         before, self._kept = set(self._kept), self._held()
         for task, kept in self._kept.items():
             if task in before:  # a smaller share is the beginning of the larger one
@@ -86,7 +88,7 @@ class DERpp(Algorithm):
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
         """Take up what `state_dict` gave; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], datasets)
+        self.memory.load_state_dict(state["memory"], cast(Mapping[int, SequenceVLDataset], datasets))
         self._kept, self._outputs = self._held(), dict(state["outputs"])
 
     def _held(self) -> dict[int, Tensor]:
