@@ -6,7 +6,7 @@ import numpy as np
 
 from libero_env.expert.clearance import Voxels, hand_points
 from libero_env.expert.geometry import Pose
-from libero_env.expert.grasp import Grasp, GraspError, grasps
+from libero_env.expert.grasp import Grasp, GraspError, crowding, grasps
 from libero_env.expert.motion import finger_axis
 from libero_env.expert.place import DOWN, Place, places
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
@@ -17,7 +17,9 @@ _HAND = hand_points()
 _GRASPS, _PLACES, _TRIED = 20, 24, 24
 _LIFTS = np.array([0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18])  # m, over the place, from which a body is let fall
 _BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room too
-_TILTS = (0.5, 1.0, 1.45)  # rad, of approaches that are not straight down
+_TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
+_NEAR = 0.3  # m, around a body: what is further away is in no hand's way
+ASIDE = 0.16  # m, before a place that is entered from a side
 _SIDES = 4  # directions of such approaches that are tried
 
 
@@ -64,8 +66,7 @@ def choose_approach(
     floor = view.scene.workspace.surface_height
     voxels = Voxels(shapes.others(view, thing, spacing=DENSE), floor, pose.pos)
     spots = places(view, voxels, cloud, pose, atom, share)
-    sides = [pose.mat @ spot.mat.T @ spot.entry for spot in spots[:_PLACES] if spot.entry[2] > -0.5]
-    holds = _free_holds(view, voxels, cloud, thing, _tilts(sides))
+    holds = _free_holds(view, voxels, cloud, thing, _tilts(spots[:_PLACES], pose))
     pairs = _pairs(voxels, holds, spots[:_PLACES], pose)
     return _reachable(view, shapes, pairs[skip % len(pairs) :])
 
@@ -87,7 +88,7 @@ def _free_holds(
     for tilt in [None, *tilts]:
         try:
             lean = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
-            number = _GRASPS if tilt is None else 6
+            number = _GRASPS if tilt is None else 4
             own = grasps(cloud, voxels.floor, axis, tilt=tilt, name=thing, number=number, apart=0.015)
         except GraspError as problem:
             error = error or problem
@@ -95,27 +96,33 @@ def _free_holds(
         found += [replace(g, cost=g.cost + lean) for g in own]
     if not found:
         raise error or GraspError(f"{thing} cannot be grasped")
-    crowd = np.array([voxels.touched(_hand_at(g.pos_world, g.mat)) for g in found])
-    before = np.array(
-        [sum(voxels.touched(_hand_at(g.pos_world - back * g.mat[:, 2], g.mat)) for back in _BEFORE) for g in found]
-    )
-    total = [
-        replace(g, cost=g.cost + 0.01 * a + 0.01 * b + 0.3 * (a > 0) + 0.2 * (b > 0))
-        for g, a, b in zip(found, crowd, before, strict=True)
-    ]
-    return sorted(total, key=lambda g: g.cost)[: 2 * _GRASPS if tilts else _GRASPS]
+    near = voxels.points[np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1) < _NEAR]
+    total = [replace(g, cost=g.cost + _crowd_price(voxels, near, g)) for g in found]
+    return sorted(total, key=lambda g: g.cost)
 
 
-def _tilts(sides: list[np.ndarray]) -> list[np.ndarray]:
-    """Rotations (3, 3) from straight down to approaches that lean towards horizontal directions, each once."""
-    turns, seen = [], set()
-    for side in sides:
-        angle = float(np.arctan2(side[1], side[0]))
-        key = round(angle / (np.pi / 6)) % 12
-        if key in seen or len(seen) == _SIDES:
+def _crowd_price(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
+    """What it costs that others are in the hand's way, at the hold and before it."""
+    crowd = crowding(near, grasp.pos_world, grasp.mat)
+    below = (_hand_at(grasp.pos_world, grasp.mat)[:, 2] < voxels.floor).sum()
+    price = 20.0 * crowd + 0.3 * (crowd > 0) + 0.01 * float(below) + 0.3 * (below > 0)
+    ways = [crowding(near, grasp.pos_world - back * grasp.mat[:, 2], grasp.mat) for back in _BEFORE]
+    return price + 5.0 * max(ways) + 0.1 * (max(ways) > 0)
+
+
+def _tilts(spots: list[Place], pose: Pose) -> list[np.ndarray]:
+    """Rotations (3, 3) from straight down to approaches that suit places entered from a side or with a lean."""
+    turns: list[np.ndarray] = []
+    seen: set[tuple] = set()
+    for spot in spots:
+        back = pose.mat @ spot.mat.T
+        side = back @ (spot.entry if spot.entry[2] > -0.5 else DOWN)
+        flat = float(np.hypot(side[0], side[1]))
+        key = round(np.arctan2(side[1], side[0]) / (np.pi / 6)) % 12
+        if flat < 0.3 or key in seen or len(seen) == _SIDES:
             continue
         seen.add(key)
-        c, s = np.cos(angle), np.sin(angle)
+        c, s = side[:2] / flat
         about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         for tilt in _TILTS:
             c1, s1 = np.cos(tilt), np.sin(tilt)
@@ -159,20 +166,27 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
 def _reachable(view: StateView, shapes: Shapes, pairs: list[Approach]) -> Approach:
     """The first that the arm reaches, or the one it misses least."""
     angles = view.simulations.fields["qpos"][view.index][:7]
-    best, seen = None, {}
-    for pair in pairs[:_TRIED]:
-        grasp, entry = pair.grasp, pair.place.entry
-        key = id(grasp)
-        if key not in seen:
-            above = grasp.pos_world - 0.10 * grasp.mat[:, 2]
-            seen[key] = shapes.arm.follow(angles, [(above, grasp.mat), (grasp.pos_world, grasp.mat)])
-        after, missed = seen[key]
-        clear = 0.08 if entry[2] < DOWN[2] + 0.5 else 0.16
-        way = [(pair.hand_pos - clear * entry, pair.hand_mat), (pair.hand_pos, pair.hand_mat)]
-        miss = max(missed, shapes.arm.follow(after, way)[1])
-        if best is None or miss < best[0]:
-            best = miss, pair
-        if miss < 1e-4:
+    best: tuple[float, Approach] | None = None
+    seen: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
+    tried = 0
+    for pair in pairs:
+        for side, flip in enumerate((np.ones(3), np.array([-1.0, -1.0, 1.0]))):  # the hand turned by half
+            grasp, key = replace(pair.grasp, mat=pair.grasp.mat * flip), (id(pair.grasp), side)
+            if key not in seen:
+                above = grasp.pos_world - 0.10 * grasp.mat[:, 2]
+                seen[key] = shapes.arm.follow(angles, [(above, grasp.mat), (grasp.pos_world, grasp.mat)])
+            after, missed = seen[key]
+            if best is not None and missed >= best[0]:
+                continue
+            own, tried = replace(pair, grasp=grasp), tried + 1
+            clear = 0.08 if pair.place.entry[2] < -0.5 else ASIDE
+            way = [(own.hand_pos - clear * pair.place.entry, own.hand_mat), (own.hand_pos, own.hand_mat)]
+            miss = max(missed, shapes.arm.follow(after, way)[1])
+            if best is None or miss < best[0]:
+                best = miss, own
+            if miss < 1e-4:
+                return own
+        if tried > _TRIED:
             break
     assert best is not None
     return best[1]

@@ -13,7 +13,7 @@ from libero_env.problem import Atom
 ATTEMPTS = 5
 OVER = 0.07  # m, of the fingertips over the body on the way to it
 LEAD = 0.035  # m, of the goal ahead of the hand while it draws
-LIGHT = 0.003  # m, kept over the bottom of the hollow
+LIGHT = -0.006  # m over the bottom of the hollow: it presses, and friction helps
 
 
 class Drag:

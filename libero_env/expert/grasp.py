@@ -17,6 +17,7 @@ PALM_ABOVE = 0.0285  # and the palm begins there, with a little room
 FINGER_HALF_WIDTH = 0.011
 FINGER_THICKNESS = 0.0265
 HAND_HALF_LENGTH, HAND_HALF_WIDTH = 0.105, 0.035  # of the palm, along and across the direction of the fingers
+_HAND_LENGTH = 0.28  # m, of hand and wrist above the grip site
 _YAWS = 18
 _HEIGHTS = 4
 _SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03)  # of the hold along the jaws, m
@@ -103,7 +104,7 @@ def choose_grasp(
     for grasp in grasps(cloud, floor, finger_axis, name=name):
         if best is not None and grasp.cost >= best[0]:
             break
-        crowd = _crowding(obstacles, grasp)
+        crowd = crowding(obstacles, grasp.pos_world, grasp.mat)
         cost = grasp.cost + 20.0 * crowd + 0.3 * (crowd > 0)
         if best is None or cost < best[0]:
             best = cost, grasp
@@ -246,15 +247,14 @@ def _width(slab: np.ndarray, yaw: float) -> float:
     return float(np.ptp(strip)) if len(strip) else 0.0
 
 
-def _crowding(obstacles: np.ndarray, grasp: Grasp) -> float:
-    """How deep obstacles reach into the open fingers and the palm, m; 0 where the way is free."""
+def crowding(obstacles: np.ndarray, pos_world: np.ndarray, mat: np.ndarray) -> float:
+    """How deep obstacles (M, 3) reach into the open fingers and the palm, m; 0 where the way is free."""
     if not len(obstacles):
         return 0.0
-    along, across = _axes(grasp.yaw)
-    offset = obstacles - grasp.pos_world
-    u, v, z = np.abs(offset[:, :2] @ along), np.abs(offset[:, :2] @ across), offset[:, 2]
+    offset = (obstacles - pos_world) @ mat
+    u, v, z = np.abs(offset[:, 0]), np.abs(offset[:, 1]), -offset[:, 2]
     outer = 0.5 * MAX_OPENING + FINGER_THICKNESS + 0.003
     fingers = (z > -TIP_BELOW) & (v < FINGER_HALF_WIDTH + 0.005)
     palm = (z > PALM_ABOVE - 0.01) & (v < HAND_HALF_WIDTH)
     depth = np.maximum(np.where(fingers, outer - u, 0.0), np.where(palm, HAND_HALF_LENGTH - u, 0.0))
-    return float(max(depth.max(), 0.0))
+    return float(max(depth[z < _HAND_LENGTH].max(initial=0.0), 0.0))

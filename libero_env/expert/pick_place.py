@@ -6,7 +6,7 @@ import numpy as np
 
 from libero_env.control import SUBSTEPS
 from libero_env.errors import LiberoError
-from libero_env.expert.approach import Approach, choose_approach
+from libero_env.expert.approach import ASIDE, Approach, choose_approach
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import TIP_BELOW
@@ -28,7 +28,6 @@ FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 AROUND = 0.08  # m, within which bodies count as in the way
 SLIPPED = 0.03  # m, that a body may move between the fingers
 GENTLE = 0.005  # m, over what carries it, where a body is let go
-ASIDE = 0.16  # m, before a place that is entered from a side
 STUCK = 130  # steps of one phase
 
 
@@ -61,7 +60,7 @@ class PickPlace:
         self._offset = np.zeros(3)  # of the object from the grip site when it was taken, in the hand's frame
         self._steps, self._opening = 0, 0.0
         self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
-        self._stuck = 0  # steps without motion
+        self._stuck, self._backings = 0, 0  # steps without motion, and times it backed off
         self._inside = False  # on the last stretch of a way in from the side
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
@@ -109,7 +108,8 @@ class PickPlace:
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._steps = phase, 0
-        self._pressed, self._backing, self._inside, self._stuck = 0, False, False, 0
+        self._pressed, self._backing, self._inside = 0, False, False
+        self._stuck, self._backings = 0, 0
 
     def _again(self) -> None:
         self.retries += 1
@@ -130,7 +130,7 @@ class PickPlace:
             self._enter("close")
             return self._close(view)
         self._stuck = self._stuck + 1 if np.linalg.norm(self._velocity) < 0.008 and self._steps > 12 else 0
-        if self._stuck > 14:
+        if self._stuck > 14 or self._backings > 2:
             self._again()
             return self._toward(view, pos + 0.08 * back, view.eef_mat, OPEN)
         lift = style.slope * (aside - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
@@ -148,8 +148,8 @@ class PickPlace:
         """The lift, or all of it while a finger that came to stand on something goes back and to the middle."""
         standing = height > lift + STANDING and np.linalg.norm(self._velocity) < STILL
         self._pressed = self._pressed + 1 if standing and self._steps > 5 else 0
-        if self._pressed >= 3:
-            self._backing = True
+        if self._pressed >= 3 and not self._backing:
+            self._backing, self._backings = True, self._backings + 1
         if aside < 0.006 and height > self._rise - TIP_BELOW + 0.01:
             self._backing = False
         return self._rise + self.style.hover if self._backing else lift

@@ -17,7 +17,8 @@ _GRID = 7  # spots along each side of a region
 _LIFT = 0.008  # m, off what carries it when a body is tested for room
 _SIDEWAYS = tuple(np.arange(0.02, 0.29, 0.025))  # m, of the way in from a side that must be free
 _NEAR = 0.024  # m, between the origins of things that stand on one another
-_CROWDED = 0.08  # share of a body's points that may seem to lie in others, as voxels are coarse
+_LEANS = (0.45, 1.3)  # rad, of a body that fits nowhere upright
+_CROWDED = 0.04  # share of a body's points that may seem to lie in others, as voxels are coarse
 _ENOUGH = 80  # points of a body that are tested
 
 
@@ -51,30 +52,63 @@ def places(
     Raises:
         PlaceError: it fits nowhere.
     """
-    found: list[Place] = []
-    step = max(1, len(cloud) // _ENOUGH)
     frame = _directions(view, atom.args[1])
-    for k in range(_YAWS):
-        angle = 2 * np.pi * k / _YAWS
-        turn = _about_vertical(angle)
+    crowded = _CROWDED if not view.is_thing(atom.args[1]) else 3 * _CROWDED
+    upright = [(turn, 0.1 * abs(angle), None) for angle, turn in _turns(_YAWS)]
+    found = _found(view, voxels, cloud, pose, atom, share, upright, frame, crowded)
+    if not found and not _flat_region(view, atom.args[1]):
+        for angle in _LEANS:
+            turns = [(_lean(d, angle) @ turn, 0.1 * abs(a), d) for d in frame for a, turn in _turns(_YAWS // 2)]
+            found = found or _found(view, voxels, cloud, pose, atom, share, turns, frame, crowded)
+    if not found:
+        found = _found(view, voxels, cloud, pose, atom, share, upright, frame, 8 * crowded)
+    if not found:
+        raise PlaceError(f"({atom.predicate} {' '.join(atom.args)}): there is no room for {atom.args[0]}")
+    lowest = min(place.pos[2] for place in found)
+    deep = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
+    return sorted(deep, key=lambda place: place.cost)
+
+
+Turn = tuple[np.ndarray, float, np.ndarray | None]  # (3, 3) to apply, its cost, the only way in that it suits
+
+
+def _found(
+    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, atom: Atom, share: tuple[int, int],
+    turns: list[Turn], directions: list[np.ndarray], crowded: float,
+) -> list[Place]:  # fmt: skip
+    """Places of a body turned in these ways, of which at most a share may seem to lie in others."""
+    found = []
+    step = max(1, len(cloud) // _ENOUGH)
+    for turn, price, only in turns:
         body = (cloud - pose.pos) @ turn.T
-        turning = 0.1 * min(angle, 2 * np.pi - angle)
         for spots, costs, below, holds in _regions(view, atom, body, share):
             heights = voxels.drop(underside(body), spots, below)
             keep = [i for i, (xy, z) in enumerate(zip(spots, heights, strict=True)) if holds(np.array([*xy, z + 0.003]))]
             if not keep:
                 continue
             origins = np.column_stack([spots, heights])[keep]
-            entries, crowd = _ways_in(voxels, body[::step], origins, frame)
+            ways = directions if only is None else [only]
+            entries, crowd = _ways_in(voxels, body[::step], origins, ways, crowded)
             for pos, cost, entry, full in zip(origins, costs[keep], entries, crowd, strict=True):
                 if entry is not None:
-                    sideways = 0.5 * (entry[2] > -0.5)
-                    found.append(Place(pos, turn @ pose.mat, entry, cost + turning + 8.0 * full + sideways))
-    if not found:
-        raise PlaceError(f"({atom.predicate} {' '.join(atom.args)}): there is no room for {atom.args[0]}")
-    lowest = min(place.pos[2] for place in found)
-    deep = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
-    return sorted(deep, key=lambda place: place.cost)
+                    aside = 0.5 * (entry[2] > -0.5)
+                    found.append(Place(pos, turn @ pose.mat, entry, cost + price + 8.0 * full + aside))
+    return found
+
+
+def _turns(number: int) -> list[tuple[float, np.ndarray]]:
+    """Turns about the vertical: (angle, (3, 3))."""
+    angles = [2 * np.pi * k / number for k in range(number)]
+    angles = [a - 2 * np.pi if a > np.pi else a for a in angles]
+    return [(a, _about_vertical(a)) for a in angles]
+
+
+def _lean(entry: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation (3, 3) by which the top of a body leans back, away from where it goes."""
+    axis = np.cross(entry, [0.0, 0.0, 1.0])
+    x, y, _ = axis
+    cross = np.array([[0, 0, y], [0, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, int]):
@@ -132,17 +166,17 @@ def _directions(view: StateView, target: str) -> list[np.ndarray]:
 
 
 def _ways_in(
-    voxels: Voxels, body: np.ndarray, origins: np.ndarray, directions: list[np.ndarray]
+    voxels: Voxels, body: np.ndarray, origins: np.ndarray, directions: list[np.ndarray], crowded: float
 ) -> tuple[list[np.ndarray | None], np.ndarray]:
     """For each origin (S, 3) the direction along which the body comes in, None for none; and the share in walls."""
     standing = origins[:, None] + body[None] + [0, 0, _LIFT]
     crowd = voxels.hits(standing) / len(body)
     entries: list[np.ndarray | None] = [None] * len(origins)
     roofed = voxels.roofed(standing).mean(axis=1)
-    for i in np.flatnonzero((crowd < _CROWDED) & (roofed <= np.maximum(crowd, 0.03))):
+    for i in np.flatnonzero((crowd < crowded) & (roofed <= np.maximum(crowd, 0.03))):
         entries[i] = DOWN
     for entry in () if any(entry is not None for entry in entries) else directions:
-        open_ = [i for i in range(len(origins)) if entries[i] is None and crowd[i] < _CROWDED]
+        open_ = [i for i in range(len(origins)) if entries[i] is None and crowd[i] < crowded]
         if not open_:
             break
         free = np.ones(len(open_), bool)
