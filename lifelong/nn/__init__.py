@@ -3,7 +3,8 @@
 from lifelong.nn.augmentation import Augmentation, ColorJitter, Compose, RandomShift
 from lifelong.nn.flow import FlowHead
 from lifelong.nn.heads import ActionHead, DeterministicHead, GMMHead
-from lifelong.nn.tokens import LanguageToken, ProprioTokens
+from lifelong.nn.patches import PatchEncoder, SpatialTransformer
+from lifelong.nn.tokens import LanguageToken, ProprioScaling, ProprioTokens
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import FiLM, ResNetFiLMEncoder, SpatialSoftmax
 
@@ -17,9 +18,12 @@ __all__ = [
     "FlowHead",
     "GMMHead",
     "LanguageToken",
+    "PatchEncoder",
+    "ProprioScaling",
     "ProprioTokens",
     "RandomShift",
     "ResNetFiLMEncoder",
     "SpatialSoftmax",
+    "SpatialTransformer",
     "TemporalTransformer",
 ]

@@ -1,0 +1,116 @@
+"""Images and instruction to one token per frame: patches, and a transformer over all of them.
+
+Shape legend: N frames, M windows, V views, P patches per view, H W image, E token.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lifelong.errors import PolicyError
+from lifelong.nn.transformer import TransformerLayer
+from lifelong.nn.vision import make_norm
+
+
+class PatchEncoder(nn.Module):
+    """A strided convolution and then one linear map per patch of its output.
+
+    Args:
+        image_size: H, W in pixels.
+        dim: E.
+        width, stem_kernel, stem_stride: of the convolution.
+        patch: side of a patch, in cells of the convolution's output.
+        norm: see `make_norm`.
+
+    Raises:
+        PolicyError: an unknown norm, or an image that patches do not tile.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: tuple[int, int],
+        dim: int = 128,
+        width: int = 64,
+        stem_kernel: int = 7,
+        stem_stride: int = 2,
+        patch: int = 8,
+        norm: str = "group",
+    ) -> None:
+        super().__init__()
+        padding = stem_kernel // 2
+        cells = [(n + 2 * padding - stem_kernel) // stem_stride + 1 for n in image_size]
+        if any(n % patch for n in cells):
+            raise PolicyError(
+                f"images of {tuple(image_size)} give {cells[0]} x {cells[1]} cells after the stem, which patches "
+                f"of {patch} x {patch} do not tile; change policy.patch or policy.stem_stride"
+            )
+        self.patches = (cells[0] // patch) * (cells[1] // patch)
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, width, stem_kernel, stem_stride, padding=padding, bias=norm == "none"),
+            make_norm(norm, width),
+            nn.ReLU(inplace=True),
+        )
+        self.project = nn.Conv2d(width, dim, patch, patch)
+        self.norm = make_norm(norm, dim)
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(N, H, W, 3) uint8 -> (N, P, E), row by row."""
+        h = images.movedim(-1, 1).to(torch.float32).mul_(2.0 / 255.0).sub_(1.0)
+        h = functional.relu(self.norm(self.project(self.stem(h))), inplace=True)
+        return h.flatten(2).transpose(1, 2)
+
+
+class SpatialTransformer(nn.Module):
+    """What a frame shows, seen with the instruction: ViLT (Kim, Son and Kim, ICML 2021) with LIBERO's sizes.
+
+    The patches of all views and the instruction's token see each other, without order in time; what is read is an
+    extra token of its own.
+
+    Args:
+        views: V.
+        patches: P of every view.
+        dim: E.
+        out_dim: size of the output.
+        layers, heads, head_dim, mlp_dim, dropout: see `TransformerLayer`.
+    """
+
+    def __init__(
+        self,
+        *,
+        views: int,
+        patches: int,
+        dim: int = 128,
+        out_dim: int = 64,
+        layers: int = 7,
+        heads: int = 8,
+        head_dim: int = 120,
+        mlp_dim: int = 256,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.positions = nn.Parameter(torch.randn(views, patches, dim))
+        self.modalities = nn.Parameter(torch.randn(views + 1, dim))  # each view, then language
+        self.read = nn.Parameter(torch.randn(dim))
+        sizes = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim, "dropout": dropout}
+        self.layers = nn.ModuleList(TransformerLayer(**sizes) for _ in range(layers))
+        self.project = nn.Linear(dim, out_dim)
+
+    def forward(self, patches: Tensor, language: Tensor) -> Tensor:
+        """Mixes the patches of each frame with its instruction.
+
+        Args:
+            patches: (N, V, P, E).
+            language: (M, E); N = M T with the T frames of a window adjacent.
+
+        Returns:
+            (N, out_dim).
+        """
+        n = len(patches)
+        seen = (patches + self.positions + self.modalities[:-1, None]).flatten(1, 2)
+        told = (language + self.modalities[-1]).repeat_interleave(n // len(language), dim=0)
+        x = torch.cat([self.read.expand(n, 1, -1), told[:, None], seen], dim=1)
+        for layer in self.layers:
+            x = layer(x)
+        return self.project(x[:, 0])

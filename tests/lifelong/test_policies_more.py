@@ -1,0 +1,340 @@
+"""Every policy with every head acts as it is trained; chunks are planned, carried out and forgotten."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hydra.utils import get_object
+from torch import nn
+
+from lifelong.data import fake_batch
+from lifelong.errors import PolicyError
+from lifelong.nn.flow import FlowHead
+from lifelong.nn.heads import GMMHead
+from lifelong.policies import BCRNN, BCTransformer, BCViLT, Policy
+from lifelong.types import Batch, Observation, PolicySpec
+
+pytestmark = pytest.mark.unit
+SPEC = PolicySpec(image_size=(32, 32), language_dim=6, seq_len=4)
+HEAD = {"head_hidden": 16, "min_std": 0.02, "chunk": 3, "execute": 2, "flow_steps": 3}
+OVER_TIME = {"embed_dim": 16, "layers": 1, "heads": 2, "head_dim": 8, "mlp_dim": 32}
+IMAGE = {"image_width": 8, "stage_blocks": (1,), "stem_stride": 4, "stem_pool": False}
+PATCHES = {"patch_embed": 16, "patch_width": 8, "stem_stride": 4, "patch": 4, "spatial_layers": 1}
+SPATIAL = {"spatial_heads": 2, "spatial_head_dim": 8, "spatial_mlp_dim": 32}
+SMALL = {
+    "transformer": (BCTransformer, IMAGE | OVER_TIME),
+    "rnn": (BCRNN, IMAGE | {"image_embed": 16, "text_embed": 8, "rnn_hidden": 16}),
+    "rnn-window": (BCRNN, IMAGE | {"image_embed": 16, "rnn_hidden": 16, "memory": "window"}),
+    "vilt": (BCViLT, PATCHES | SPATIAL | OVER_TIME),
+}
+CONFIGS = sorted((Path(__file__).parents[2] / "configs" / "policy").glob("*.yaml"))
+every_policy = pytest.mark.parametrize("kind", SMALL)
+every_head = pytest.mark.parametrize("head", ["gmm", "deterministic", "flow"])
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def make_policy(kind: str, spec: PolicySpec = SPEC, **changes) -> Policy:
+    target, sizes = SMALL[kind]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        policy = target(spec=spec, **(HEAD | sizes | changes))
+        for module in policy.modules():  # FiLM starts as the identity: let language matter
+            if isinstance(module, nn.Linear):
+                nn.init.normal_(module.weight, std=0.2)
+    return policy
+
+
+def rows(observation: Observation, at: slice) -> Observation:
+    """Some environments."""
+    proprio = {k: v[at] for k, v in observation.proprio.items()}
+    return Observation(observation.images[at], proprio, observation.language[at])
+
+
+def steps(observation: Observation, at: slice) -> Observation:
+    """Some steps of a window."""
+    proprio = {k: v[:, at] for k, v in observation.proprio.items()}
+    return Observation(observation.images[:, at], proprio, observation.language)
+
+
+def frame(observation: Observation, t: int) -> Observation:
+    return steps(observation, slice(t, t + 1))
+
+
+def act_through(policy: Policy, observation: Observation, seeds: list[int] | None = None) -> torch.Tensor:
+    """Actions of an episode whose frames are the window's, (B, T, A)."""
+    generators = None if seeds is None else [generator(seed) for seed in seeds]
+    policy.reset(len(observation.images))
+    actions = [policy.act(frame(observation, t), generators) for t in range(observation.images.shape[1])]
+    return torch.stack(actions, dim=1)
+
+
+@pytest.mark.parametrize(("target", "count"), [(BCRNN, 19_105_707), (BCViLT, 7_917_963)])
+def test_the_published_sizes_give_the_published_number_of_parameters(target: type, count: int) -> None:
+    with torch.device("meta"):
+        policy = target(spec=PolicySpec(language_dim=768))
+    assert sum(p.numel() for p in policy.parameters()) == count
+
+
+@pytest.mark.parametrize("file", CONFIGS, ids=lambda file: file.stem)
+def test_every_configuration_trains_and_acts(file: Path) -> None:
+    config = yaml.safe_load(file.read_text())
+    target = get_object(config.pop("_target_"))
+    with torch.device("meta"):
+        target(spec=PolicySpec(image_size=(128, 128), language_dim=768), **config)
+    spec = PolicySpec(image_size=(64, 64), language_dim=8, seq_len=5)
+    policy, batch = target(spec=spec, **config).eval(), fake_batch(spec, 1, generator())
+    assert policy.window_losses(batch).isfinite().all()
+    assert act_through(policy, steps(batch.observation, slice(2)), [0]).shape == (1, 2, 7)
+
+
+@every_policy
+@every_head
+def test_acting_step_by_step_equals_the_training_forward(kind: str, head: str) -> None:
+    policy, batch = make_policy(kind, head=head).eval(), fake_batch(SPEC, 3, generator())
+    whole = policy.distribution(batch.observation)
+    policy.reset(3)
+    with torch.no_grad():
+        for t in range(policy.memory_steps):
+            for key, value in policy._step(frame(batch.observation, t)).items():
+                torch.testing.assert_close(value, whole[key][:, t], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["transformer", "rnn-window", "vilt"])
+@every_head
+def test_only_the_latest_frames_are_remembered(kind: str, head: str) -> None:
+    policy = make_policy(kind, head=head, execute=1).eval()
+    long = fake_batch(SPEC, 2, generator(), steps=9)
+    actions, window = act_through(policy, long.observation), slice(9 - policy.memory_steps, 9)
+    alone = act_through(policy, steps(long.observation, window))
+    torch.testing.assert_close(actions[:, -1], alone[:, -1], atol=1e-5, rtol=1e-5)
+
+
+def test_a_carried_state_is_emptied_every_seq_len_steps() -> None:
+    policy, long = make_policy("rnn", head="gmm").eval(), fake_batch(SPEC, 2, generator(), steps=8)
+    actions = act_through(policy, long.observation)
+    again = act_through(policy, steps(long.observation, slice(4, 8)))
+    torch.testing.assert_close(actions[:, 4:], again)
+    changed = long.observation.images.clone()
+    changed[:, 4] = 255 - changed[:, 4]  # the first frame of the second half is felt until its end
+    other = act_through(policy, Observation(changed, long.observation.proprio, long.observation.language))
+    assert not torch.allclose(actions[:, 7], other[:, 7], atol=1e-6)
+
+
+@every_policy
+@every_head
+def test_reset_forgets(kind: str, head: str) -> None:
+    policy, batch = make_policy(kind, head=head).eval(), fake_batch(SPEC, 2, generator())
+    first = act_through(policy, batch.observation)
+    assert torch.equal(first, act_through(policy, batch.observation))
+
+
+@every_policy
+@every_head
+def test_environments_do_not_mix(kind: str, head: str) -> None:
+    policy = make_policy(kind, head=head, stochastic=True).eval()
+    observation = fake_batch(SPEC, 3, generator(), steps=6).observation
+    together = act_through(policy, observation, [5, 6, 7])
+    alone = act_through(policy, rows(observation, slice(1, 2)), [6])
+    torch.testing.assert_close(alone[0], together[1], atol=1e-5, rtol=1e-5)
+
+
+@every_policy
+@every_head
+def test_losses_reach_every_parameter_and_leave_the_batch(kind: str, head: str) -> None:
+    policy, batch = make_policy(kind, head=head), fake_batch(SPEC, 4, generator())
+    images, actions = batch.observation.images.clone(), batch.actions.clone()
+    losses = policy.window_losses(batch)
+    assert (losses.shape, losses.dtype) == ((4,), torch.float32)
+    losses.mean().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in policy.parameters())
+    assert torch.equal(images, batch.observation.images)
+    assert torch.equal(actions, batch.actions)
+
+
+@every_policy
+@every_head
+def test_in_eval_mode_the_loss_of_a_window_is_its_own(kind: str, head: str) -> None:
+    policy, batch = make_policy(kind, head=head).eval(), fake_batch(SPEC, 3, generator())
+    alone = Batch(
+        rows(batch.observation, slice(2, 3)),
+        *(x[2:3] for x in (batch.actions, batch.task_ids, batch.window_ids)),
+    )
+    torch.testing.assert_close(
+        policy.window_losses(batch)[2:], policy.window_losses(alone), rtol=1e-4, atol=1e-4
+    )
+
+
+@every_policy
+@every_head
+def test_predict_answers_every_step_with_gradients_and_nothing_random(kind: str, head: str) -> None:
+    policy, batch = make_policy(kind, head=head, stochastic=True).eval(), fake_batch(SPEC, 3, generator())
+    answer = policy.predict(batch)
+    assert (answer.shape, answer.dtype) == (batch.actions.shape, torch.float32)
+    assert torch.equal(answer, policy.predict(batch))
+    answer.square().sum().backward()
+    touched = [n for n, p in policy.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0]
+    assert any(n.startswith("encoders") for n in touched)
+    assert any(n.startswith("head") for n in touched)
+
+
+@every_policy
+def test_acting_without_chance_carries_out_what_is_predicted(kind: str) -> None:
+    policy, batch = make_policy(kind, head="flow", execute=1).eval(), fake_batch(SPEC, 2, generator())
+    actions = act_through(policy, steps(batch.observation, slice(policy.memory_steps)))
+    expected = policy.predict(batch)[:, : policy.memory_steps].clamp(-1, 1)
+    torch.testing.assert_close(actions, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_the_mean_of_a_mixture_is_weighted() -> None:
+    head = GMMHead(in_dim=2, action_dim=1, modes=2, hidden=4)
+    means, logits = torch.tensor([[[0.2], [1.0]]]), torch.tensor([[0.75, 0.25]]).log()
+    torch.testing.assert_close(head.mean({"means": means, "logits": logits}), torch.tensor([[0.4]]))
+
+
+@every_policy
+def test_language_and_every_input_matter(kind: str) -> None:
+    policy, batch = make_policy(kind).eval(), fake_batch(SPEC, 2, generator())
+    obs, base = batch.observation, policy.predict(batch)
+    changes = [Observation(obs.images, obs.proprio, obs.language.flip(0))]
+    changes += [
+        Observation(obs.images, obs.proprio | {k: v.flip(0)}, obs.language) for k, v in obs.proprio.items()
+    ]
+    for view in range(2):
+        images = obs.images.clone()
+        images[:, :, view] = images[:, :, view].flip(0)
+        changes.append(Observation(images, obs.proprio, obs.language))
+    for changed in changes:
+        other = policy.predict(Batch(changed, batch.actions, batch.task_ids, batch.window_ids))
+        assert not torch.allclose(other, base, rtol=0, atol=1e-6)
+
+
+@every_policy
+def test_no_step_sees_what_comes_after_it(kind: str) -> None:
+    policy, batch = make_policy(kind, head="gmm").eval(), fake_batch(SPEC, 2, generator())
+    shorter = policy.distribution(steps(batch.observation, slice(2)))["means"]
+    whole = policy.distribution(batch.observation)["means"][:, :2]
+    torch.testing.assert_close(shorter, whole, atol=1e-5, rtol=1e-5)
+
+
+@every_policy
+def test_weights_round_trip_through_the_state_dict(kind: str) -> None:
+    one, batch = make_policy(kind, head="flow").eval(), fake_batch(SPEC, 2, generator())
+    target, sizes = SMALL[kind]
+    other = target(spec=SPEC, **(HEAD | sizes | {"head": "flow"})).eval()
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(one.window_losses(batch), other.window_losses(batch))
+
+
+class TestFlow:
+    """The flow matching head by itself."""
+
+    def test_slots_of_a_chunk_end_with_the_window(self) -> None:
+        head = FlowHead(in_dim=2, action_dim=1, chunk=3, execute=1, hidden=8)
+        assert head(torch.zeros(1, 4, 2))["slots"][0].tolist() == [[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 0, 0]]
+        assert head(torch.zeros(1, 2))["slots"].tolist() == [[1, 1, 1]]
+
+    def test_a_chunk_is_the_actions_from_its_step_on(self) -> None:
+        head = FlowHead(in_dim=2, action_dim=1, chunk=3, execute=1, hidden=8)
+        chunks = head._chunks(torch.arange(4.0).view(1, 4, 1))[0, :, :, 0]
+        assert chunks[0].tolist() == [0, 1, 2]
+        assert chunks[1].tolist() == [1, 2, 3]
+        assert chunks[3, 0] == 3
+
+    def test_the_loss_by_hand(self) -> None:
+        head = FlowHead(in_dim=2, action_dim=2, chunk=2, execute=1, hidden=8).eval()
+        latent, actions = (
+            torch.randn(1, 2, 2, generator=generator()),
+            torch.rand(1, 2, 2, generator=generator(1)),
+        )
+        params = head(latent)
+        noise, time = head._draw(head._chunks(actions))
+        with torch.no_grad():
+            losses = head.losses(params, actions)
+            for step, chunk in enumerate([actions[0], actions[0, 1:]]):
+                e, s, n = noise[0, step], time[0, step], len(chunk)
+                x = torch.zeros(2, 2)
+                x[:n] = (1 - s) * e[:n] + s * chunk
+                v = head.velocity(x, s, latent[0, step], params["slots"][0, step])
+                expected = (v[:n] - (chunk - e[:n])).square().mean()
+                torch.testing.assert_close(losses[0, step], expected)
+
+    def test_what_lies_beyond_the_window_changes_nothing(self) -> None:
+        head = FlowHead(in_dim=2, action_dim=1, chunk=2, execute=1, hidden=8).eval()
+        x, latent, slots = torch.zeros(2, 1), torch.ones(2), torch.tensor([1.0, 0.0])
+        other = torch.tensor([[0.0], [5.0]])
+        with torch.no_grad():
+            velocities = [head.velocity(y, torch.tensor(0.5), latent, slots) for y in (x, other)]
+        assert torch.equal(*velocities)
+        assert velocities[0][1] == 0
+
+    def test_it_learns_both_of_two_choices(self) -> None:
+        """Where a mean would lie between, samples lie at one or the other, and a chunk keeps to its choice."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            head = FlowHead(in_dim=1, action_dim=1, chunk=2, execute=2, hidden=64, steps=20)
+            optimizer = torch.optim.Adam(head.parameters(), lr=3e-3)
+            side = torch.tensor([-0.8, 0.8]).repeat(64)[:, None, None]
+            for _ in range(300):
+                loss = head.losses(head(torch.zeros(128, 2, 1)), side.expand(128, 2, 1)).mean()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+        with torch.no_grad():
+            plan = head.plan(head(torch.zeros(200, 1)), [generator(i) for i in range(200)])[..., 0]
+        assert ((plan.abs() - 0.8).abs() < 0.3).float().mean() > 0.85
+        assert (plan.prod(1) > 0).float().mean() > 0.85
+        assert 0.3 < (plan[:, 0] > 0).float().mean() < 0.7
+
+    def test_a_plan_is_carried_out_before_the_next_is_made(self) -> None:
+        policy = make_policy("transformer", head="flow", stochastic=True).eval()
+        observation = fake_batch(SPEC, 2, generator(), steps=5).observation
+        actions = act_through(policy, observation, [1, 2])
+        changed = observation.images.clone()
+        changed[:, 3] = 255 - changed[:, 3]  # the second step of the second plan
+        other = act_through(policy, Observation(changed, observation.proprio, observation.language), [1, 2])
+        assert torch.equal(actions[:, :4], other[:, :4])
+        assert not torch.allclose(actions[:, 4], other[:, 4], atol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"chunk": 5}, "data.seq_len to 5 or more"),
+            ({"execute": 4}, "1 <= execute <= chunk"),
+            ({"flow_steps": 0}, "flow_steps >= 1"),
+        ],
+    )
+    def test_sizes_that_cannot_work_are_refused(self, changes: dict, message: str) -> None:
+        with pytest.raises(PolicyError, match=message):
+            make_policy("transformer", head="flow", **changes)
+
+
+def test_wrong_use_is_refused() -> None:
+    batch = fake_batch(SPEC, 2, generator())
+    with pytest.raises(PolicyError, match="Valid: reset, window"):
+        make_policy("rnn", memory="carry")
+    with pytest.raises(PolicyError, match="do not tile"):
+        make_policy("vilt", patch=3)
+    for kind in SMALL:
+        policy = make_policy(kind, stochastic=True).eval()
+        with pytest.raises(PolicyError, match="reset"):
+            policy.act(frame(batch.observation, 0))
+        policy.reset(2)
+        with pytest.raises(PolicyError, match="generator"):
+            policy.act(frame(batch.observation, 0))
+
+
+def test_a_policy_without_predict_says_so() -> None:
+    class Silent(Policy):
+        def window_losses(self, batch):
+            return batch.actions.mean((1, 2))
+
+        def reset(self, num_envs): ...
+
+        def _act(self, observation, generators): ...
+
+    with pytest.raises(PolicyError, match="Silent has no predict"):
+        Silent(SPEC).predict(fake_batch(SPEC, 2, generator()))
