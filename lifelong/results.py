@@ -136,7 +136,7 @@ class Results:
         return next((r for r in reversed(self.of(TaskEndRecord)) if r.task == task), None)
 
     def learned_tasks(self) -> int:
-        """How many tasks, from the first on, have a complete row in the matrix; all, where only the last has (joint)."""
+        """How many tasks, from the first on, have a complete row in the matrix; all of them where the last has one."""
         rates, _ = self.success_matrix()
         full = [bool(np.isfinite(rates[i, : i + 1]).all()) for i in range(len(rates))]
         return full.index(False) if False in full and not full[-1] else len(full)
