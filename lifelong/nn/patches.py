@@ -93,8 +93,10 @@ class SpatialTransformer(nn.Module):
         self.positions = nn.Parameter(torch.randn(views, patches, dim))
         self.modalities = nn.Parameter(torch.randn(views + 1, dim))  # each view, then language
         self.read = nn.Parameter(torch.randn(dim))
-        sizes = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim, "dropout": dropout}
-        self.layers = nn.ModuleList(TransformerLayer(**sizes) for _ in range(layers))
+        self.layers = nn.ModuleList(
+            TransformerLayer(dim=dim, heads=heads, head_dim=head_dim, mlp_dim=mlp_dim, dropout=dropout)
+            for _ in range(layers)
+        )
         self.project = nn.Linear(dim, out_dim)
 
     def forward(self, patches: Tensor, language: Tensor) -> Tensor:

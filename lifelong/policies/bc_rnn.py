@@ -101,11 +101,10 @@ class BCRNN(HistoryPolicy):
             }
         )
         self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
-        self.proprio = ProprioScaling(
-            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
-        )
+        readings = spec.proprio or {}
+        self.proprio = ProprioScaling(proprio=readings, normalise=normalise_proprio, dropout=proprio_dropout)
         self.rnn = nn.LSTM(
-            input_size=image_embed * len(spec.views) + text_embed + sum(spec.proprio.values()),
+            input_size=image_embed * len(spec.views) + text_embed + sum(readings.values()),
             hidden_size=rnn_hidden,
             num_layers=rnn_layers,
             dropout=dropout if rnn_layers > 1 else 0.0,

@@ -105,7 +105,7 @@ class BCViLT(HistoryPolicy):
         )
         self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
         self.proprio = ProprioTokens(
-            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
+            proprio=spec.proprio or {}, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
         )
         self.transformer = TemporalTransformer(
             dim=embed_dim,

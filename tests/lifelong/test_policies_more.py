@@ -189,6 +189,19 @@ def test_acting_without_chance_carries_out_what_is_predicted(kind: str) -> None:
     torch.testing.assert_close(actions, expected, atol=1e-5, rtol=1e-5)
 
 
+@every_policy
+@every_head
+def test_it_learns_a_batch_by_heart(kind: str, head: str) -> None:
+    policy, batch = make_policy(kind, head=head, dropout=0.0), fake_batch(SPEC, 2, generator())
+    before = policy.eval().loss(batch).item()
+    optimizer = torch.optim.AdamW(policy.train().parameters(), lr=3e-3)
+    for _ in range(30):
+        optimizer.zero_grad()
+        policy.loss(batch).backward()
+        optimizer.step()
+    assert policy.eval().loss(batch).item() < before - 0.1
+
+
 def test_the_mean_of_a_mixture_is_weighted() -> None:
     head = GMMHead(in_dim=2, action_dim=1, modes=2, hidden=4)
     means, logits = torch.tensor([[[0.2], [1.0]]]), torch.tensor([[0.75, 0.25]]).log()
