@@ -13,9 +13,21 @@ from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.predicates import StateView
 from libero_env.problem import Atom
 
+
+def _lean(azimuth: float, tilt: float) -> np.ndarray:
+    """Rotation (3, 3) that takes straight down to an approach that leans towards a horizontal direction."""
+    c, s, c1, s1 = np.cos(azimuth), np.sin(azimuth), np.cos(tilt), np.sin(tilt)
+    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return about @ np.array([[c1, 0.0, -s1], [0.0, 1.0, 0.0], [s1, 0.0, c1]]) @ about.T
+
+
 _HAND = hand_points()
+_CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
+_RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.35, 0.6) for k in range(8)]
 _GRASPS, _PLACES, _TRIED = 20, 24, 24
-_LIFTS = np.array([0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18])  # m, over the place, from which a body is let fall
+_LIFTS = np.array(
+    [0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18]
+)  # m, over the place, from which a body is let fall
 _BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room too
 _TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
 _NEAR = 0.3  # m, around a body: what is further away is in no hand's way
@@ -74,7 +86,12 @@ def choose_approach(
 def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
     """Whether something of a body fits between the fingers from above."""
     try:
-        grasps(shapes.cloud(view, thing), view.scene.workspace.surface_height, finger_axis(view.eef_mat), number=1)
+        grasps(
+            shapes.cloud(view, thing),
+            view.scene.workspace.surface_height,
+            finger_axis(view.eef_mat),
+            number=1,
+        )
     except GraspError:
         return False
     return True
@@ -84,8 +101,12 @@ def _free_holds(
     view: StateView, voxels: Voxels, cloud: np.ndarray, thing: str, tilts: list[np.ndarray]
 ) -> list[Grasp]:
     """Holds from above and along other approaches, those in the way of others last."""
-    axis, error, found = finger_axis(view.eef_mat), None, []
-    for tilt in [None, *tilts]:
+    near = voxels.points[np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1) < _NEAR]
+    axis, error = finger_axis(view.eef_mat), None
+    found: list[Grasp] = []
+    for tilt in [None, *tilts, *_RING]:
+        if tilt is _RING[0] and any(grasp.cost < _CROWDED for grasp in found):
+            break  # there is a hold that nothing is in the way of
         try:
             lean = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
             number = _GRASPS if tilt is None else 4
@@ -93,12 +114,10 @@ def _free_holds(
         except GraspError as problem:
             error = error or problem
             continue
-        found += [replace(g, cost=g.cost + lean) for g in own]
+        found += [replace(g, cost=g.cost + lean + _crowd_price(voxels, near, g)) for g in own]
     if not found:
         raise error or GraspError(f"{thing} cannot be grasped")
-    near = voxels.points[np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1) < _NEAR]
-    total = [replace(g, cost=g.cost + _crowd_price(voxels, near, g)) for g in found]
-    return sorted(total, key=lambda g: g.cost)
+    return sorted(found, key=lambda g: g.cost)
 
 
 def _crowd_price(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
@@ -122,12 +141,7 @@ def _tilts(spots: list[Place], pose: Pose) -> list[np.ndarray]:
         if flat < 0.3 or key in seen or len(seen) == _SIDES:
             continue
         seen.add(key)
-        c, s = side[:2] / flat
-        about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        for tilt in _TILTS:
-            c1, s1 = np.cos(tilt), np.sin(tilt)
-            lean = np.array([[c1, 0.0, -s1], [0.0, 1.0, 0.0], [s1, 0.0, c1]])  # takes down to (s1, 0, -c1)
-            turns.append(about @ lean @ about.T)
+        turns += [_lean(float(np.arctan2(side[1], side[0])), tilt) for tilt in _TILTS]
     return turns
 
 
@@ -156,7 +170,9 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
         for i, spot in enumerate(spots):
             outside = 0.0
             if not down[i]:
-                back = voxels.touched(hand[i] - 0.08 * spot.entry) + voxels.touched(hand[i] - 0.16 * spot.entry)
+                back = voxels.touched(hand[i] - 0.08 * spot.entry) + voxels.touched(
+                    hand[i] - 0.16 * spot.entry
+                )
                 outside = 0.01 * float(back)
             cost = grasp.cost + spot.cost + float(price[i, best[i]]) + outside
             found.append(Approach(grasp, spot, pose, float(_LIFTS[best[i]]), cost))

@@ -8,7 +8,8 @@ from libero_env.robot import REST_QPOS
 
 _STEPS, _GAIN, _REST = 60, 0.5, 0.03
 _POS, _TURN = 0.006, 0.06  # m and rad, what counts as reached
-_MARGIN = 0.06  # rad, kept from the limits of a joint
+_MARGIN = 0.08  # rad, kept from the limits of a joint
+_STRAIGHT = -0.4  # rad, of the elbow: from a straight arm the controller does not come back
 _SITE = "gripper0_grip_site"
 
 
@@ -21,9 +22,12 @@ class Arm:
         joints = [model.joint(f"robot0_joint{k}") for k in range(1, 8)]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dof = np.array([joint.dofadr[0] for joint in joints])
-        self._range = np.array([joint.range for joint in joints])
+        self._low, self._high = np.array([joint.range for joint in joints]).T + [[_MARGIN], [-_MARGIN]]
+        self._high[3] = _STRAIGHT
 
-    def follow(self, start: np.ndarray, poses: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float]:
+    def follow(
+        self, start: np.ndarray, poses: list[tuple[np.ndarray, np.ndarray]]
+    ) -> tuple[np.ndarray, float]:
         """Go through poses of the grip site one after the other.
 
         Args:
@@ -43,7 +47,6 @@ class Arm:
         """Joint angles (7,) near a pose, and by how much it is missed (m, and radians tenfold less)."""
         model, data, angles = self._model, self._data, start.copy()
         jac = np.zeros((6, model.nv))
-        low, high = self._range[:, 0] + _MARGIN, self._range[:, 1] - _MARGIN
         for _ in range(_STEPS):
             data.qpos[self._qpos] = angles
             mujoco.mj_kinematics(model, data)
@@ -57,6 +60,6 @@ class Arm:
             inverse = own.T @ np.linalg.inv(own @ own.T + 1e-3 * np.eye(6))
             step = inverse @ np.concatenate([away, turn])
             step += _REST * (np.eye(7) - inverse @ own) @ (np.array(REST_QPOS) - angles)
-            angles = np.clip(angles + _GAIN * np.clip(step, -0.5, 0.5), low, high)
+            angles = np.clip(angles + _GAIN * np.clip(step, -0.5, 0.5), self._low, self._high)
         miss = max(np.linalg.norm(away) - _POS, 0.0) + 0.1 * max(np.linalg.norm(turn) - _TURN, 0.0)
         return angles, float(miss)

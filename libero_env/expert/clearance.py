@@ -3,7 +3,13 @@
 import numpy as np
 
 from libero_env.expert.grasp import (
-    FINGER_HALF_WIDTH, FINGER_THICKNESS, HAND_HALF_LENGTH, HAND_HALF_WIDTH, MAX_OPENING, PALM_ABOVE, TIP_BELOW,
+    FINGER_HALF_WIDTH,
+    FINGER_THICKNESS,
+    HAND_HALF_LENGTH,
+    HAND_HALF_WIDTH,
+    MAX_OPENING,
+    PALM_ABOVE,
+    TIP_BELOW,
 )  # fmt: skip
 
 _CELL, _COARSE = 0.006, 0.012  # m, for what stands close to others, and for the hand
@@ -83,7 +89,9 @@ def hand_points(opening: float = MAX_OPENING) -> np.ndarray:
     blocks = [
         finger,
         finger * [-1, 1, 1],
-        _block((-HAND_HALF_LENGTH, HAND_HALF_LENGTH), (-HAND_HALF_WIDTH, HAND_HALF_WIDTH), (-0.12, -PALM_ABOVE)),
+        _block(
+            (-HAND_HALF_LENGTH, HAND_HALF_LENGTH), (-HAND_HALF_WIDTH, HAND_HALF_WIDTH), (-0.12, -PALM_ABOVE)
+        ),
         _block((-0.06, 0.06), (-0.06, 0.06), (-0.28, -0.13), 0.03),
     ]
     return np.concatenate(blocks)
@@ -96,7 +104,9 @@ def _block(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE) -> np.ndarray
     return points[(np.isclose(points, low) | np.isclose(points, high)).any(axis=1)]
 
 
-def obstacle_height(points: np.ndarray, start: np.ndarray, goal: np.ndarray, radius: float, floor: float) -> float:
+def obstacle_height(
+    points: np.ndarray, start: np.ndarray, goal: np.ndarray, radius: float, floor: float
+) -> float:
     """Height of the highest point near the next decimetre of the straight way over the ground, m."""
     way = goal[:2] - start[:2]
     way = way * min(1.0, 0.10 / max(float(np.linalg.norm(way)), 1e-9))

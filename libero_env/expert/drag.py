@@ -32,7 +32,7 @@ class Drag:
         """Whether the place is on the table and the body has a hollow over its origin."""
         region = view.scene.problem.region(atom.args[1])
         flat = region is not None and bool(region.ranges) and region.target == view.scene.workspace_name
-        points = (shapes.cloud(view, atom.args[0]) - view.body_pos(atom.args[0]))
+        points = shapes.cloud(view, atom.args[0]) - view.body_pos(atom.args[0])
         inner = points[np.hypot(points[:, 0], points[:, 1]) < 0.02, 2]
         upright = pose_of(view, atom.args[0]).mat[2, 2] > 0.9
         return flat and upright and len(inner) > 0 and points[:, 2].max() - inner.max() > 0.006
@@ -55,7 +55,10 @@ class Drag:
         points = self.shapes.cloud(view, thing)
         origin = view.body_pos(thing)
         hollow = points[np.hypot(*(points - origin)[:, :2].T) < 0.02, 2].max()
-        target = min((box[0][:2] for box in _boxes(view, self.atom.args[1])), key=lambda c: np.linalg.norm(c - origin[:2]))
+        target = min(
+            (box[0][:2] for box in _boxes(view, self.atom.args[1])),
+            key=lambda c: np.linalg.norm(c - origin[:2]),
+        )
         way = target - origin[:2]
         left = float(np.linalg.norm(way))
         mat = downward(float(np.arctan2(*view.eef_mat[1::-1, 0])), finger_axis(view.eef_mat))
@@ -89,7 +92,9 @@ class Drag:
         lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.06, 0.0, 1.0)
         return self._toward(view, over, mat, lateral=lateral)
 
-    def _toward(self, view: StateView, goal: np.ndarray, mat: np.ndarray, speed: float = 1.0, lateral: float = 1.0):
+    def _toward(
+        self, view: StateView, goal: np.ndarray, mat: np.ndarray, speed: float = 1.0, lateral: float = 1.0
+    ):
         return action_toward(
             view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=CLOSE, gain=self.style.gain,
             speed=speed * self.style.speed, lateral=lateral,

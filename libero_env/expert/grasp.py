@@ -24,6 +24,7 @@ _SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03)  # of the hold along the 
 WALL = 0.5  # cost of a hold by a wall, over one around the whole body
 _WALL_STEP = 0.012  # m between such holds
 _LEAST = 0.005  # m, that a wall must reach up between the pads
+_STEEPEST = 0.6  # slope of a face against the pads
 _THICKEST = 0.045  # m, of a wall
 _TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
 _SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
@@ -74,7 +75,9 @@ def grasps(
     points = cloud @ turn
     axis = finger_axis @ turn
     now = float(np.arctan2(axis[1], axis[0]))
-    candidates = list(_candidates(points, floor if tilt is None else -np.inf, now, _YAWS if tilt is None else 8))
+    candidates = list(
+        _candidates(points, floor if tilt is None else -np.inf, now, _YAWS if tilt is None else 8)
+    )
     narrow = sorted((c for c in candidates if c[3] <= WIDEST), key=lambda candidate: candidate[0])
     if not narrow:
         narrowest = min((c[3] for c in candidates), default=np.inf)
@@ -127,7 +130,9 @@ def _candidates(
         for yaw in aligned + [now + np.pi * k / yaws for k in range(yaws)]:
             askew = min((_turn(yaw, other) for other in aligned), default=0.0)
             for center, width, shift in _holds(slab, yaw):
-                cost = 0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                cost = (
+                    0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                )
                 yield cost, np.array([*center, height]), float(yaw), width
         column = _thinned(cloud[cloud[:, 2] > height - TIP_BELOW])
         for yaw in [now + np.pi * k / yaws for k in range(yaws)]:
@@ -147,7 +152,9 @@ def _thinned(points: np.ndarray) -> np.ndarray:
     return order[first]
 
 
-def _walls(slab: np.ndarray, column: np.ndarray, height: float, yaw: float) -> Iterator[tuple[np.ndarray, float, float]]:
+def _walls(
+    slab: np.ndarray, column: np.ndarray, height: float, yaw: float
+) -> Iterator[tuple[np.ndarray, float, float]]:
     """(centre (2,), thickness, badness) of walls across the fingers with room for both of them.
 
     Args:
@@ -179,15 +186,23 @@ def _walls(slab: np.ndarray, column: np.ndarray, height: float, yaw: float) -> I
                 if _room(beside, center, wall[0] - 0.008, wall[-1] + 0.008):
                     own = strip & (u >= wall[0]) & (u <= wall[-1])
                     badness = 2.0 * width + 40.0 * max(0.012 - top, 0.0) + 6.0 * max(top - 0.02, 0.0)
-                    badness += 3.0 * abs(aside) + _slope(v[own], u[own])
+                    slope = max(_slope(v[own], u[own]), _slope(v[own], -u[own]))
+                    if slope > _STEEPEST:
+                        break
+                    badness += 3.0 * abs(aside) + slope
                     yield center * along + middle * across, width, badness
                     break
 
 
 def _slope(v: np.ndarray, u: np.ndarray) -> float:
-    """How much a wall leans against the direction of the jaws, 0 where they meet it squarely."""
+    """How much the face of a wall at its smallest u leans against a pad, 0 where the pad meets it squarely."""
+    order = np.lexsort((u, np.round(v / 0.003)))
+    _, first = np.unique(np.round(v / 0.003)[order], return_index=True)
+    v, u = v[order][first], u[order][first]
+    if len(v) < 2 or np.ptp(v) < 0.008:
+        return 0.0
     v, u = v - v.mean(), u - u.mean()
-    return float(abs(v @ u) / (v @ v)) if np.ptp(v) > 0.008 else 0.0
+    return float(abs(v @ u) / (v @ v))
 
 
 def _room(beside: np.ndarray, center: float, low: float, high: float) -> bool:

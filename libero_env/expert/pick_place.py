@@ -21,7 +21,9 @@ Phase = Literal["reach", "close", "carry", "release", "withdraw", "rest"]
 
 CONTROL_HZ = 1.0 / (SUBSTEPS * TIMESTEP)
 ATTEMPTS = 6
-ARRIVED = 0.012  # m; wide, so that the moment to close is passed in motion and not approached for ever by a clone
+ARRIVED = (
+    0.012  # m; wide, so that the moment to close is passed in motion and not approached for ever by a clone
+)
 ARRIVED_TURN = 0.12  # rad
 STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
@@ -196,12 +198,16 @@ class PickPlace:
         over[2] += np.clip(funnel, 0.0, 0.04)
         if away > 0.03 or turn > 0.4:
             high = self._in_the_way(view, goal, self._radius(view)) + hang + 0.7 * style.margin
-            there = obstacle_height(self._others(view), goal, goal, 0.05, self._floor(view)) + hang + style.margin
+            there = (
+                obstacle_height(self._others(view), goal, goal, 0.05, self._floor(view)) + hang + style.margin
+            )
             over[2] = max(over[2], high, there)
         lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0)
         return self._toward(view, over, mat, CLOSE, lateral, slow=pos[2] - goal[2] < 0.04 and away < 0.05)
 
-    def _carry_aside(self, view: StateView, goal: np.ndarray, mat: np.ndarray, entry: np.ndarray, hang: float):
+    def _carry_aside(
+        self, view: StateView, goal: np.ndarray, mat: np.ndarray, entry: np.ndarray, hang: float
+    ):
         """Up, over to a point before the place, down, and in along the entry."""
         pos = view.eef_pos
         pre = goal - ASIDE * entry
@@ -245,7 +251,13 @@ class PickPlace:
         return np.array([0.0] * 6 + [OPEN])
 
     def _toward(
-        self, view: StateView, goal: np.ndarray, mat: np.ndarray, gripper: float, lateral: float = 1.0, slow: bool = False
+        self,
+        view: StateView,
+        goal: np.ndarray,
+        mat: np.ndarray,
+        gripper: float,
+        lateral: float = 1.0,
+        slow: bool = False,
     ) -> np.ndarray:
         style = self.style
         return action_toward(

@@ -37,7 +37,12 @@ class Place:
 
 
 def places(
-    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, atom: Atom, share: tuple[int, int] = (0, 1)
+    view: StateView,
+    voxels: Voxels,
+    cloud: np.ndarray,
+    pose: Pose,
+    atom: Atom,
+    share: tuple[int, int] = (0, 1),
 ) -> list[Place]:
     """Poses at which the atom would hold, the best first; upright as the body is now, turned about the vertical.
 
@@ -58,7 +63,9 @@ def places(
     found = _found(view, voxels, cloud, pose, atom, share, upright, frame, crowded)
     if not found and not _flat_region(view, atom.args[1]):
         for angle in _LEANS:
-            turns = [(_lean(d, angle) @ turn, 0.1 * abs(a), d) for d in frame for a, turn in _turns(_YAWS // 2)]
+            turns = [
+                (_lean(d, angle) @ turn, 0.1 * abs(a), d) for d in frame for a, turn in _turns(_YAWS // 2)
+            ]
             found = found or _found(view, voxels, cloud, pose, atom, share, turns, frame, crowded)
     if not found:
         found = _found(view, voxels, cloud, pose, atom, share, upright, frame, 8 * crowded)
@@ -83,7 +90,11 @@ def _found(
         body = (cloud - pose.pos) @ turn.T
         for spots, costs, below, holds in _regions(view, atom, body, share):
             heights = voxels.drop(underside(body), spots, below)
-            keep = [i for i, (xy, z) in enumerate(zip(spots, heights, strict=True)) if holds(np.array([*xy, z + 0.003]))]
+            keep = [
+                i
+                for i, (xy, z) in enumerate(zip(spots, heights, strict=True))
+                if holds(np.array([*xy, z + 0.003]))
+            ]
             if not keep:
                 continue
             origins = np.column_stack([spots, heights])[keep]
@@ -181,7 +192,9 @@ def _ways_in(
             break
         free = np.ones(len(open_), bool)
         for length in _SIDEWAYS:
-            free &= voxels.hits(standing[open_] - length * entry) <= np.maximum(crowd[open_], 0.03) * len(body)
+            free &= voxels.hits(standing[open_] - length * entry) <= np.maximum(crowd[open_], 0.03) * len(
+                body
+            )
         for i, good in zip(open_, free, strict=True):
             if good:
                 entries[i] = entry

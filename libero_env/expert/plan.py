@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from libero_env.errors import LiberoError
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.predicates import StateView, _boxes, _inside, evaluate
@@ -51,7 +49,9 @@ def plan_goal(goal: Expression, view: StateView) -> tuple[Step, ...]:
     receiving = {_joint_owner(atom.args[1], scene) for atom in putting} | {need.args[0] for need in needed}
     closing = [atom for atom in left if atom.predicate == "Close"]
     early = [atom for atom in closing if atom.args[0] not in receiving]
-    turning = [atom for atom in left if atom.predicate in ("Turnon", "Turnoff", "Open") and atom not in needed]
+    turning = [
+        atom for atom in left if atom.predicate in ("Turnon", "Turnoff", "Open") and atom not in needed
+    ]
     late = [atom for atom in closing if atom not in early]
     opening = [need for need in dict.fromkeys(needed) if not evaluate(need, view)]
     order = [*early, *turning, *opening, *putting, *late]
@@ -73,11 +73,13 @@ def _wanted(goal: Expression, view: StateView) -> list[Atom]:
             choices = [_wanted(part, view) for part in parts]
             return min(choices, key=lambda atoms: sum(not evaluate(atom, view) for atom in atoms))
         case Not(Atom(predicate, args)) if predicate in OPPOSITES:
-            return [Atom(OPPOSITES[predicate], args)]
+            return [] if evaluate(goal, view) else [Atom(OPPOSITES[predicate], args)]
         case Not() | ForAll():
             if evaluate(goal, view):
                 return []
-            raise UnsupportedGoalError(f"no skill reaches {goal}; state what shall hold instead of what shall not")
+            raise UnsupportedGoalError(
+                f"no skill reaches {goal}; state what shall hold instead of what shall not"
+            )
     raise TypeError(f"not a goal: {goal!r}")
 
 
@@ -106,7 +108,11 @@ def _carriers_first(atoms: list[Atom]) -> list[Atom]:
     waiting = list(atoms)
     while waiting:
         moved = {atom.args[0] for atom in waiting}
-        ready = [atom for atom in waiting if not any(_belongs(atom.args[1], name) for name in moved - {atom.args[0]})]
+        ready = [
+            atom
+            for atom in waiting
+            if not any(_belongs(atom.args[1], name) for name in moved - {atom.args[0]})
+        ]
         order += ready or waiting  # in a circle as they are written
         waiting = [atom for atom in waiting if atom not in order]
     return order
@@ -133,12 +139,7 @@ def _needs(atom: Atom, view: StateView) -> list[Atom]:
         found.append(address)
     for region in scene.problem.regions:
         part = None if region.ranges else _joint_owner(region.address, scene)
-        if part is not None and region.address in scene.joints and not region.address.endswith("_side"):
-            if any(_inside(_larger(box), view.body_pos(thing)) for box in _boxes(view, region.address)):
-                found.append(part)
+        covered = part is not None and region.address in scene.joints and not region.address.endswith("_side")
+        if covered and any(_inside(box, view.body_pos(thing)) for box in _boxes(view, region.address)):
+            found.append(part)
     return [Atom("Open", (part,)) for part in found if scene.joints.get(part)]
-
-
-def _larger(box):
-    centre, mat, size = box
-    return centre, mat, size + np.array([0.0, 0.0, 0.0])

@@ -10,7 +10,11 @@ from libero_env.expert.geometry import Pose, body_points, surface_points
 from libero_env.predicates import StateView
 from libero_env.scene import Scene
 
-FINE, COARSE, DENSE = 0.004, 0.02, 0.005  # m between points: to measure widths, to keep away from, to fill voxels
+FINE, COARSE, DENSE = (
+    0.004,
+    0.02,
+    0.005,
+)  # m between points: to measure widths, to keep away from, to fill voxels
 
 
 class Shapes:
