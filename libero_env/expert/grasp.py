@@ -24,7 +24,7 @@ _SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03)  # of the hold along the 
 WALL = 0.5  # cost of a hold by a wall, over one around the whole body
 _WALL_STEP = 0.012  # m between such holds
 _LEAST = 0.005  # m, that a wall must reach up between the pads
-_STEEPEST = 0.6  # slope of a face against the pads
+_STEEPEST = 0.4  # slope of the faces against the pads
 _THICKEST = 0.045  # m, of a wall
 _TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
 _SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
@@ -186,7 +186,7 @@ def _walls(
                 if _room(beside, center, wall[0] - 0.008, wall[-1] + 0.008):
                     own = strip & (u >= wall[0]) & (u <= wall[-1])
                     badness = 2.0 * width + 40.0 * max(0.012 - top, 0.0) + 6.0 * max(top - 0.02, 0.0)
-                    slope = max(_slope(v[own], u[own]), _slope(v[own], -u[own]))
+                    slope = 0.5 * (_slope(v[own], u[own]) + _slope(v[own], -u[own]))
                     if slope > _STEEPEST:
                         break
                     badness += 3.0 * abs(aside) + slope
@@ -196,8 +196,8 @@ def _walls(
 
 def _slope(v: np.ndarray, u: np.ndarray) -> float:
     """How much the face of a wall at its smallest u leans against a pad, 0 where the pad meets it squarely."""
-    order = np.lexsort((u, np.round(v / 0.003)))
-    _, first = np.unique(np.round(v / 0.003)[order], return_index=True)
+    order = np.lexsort((u, np.round(v / 0.006)))
+    _, first = np.unique(np.round(v / 0.006)[order], return_index=True)
     v, u = v[order][first], u[order][first]
     if len(v) < 2 or np.ptp(v) < 0.008:
         return 0.0
