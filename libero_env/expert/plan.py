@@ -139,7 +139,8 @@ def _needs(atom: Atom, view: StateView) -> list[Atom]:
         found.append(address)
     for region in scene.problem.regions:
         part = None if region.ranges else _joint_owner(region.address, scene)
-        covered = part is not None and region.address in scene.joints and not region.address.endswith("_side")
-        if covered and any(_inside(box, view.body_pos(thing)) for box in _boxes(view, region.address)):
+        if part is None or region.address not in scene.joints or region.address.endswith("_side"):
+            continue
+        if any(_inside(box, view.body_pos(thing)) for box in _boxes(view, region.address)):
             found.append(part)
     return [Atom("Open", (part,)) for part in found if scene.joints.get(part)]
