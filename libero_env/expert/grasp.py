@@ -25,6 +25,7 @@ WALL = 0.5  # cost of a hold by a wall, over one around the whole body
 _WALL_STEP = 0.012  # m between such holds
 _LEAST = 0.005  # m, that a wall must reach up between the pads
 _STEEPEST = 0.4  # slope of the faces against the pads
+_SLANT = 0.0025  # m, that a face may give way over the pads
 _THICKEST = 0.045  # m, of a wall
 _TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
 _SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
@@ -88,11 +89,26 @@ def grasps(
     kept: dict[tuple, Grasp] = {}
     for cost, pos, yaw, width in narrow:
         key = (*np.round(pos / apart).astype(int), round(yaw / 0.35)) if apart else (len(kept),)
-        if key not in kept:
+        if key not in kept and (tilt is None or _faced(points, pos, yaw)):
             kept[key] = Grasp(turn @ pos, turn @ downward(yaw, axis), width, cost)
         if len(kept) == number:
             break
+    if not kept:
+        raise GraspError(f"{name} has no faces that the pads meet squarely from this side")
     return list(kept.values())
+
+
+def _faced(points: np.ndarray, pos: np.ndarray, yaw: float) -> bool:
+    """Whether the pads meet faces on both sides that stand along the approach, and not slanted ones."""
+    along, across = _axes(yaw)
+    local = points - pos
+    local = local[(np.abs(local[:, :2] @ across) < FINGER_HALF_WIDTH) & (np.abs(local[:, 2]) < PAD_ABOVE)]
+    u, z = local[:, :2] @ along, local[:, 2]
+    between = np.abs(u) < 0.5 * MAX_OPENING
+    if not between.any():
+        return False
+    faces = u - u[between].min(), u[between].max() - u
+    return all(z[between & (face < _SLANT)].max() > 0.6 * PAD_ABOVE for face in faces)
 
 
 def choose_grasp(
