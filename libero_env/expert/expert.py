@@ -7,6 +7,7 @@ import numpy as np
 from libero_env.expert.approach import takeable
 from libero_env.expert.articulated import MoveJoint
 from libero_env.expert.drag import Drag
+from libero_env.expert.into_container import IntoContainer
 from libero_env.expert.motion import OPEN
 from libero_env.expert.pick_place import PickPlace
 from libero_env.expert.plan import JOINT_STATES, Shapes, Step, plan_goal
@@ -101,6 +102,9 @@ class Expert:
         state = JOINT_STATES.get(step.atom.predicate)
         if state is not None:
             return MoveJoint(step.atom.args[0], state, style=self.style)
+        container = IntoContainer.container_of(view, self.shapes, step.atom)
+        if container is not None:
+            return IntoContainer(step.atom, container, style=self.style, shapes=self.shapes)
         if Drag.suits(view, self.shapes, step.atom) and not takeable(view, self.shapes, step.atom.args[0]):
             return Drag(step.atom, style=self.style, shapes=self.shapes)
         return PickPlace(step.atom, style=self.style, shapes=self.shapes, share=step.share)
