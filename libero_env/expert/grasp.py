@@ -27,6 +27,7 @@ _LEAST = 0.005  # m, that a wall must reach up between the pads
 _STEEPEST = 0.4  # slope of the faces against the pads
 _SLANT = 0.0025  # m, that a face may give way over the pads
 _THICKEST = 0.045  # m, of a wall
+_TIP, _WIDENS = 0.0145, 0.41  # m, thickness of a finger at its tip, and how much more of it each m further up
 _TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
 _SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
 
@@ -207,7 +208,6 @@ def _walls(
                         break
                     badness += 3.0 * abs(aside) + slope
                     yield center * along + middle * across, width, badness
-                    break
 
 
 def _slope(v: np.ndarray, u: np.ndarray) -> float:
@@ -284,7 +284,8 @@ def crowding(obstacles: np.ndarray, pos_world: np.ndarray, mat: np.ndarray) -> f
         return 0.0
     offset = (obstacles - pos_world) @ mat
     u, v, z = np.abs(offset[:, 0]), np.abs(offset[:, 1]), -offset[:, 2]
-    outer = 0.5 * MAX_OPENING + FINGER_THICKNESS + 0.003
+    thick = np.clip(_TIP + _WIDENS * (z + TIP_BELOW), _TIP, FINGER_THICKNESS)
+    outer = 0.5 * MAX_OPENING + thick + 0.002
     fingers = (z > -TIP_BELOW) & (v < FINGER_HALF_WIDTH + 0.005)
     palm = (z > PALM_ABOVE - 0.01) & (v < HAND_HALF_WIDTH)
     depth = np.maximum(np.where(fingers, outer - u, 0.0), np.where(palm, HAND_HALF_LENGTH - u, 0.0))
