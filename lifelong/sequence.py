@@ -156,6 +156,9 @@ class TaskSequence:
                     f"task {stretch.task}, epoch {best}. Start afresh with resume=false"
                 )
             checkpoints.load_weights(p.policy, state["policy"], str(p.directory.best_path))
+            with torch.no_grad():
+                for own, kept in zip(self._own(), state.get("own", []), strict=True):
+                    own.copy_(kept)
         p.algorithm.end_phase(stretch.phase, p.policy)
 
     def _after_epoch(self, stretch: Stretch, end: EpochEnd) -> None:
@@ -173,8 +176,13 @@ class TaskSequence:
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
         self._say(f"  epoch {epoch:3d}: {loss}success {record.rate:4.0%}")
         if self._selects(stretch) and self._best_epoch(stretch, end.epoch) == end.epoch:
-            best = {"task": task, "epoch": end.epoch, "policy": p.policy.state_dict()}
+            best = {"task": task, "epoch": end.epoch, "policy": p.policy.state_dict(), "own": self._own()}
             checkpoints.save(p.directory.best_path, best)
+
+    def _own(self) -> list[Tensor]:
+        """What is trained besides the policy's parameters: the algorithm's own."""
+        of_policy = {id(p) for p in self.parts.policy.parameters()}
+        return [p for p in self.parts.algorithm.trained(self.parts.policy) if id(p) not in of_policy]
 
     def _selects(self, stretch: Stretch) -> bool:
         return self.parts.eval.select == "best" and stretch.phase.measures_transfer

@@ -119,7 +119,7 @@ def fit(
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
     device = torch.device(device)
     steps = settings.steps_per_epoch or math.ceil(len(dataset) / settings.batch_size)
-    optimizer = _optimizer(policy, settings)
+    optimizer = _optimizer(algorithm.trained(policy), settings)
     first, loss, penalty = 0, math.nan, 0.0
     if resume is not None:
         first, loss, penalty = _take_up(resume, policy, optimizer)
@@ -202,7 +202,8 @@ class _Step:
         with autocast(self.device, self.settings.precision):
             self.algorithm.after_backward(self.policy)
         if self.settings.grad_clip:
-            nn.utils.clip_grad_norm_(self.policy.parameters(), self.settings.grad_clip)
+            moved = [p for group in self.optimizer.param_groups for p in group["params"]]
+            nn.utils.clip_grad_norm_(moved, self.settings.grad_clip)
         for group in self.optimizer.param_groups:
             group["lr"] = lr
         self.optimizer.step()
@@ -245,8 +246,7 @@ def _order(windows: int, wanted: int, draws: torch.Generator) -> Tensor:
     return order[:wanted]
 
 
-def _optimizer(policy: Policy, settings: FitSettings) -> torch.optim.AdamW:
-    trained = [p for p in policy.parameters() if p.requires_grad]
+def _optimizer(trained: list[nn.Parameter], settings: FitSettings) -> torch.optim.AdamW:
     return torch.optim.AdamW(
         trained, lr=settings.lr, betas=tuple(settings.betas), weight_decay=settings.weight_decay
     )

@@ -3,7 +3,7 @@
 The order in which they are called, for every task (or every stage of `stages`):
 
     begin_task
-      for each of phases():  begin_phase
+      for each of phases():  begin_phase, trained
                              per step: mix -> (policy loss) + penalty -> after_backward -> after_step
                              end_phase          with the phase's best weights loaded
     end_task
@@ -17,7 +17,7 @@ from functools import reduce
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -87,6 +87,14 @@ class Algorithm:
 
     def begin_phase(self, phase: Phase, policy: Policy) -> None:
         """Before the first step of a phase; not called again when a killed run goes on inside it."""
+
+    def trained(self, policy: Policy) -> list[nn.Parameter]:
+        """What the optimiser moves and whose gradient is clipped, always in the same order.
+
+        Asked for before the first step of a phase, and again when a killed run goes on inside it. An algorithm may
+        add parameters of its own, which it keeps in `state_dict`, and may switch off gradients of others.
+        """
+        return [p for p in policy.parameters() if p.requires_grad]
 
     def mode_train(self, policy: Policy) -> None:
         """Put the policy in training mode; an algorithm may keep some layers in evaluation mode."""
