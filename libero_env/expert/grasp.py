@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.errors import LiberoError
+from libero_env.expert import hold_kernels
 from libero_env.expert.motion import downward
 
 # The Panda gripper, measured from the grip site along the fingers, m.
@@ -142,19 +143,18 @@ def _candidates(
         slab = _slab(cloud, height - PAD_BELOW, height + PAD_ABOVE)
         if len(slab) < 4:
             continue
-        aligned = _aligned_yaws(slab, now)
+        aligned = aligned_yaws(slab, now)
         away_from_middle = abs(height - 0.5 * (bottom + top)) + 5.0 * max(0.010 - top + height, 0.0)
         for yaw in aligned + [now + np.pi * k / yaws for k in range(yaws)]:
-            askew = min((_turn(yaw, other) for other in aligned), default=0.0)
-            for center, width, shift in _holds(slab, yaw):
-                cost = (
-                    0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
-                )
-                yield cost, np.array([*center, height]), float(yaw), width
+            askew = min((turn_between(yaw, other) for other in aligned), default=0.0)
+            price = 0.25 * turn_between(yaw, now) + 4.0 * away_from_middle + 0.4 * askew
+            for x, y, width, shift in whole_holds(slab, yaw):
+                yield price + 8.0 * width + 3.0 * shift, np.array([x, y, height]), float(yaw), width
         column = _thinned(cloud[cloud[:, 2] > height - TIP_BELOW])
         for yaw in [now + np.pi * k / yaws for k in range(yaws)]:
-            for center, width, badness in _walls(slab, column, height, yaw):
-                yield WALL + 0.25 * _turn(yaw, now) + badness, np.array([*center, height]), float(yaw), width
+            price = WALL + 0.25 * turn_between(yaw, now)
+            for x, y, width, badness in _walls(slab, column, height, yaw):
+                yield price + badness, np.array([x, y, height]), float(yaw), width
 
 
 def _slab(cloud: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -169,71 +169,20 @@ def _thinned(points: np.ndarray) -> np.ndarray:
     return order[first]
 
 
-def _walls(
-    slab: np.ndarray, column: np.ndarray, height: float, yaw: float
-) -> Iterator[tuple[np.ndarray, float, float]]:
-    """(centre (2,), thickness, badness) of walls across the fingers with room for both of them.
-
-    Args:
-        slab: what the pads would touch, (N, 2).
-        column: what is beside fingers that reach down to the hold, (M, 3).
-        height: of the hold.
-        yaw: of the fingers.
-    """
-    along, across = _axes(yaw)
-    u, v = slab @ along, slab @ across
-    column_u, column_v = column[:, :2] @ along, column[:, :2] @ across
-    for middle in np.arange(v.min() + 0.01, v.max() - 0.009, _WALL_STEP):
-        strip = np.abs(v - middle) < FINGER_HALF_WIDTH
-        here = np.abs(column_v - middle) < FINGER_HALF_WIDTH + 0.003
-        beside, heights = column_u[here], column[here, 2]
-        if strip.sum() < 2:
-            continue
-        inner = np.sort(u[strip])
-        for wall in np.split(inner, np.flatnonzero(np.diff(inner) > 0.012) + 1):
-            width = float(wall[-1] - wall[0])
-            if width > _THICKEST or len(wall) < 2:
-                continue
-            top = heights[(beside > wall[0] - 0.008) & (beside < wall[-1] + 0.008)].max() - height
-            if top < _LEAST:
-                continue
-            side = 0.5 * (MAX_OPENING - width) - _SPARE
-            for aside in (0.0, 0.5 * side, -0.5 * side, side, -side):
-                center = 0.5 * (wall[0] + wall[-1]) + aside
-                if _room(beside, center, wall[0] - 0.008, wall[-1] + 0.008):
-                    own = strip & (u >= wall[0]) & (u <= wall[-1])
-                    badness = 2.0 * width + 40.0 * max(0.012 - top, 0.0) + 6.0 * max(top - 0.02, 0.0)
-                    slope = 0.5 * (_slope(v[own], u[own]) + _slope(v[own], -u[own]))
-                    if slope > _STEEPEST:
-                        break
-                    badness += 3.0 * abs(aside) + slope
-                    yield center * along + middle * across, width, badness
+def _walls(slab: np.ndarray, column: np.ndarray, height: float, yaw: float) -> np.ndarray:
+    """(x, y, thickness, badness) of walls across the fingers with room for both of them, (K, 4)."""
+    return hold_kernels.wall_holds(
+        slab, column, height, np.cos(yaw), np.sin(yaw), _WALL_STEP, FINGER_HALF_WIDTH, _THICKEST, _LEAST,
+        _STEEPEST, MAX_OPENING, _SPARE, _TIP_THICKNESS,
+    )  # fmt: skip
 
 
-def _slope(v: np.ndarray, u: np.ndarray) -> float:
-    """How much the face of a wall at its smallest u leans against a pad, 0 where the pad meets it squarely."""
-    order = np.lexsort((u, np.round(v / 0.006)))
-    _, first = np.unique(np.round(v / 0.006)[order], return_index=True)
-    v, u = v[order][first], u[order][first]
-    if len(v) < 2 or np.ptp(v) < 0.008:
-        return 0.0
-    v, u = v - v.mean(), u - u.mean()
-    return float(abs(v @ u) / (v @ v))
-
-
-def _room(beside: np.ndarray, center: float, low: float, high: float) -> bool:
-    """Whether open fingers around `center` meet nothing, and hold between them only what is in [low, high]."""
-    reach = 0.5 * MAX_OPENING + _TIP_THICKNESS
-    near = beside[np.abs(beside - center) < reach]
-    return bool(((near > low) & (near < high)).all())
-
-
-def _turn(yaw: float, other: float) -> float:
+def turn_between(yaw: float, other: float) -> float:
     """Angle between two directions of the fingers, which have no front, rad."""
     return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
 
 
-def _aligned_yaws(slab: np.ndarray, now: float) -> list[float]:
+def aligned_yaws(slab: np.ndarray, now: float) -> list[float]:
     """Yaws at which the fingers meet a cross-section (N, 2) squarely: where it is narrowest among the yaws nearby."""
     grid = np.pi * np.arange(_YAWS) / _YAWS
     width = np.array([_width(slab, now + yaw) for yaw in grid])
@@ -252,41 +201,21 @@ def _axes(yaw: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
 
 
-def _holds(slab: np.ndarray, yaw: float) -> Iterator[tuple[np.ndarray, float, float]]:
-    """(centre (2,), width, distance from the middle) of holds at a yaw: along the jaws' length and, within what the
-    open fingers leave free, to either side."""
-    along, across = _axes(yaw)
-    u, v = slab @ along, slab @ across
-    low, high = v.min(), v.max()
-    for shift in _SHIFTS:
-        middle = 0.5 * (low + high) + shift
-        strip = u[np.abs(v - middle) < FINGER_HALF_WIDTH]
-        if len(strip) < 2 or shift and not low + 0.008 < middle < high - 0.008:
-            continue
-        width = float(strip.max() - strip.min())
-        center = 0.5 * (strip.min() + strip.max()) * along + middle * across
-        side = max(0.5 * (MAX_OPENING - width) - _SPARE, 0.0)
-        for aside in (0.0, side, -side):
-            yield center + aside * along, width, abs(shift) + abs(aside)
+def whole_holds(slab: np.ndarray, yaw: float) -> np.ndarray:
+    """(x, y, width, distance from the middle) of holds around the whole body at a yaw, (K, 4)."""
+    return hold_kernels.whole_holds(
+        slab, np.cos(yaw), np.sin(yaw), np.array(_SHIFTS), FINGER_HALF_WIDTH, MAX_OPENING, _SPARE
+    )
 
 
 def _width(slab: np.ndarray, yaw: float) -> float:
     """Width of the hold in the middle, m."""
-    along, across = _axes(yaw)
-    v = slab @ across
-    strip = slab[np.abs(v - 0.5 * (v.min() + v.max())) < FINGER_HALF_WIDTH] @ along
-    return float(np.ptp(strip)) if len(strip) else 0.0
+    return hold_kernels.width_in_the_middle(slab, np.cos(yaw), np.sin(yaw), FINGER_HALF_WIDTH)
 
 
 def crowding(obstacles: np.ndarray, pos_world: np.ndarray, mat: np.ndarray) -> float:
     """How deep obstacles (M, 3) reach into the open fingers and the palm, m; 0 where the way is free."""
-    if not len(obstacles):
-        return 0.0
-    offset = (obstacles - pos_world) @ mat
-    u, v, z = np.abs(offset[:, 0]), np.abs(offset[:, 1]), -offset[:, 2]
-    thick = np.clip(_TIP + _WIDENS * (z + TIP_BELOW), _TIP, FINGER_THICKNESS)
-    outer = 0.5 * MAX_OPENING + thick + 0.002
-    fingers = (z > -TIP_BELOW) & (v < FINGER_HALF_WIDTH + 0.005)
-    palm = (z > PALM_ABOVE - 0.01) & (v < HAND_HALF_WIDTH)
-    depth = np.maximum(np.where(fingers, outer - u, 0.0), np.where(palm, HAND_HALF_LENGTH - u, 0.0))
-    return float(max(depth[z < _HAND_LENGTH].max(initial=0.0), 0.0))
+    return hold_kernels.depth_in_hand(
+        obstacles, pos_world, mat, TIP_BELOW, _TIP, _WIDENS, FINGER_THICKNESS, 0.5 * MAX_OPENING,
+        FINGER_HALF_WIDTH + 0.005, PALM_ABOVE - 0.01, HAND_HALF_WIDTH, HAND_HALF_LENGTH, _HAND_LENGTH,
+    )  # fmt: skip

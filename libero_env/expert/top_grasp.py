@@ -17,12 +17,13 @@ from libero_env.expert.grasp import (
     TIP_BELOW,
     WIDEST,
     GraspError,
+    aligned_yaws,
+    turn_between,
+    whole_holds,
 )
 
 _YAWS = 18
 _HEIGHTS = 4
-_SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03)  # of the hold along the jaws, m
-_SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
 
 
 @dataclass(frozen=True)
@@ -83,72 +84,23 @@ def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[f
         slab = np.unique(np.round(slab, 3), axis=0)
         if len(slab) < 4:
             continue
-        aligned = _aligned_yaws(slab, now)
+        aligned = aligned_yaws(slab, now)
         away_from_middle = abs(height - 0.5 * (bottom + top))
         for yaw in aligned + [now + np.pi * k / _YAWS for k in range(_YAWS)]:
-            askew = min((_turn(yaw, other) for other in aligned), default=0.0)
-            for center, width, shift in _holds(slab, yaw):
+            askew = min((turn_between(yaw, other) for other in aligned), default=0.0)
+            for x, y, width, shift in whole_holds(slab, yaw):
                 cost = (
-                    0.25 * _turn(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                    0.25 * turn_between(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
                 )
-                yield cost, TopGrasp(np.array([*center, height]), float(yaw), width)
-
-
-def _turn(yaw: float, other: float) -> float:
-    """Angle between two directions of the fingers, which have no front, rad."""
-    return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
-
-
-def _aligned_yaws(slab: np.ndarray, now: float) -> list[float]:
-    """Yaws at which the fingers meet a cross-section (N, 2) squarely: where it is narrowest among the yaws nearby."""
-    grid = np.pi * np.arange(_YAWS) / _YAWS
-    width = np.array([_width(slab, now + yaw) for yaw in grid])
-    near = np.stack([np.roll(width, k) for k in (-3, -2, -1, 1, 2, 3)]).min(axis=0)
-    yaws = []
-    for yaw in grid[width <= near + 1e-3]:
-        fine = now + yaw + np.pi / _YAWS * np.linspace(-1, 1, 9)
-        widths = np.array([_width(slab, angle) for angle in fine])
-        # of equally narrow ones the one in the middle, which is no turn at all for a round body
-        yaws.append(float(np.mean(fine[widths <= widths.min() + 2e-4])))
-    return yaws
-
-
-def _axes(yaw: float) -> tuple[np.ndarray, np.ndarray]:
-    """Horizontal directions along and across the opening of the fingers, (2,) each."""
-    return np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-
-
-def _holds(slab: np.ndarray, yaw: float) -> Iterator[tuple[np.ndarray, float, float]]:
-    """(centre (2,), width, distance from the middle) of holds at a yaw: along the jaws' length and, within what the
-    open fingers leave free, to either side."""
-    along, across = _axes(yaw)
-    u, v = slab @ along, slab @ across
-    low, high = v.min(), v.max()
-    for shift in _SHIFTS:
-        middle = 0.5 * (low + high) + shift
-        strip = u[np.abs(v - middle) < FINGER_HALF_WIDTH]
-        if len(strip) < 2 or shift and not low + 0.008 < middle < high - 0.008:
-            continue
-        width = float(strip.max() - strip.min())
-        center = 0.5 * (strip.min() + strip.max()) * along + middle * across
-        side = max(0.5 * (MAX_OPENING - width) - _SPARE, 0.0)
-        for aside in (0.0, side, -side):
-            yield center + aside * along, width, abs(shift) + abs(aside)
-
-
-def _width(slab: np.ndarray, yaw: float) -> float:
-    """Width of the hold in the middle, m."""
-    along, across = _axes(yaw)
-    v = slab @ across
-    strip = slab[np.abs(v - 0.5 * (v.min() + v.max())) < FINGER_HALF_WIDTH] @ along
-    return float(np.ptp(strip)) if len(strip) else 0.0
+                yield cost, TopGrasp(np.array([x, y, height]), float(yaw), width)
 
 
 def _crowding(obstacles: np.ndarray, grasp: TopGrasp) -> float:
     """How deep obstacles reach into the open fingers and the palm, m; 0 where the way is free."""
     if not len(obstacles):
         return 0.0
-    along, across = _axes(grasp.yaw)
+    c, s = np.cos(grasp.yaw), np.sin(grasp.yaw)
+    along, across = np.array([c, s]), np.array([-s, c])
     offset = obstacles - grasp.pos_world
     u, v, z = np.abs(offset[:, :2] @ along), np.abs(offset[:, :2] @ across), offset[:, 2]
     outer = 0.5 * MAX_OPENING + FINGER_THICKNESS + 0.003
