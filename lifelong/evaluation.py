@@ -15,8 +15,9 @@ from tqdm import tqdm
 
 from libero_env.init_states import NUM_INIT_STATES
 from lifelong.errors import ConfigError
+from lifelong.nn.precision import autocast
 from lifelong.policies.base import Policy
-from lifelong.training import autocast, generator
+from lifelong.training import generator
 from lifelong.types import Observation, PolicySpec
 
 Obs = Mapping[str, np.ndarray]  # name -> (B, ...)

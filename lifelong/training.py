@@ -14,12 +14,11 @@ from tqdm import tqdm
 
 from lifelong.algorithms.base import Algorithm, WindowDataset
 from lifelong.checkpoints import load_weights
+from lifelong.distributed import Ranks
 from lifelong.errors import ConfigError, TrainingError
-from lifelong.nn.precision import bf16_runs_on_cpu
+from lifelong.nn.precision import COMPILE_MODES
 from lifelong.policies.base import Policy
-from lifelong.types import Batch
-
-BatchAugmentation = Callable[[Batch, torch.Generator], Batch]
+from lifelong.step import BatchAugmentation, Step
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,10 @@ class FitSettings:
         weight_decay: AdamW's decoupled weight decay.
         grad_clip: Largest norm of the gradient; 0 switches clipping off.
         precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor has it.
+        accumulate: Micro-batches that a batch is cut into, one after the other in memory. The gradient is that
+            of the whole batch, up to rounding and to what the policy draws for itself (dropout).
+        compile: `torch.compile` of the policy's loss: `off`, `default`, or `reduce-overhead`, which on a GPU
+            replays CUDA graphs. It changes rounding.
     """
 
     epochs: int = 50
@@ -50,11 +53,16 @@ class FitSettings:
     weight_decay: float = 1e-4
     grad_clip: float = 100.0
     precision: Literal["auto", "bf16", "fp32"] = "auto"
+    accumulate: int = 1
+    compile: Literal["off", "default", "reduce-overhead"] = "off"
 
     def __post_init__(self) -> None:
-        if self.precision not in ("auto", "bf16", "fp32"):
-            raise ConfigError(f"train.precision is {self.precision!r}; valid: auto, bf16, fp32")
-        for name in ("epochs", "batch_size"):
+        if self.compile is False:  # what YAML makes of an unquoted off
+            object.__setattr__(self, "compile", "off")
+        for name, valid in (("precision", ("auto", "bf16", "fp32")), ("compile", COMPILE_MODES)):
+            if getattr(self, name) not in valid:
+                raise ConfigError(f"train.{name} is {getattr(self, name)!r}; valid: {', '.join(valid)}")
+        for name in ("epochs", "batch_size", "accumulate"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"train.{name} is {getattr(self, name)}; it must be at least 1")
 
@@ -91,12 +99,14 @@ def fit(
     resume: dict[str, Any] | None = None,
     label: str = "",
     progress: bool = False,
+    ranks: Ranks = Ranks(),  # noqa: B008 - frozen
 ) -> None:
     """Train a policy on one task's windows, with what the algorithm adds.
 
     On one machine the result depends on the arguments alone: each epoch's randomness is derived from `seed`
     and the epoch, and the global generators are as before afterwards. A call that takes up a state goes on to
-    the same bits as one that never stopped.
+    the same bits as one that never stopped. Several processes that call it alike come to the same weights; see
+    `lifelong.distributed`.
 
     Args:
         policy: Trained in place; has `loss(batch) -> scalar`.
@@ -111,9 +121,11 @@ def fit(
         resume: A state from `EpochEnd.state`.
         label: Stands before the progress bar.
         progress: Show a progress bar with the time left.
+        ranks: This process among those that train together.
 
     Raises:
         TrainingError: The dataset is empty, or the loss is not finite.
+        ConfigError: The batch is cut into parts, and the policy normalises over the batch.
     """
     if not len(dataset):
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
@@ -123,6 +135,7 @@ def fit(
     first, loss, penalty = 0, math.nan, 0.0
     if resume is not None:
         first, loss, penalty = _take_up(resume, policy, optimizer)
+    step = Step(policy, algorithm, optimizer, settings, device, augment, ranks)
     total = settings.epochs * steps
     bar = tqdm(total=total, initial=first * steps, desc=label, disable=not progress, unit="step", leave=False)
 
@@ -136,7 +149,6 @@ def fit(
         for epoch in range(first, settings.epochs):
             started = time.perf_counter()
             rate = lambda k, e=epoch: learning_rate(e * steps + k, total, settings)  # noqa: E731
-            step = _Step(policy, algorithm, optimizer, settings, device, augment)
             loss, penalty = _epoch(step, dataset, steps, (*seed, epoch), rate, bar)
             end(epoch + 1, time.perf_counter() - started)
 
@@ -147,17 +159,6 @@ def learning_rate(step: int, total: int, settings: FitSettings) -> float:
         return settings.lr * (step + 1) / settings.warmup_steps
     share = (step - settings.warmup_steps) / max(1, total - settings.warmup_steps)
     return settings.lr_min + (settings.lr - settings.lr_min) * 0.5 * (1 + math.cos(math.pi * share))
-
-
-def autocast(device: torch.device, precision: str) -> torch.autocast:
-    """The autocast context of a precision; `auto` takes bf16 where the processor computes in it."""
-    if precision == "auto":
-        if device.type == "cuda":
-            fast = torch.cuda.is_bf16_supported()
-        else:
-            fast = device.type == "cpu" and bf16_runs_on_cpu()
-        precision = "bf16" if fast else "fp32"
-    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
 
 
 def generator(*seed: int, device: torch.device | str = "cpu") -> torch.Generator:
@@ -178,41 +179,8 @@ def _word(seed: Sequence[int]) -> int:
     return int(np.random.SeedSequence(list(seed)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-@dataclass(frozen=True)
-class _Step:
-    """One step of the optimiser."""
-
-    policy: Policy
-    algorithm: Algorithm
-    optimizer: torch.optim.Optimizer
-    settings: FitSettings
-    device: torch.device
-    augment: BatchAugmentation | None
-
-    def __call__(self, batch: Batch, generator: torch.Generator, lr: float) -> tuple[Tensor, Tensor]:
-        batch = self.algorithm.mix(batch, generator)
-        if self.augment is not None:
-            batch = self.augment(batch, generator)
-        batch = batch.to(self.device)
-        with autocast(self.device, self.settings.precision):
-            loss = self.policy.loss(batch)
-            penalty = self.algorithm.penalty(self.policy)
-        self.optimizer.zero_grad(set_to_none=True)
-        (loss if penalty is None else loss + penalty).backward()
-        with autocast(self.device, self.settings.precision):
-            self.algorithm.after_backward(self.policy)
-        if self.settings.grad_clip:
-            moved = [p for group in self.optimizer.param_groups for p in group["params"]]
-            nn.utils.clip_grad_norm_(moved, self.settings.grad_clip)
-        for group in self.optimizer.param_groups:
-            group["lr"] = lr
-        self.optimizer.step()
-        self.algorithm.after_step(self.policy)
-        return loss.detach(), torch.zeros_like(loss) if penalty is None else penalty.detach()
-
-
 def _epoch(
-    step: _Step,
+    step: Step,
     dataset: WindowDataset,
     steps: int,
     seed: Sequence[int],
@@ -220,23 +188,23 @@ def _epoch(
     bar: tqdm,
 ) -> tuple[float, float]:
     """Mean loss and mean penalty of an epoch."""
-    draws = generator(*seed, 0)
+    draws, ranks = generator(*seed, 0), step.ranks
     order = _order(len(dataset), steps * step.settings.batch_size, draws)
-    losses, penalties = [], []
+    terms = []
+    step.agree()
     step.algorithm.mode_train(step.policy)
-    with seeded(*seed, 1, device=step.device):  # for dropout
+    alone = () if ranks.first else (ranks.rank,)
+    with seeded(*seed, 1, *alone, device=step.device):  # for dropout
         for k, indices in enumerate(order.split(step.settings.batch_size)):
-            loss, penalty = step(dataset.batch(indices), draws, rate(k))
-            losses.append(loss)
-            penalties.append(penalty)
+            terms.append(torch.stack(step(dataset.batch(indices), draws, rate(k))))
             bar.update()
-    loss = torch.stack(losses).float().mean().item()
+    loss, penalty = ranks.sum(torch.stack(terms).mean(0)).tolist()
     if not math.isfinite(loss):
         raise TrainingError(
             f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
         )
     bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
-    return loss, torch.stack(penalties).float().mean().item()
+    return loss, penalty
 
 
 def _order(windows: int, wanted: int, draws: torch.Generator) -> Tensor:

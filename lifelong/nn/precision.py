@@ -1,11 +1,21 @@
-"""Can this CPU compute in bfloat16?"""
+"""How networks are computed: in which precision, with which kernels, compiled or not."""
 
+import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import cache
+from typing import Any
 
 import torch
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from lifelong.errors import ConfigError, TrainingError
+
+COMPILE_MODES = ("off", "default", "reduce-overhead")
+
+_CUBLAS = "CUBLAS_WORKSPACE_CONFIG"
 _PROBE = """
 import torch
 torch.set_num_threads(1)
@@ -13,6 +23,17 @@ layer, x = torch.nn.Linear(384, 64), torch.randn(64, 384)
 with torch.autocast("cpu", torch.bfloat16):
     layer(x).sum().backward()
 """
+
+
+def autocast(device: torch.device, precision: str) -> torch.autocast:
+    """The autocast context of a precision; `auto` takes bf16 where the processor computes in it."""
+    if precision == "auto":
+        if device.type == "cuda":
+            fast = torch.cuda.is_bf16_supported()
+        else:
+            fast = device.type == "cpu" and bf16_runs_on_cpu()
+        precision = "bf16" if fast else "fp32"
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
 
 
 @cache
@@ -30,3 +51,76 @@ def bf16_runs_on_cpu() -> bool:
     except (OSError, subprocess.TimeoutExpired):
         return False
     return probe.returncode == 0
+
+
+@contextmanager
+def deterministic(on: bool) -> Iterator[None]:
+    """Within the context, every kernel gives the same bits each time, or fails; afterwards all is as before.
+
+    On a CPU that is so anyway. On a GPU it costs speed: sums without atomics, a fixed cuBLAS workspace (which
+    cuBLAS reads when it is first used, so this comes before), attention as plain products.
+
+    Raises:
+        TrainingError: An operation has no such kernel on this device; the message names it.
+    """
+    if not on:
+        yield
+        return
+    before = (
+        torch.are_deterministic_algorithms_enabled(),
+        torch.is_deterministic_algorithms_warn_only_enabled(),
+    )
+    benchmark, workspace = torch.backends.cudnn.benchmark, os.environ.get(_CUBLAS)
+    os.environ.setdefault(_CUBLAS, ":4096:8")
+    torch.backends.cudnn.benchmark = False
+    torch.use_deterministic_algorithms(True)
+    try:
+        with ExitStack() as stack:
+            if torch.cuda.is_available():
+                stack.enter_context(sdpa_kernel(SDPBackend.MATH))
+            yield
+    except RuntimeError as error:
+        if "does not have a deterministic implementation" not in str(error):
+            raise
+        raise TrainingError(
+            f"deterministic=true, but {str(error).splitlines()[0]} Use device=cpu or deterministic=false"
+        ) from error
+    finally:
+        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        torch.backends.cudnn.benchmark = benchmark
+        if workspace is None:
+            os.environ.pop(_CUBLAS, None)
+
+
+def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
+    """A function as `torch.compile` makes it; the module it may be a method of keeps its names and weights.
+
+    Args:
+        function: What is compiled, when it is first called with arguments of a kind.
+        mode: `off`: the function as it is; `default`; `reduce-overhead`: on a GPU as CUDA graphs, which spare
+            the launching of kernels. What such a function returns is overwritten by its next call.
+    """
+    if mode == "off":
+        return function
+    return torch.compile(function, mode=None if mode == "default" else mode)
+
+
+def check_compiler(device: torch.device) -> None:
+    """Compile something small, so that a missing compiler is told before anything else is done.
+
+    Raises:
+        ConfigError: It does not work here.
+    """
+    try:
+        torch.compile(_small)(torch.ones(64, device=device))
+    except (RuntimeError, ImportError, OSError) as error:
+        needed = "Triton and a C compiler" if device.type == "cuda" else "a C++ compiler such as g++"
+        reason = next((line for line in reversed(str(error).strip().splitlines()) if line.strip()), "")
+        raise ConfigError(
+            f"torch.compile does not work here; it needs {needed} ({type(error).__name__}: {reason.strip()}). "
+            "Install that, or use train.compile=off"
+        ) from error
+
+
+def _small(x: torch.Tensor) -> torch.Tensor:
+    return (x.sin() + 1).sum()

@@ -107,7 +107,7 @@ def test_the_paper_preset_is_the_published_protocol():
     assert OmegaConf.to_container(config.train) == {
         "_target_": "lifelong.training.FitSettings", "epochs": 50, "batch_size": 32, "steps_per_epoch": None,
         "lr": 1e-4, "lr_min": 1e-5, "warmup_steps": 0, "betas": [0.9, 0.999], "weight_decay": 1e-4,
-        "grad_clip": 100.0, "precision": "auto",
+        "grad_clip": 100.0, "precision": "auto", "accumulate": 1, "compile": "off",
     }  # fmt: skip
     assert (config.data.demos, config.data.image_size, config.data.seq_len) == (50, 128, 10)
     e = config.eval
