@@ -27,6 +27,7 @@ ARRIVED = (
 ARRIVED_TURN = 0.12  # rad
 STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
+LEVEL = 0.45  # vertical part of an approach below which it counts as level
 AROUND = 0.08  # m, within which bodies count as in the way
 SLIPPED = 0.03  # m, that a body may move between the fingers
 GENTLE = 0.005  # m, over what carries it, where a body is let go
@@ -137,14 +138,29 @@ class PickPlace:
             return self._toward(view, pos + 0.08 * back, view.eef_mat, OPEN)
         lift = style.slope * (aside - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
         lift = self._backed_off(aside, -float(error @ back), np.clip(lift, 0.0, self._rise + style.hover))
-        over = goal + lift * back
+        over, far = self._over(view, goal, back, lift, aside)
         lateral = 1.0
-        if aside > 0.05:
-            way = self._in_the_way(view, over, AROUND)
-            over[2] = max(over[2], way + FINGER_CLEARANCE + TIP_BELOW)
-        if aside > 0.05 or back[2] > 0.9:
+        if far or back[2] > 0.9:
             lateral = np.clip(1.0 - (over[2] - pos[2] - 0.02) / 0.04, 0.0, 1.0)
         return self._toward(view, over, mat, OPEN, lateral)
+
+    def _over(
+        self, view: StateView, goal: np.ndarray, back: np.ndarray, lift: float, aside: float
+    ) -> tuple[np.ndarray, bool]:
+        """Where to go on the way to a hold, (3,), and whether that is to pass over what stands between.
+
+        A hand that leans joins its approach where that is higher than what it passes; one that comes nearly level
+        comes down before the hold.
+        """
+        over = goal + lift * back
+        level = back[2] < LEVEL
+        far = float(np.linalg.norm((over - view.eef_pos)[:2])) > 0.03 if level else aside > 0.05
+        if not (far and aside > 0.05):
+            return over, False
+        height = self._in_the_way(view, over, AROUND) + FINGER_CLEARANCE + TIP_BELOW
+        if level:
+            return np.array([*over[:2], max(over[2], height)]), True
+        return over + max(height - over[2], 0.0) / back[2] * back, True
 
     def _backed_off(self, aside: float, height: float, lift: float) -> float:
         """The lift, or all of it while a finger that came to stand on something goes back and to the middle."""
