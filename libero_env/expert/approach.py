@@ -153,27 +153,26 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
     """Holds and places together, the best first; a body is let fall from where the hand has room."""
     found = []
     turns = np.stack([spot.mat @ pose.mat.T for spot in spots])
-    down = np.array([spot.entry[2] < -0.5 for spot in spots])
+    entries = np.stack([spot.entry for spot in spots])
+    down = entries[:, 2] < -0.5
     for grasp in holds:
         mats = turns @ grasp.mat
         origins = np.stack([spot.pos for spot in spots]) + turns @ (grasp.pos_world - pose.pos)
-        hand = origins[:, None] + np.einsum("nk,pik->pni", _HAND, mats)
         hits = np.full((len(spots), len(_LIFTS)), 1e6)
         wanting = np.ones(len(spots), bool)
         for k, lift in enumerate(_LIFTS):
-            hits[wanting, k] = voxels.touched(hand[wanting] + [0, 0, lift + 0.008])
+            raised = origins[wanting] + [0, 0, lift + 0.008]
+            hits[wanting, k] = voxels.touched(_HAND, raised, mats[wanting])
             wanting &= (hits[:, k] > 0) & down
             if not wanting.any():
                 break
         price = 0.01 * hits + 0.3 * (hits > 0) + 4.0 * _LIFTS
         best = price.argmin(axis=1)
+        befores = origins[:, None] - np.array([0.08, 0.16])[:, None] * entries[:, None]
         for i, spot in enumerate(spots):
             outside = 0.0
             if not down[i]:
-                back = voxels.touched(hand[i] - 0.08 * spot.entry) + voxels.touched(
-                    hand[i] - 0.16 * spot.entry
-                )
-                outside = 0.01 * float(back)
+                outside = 0.01 * float(voxels.touched(_HAND, befores[i], mats[[i, i]]).sum())
             cost = grasp.cost + spot.cost + float(price[i, best[i]]) + outside
             found.append(Approach(grasp, spot, pose, float(_LIFTS[best[i]]), cost))
     return sorted(found, key=lambda approach: approach.cost)

@@ -1,6 +1,7 @@
 """What is in the way: voxels of the scene, the volume of the hand, and how high things reach."""
 
 import numpy as np
+from numba import njit
 
 from libero_env.expert.grasp import (
     FINGER_HALF_WIDTH,
@@ -28,6 +29,7 @@ class Voxels:
         self._full[tuple(cells[inside].T)] = True
         self._coarse = np.zeros(self._shape // 2 + 1, bool)
         self._coarse[tuple(cells[inside].T // 2)] = True
+        self._tops: dict[float, np.ndarray] = {}  # heights by what lies below
 
     def hits(self, points: np.ndarray) -> np.ndarray:
         """How many of the points (..., N, 3) lie in something, (...)."""
@@ -36,14 +38,10 @@ class Voxels:
         full = self._full[cells[..., 0], cells[..., 1], cells[..., 2]] & inside
         return (full | (points[..., 2] < self.floor)).sum(axis=-1)
 
-    def touched(self, points: np.ndarray) -> np.ndarray:
-        """How many of the points (..., N, 3), a centimetre apart, come near something, (...)."""
-        cells = np.floor((points - self._low) * (1 / _COARSE)).astype(np.int32)
-        shape = np.array(self._coarse.shape, np.int32)
-        inside = ((cells >= 0) & (cells < shape)).all(axis=-1)
-        flat = (cells[..., 0] * shape[1] + cells[..., 1]) * shape[2] + cells[..., 2]
-        full = self._coarse.ravel()[np.where(inside, flat, 0)] & inside
-        return (full | (points[..., 2] < self.floor)).sum(axis=-1)
+    def touched(self, hand: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+        """How many of a hand's points (N, 3), a centimetre apart, come near something; at P poses, (P,)."""
+        low = self._low + np.zeros(3)
+        return _touched(self._coarse, low, self.floor, hand, pos, np.ascontiguousarray(mat))
 
     def drop(self, profile: np.ndarray, xy: np.ndarray, below: float) -> np.ndarray:
         """Height at which a body's origin comes to stand, over each of the spots xy (S, 2); (S,).
@@ -64,15 +62,39 @@ class Voxels:
         return self._heights(np.inf)[cells[..., 0], cells[..., 1]] > points[..., 2] + 2 * _CELL
 
     def _heights(self, below: float) -> np.ndarray:
-        cells, inside = self._cells(self.points)
-        keep = inside & (self.points[:, 2] < below)
-        heights = np.full(self._shape[:2], self.floor)
-        np.maximum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
-        return heights
+        if below not in self._tops:
+            cells, inside = self._cells(self.points)
+            keep = inside & (self.points[:, 2] < below)
+            heights = np.full(self._shape[:2], self.floor)
+            np.maximum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
+            self._tops[below] = heights
+        return self._tops[below]
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         cells = np.floor((points - self._low) / _CELL).astype(int)
         return cells, ((cells >= 0) & (cells < self._shape)).all(axis=-1)
+
+
+@njit(cache=True, nogil=True)
+def _touched(
+    full: np.ndarray, low: np.ndarray, floor: float, points: np.ndarray, pos: np.ndarray, mat: np.ndarray
+) -> np.ndarray:
+    found = np.zeros(len(pos), np.int64)
+    nx, ny, nz = full.shape
+    for p in range(len(pos)):
+        m, o = mat[p], pos[p]
+        for i in range(len(points)):
+            a, b, c = points[i]
+            z = o[2] + m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
+            if z < floor:
+                found[p] += 1
+                continue
+            x = int(np.floor((o[0] + m[0, 0] * a + m[0, 1] * b + m[0, 2] * c - low[0]) / _COARSE))
+            y = int(np.floor((o[1] + m[1, 0] * a + m[1, 1] * b + m[1, 2] * c - low[1]) / _COARSE))
+            k = int(np.floor((z - low[2]) / _COARSE))
+            if 0 <= x < nx and 0 <= y < ny and 0 <= k < nz and full[x, y, k]:
+                found[p] += 1
+    return found
 
 
 def underside(points: np.ndarray) -> np.ndarray:

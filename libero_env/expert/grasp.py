@@ -102,15 +102,9 @@ def grasps(
 
 def _faced(points: np.ndarray, pos: np.ndarray, yaw: float) -> bool:
     """Whether the pads meet faces on both sides that stand along the approach, and not slanted ones."""
-    along, across = _axes(yaw)
-    local = points - pos
-    local = local[(np.abs(local[:, :2] @ across) < FINGER_HALF_WIDTH) & (np.abs(local[:, 2]) < PAD_ABOVE)]
-    u, z = local[:, :2] @ along, local[:, 2]
-    between = np.abs(u) < 0.5 * MAX_OPENING
-    if not between.any():
-        return False
-    faces = u - u[between].min(), u[between].max() - u
-    return all(z[between & (face < _SLANT)].max() > 0.6 * PAD_ABOVE for face in faces)
+    return hold_kernels.faces_reach_up(
+        points, pos, np.cos(yaw), np.sin(yaw), FINGER_HALF_WIDTH, PAD_ABOVE, MAX_OPENING, _SLANT, 0.6 * PAD_ABOVE
+    )
 
 
 def choose_grasp(
@@ -150,7 +144,8 @@ def _candidates(
             price = 0.25 * turn_between(yaw, now) + 4.0 * away_from_middle + 0.4 * askew
             for x, y, width, shift in whole_holds(slab, yaw):
                 yield price + 8.0 * width + 3.0 * shift, np.array([x, y, height]), float(yaw), width
-        column = _thinned(cloud[cloud[:, 2] > height - TIP_BELOW])
+        # what is below the highest point of a cell makes no difference to fingers
+        column = hold_kernels.highest_in_cells(cloud[cloud[:, 2] > height - TIP_BELOW], 0.004)
         for yaw in [now + np.pi * k / yaws for k in range(yaws)]:
             price = WALL + 0.25 * turn_between(yaw, now)
             for x, y, width, badness in _walls(slab, column, height, yaw):
@@ -160,13 +155,6 @@ def _candidates(
 def _slab(cloud: np.ndarray, low: float, high: float) -> np.ndarray:
     """Ground plan (N, 2) of what lies between two heights."""
     return np.unique(np.round(cloud[(cloud[:, 2] > low) & (cloud[:, 2] < high), :2], 3), axis=0)
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """The highest point (x, y, z) of each 4 mm of the ground plan; what is below makes no difference to fingers."""
-    order = points[np.argsort(-points[:, 2])]
-    _, first = np.unique(np.round(order[:, :2] / 0.004), axis=0, return_index=True)
-    return order[first]
 
 
 def _walls(slab: np.ndarray, column: np.ndarray, height: float, yaw: float) -> np.ndarray:
@@ -194,11 +182,6 @@ def aligned_yaws(slab: np.ndarray, now: float) -> list[float]:
         # of equally narrow ones the one in the middle, which is no turn at all for a round body
         yaws.append(float(np.mean(fine[widths <= widths.min() + 2e-4])))
     return yaws
-
-
-def _axes(yaw: float) -> tuple[np.ndarray, np.ndarray]:
-    """Horizontal directions along and across the opening of the fingers, (2,) each."""
-    return np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
 
 
 def whole_holds(slab: np.ndarray, yaw: float) -> np.ndarray:

@@ -185,3 +185,57 @@ def depth_in_hand(
         if up > palm_above:
             deepest = max(deepest, palm_reach - u)
     return deepest
+
+
+@njit(cache=True, nogil=True)
+def highest_in_cells(points: np.ndarray, cell: float) -> np.ndarray:
+    """The highest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
+    x, y = np.rint(points[:, 0] / cell), np.rint(points[:, 1] / cell)
+    x, y = x - x.min(), y - y.min()
+    rows = int(y.max()) + 1
+    best = np.full((int(x.max()) + 1) * rows, -1)
+    for i in range(len(points)):
+        k = int(x[i]) * rows + int(y[i])
+        if best[k] < 0 or points[i, 2] > points[best[k], 2]:
+            best[k] = i
+    return points[best[best >= 0]]
+
+
+@njit(cache=True, nogil=True)
+def faces_reach_up(
+    points: np.ndarray, pos: np.ndarray, c: float, s: float, half: float, high: float, opening: float,
+    slant: float, least: float,
+) -> bool:  # fmt: skip
+    """Whether on both sides what pads at `pos` touch first, within `slant`, reaches higher than `least` over it, m.
+
+    Args:
+        points: of a body, (N, 3).
+        pos: middle of the pads, (3,).
+        c, s: direction of the fingers.
+        half, high: of the pads to either side, m.
+        opening: of the fingers, m.
+        slant: m, that a face may give way over the pads.
+        least: m.
+    """
+    us, zs = np.empty(len(points)), np.empty(len(points))
+    count = 0
+    for i in range(len(points)):
+        z = points[i, 2] - pos[2]
+        if abs(z) >= high:
+            continue
+        x, y = points[i, 0] - pos[0], points[i, 1] - pos[1]
+        u = x * c + y * s
+        if abs(y * c - x * s) < half and abs(u) < 0.5 * opening:
+            us[count], zs[count] = u, z
+            count += 1
+    if count == 0:
+        return False
+    us, zs = us[:count], zs[:count]
+    first, last = us.min(), us.max()
+    low_side, high_side = -np.inf, -np.inf
+    for i in range(count):
+        if us[i] - first < slant:
+            low_side = max(low_side, zs[i])
+        if last - us[i] < slant:
+            high_side = max(high_side, zs[i])
+    return low_side > least and high_side > least
