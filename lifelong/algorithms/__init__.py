@@ -5,6 +5,7 @@ from lifelong.algorithms.base import Algorithm, Phase
 from lifelong.algorithms.derpp import DERpp
 from lifelong.algorithms.er import ER
 from lifelong.algorithms.ewc import EWC
+from lifelong.algorithms.lora import LoRA
 from lifelong.algorithms.lwf import LwF
 from lifelong.algorithms.mas import MAS
 from lifelong.algorithms.multitask import Multitask
@@ -14,6 +15,6 @@ from lifelong.algorithms.si import SI
 from lifelong.algorithms.single_task import SingleTask
 
 __all__ = [
-    "AGEM", "ER", "EWC", "MAS", "SI", "Algorithm", "DERpp", "LwF", "Multitask", "PackNet", "Phase",
+    "AGEM", "ER", "EWC", "MAS", "SI", "Algorithm", "DERpp", "LoRA", "LwF", "Multitask", "PackNet", "Phase",
     "Sequential", "SingleTask",
 ]  # fmt: skip

@@ -1,0 +1,192 @@
+"""Low-rank adapters of each task on a frozen base."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.errors import ConfigError
+from lifelong.nn.adapters import check_found, freeze_statistics, matches, start_pair
+from lifelong.policies.base import Policy
+
+
+class LoRA(Algorithm):
+    """Learn the first task with the whole policy, and every later one with a small adapter on it.
+
+    TAIL (Liu et al. 2024, "TAIL: Task-specific adapters for imitation learning with large pretrained models", ICLR)
+    with LoRA (Hu et al. 2022): the weight of task k is `W_k = W + (alpha / rank) B_k A_k` (Hu et al., eq. 3) with W
+    frozen. Small parameters (`own`) are learned anew by every task. Nothing that an earlier task uses ever moves:
+    its outputs stay bit-identical.
+
+    The sum is kept in the policy's own parameters, which therefore compute as always, whatever their kind: linear,
+    convolution, recurrent. Gradients come from the chain rule, dL/dB = s G A^T and dL/dA = s B^T G with G = dL/dW_k;
+    the optimiser moves A and B, and W_k is put together again after each step.
+
+    Departures: TAIL adapts large pretrained encoders and a transformer; here the base is the policy after the first
+    `base_tasks`, or as it was given with `base_tasks=0` (pretraining), and by default every matrix is adapted,
+    because a base that saw one task has no general features. There is no dropout before A.
+    """
+
+    def __init__(
+        self,
+        *,
+        rank: int = 16,
+        alpha: float = 32.0,
+        adapted: Sequence[str] = ("*",),
+        own: Sequence[str] = ("*bias*", "*norm*"),
+        base_tasks: int = 1,
+    ):
+        """Make the algorithm.
+
+        Args:
+            rank: Of the adapters; a smaller side of a weight limits it.
+            alpha: The adapters' scale is alpha / rank.
+            adapted: Patterns of names of the parameters that get adapters, of those with two or more dimensions,
+                e.g. `transformer.*`, `head.*`, `*.qkv.weight`.
+            own: Patterns of names of parameters of which every task has its own copy.
+            base_tasks: So many tasks (counted together where they are learned together) train the whole policy,
+                which is frozen afterwards.
+
+        Raises:
+            ConfigError: A rank below 1 or fewer than 0 tasks.
+        """
+        if rank < 1 or base_tasks < 0:
+            raise ConfigError(f"algo.rank={rank}, algo.base_tasks={base_tasks}; valid: at least 1, at least 0")
+        self.rank, self.scale = rank, alpha / rank
+        self.adapted, self.own = tuple(adapted), tuple(own)
+        self.task_index, self._base_left, self._base_last = -1, base_tasks, -1
+        self._seed = 0  # of the next task's A; drawn when a task ends
+        self._base: dict[str, Tensor] = {}  # frozen values of all that a task may change
+        self._pairs: dict[int, dict[str, dict[str, Tensor]]] = {}  # task -> name -> a (r, in), b (out, r)
+        self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
+
+    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+        """Freeze the base when it is learned, and start the task's adapter from it."""
+        self.task_index = task_index
+        if self._base_left:
+            self._base_left, self._base_last = self._base_left - 1, task_index
+            return
+        if not self._base:
+            self._base = self._take_base(policy)
+        draws = torch.Generator().manual_seed(self._seed)
+        pairs = self._pairs[task_index] = {}
+        for name, base in self._base.items():
+            if not matches(name, self.own):
+                out, inputs = base.flatten(1).shape
+                rank = min(self.rank, out, inputs)
+                a, b = start_pair(out, inputs, rank, draws)
+                pairs[name] = {"a": nn.Parameter(a.to(base.device)), "b": nn.Parameter(b.to(base.device))}
+        _put(policy, self._base)
+        policy.zero_grad()  # the optimiser, which does it at each step, has the matrices no longer
+
+    def trained(self, policy: Policy) -> list[nn.Parameter]:
+        """The task's A and B and its own copies; everything while the base is learned."""
+        pairs = self._pairs.get(self.task_index)
+        if pairs is None:
+            return super().trained(policy)
+        chosen: list[Any] = []
+        for name, p in policy.named_parameters():
+            p.requires_grad_(name in self._base)
+            if name in pairs:
+                chosen += pairs[name].values()
+            elif name in self._base:
+                chosen.append(p)
+        return chosen
+
+    def mode_train(self, policy: Policy) -> None:
+        """Training mode, with running statistics frozen with the base."""
+        policy.train()
+        if self._base:
+            freeze_statistics(policy)
+
+    @torch.no_grad()
+    def after_backward(self, policy: Policy) -> None:
+        """Gradients of A and B from those of the weights, which are then dropped."""
+        pairs = self._pairs.get(self.task_index, {})
+        for name, p in policy.named_parameters():
+            if name in pairs and p.grad is not None:
+                a, b, g = pairs[name]["a"], pairs[name]["b"], p.grad.flatten(1)
+                with torch.autocast(p.device.type, enabled=False):
+                    a.grad, b.grad = self.scale * (b.T @ g), self.scale * (g @ a.T)
+                p.grad = None
+
+    def after_step(self, policy: Policy) -> None:
+        """Put the weights together again."""
+        pairs = self._pairs.get(self.task_index, {})
+        _put(policy, {name: self._sum(name, pair) for name, pair in pairs.items()})
+
+    def end_task(
+        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Keep the task's own copies; its A and B are kept already."""
+        self._seed = int(torch.randint(2**62, (), generator=generator))
+        if task_index in self._pairs:
+            params = dict(policy.named_parameters())
+            names = self._base.keys() - self._pairs[task_index].keys()
+            self._kept[task_index] = {n: params[n].detach().clone() for n in sorted(names)}
+
+    @contextmanager
+    def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
+        """The policy with the task's adapter; as it is for the present task and those not begun."""
+        learned = [-1] if task_index <= self._base_last else [t for t in self._kept if t >= task_index]
+        if not self._base or not learned:
+            yield policy
+            return
+        present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self._base}
+        stage = min(learned)  # goes by the last of the tasks that were learned together
+        sums = {name: self._sum(name, pair) for name, pair in self._pairs.get(stage, {}).items()}
+        _put(policy, self._base | sums | self._kept.get(stage, {}))
+        try:
+            yield policy
+        finally:
+            _put(policy, present)
+
+    def sizes(self) -> dict[int, int]:
+        """Numbers that each task with an adapter learned, its own copies included."""
+        small = sum(p.numel() for n, p in self._base.items() if matches(n, self.own))
+        pairs = {task: [t for pair in p.values() for t in pair.values()] for task, p in self._pairs.items()}
+        return {task: small + sum(t.numel() for t in tensors) for task, tensors in pairs.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The base, and every task's A, B and own copies."""
+        pairs = {
+            task: {name: {k: t.detach() for k, t in pair.items()} for name, pair in of_task.items()}
+            for task, of_task in self._pairs.items()
+        }
+        state = {"base": dict(self._base), "pairs": pairs, "own": dict(self._kept)}
+        place = {"task_index": self.task_index, "base_left": self._base_left, "base_last": self._base_last}
+        return {**place, "seed": self._seed, **state}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+        """Take up what `state_dict` gave."""
+        self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
+        self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])
+        self._base, self._kept = dict(state["base"]), dict(state["own"])
+        self._pairs = {
+            task: {name: {k: nn.Parameter(t) for k, t in pair.items()} for name, pair in of_task.items()}
+            for task, of_task in state["pairs"].items()
+        }
+
+    def _take_base(self, policy: Policy) -> dict[str, Tensor]:
+        """Copies of all parameters that tasks may change, by name."""
+        learned = {n: p for n, p in policy.named_parameters() if p.requires_grad}
+        matrices = [n for n, p in learned.items() if p.dim() >= 2 and not matches(n, self.own)]
+        found = [n for n in matrices if matches(n, self.adapted)]
+        check_found(found, self.adapted, matrices, "matrix")
+        return {n: p.detach().clone() for n, p in learned.items() if n in found or matches(n, self.own)}
+
+    @torch.no_grad()
+    def _sum(self, name: str, pair: Mapping[str, Tensor]) -> Tensor:
+        """W + (alpha / rank) B A."""
+        base = self._base[name]
+        return base + (self.scale * (pair["b"] @ pair["a"])).view(base.shape)
+
+
+@torch.no_grad()
+def _put(policy: Policy, values: Mapping[str, Tensor]) -> None:
+    for name, p in policy.named_parameters():
+        if name in values:
+            p.copy_(values[name])
