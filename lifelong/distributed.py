@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -89,14 +89,14 @@ class Ranks:
         """Until all ranks are here."""
         self.sum(torch.zeros(1))
 
-    def share(self, make: Callable[[], T]) -> T:
-        """What `make` gives on the first rank, given to all; the others do not call it.
+    def share(self, make: Callable[..., T], *args: Any) -> T:
+        """What `make(*args)` gives on the first rank, given to all; the others do not call it.
 
         What is given travels as a pickle, between processes of one run only.
         """
         if self.size == 1:
-            return make()
-        box = [make() if self.first else None]
+            return make(*args)
+        box: list[Any] = [make(*args) if self.first else None]
         with _together():
             dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
         return box[0]
@@ -156,6 +156,11 @@ def joined() -> Iterator[Ranks]:
         dist.init_process_group(backend, timeout=_PATIENCE)
     yield Ranks(dist.get_rank(), dist.get_world_size(), int(os.environ.get("LOCAL_RANK", "0")))
     dist.destroy_process_group()  # not after an error: it would wait for the others
+
+
+def rank() -> int:
+    """This process's number, where nothing else tells it; 0 if there is no other."""
+    return dist.get_rank() if dist.is_initialized() else 0
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from libero_env.tasks import Task
 from libero_env.vector import BatchEnv
 from lifelong.algorithms import Algorithm
 from lifelong.data import SequenceVLDataset
-from lifelong.errors import ConfigError
+from lifelong.distributed import Ranks
 from lifelong.evaluation import EnvPool, EvalSettings
+from lifelong.nn.precision import check_compiler, deterministic
 from lifelong.policies import Policy
 from lifelong.records import PhaseRecord, RunEndRecord, TaskEndRecord, start_record, utc_now
 from lifelong.report import write_report
@@ -34,12 +36,13 @@ GROUPS = ("algo", "benchmark", "policy", "data", "augmentation", "train", "eval"
 INIT = 0  # first word of the seed of the policy's initial weights, see lifelong.sequence
 
 
-def run(config: DictConfig, names: Mapping[str, str]) -> Path:
+def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) -> Path:  # noqa: B008 - frozen
     """Run a configuration to its end, or go on with a run that was interrupted.
 
     Args:
         config: What configs/config.yaml composes.
         names: The file chosen in each group, such as algo -> ewc; they name the run.
+        ranks: This process among those that train together.
 
     Returns:
         The run's directory, with results.json and report.html in it.
@@ -50,20 +53,30 @@ def run(config: DictConfig, names: Mapping[str, str]) -> Path:
     settings = RunSettings(**{str(k): v for k, v in config.items() if k not in GROUPS})
     if settings.threads:
         torch.set_num_threads(settings.threads)
-    built = _build_all(config, settings)  # before anything is written: what cannot work leaves no trace
+    with deterministic(settings.deterministic):
+        return _run(config, names, settings, ranks)
+
+
+def _run(config: DictConfig, names: Mapping[str, str], settings: RunSettings, ranks: Ranks) -> Path:
+    # before anything is written: what cannot work leaves no trace
+    built = _build_all(config, settings, ranks)
     label = "_".join([names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])])
     name = f"{names['benchmark']}/{names['algo']}/{label}"
     directory = RunDirectory(Path(settings.runs_dir) / name)
     plain: Any = OmegaConf.to_container(config, resolve=True)
-    with directory.opened(plain, settings.resume):
-        if directory.log.read().finished:
+    with directory.opened(plain, settings.resume) if ranks.first else nullcontext():
+        finished = ranks.share(lambda: directory.log.read().finished)
+        if finished and ranks.first:
             print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
-        else:
+        if not finished and ranks.first:
             built.tracker.start(name, str(directory.path), plain)
             _record_start(directory, names, settings.seed, built.tasks, plain)
-            _walk(built, settings, directory)
+        if not finished:
+            _walk(built, settings, directory, ranks)
+        if ranks.first:
             built.tracker.finish()
-        return _sum_up(directory, plain)
+            _sum_up(directory, plain)
+        return directory.path
 
 
 @dataclass(frozen=True)
@@ -83,11 +96,14 @@ class Built:
     device: torch.device
 
 
-def _build_all(config: DictConfig, settings: RunSettings) -> Built:
+def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built:
     benchmark: BenchmarkSettings = _build(config.benchmark)
-    tasks, device = benchmark.sequence(), _device(settings.device)
+    tasks, device = benchmark.sequence(), ranks.device(settings.device)
     data: DataSettings = _build(config.data)
-    languages = _build(config.language).embed([t.language for t in tasks])
+    fit: FitSettings = _build(config.train)
+    if fit.compile != "off":
+        check_compiler(device)
+    languages = ranks.share(lambda: _build(config.language).embed([t.language for t in tasks]))
     spec = data.spec(languages.shape[1])
     with seeded(settings.seed, INIT):
         policy = _build(config.policy, spec=spec).to(device)
@@ -98,7 +114,7 @@ def _build_all(config: DictConfig, settings: RunSettings) -> Built:
         spec=spec,
         policy=policy,
         algorithm=_build(config.algo),
-        fit=_build(config.train),
+        fit=fit,
         eval=_build(config.eval),
         augment=_build(config.augmentation),
         tracker=_build(config.wandb),
@@ -128,11 +144,12 @@ def _record_start(
     )
 
 
-def _walk(built: Built, settings: RunSettings, directory: RunDirectory) -> None:
+def _walk(built: Built, settings: RunSettings, directory: RunDirectory, ranks: Ranks) -> None:
     """Make sure of the demonstrations and learn the sequence."""
     began = time.perf_counter()
     progress = sys.stderr.isatty() if settings.progress is None else settings.progress
-    paths = _demos(built.tasks, built.data, directory, progress)
+    progress = progress and ranks.first
+    paths = ranks.share(_demos, built.tasks, built.data, directory, progress)
     with EnvPool(lambda key: _env(built, key), built.eval.open_environments) as envs:
         parts = Parts(
             instructions=tuple(t.language for t in built.tasks),
@@ -149,9 +166,11 @@ def _walk(built: Built, settings: RunSettings, directory: RunDirectory) -> None:
             seed=settings.seed,
             device=built.device,
             progress=progress,
+            ranks=ranks,
         )
         TaskSequence(parts).run()
-    directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
+    if ranks.first:
+        directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
 
 
 def _env(built: Built, key: tuple[int, int]) -> BatchEnv:
@@ -164,18 +183,6 @@ def _env(built: Built, key: tuple[int, int]) -> BatchEnv:
         camera_size=built.spec.image_size,
         horizon=built.eval.horizon + built.eval.settle_steps,
     )
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device={name}, but torch finds no GPU; use device=auto or device=cpu")
-    return device
 
 
 def _demos(
@@ -227,11 +234,10 @@ class DemoDatasets(Mapping[int, SequenceVLDataset]):
         return len(self.paths)
 
 
-def _sum_up(directory: RunDirectory, config: Mapping[str, Any]) -> Path:
-    """Write results.json and the report; the run's directory."""
+def _sum_up(directory: RunDirectory, config: Mapping[str, Any]) -> None:
+    """Write results.json and the report."""
     results = directory.log.read()
     write_summary(directory.path / "results.json", results, config)
     page = write_report([directory.path])
     ends = len(results.of(TaskEndRecord))
     print(f"{ends} tasks learned. Report: {page}")
-    return directory.path

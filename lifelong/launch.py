@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.errors import LiberoError, UnknownNameError
 from lifelong import experiment
+from lifelong.distributed import Ranks, joined, rank
 from lifelong.report import write_report
 
 
@@ -29,8 +30,8 @@ class CombinedReport(Callback):
             self._runs.append(job_return._return_value)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare what ended well."""
-        if len(self._runs) > 1:
+        """Compare what ended well; where several processes train together, the first does."""
+        if len(self._runs) > 1 and rank() == 0:
             page = write_report(self._runs, Path(config.runs_dir) / "sweep" / "report.html")
             print(f"{len(self._runs)} runs compared: {page}")
 
@@ -44,28 +45,41 @@ def main(config_dir: str) -> int:
     Returns:
         Exit status: 0, or 1 where something went wrong (told in one line).
     """
+    path = Path(sys.argv[0]).resolve().parent / config_dir
+    try:
+        with joined() as ranks:
+            check_choices(sys.argv[1:], path)
+            return _compose_and_run(str(path), ranks)
+    except LiberoError as error:
+        _tell(error)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+
+
+def _compose_and_run(path: str, ranks: Ranks) -> int:
+    """Exit status of the jobs of the command line, which are several after `-m`."""
     failed = False
 
     def job(config: DictConfig) -> Path | None:
         nonlocal failed
         try:
-            return experiment.run(config, HydraConfig.get().runtime.choices)
+            return experiment.run(config, HydraConfig.get().runtime.choices, ranks)
         except (LiberoError, HydraException, OmegaConfBaseException, OSError) as error:
             failed = True
-            print(f"error: {_one_line(error)}", file=sys.stderr)
+            _tell(error)
+            if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
+                raise SystemExit(1) from error
             return None
 
-    path = Path(sys.argv[0]).resolve().parent / config_dir
-    try:
-        check_choices(sys.argv[1:], path)
-        hydra.main(version_base="1.3", config_path=str(path), config_name="config")(job)()
-    except LiberoError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
+    hydra.main(version_base="1.3", config_path=path, config_name="config")(job)()
     return int(failed)
+
+
+def _tell(error: Exception) -> None:
+    who = f"rank {rank()}: " if rank() else ""
+    print(f"error: {who}{_one_line(error)}", file=sys.stderr)
 
 
 def check_choices(overrides: Sequence[str], config_dir: Path) -> None:

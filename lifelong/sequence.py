@@ -2,6 +2,9 @@
 
 It can be killed anywhere. What is done is found again in the records and checkpoints; the rest comes out with
 the same bits, because all randomness is derived from the seed and the place in the sequence.
+
+Where several processes train together, all of them walk, but only the first evaluates and writes. They wait for
+each other wherever one reads what another has written, or will write anew.
 """
 
 import time
@@ -14,12 +17,13 @@ from torch import Tensor
 
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm, JoinedWindows, Phase, WindowDataset
+from lifelong.distributed import Ranks
 from lifelong.evaluation import EnvPool, EvalSettings, rollout, save_animation
 from lifelong.policies.base import Policy
 from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.rundir import RunDirectory
 from lifelong.tracking import Tracker
-from lifelong.training import BatchAugmentation, EpochEnd, FitSettings, fit, generator
+from lifelong.training import BatchAugmentation, EpochEnd, FitSettings, fit, generator, seeded
 
 # First words of the seeds derived from the run's seed, one for each use.
 FIT, END_TASK, ROLLOUT = 1, 2, 3
@@ -45,6 +49,7 @@ class Parts:
     seed: int
     device: torch.device
     progress: bool
+    ranks: Ranks = Ranks()
 
 
 @dataclass(frozen=True)
@@ -72,10 +77,10 @@ class TaskSequence:
         stages = self.parts.algorithm.stages(len(self.parts.instructions))
         done = self._restore(stages)
         if done:
-            self._finish(stages[done - 1])
+            self.parts.ranks.share(self._finish, stages[done - 1])
         for stage in stages[done:]:
             self._learn(stage)
-            self._finish(stage)
+            self.parts.ranks.share(self._finish, stage)
 
     def _restore(self, stages: Sequence[Sequence[int]]) -> int:
         """Take up the state after the last stage that was learned; how many are."""
@@ -83,9 +88,12 @@ class TaskSequence:
         while done < len(stages) and p.directory.task_path(stages[done][-1]).exists():
             done += 1
         if done:
-            path = p.directory.task_path(stages[done - 1][-1])
-            self._take_up(checkpoints.load(path, p.device), str(path))
+            self._take_up_task(stages[done - 1][-1])
         return done
+
+    def _take_up_task(self, task: int) -> None:
+        path = self.parts.directory.task_path(task)
+        self._take_up(checkpoints.load(path, self.parts.device), str(path))
 
     def _take_up(self, state: Mapping[str, Any], source: str) -> None:
         if state.get("policy") is not None:
@@ -100,6 +108,7 @@ class TaskSequence:
         if len(stage) > 1:
             numbers, what = f"Tasks {stage[0] + 1}-{task + 1}", "together"
         self._say(f"{numbers}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
+        p.ranks.wait()  # all have read what is saved
         if saved is None:
             p.algorithm.begin_task(task, dataset, p.policy)
         else:
@@ -109,9 +118,16 @@ class TaskSequence:
                 continue
             resume = saved["fit"] if saved is not None and stretch.number == saved["phase"] else None
             self._train(stretch, dataset, resume)
-            self._save(task, stretch.number + 1)
-        draws = generator(p.seed, END_TASK, task)
-        p.algorithm.end_task(task, dataset, p.policy, draws)
+            p.ranks.share(self._save, task, stretch.number + 1)
+        p.ranks.share(self._end_task, task, dataset)
+        if not p.ranks.first:
+            self._take_up_task(task)
+
+    def _end_task(self, task: int, dataset: WindowDataset) -> None:
+        """What the algorithm does after a task, and the checkpoint of it."""
+        p, draws = self.parts, generator(self.parts.seed, END_TASK, task)
+        with seeded(p.seed, END_TASK, task, 1, device=p.device):  # for dropout
+            p.algorithm.end_task(task, dataset, p.policy, draws)
         state = {"task": task, "policy": p.policy.state_dict(), "algorithm": p.algorithm.state_dict()}
         checkpoints.save(p.directory.task_path(task), state)
 
@@ -142,13 +158,14 @@ class TaskSequence:
             seed=(p.seed, FIT, stretch.task, stretch.number),
             device=p.device,
             augment=p.augment,
-            on_epoch=lambda end: self._after_epoch(stretch, end),
+            on_epoch=lambda end: p.ranks.share(self._after_epoch, stretch, end),
             resume=resume,
             label=f"task {stretch.task + 1} {stretch.phase.name}",
             progress=p.progress,
+            ranks=p.ranks,
         )
         if self._selects(stretch):
-            best = self._best_epoch(stretch, stretch.epochs)
+            best = p.ranks.share(self._best_epoch, stretch, stretch.epochs)
             state = checkpoints.load(p.directory.best_path, p.device)
             if (state["task"], state["epoch"]) != (stretch.task, best):
                 raise checkpoints.CheckpointError(
@@ -282,4 +299,5 @@ class TaskSequence:
         return f"; about {max(1, round(seconds / 60))} min left"
 
     def _say(self, text: str) -> None:
-        print(text, flush=True)
+        if self.parts.ranks.first:
+            print(text, flush=True)

@@ -24,6 +24,7 @@ class RunSettings:
     run_id: str | None
     resume: bool
     progress: bool | None
+    deterministic: bool
 
 
 @dataclass(frozen=True)
