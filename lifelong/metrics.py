@@ -65,8 +65,23 @@ class Scores:
 
 
 @dataclass(frozen=True)
+class Cells:
+    """All success rates of a run in one row, and every metric's weights on them: metric = weights · rates.
+
+    Attributes:
+        rates: (C,) the matrix up to its diagonal, then the learning curves.
+        episodes: (C,) rollouts behind each.
+        weights: (C,) for each name of `METRIC_NAMES`, with the best epochs as they are; NaN where undefined.
+    """
+
+    rates: Floats
+    episodes: NDArray[np.int64]
+    weights: dict[str, Floats]
+
+
+@dataclass(frozen=True)
 class Estimate:
-    """A value with its confidence interval, over the episodes of one run."""
+    """A value with its confidence interval."""
 
     value: float
     low: float
@@ -125,13 +140,15 @@ def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
     Every measure is a weighted sum of independent success rates once the best epochs are known, so the
     intervals combine the cells' Wilson intervals (see `combine_intervals`): they have width also where
     every episode succeeded or every one failed, and need no random numbers. They cover the chance in the
-    episodes of this run, given its checkpoints; the spread between seeds is `mean_and_standard_error`.
+    episodes of this run, given its checkpoints; the spread between seeds is `mean_and_standard_error`, and
+    `lifelong.bootstrap` has intervals over both.
     """
     fwt = forward_transfer(scores.curves)
     nbt = negative_backward_transfer(scores.matrix)
     auc = area_under_curve(fwt, scores.matrix)
-    rates, low, high, weights = _cells_and_weights(scores, confidence)
-    estimates = {name: combine_intervals(w, rates, low, high) for name, w in weights.items()}
+    row = cells(scores)
+    low, high = wilson_interval(row.rates * row.episodes, row.episodes, confidence)
+    estimates = {name: combine_intervals(w, row.rates, low, high) for name, w in row.weights.items()}
     return Metrics(**estimates, fwt_by_task=fwt, nbt_by_task=nbt, auc_by_task=auc)
 
 
@@ -186,14 +203,13 @@ def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
     return float(x.mean()), error
 
 
-def _cells_and_weights(scores: Scores, confidence: float) -> tuple[Floats, Floats, Floats, dict[str, Floats]]:
-    """All cells in one row (matrix below the diagonal, then curves), and each metric's weights on them."""
+def cells(scores: Scores) -> Cells:
+    """The success rates of a run in one row, and how the metrics of eq. 3 weigh them."""
     size = len(scores.curves)
     rows, cols = np.tril_indices(size)
     counts = [scores.episodes[rows, cols], *(c.episodes for c in scores.curves)]
     rates = np.concatenate([scores.matrix[rows, cols], *(c.rates for c in scores.curves)])
     episodes = np.concatenate(counts)
-    low, high = wilson_interval(rates * episodes, episodes, confidence)
 
     after = rows > cols
     later = size - 1 - cols  # tasks learned after column k
@@ -210,7 +226,7 @@ def _cells_and_weights(scores: Scores, confidence: float) -> tuple[Floats, Float
     weights = {n: np.concatenate([w, *curve_weights.get(n, none)]) for n, w in matrix_weights.items()}
     if any(len(c.rates) == 0 for c in scores.curves):  # a task without a learning curve
         weights["fwt"] = weights["auc"] = np.full(len(rates), np.nan)
-    return rates, low, high, weights
+    return Cells(rates, episodes, weights)
 
 
 def _held_weights(curve: Curve) -> Floats:

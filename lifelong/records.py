@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -63,7 +63,9 @@ class LossRecord:
 class EvalRecord:
     """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
 
-    The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot).
+    The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). Which of
+    the goal's atoms held before the policy acted, at any time from then on, and at the end is said for each
+    episode; older records do not say it.
     """
 
     kind: Literal["eval"] = field(default="eval", init=False)
@@ -75,6 +77,10 @@ class EvalRecord:
     lengths: tuple[int, ...]  # control steps
     init_states: tuple[int, ...]
     seconds: float
+    atoms: tuple[str, ...] = ()  # the parts of the goal: (On plate_1 stove_1)
+    atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
+    atoms_ever: tuple[tuple[bool, ...], ...] = ()
+    atoms_at_end: tuple[tuple[bool, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if self.phase not in ("curve", "matrix"):
@@ -84,6 +90,10 @@ class EvalRecord:
                 "an evaluation has as many successes as lengths and initial states, at least one; got "
                 f"{len(self.successes)}, {len(self.lengths)} and {len(self.init_states)}"
             )
+        for name in ("atoms_at_start", "atoms_ever", "atoms_at_end"):
+            shape = [len(row) for row in getattr(self, name)]
+            if self.atoms and shape != [len(self.atoms)] * len(self.successes):
+                raise ValueError(f"{name} of an evaluation has a row for each episode, a column for each atom")
 
     @property
     def rate(self) -> float:
@@ -98,6 +108,18 @@ class PhaseRecord:
     kind: Literal["phase"] = field(default="phase", init=False)
     phase: str
     seconds: float
+
+
+@dataclass(frozen=True)
+class CostRecord:
+    """What learning a task took beside the time of its epochs and evaluations; see `lifelong.costs` for the names.
+
+    A task may have several, each with some of the costs.
+    """
+
+    kind: Literal["cost"] = field(default="cost", init=False)
+    task: int
+    costs: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -119,10 +141,10 @@ class RunEndRecord:
     finished: str
 
 
-Record = RunRecord | LossRecord | EvalRecord | PhaseRecord | TaskEndRecord | RunEndRecord
+Record = RunRecord | LossRecord | EvalRecord | PhaseRecord | CostRecord | TaskEndRecord | RunEndRecord
 RECORD_TYPES: Mapping[str, type] = {
     t.__dataclass_fields__["kind"].default: t
-    for t in (RunRecord, LossRecord, EvalRecord, PhaseRecord, TaskEndRecord, RunEndRecord)
+    for t in (RunRecord, LossRecord, EvalRecord, PhaseRecord, CostRecord, TaskEndRecord, RunEndRecord)
 }
 
 
@@ -210,9 +232,10 @@ def from_line(line: bytes) -> Record:
     kind = values.pop("kind", None) if isinstance(values, dict) else None
     if kind not in RECORD_TYPES:
         raise ValueError(f"unknown kind of record {kind!r}; valid: {', '.join(RECORD_TYPES)}")
-    expected = {f.name: f.type for f in fields(RECORD_TYPES[kind]) if f.init}
-    if expected.keys() != values.keys():
-        odd = sorted(expected.keys() ^ values.keys())
+    known = [f for f in fields(RECORD_TYPES[kind]) if f.init]
+    expected = {f.name: f.type for f in known}
+    optional = {f.name for f in known if f.default is not MISSING}  # of records that older versions wrote
+    if odd := sorted((expected.keys() ^ values.keys()) - (optional - values.keys())):
         raise ValueError(f"a {kind!r} record has the keys {', '.join(expected)}; missing or unknown: {odd}")
     return RECORD_TYPES[kind](**{k: _checked(kind, k, v, expected[k]) for k, v in values.items()})
 
