@@ -1,0 +1,107 @@
+"""What test_distributed.py runs in several processes: python -m torch.distributed.run ... ranks_worker.py MODE FOLDER."""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from lifelong import checkpoints
+from lifelong.distributed import Ranks, joined
+from lifelong.evaluation import EvalSettings
+from lifelong.nn.augmentation import RandomShift
+from lifelong.policies import BCTransformer
+from lifelong.records import LossRecord
+from lifelong.results import ResultLog
+from lifelong.sequence import TaskSequence
+from lifelong.training import FitSettings, seeded
+from tests.lifelong import test_sequence as walk
+
+CONFIGS = Path(__file__).parents[2] / "configs" / "algo"
+ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("*.yaml"))
+STEPS, TASKS = 12, 2
+# Seven windows: two processes get three and four. One step is an epoch, so that records hold every step's loss.
+FIT = FitSettings(
+    epochs=STEPS, steps_per_epoch=1, batch_size=7, lr=3e-3, warmup_steps=2, grad_clip=1.0, precision="fp32"
+)
+EVAL = EvalSettings(episodes=2, curve_episodes=2, every=4, horizon=4, settle_steps=0, precision="fp32")
+
+
+def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float], dict[str, torch.Tensor]]:
+    """Two tasks with an algorithm as it is configured; every step's loss, and the weights at the end.
+
+    Without dropout: its masks are each rank's own.
+    """
+    walk.ALGORITHMS[algo] = lambda: instantiate(OmegaConf.load(CONFIGS / f"{algo}.yaml"))
+    with seeded(7):
+        policy = BCTransformer(
+            spec=walk.SPEC, embed_dim=8, image_width=8, stage_blocks=[1], stem_pool=False, layers=1, heads=2,
+            head_dim=4, mlp_dim=8, head_hidden=8, head_layers=1, modes=2, min_std=0.05, dropout=0.0,
+        )  # fmt: skip
+    parts = walk.parts(folder / algo, algo)
+    parts = replace(
+        parts,
+        instructions=parts.instructions[:TASKS],
+        policy=policy,
+        augment=RandomShift(1),
+        fit=replace(FIT, **changes),
+        eval=EVAL,
+        ranks=ranks,
+    )
+    TaskSequence(parts).run()
+    losses = [record.loss for record in parts.directory.log.read().of(LossRecord)]
+    return losses, {name: value.clone() for name, value in policy.state_dict().items()}
+
+
+def refuse(*args, **kwargs):
+    raise AssertionError("only the first process writes")
+
+
+def learn_all(folder: Path, ranks: Ranks) -> None:
+    """All algorithms; each rank leaves its weights, and the first the losses."""
+    if not ranks.first:
+        checkpoints_save, checkpoints.save, ResultLog.append = checkpoints.save, refuse, refuse
+    else:
+        checkpoints_save = checkpoints.save
+    for algo in ALGORITHMS:
+        losses, weights = learn(algo, folder / "runs", ranks)
+        checkpoints_save(folder / f"{algo}_{ranks.rank}.safetensors", weights)
+        if ranks.first:
+            (folder / f"{algo}.json").write_text(json.dumps(losses))
+
+
+def talk(folder: Path, ranks: Ranks) -> None:
+    """What processes tell each other, with nothing to learn."""
+    shared = ranks.share(lambda: {"from": ranks.rank, "path": folder})
+    assert shared == {"from": 0, "path": folder}
+    a, b, c = (torch.nn.Parameter(torch.zeros(2, 2)) for _ in range(3))
+    a.grad = torch.full((2, 2), float(ranks.rank + 1))
+    if not ranks.first:
+        b.grad = torch.arange(4.0).view(2, 2)
+    ranks.sum_gradients([a, b, c])
+    assert torch.equal(a.grad, torch.full((2, 2), 3.0))
+    assert torch.equal(b.grad, torch.arange(4.0).view(2, 2)), "one rank alone has a gradient"
+    assert c.grad is None, "no rank has one"
+    drifted = torch.full((3,), float(ranks.rank), requires_grad=True)
+    ranks.agree([drifted])
+    assert torch.equal(drifted, torch.zeros(3))
+    (folder / f"talked_{ranks.rank}").touch()
+
+
+def die(folder: Path, ranks: Ranks) -> None:
+    """The second process is killed; the first waits for it, for ever if nobody ends it."""
+    if not ranks.first:
+        os.kill(os.getpid(), signal.SIGKILL)
+    ranks.wait()
+    (folder / "went_on").touch()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    with joined() as ranks:
+        {"learn": learn_all, "talk": talk, "die": die}[sys.argv[1]](Path(sys.argv[2]), ranks)

@@ -1,0 +1,107 @@
+"""Several processes train as one: the same losses, the same weights on all, and none goes on alone."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from lifelong import checkpoints
+from lifelong.distributed import Ranks, joined
+from lifelong.errors import ConfigError
+from tests.lifelong import ranks_worker as worker
+
+ROOT = Path(__file__).parents[2]
+
+
+def torchrun(processes: int, *arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess:
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        str(processes),
+    ]
+    env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [*command, *arguments], cwd=cwd, env=env, capture_output=True, text=True, timeout=600, check=False
+    )
+
+
+def run_worker(mode: str, folder: Path) -> subprocess.CompletedProcess:
+    return torchrun(2, str(ROOT / "tests" / "lifelong" / "ranks_worker.py"), mode, str(folder))
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("two")
+    done = run_worker("learn", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", worker.ALGORITHMS)
+def test_two_processes_learn_as_one_with_the_same_batch(algo, learned, tmp_path):
+    whole, _ = worker.learn(algo, tmp_path, Ranks())
+    split = json.loads((learned / f"{algo}.json").read_text())
+    assert len(split) >= worker.STEPS
+    assert split == pytest.approx(whole, rel=1e-5)
+    assert split[-1] != split[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", worker.ALGORITHMS)
+def test_all_processes_end_with_the_same_weights(algo, learned):
+    first, second = (checkpoints.load(learned / f"{algo}_{rank}.safetensors") for rank in (0, 1))
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+
+
+def test_what_processes_tell_each_other(tmp_path):
+    done = run_worker("talk", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"talked_0", "talked_1"}
+
+
+def test_one_that_dies_ends_all(tmp_path):
+    done = run_worker("die", tmp_path)
+    assert done.returncode != 0
+    assert "another process of this run has ended" in done.stderr or "SIGKILL" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
+@pytest.mark.parametrize("count", [1, 7, 32])
+def test_every_row_is_somebodys_and_shares_are_even(size, count):
+    rows = [range(count)[Ranks(rank, size).rows(count)] for rank in range(size)]
+    assert [i for part in rows for i in part] == list(range(count))
+    assert max(map(len, rows)) - min(map(len, rows)) <= 1
+
+
+def test_alone_nothing_is_said():
+    value, made = torch.ones(3), []
+    with joined() as ranks:
+        assert ranks == Ranks() and ranks.first
+        ranks.wait()
+        assert ranks.share(made.append, 5) is None and made == [5]
+        assert torch.equal(ranks.sum(value), torch.ones(3))
+
+
+def test_devices_that_cannot_be_are_named(monkeypatch):
+    with pytest.raises(ConfigError, match="valid: auto, cpu, cuda"):
+        Ranks().device("tpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert Ranks().device("auto") == torch.device("cpu")
+    with pytest.raises(ConfigError, match="finds no GPU"):
+        Ranks().device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for ranks, name in ((Ranks(2, 3, 2), "cuda"), (Ranks(0, 2, 0), "cuda:1")):
+        with pytest.raises(ConfigError, match="need a GPU each"):
+            ranks.device(name)
