@@ -9,7 +9,7 @@ from libero_env.robot import REST_QPOS
 _STEPS, _GAIN, _REST = 60, 0.5, 0.03
 _POS, _TURN = 0.006, 0.06  # m and rad, what counts as reached
 _MARGIN = 0.08  # rad, kept from the limits of a joint
-_STRAIGHT = -0.4  # rad, of the elbow: from a straight arm the controller does not come back
+_STRAIGHT = -0.9  # rad, of the elbow: at -0.47 the arm is straight, and beyond it bends the other way and does not come back
 _SITE = "gripper0_grip_site"
 
 
