@@ -35,11 +35,13 @@ class BenchmarkSettings:
         suite: Name of a suite.
         order: One of its published sequences.
         tasks: The first so many of the sequence, or a list of names or indices, in the order to be learned.
+        horizon: Control steps in which a quick policy solves any of them, for `eval.horizon` to refer to.
     """
 
     suite: str
     order: int = 0
     tasks: int | Sequence[int | str] | None = None
+    horizon: int = 600
 
     def sequence(self) -> tuple[Task, ...]:
         """The tasks in learning order.
