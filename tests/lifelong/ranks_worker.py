@@ -1,4 +1,4 @@
-"""What test_distributed.py runs in several processes: python -m torch.distributed.run ... ranks_worker.py MODE FOLDER."""
+"""What test_distributed.py runs in several processes: torchrun ... ranks_worker.py MODE FOLDER."""
 
 import json
 import os
