@@ -14,7 +14,7 @@ Labels. Some demonstrations are made with disturbed actions. `actions` is what w
 `expert_actions`, where present, is what the expert wanted at that moment, which is what there is to learn.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -73,25 +73,75 @@ def read_demos(
         DemoError: a file that is absent, truncated or empty, a key that is missing or of the wrong shape or type; the
             message names file, demonstration, key and what was expected. Nothing is returned then.
     """
-    demos: list[Demo] = []
+    return list(iter_demos(path, obs_keys, limit, labels=labels, pairing=pairing))
+
+
+def iter_demos(
+    path: str | Path,
+    obs_keys: Sequence[str] | None = None,
+    limit: int | None = None,
+    *,
+    labels: Literal["expert", "executed"] = "expert",
+    pairing: Literal["stored", "aligned"] = "stored",
+) -> Iterator[Demo]:
+    """Read demonstrations one after the other, for files that do not fit in memory; see `read_demos`.
+
+    Raises:
+        DemoError: as for `read_demos`, before the first one is given; only damage that shows when an array is read
+            comes later.
+    """
+    wanted: list[tuple[Path, list[str], list[str]]] = []
+    count, shapes = 0, None
     for file in demo_files(path):
         with opened(file) as handle:
-            names = demo_names(handle, file)[: None if limit is None else max(limit - len(demos), 0)]
+            names = demo_names(handle, file)[: None if limit is None else max(limit - count, 0)]
             keys = _wanted_keys(handle, file, names, obs_keys)
             for name in names:
                 check_demo(handle["data"][name], file, name, keys)
-            demos += [_load(handle["data"], file, name, keys, labels) for name in names]
-    if not demos:
+                shapes = _same_shapes(handle["data"][name], keys, path, name, shapes)
+        wanted.append((file, names, keys))
+        count += len(names)
+    if not count:
         raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0. Record them again")
-    shapes = {key: value.shape[1:] for key, value in demos[0].obs.items()}
-    for demo in demos:
-        for key, shape in shapes.items():
-            if key not in demo.obs or demo.obs[key].shape[1:] != shape:
-                found = demo.obs[key].shape[1:] if key in demo.obs else "nothing"
-                raise DemoError(
-                    f"{path}: {demo.name}/obs/{key} holds {found}; expected {shape} as in {demos[0].name}"
-                )
-    return [aligned(demo) for demo in demos] if pairing == "aligned" else demos
+    for file, names, keys in wanted:
+        with opened(file) as handle:
+            for name in names:
+                demo = _load(handle["data"], file, name, keys, labels)
+                yield aligned(demo) if pairing == "aligned" else demo
+
+
+def demo_lengths(
+    path: str | Path, limit: int | None = None, *, pairing: Literal["stored", "aligned"] = "stored"
+) -> list[int]:
+    """Steps of each demonstration that `iter_demos` gives, without reading any.
+
+    Raises:
+        DemoError: there is no whole file, or a demonstration without actions.
+    """
+    lengths: list[int] = []
+    for file in demo_files(path):
+        with opened(file) as handle:
+            names = demo_names(handle, file)[: None if limit is None else max(limit - len(lengths), 0)]
+            shifted = pairing == "aligned" and _pairing(handle["data"]) == "libero"
+            lengths += [
+                len(_dataset(handle["data"][name], "actions", file, name)) - shifted for name in names
+            ]
+    return lengths
+
+
+def _same_shapes(
+    group: h5py.Group, keys: list[str], path: str | Path, name: str, first: tuple[str, dict] | None
+) -> tuple[str, dict]:
+    """The first demonstration's name and shapes of an observation; raises DemoError where this one differs."""
+    found = {key: group[f"obs/{key}"].shape[1:] for key in keys}
+    if first is None:
+        return name, found
+    for key, shape in first[1].items():
+        if found.get(key) != shape:
+            raise DemoError(
+                f"{path}: {name}/obs/{key} holds {found.get(key, 'nothing')}; expected {shape} as in {first[0]}"
+            )
+    return first
 
 
 def aligned(demo: Demo) -> Demo:
@@ -254,4 +304,9 @@ def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str)
     states, rewards, dones = (read(key) if key in group else None for key in ("states", "rewards", "dones"))
     ends = [x[-1] for x in (rewards, dones) if x is not None]
     success = bool(group.attrs.get("success", any(end > 0 for end in ends) if ends else True))
-    return Demo(name, actions, obs, states, rewards, dones, success, data.attrs.get("pairing", "libero"))
+    return Demo(name, actions, obs, states, rewards, dones, success, _pairing(data))
+
+
+def _pairing(data: h5py.Group) -> Pairing:
+    """The original's files do not say it."""
+    return data.attrs.get("pairing", "libero")

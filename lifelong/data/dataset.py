@@ -4,15 +4,15 @@ Shape legend: F frames of all demonstrations, W = F windows, B batch, T time, V 
 L language embedding.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from libero_env.demos import Demo, read_demos
+from libero_env.demos import Demo
+from lifelong.data.source import DemoArrays, DemoSource, check_fits, check_language, last_frames
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation, PolicySpec
 
@@ -35,6 +35,8 @@ class SequenceVLDataset:
     language: Tensor  # (L,) float32
     task_id: int
     seq_len: int
+    target: torch.device | None = None  # where batches are wanted; None: where the frames are
+    pin: bool = False  # gather them in page-locked memory first, so that the copy to a GPU is asynchronous
 
     def __post_init__(self) -> None:
         if not len(self.actions):
@@ -68,9 +70,9 @@ class SequenceVLDataset:
             DemoError: the file is broken; names file, demonstration, key and what was expected.
             DataError: the file is sound but does not fit the spec.
         """
-        keys = [*spec.views, *spec.proprio]
-        demos = read_demos(path, keys, limit, pairing=pairing, labels=labels)
-        return cls.from_demos(demos, spec=spec, language=language, task_id=task_id, source=str(path))
+        source = DemoSource(Path(path), spec, limit, pairing, labels)
+        language, lengths = check_language(language, spec), source.lengths()
+        return cls._filled(source.demos(), lengths, spec, language, task_id)
 
     @classmethod
     def from_demos(
@@ -87,30 +89,26 @@ class SequenceVLDataset:
         Raises:
             DataError: they do not fit the spec; names source, demonstration, key and what was expected.
         """
-        language = torch.as_tensor(language, dtype=torch.float32)
-        if language.shape != (spec.language_dim,):
-            raise DataError(
-                f"the language embedding has shape {tuple(language.shape)}; the policy's spec expects "
-                f"({spec.language_dim},). Choose the language encoder that the spec was made for"
-            )
+        language = check_language(language, spec)
         for demo in demos:
-            _check(demo, spec, source)
-        demos = [demo for demo in demos if len(demo.actions)]
-        lengths = [len(demo.actions) for demo in demos]
-        ends = torch.tensor(lengths, dtype=torch.int64).cumsum(0)
-        frames = int(ends[-1]) if lengths else 0
+            check_fits(demo, spec, source)
+        return cls._filled(demos, [len(demo) for demo in demos], spec, language, task_id)
+
+    @classmethod
+    def _filled(
+        cls, demos: Iterable[Demo], lengths: list[int], spec: PolicySpec, language: Tensor, task_id: int
+    ) -> "SequenceVLDataset":
+        """Arrays of the right size, filled one demonstration after the other."""
+        frames, end = sum(lengths), 0
         images = torch.empty(frames, len(spec.views), *spec.image_size, 3, dtype=torch.uint8)
         proprio = {name: torch.empty(frames, size) for name, size in spec.proprio.items()}
         actions = torch.empty(frames, spec.action_dim)
-        for demo, end in zip(demos, ends.tolist(), strict=True):
-            rows = slice(end - len(demo.actions), end)
-            for view, key in enumerate(spec.views):
-                images[rows, view] = torch.from_numpy(np.ascontiguousarray(demo.obs[key]))
+        for demo in demos:
+            arrays, rows = DemoArrays.of(demo, spec), slice(end, end + len(demo))
+            images[rows], actions[rows], end = arrays.images, arrays.actions, rows.stop
             for name, array in proprio.items():
-                array[rows] = torch.from_numpy(np.asarray(demo.obs[name], dtype=np.float32))
-            actions[rows] = torch.from_numpy(np.asarray(demo.actions, dtype=np.float32))
-        last = (ends - 1).repeat_interleave(torch.tensor(lengths, dtype=torch.int64))
-        return cls(images, proprio, actions, last, language, task_id, spec.seq_len)
+                array[rows] = arrays.proprio[name]
+        return cls(images, proprio, actions, last_frames(lengths), language, task_id, spec.seq_len)
 
     def __len__(self) -> int:
         """Number of windows, W."""
@@ -138,18 +136,30 @@ class SequenceVLDataset:
                 f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
             )
         frames = self.frames(indices)
-        gather = lambda x: x.index_select(0, frames.flatten()).view(*frames.shape, *x.shape[1:])  # noqa: E731
+        gather = lambda x: self._gather(x, frames)  # noqa: E731
         language = self.language.expand(len(indices), -1)
         observation = Observation(
             gather(self.images), {k: gather(v) for k, v in self.proprio.items()}, language
         )
-        return Batch(observation, gather(self.actions), torch.full_like(indices, self.task_id), indices)
+        batch = Batch(observation, gather(self.actions), torch.full_like(indices, self.task_id), indices)
+        return batch if self.target is None else batch.to(self.target)
+
+    def _gather(self, array: Tensor, frames: Tensor) -> Tensor:
+        """(F, ...) and (B, T) to (B, T, ...)."""
+        shape = (frames.numel(), *array.shape[1:])
+        out = torch.empty(shape, dtype=array.dtype, pin_memory=True) if self.pin else None
+        return torch.index_select(array, 0, frames.flatten(), out=out).view(*frames.shape, *array.shape[1:])
 
     def to(self, device: torch.device | str) -> "SequenceVLDataset":
         """The same windows held on another device."""
         proprio = {k: v.to(device) for k, v in self.proprio.items()}
-        arrays = [x.to(device) for x in (self.actions, self.last, self.language)]
-        return SequenceVLDataset(self.images.to(device), proprio, *arrays, self.task_id, self.seq_len)
+        names = ("images", "actions", "last", "language")
+        arrays = {name: getattr(self, name).to(device) for name in names}
+        return replace(self, proprio=proprio, target=None, pin=False, **arrays)
+
+    def delivering(self, device: torch.device | str, *, pin: bool = False) -> "SequenceVLDataset":
+        """The same windows held where they are, with batches given on another device."""
+        return replace(self, target=torch.device(device), pin=pin)
 
     def nbytes(self) -> int:
         """Bytes of memory the frames take."""
@@ -176,25 +186,3 @@ def batches(
     for indices in order.split(batch_size):
         if len(indices) == batch_size or not drop_last:
             yield dataset.batch(indices)
-
-
-def _check(demo: Demo, spec: PolicySpec, source: str) -> None:
-    """Raises DataError when a demonstration does not fit the spec."""
-    expected: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
-    expected |= {name: (size,) for name, size in spec.proprio.items()}
-    where = f"{source}: {demo.name}"
-    if demo.actions.ndim != 2 or demo.actions.shape[1] != spec.action_dim:
-        raise DataError(f"{where}/actions is {demo.actions.shape}; expected (T, {spec.action_dim})")
-    for key, shape in expected.items():
-        if key not in demo.obs:
-            raise DataError(f"{where}/obs/{key} is missing; it has {', '.join(sorted(demo.obs))}")
-        found = demo.obs[key].shape
-        if found != (len(demo.actions), *shape):
-            hint = ""
-            if key in spec.views and len(found) == 4:
-                hint = f". Set the policy's image_size to {list(found[1:3])}, or record at {list(shape[:2])}"
-            raise DataError(
-                f"{where}/obs/{key} is {found}; the policy expects {(len(demo.actions), *shape)}{hint}"
-            )
-        if key in spec.views and demo.obs[key].dtype != np.uint8:
-            raise DataError(f"{where}/obs/{key} is {demo.obs[key].dtype}; expected uint8 in 0..255")

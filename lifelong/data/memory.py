@@ -1,14 +1,24 @@
 """Memory of past tasks for rehearsal."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from lifelong.data.dataset import SequenceVLDataset
 from lifelong.errors import DataError
 from lifelong.types import Batch
+
+
+class TaskWindows(Protocol):
+    """What the memory needs of a task's windows, whatever reads and holds them."""
+
+    @property
+    def task_id(self) -> int: ...
+
+    def __len__(self) -> int: ...
+
+    def batch(self, indices: Tensor) -> Batch: ...
 
 
 class ReplayMemory:
@@ -29,7 +39,7 @@ class ReplayMemory:
         if budget < 1:
             raise DataError(f"the memory's budget is {budget} windows; it must be at least 1")
         self.budget = budget
-        self._datasets: dict[int, SequenceVLDataset] = {}
+        self._datasets: dict[int, TaskWindows] = {}
         self._indices: dict[int, Tensor] = {}  # task id -> (n,) window indices
 
     def __len__(self) -> int:
@@ -41,7 +51,7 @@ class ReplayMemory:
         """Windows held of each task, by task id."""
         return {task: len(indices) for task, indices in self._indices.items()}
 
-    def add(self, dataset: SequenceVLDataset, generator: torch.Generator) -> None:
+    def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Takes a task in; its windows are drawn with the generator.
 
         Raises:
@@ -87,7 +97,7 @@ class ReplayMemory:
         """Budget and indices by task id; the frames are read again from the demonstrations."""
         return {"budget": self.budget, "indices": {str(task): i.clone() for task, i in self._indices.items()}}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, SequenceVLDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Takes up what `state_dict` gave.
 
         Args:

@@ -1,0 +1,148 @@
+"""Windows read through robomimic, the library that the original LIBERO reads its data with.
+
+robomimic is optional: `pip install --no-deps robomimic termcolor` is enough, as only its dataset is used.
+"""
+
+import contextlib
+import io
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from libero_env.demos import demo_files, demo_names, opened
+from lifelong.data.source import DemoSource, check_language
+from lifelong.errors import DataError
+from lifelong.types import Batch, Observation
+
+
+class RobomimicWindows:
+    """The windows that `SequenceVLDataset` has, each read by robomimic's `SequenceDataset` when it is asked for.
+
+    robomimic keeps the low-dimensional data in memory and reads pictures from the file, as the original LIBERO
+    has it do. It repeats the last frame past the end of a demonstration, as `SequenceVLDataset` does; it knows
+    nothing of pairings, so for `aligned` windows of a file that pairs each action with the observation after it
+    it is asked for one step more, and observations and actions are taken one step apart.
+    """
+
+    def __init__(
+        self,
+        source: DemoSource,
+        *,
+        language: Tensor,
+        task_id: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Open a file.
+
+        Args:
+            source: What is read; a file, not a folder of parts.
+            language: (L,) embedding of the instruction.
+            task_id: Position in the task sequence.
+            device: Where batches are wanted.
+
+        Raises:
+            DemoError: The file is broken.
+            DataError: It does not fit the spec, or robomimic is not installed.
+        """
+        self.source, self.task_id, self.seq_len = source, task_id, source.spec.seq_len
+        self.device = torch.device(device)
+        self.language = check_language(language, source.spec)
+        next(source.demos())  # refuses what does not fit
+        self._labels, self._shift = self._layout()
+        self._windows = _sequence_dataset(source, self._labels, self.seq_len + self._shift)
+        lengths = torch.tensor(source.lengths())
+        self._steps = torch.cat([torch.arange(n) for n in lengths])  # (W,) of a window in its demonstration
+        self._left = lengths.repeat_interleave(lengths) - 1 - self._steps  # (W,) frames that come after it
+        starts = (lengths + self._shift).cumsum(0) - (lengths + self._shift)
+        self._indices = starts.repeat_interleave(lengths) + self._steps  # (W,) robomimic's index
+
+    def _layout(self) -> tuple[str, int]:
+        """Where the labels are, and by how many steps actions and observations are apart."""
+        files = demo_files(self.source.path)
+        if files != [self.source.path]:
+            raise DataError(f"{self.source.path}: robomimic reads single files; use data.backend=native")
+        with opened(files[0]) as file:
+            names = demo_names(file, files[0])[: self.source.limit]
+            labelled = {"expert_actions" in file["data"][name] for name in names}
+            if self.source.labels == "expert" and len(labelled) > 1:
+                raise DataError(
+                    f"{files[0]}: some demonstrations have expert_actions and some have not, which robomimic "
+                    "cannot read; use data.labels=executed or data.backend=native"
+                )
+            expert = self.source.labels == "expert" and True in labelled
+            shifted = (
+                self.source.pairing == "aligned" and file["data"].attrs.get("pairing", "libero") == "libero"
+            )
+        return ("expert_actions" if expert else "actions"), int(shifted)
+
+    def __len__(self) -> int:
+        """Number of windows, W."""
+        return len(self._steps)
+
+    @property
+    def demos(self) -> int:
+        """Number of demonstrations."""
+        return len(self.source.lengths())
+
+    def batch(self, indices: Tensor) -> Batch:
+        """The windows of these indices, (B,) int64 in [0, W), as one batch.
+
+        Raises:
+            DataError: An index out of range.
+        """
+        indices = torch.as_tensor(indices, dtype=torch.int64, device="cpu")
+        if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
+            raise DataError(
+                f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
+            )
+        spec, windows = self.source.spec, [self._window(int(i)) for i in indices]
+        views = [np.stack([w["obs"][view] for w in windows])[:, :, ::-1] for view in spec.views]
+        images = torch.from_numpy(np.stack(views, axis=2))  # the file has OpenGL rows
+        floats = lambda arrays: torch.from_numpy(np.stack(arrays).astype(np.float32))  # noqa: E731
+        proprio = {name: floats([w["obs"][name] for w in windows]) for name in spec.proprio or ()}
+        observation = Observation(images, proprio, self.language.expand(len(indices), -1))
+        actions = floats([w["actions"] for w in windows])
+        task_ids = torch.full_like(indices, self.task_id)
+        return Batch(observation, actions, task_ids, indices).to(self.device)
+
+    def _window(self, index: int) -> dict[str, Any]:
+        """A window as arrays, (T, ...) each; observations at its steps, actions so many later as they are apart."""
+        raw = self._windows[int(self._indices[index])]
+        steps = np.minimum(np.arange(self.seq_len), int(self._left[index]))
+        keys = [*self.source.spec.views, *(self.source.spec.proprio or ())]
+        observations = {key: raw["obs"][key][steps] for key in keys}
+        return {"obs": observations, "actions": raw[self._labels][steps + self._shift]}
+
+
+def _sequence_dataset(source: DemoSource, labels: str, steps: int) -> Any:
+    """robomimic's dataset of a file, which it is told to be silent about."""
+    try:
+        from robomimic.utils import obs_utils
+        from robomimic.utils.dataset import SequenceDataset
+    except ImportError as error:
+        raise DataError(
+            f"data.backend=robomimic needs robomimic ({error}): pip install --no-deps robomimic termcolor, or "
+            "data.backend=native"
+        ) from error
+    rgb, low_dim = list(source.spec.views), list(source.spec.proprio or ())
+    silent = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(silent), contextlib.redirect_stderr(silent):
+            # global in robomimic: which keys are pictures
+            obs_utils.initialize_obs_utils_with_obs_specs({"obs": {"low_dim": low_dim, "rgb": rgb}})
+            return SequenceDataset(
+                hdf5_path=str(source.path),
+                obs_keys=(*rgb, *low_dim),
+                dataset_keys=(labels,),
+                seq_length=steps,
+                hdf5_cache_mode="low_dim",
+                hdf5_use_swmr=False,
+                load_next_obs=False,
+            )
+    except KeyError as error:
+        raise DataError(
+            f"{source.path}: robomimic misses something in the file ({error}), such as the attribute "
+            "num_samples of each demonstration; use data.backend=native"
+        ) from error

@@ -1,0 +1,305 @@
+"""Wherever frames are held and whatever reads them, batches are the same to the bit."""
+
+import json
+import multiprocessing
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from libero_env.demos import Demo, demo_lengths, read_demos
+from libero_env.errors import DemoError
+from lifelong.data import DemoSource, ReplayMemory, SequenceVLDataset, frame_cache, loading, open_windows
+from lifelong.data.frame_cache import cache_root
+from lifelong.data.loading import choose
+from lifelong.errors import DataError
+from lifelong.types import Batch, PolicySpec
+
+pytestmark = pytest.mark.unit
+SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
+LENGTHS = (7, 2, 4, 12)
+LANGUAGE = torch.arange(4.0)
+CPU, GPU = torch.device("cpu"), torch.device("cuda")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def write_file(
+    path: Path,
+    seed: int = 0,
+    lengths: tuple[int, ...] = LENGTHS,
+    pairing: str = "libero",
+    expert: bool = False,
+) -> Path:
+    """A demonstration file in the original's layout, with pictures upside down."""
+    rng = np.random.default_rng(seed)
+    with h5py.File(path, "w") as file:
+        file.create_group("data").attrs["pairing"] = pairing
+        for number, steps in enumerate(lengths):
+            group = file.create_group(f"data/demo_{number}")
+            group.attrs["num_samples"] = steps
+            group["actions"] = rng.uniform(-1, 1, (steps, 7))
+            if expert:
+                group["expert_actions"] = rng.uniform(-1, 1, (steps, 7))
+            for view in SPEC.views:
+                group[f"obs/{view}"] = rng.integers(0, 256, (steps, *SPEC.image_size, 3), dtype=np.uint8)
+            for key, size in SPEC.proprio.items():
+                group[f"obs/{key}"] = rng.normal(size=(steps, size))
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return write_file(tmp_path / "task_demo.hdf5")
+
+
+def assert_same(one: Batch, other: Batch) -> None:
+    one, other = one.to("cpu"), other.to("cpu")
+    assert torch.equal(one.observation.images, other.observation.images)
+    assert one.observation.images.dtype == other.observation.images.dtype == torch.uint8
+    assert torch.equal(one.observation.language, other.observation.language)
+    assert one.observation.proprio.keys() == other.observation.proprio.keys()
+    for name, values in one.observation.proprio.items():
+        assert torch.equal(values, other.observation.proprio[name])
+    for name in ("actions", "task_ids", "window_ids"):
+        assert torch.equal(getattr(one, name), getattr(other, name))
+
+
+def everything(dataset) -> Batch:
+    """All windows, in another order than the file's."""
+    return dataset.batch(torch.randperm(len(dataset), generator=torch.Generator().manual_seed(1)))
+
+
+@pytest.mark.parametrize("pairing", ["aligned", "stored"])
+@pytest.mark.parametrize("memory", ["auto", "host", "device", "mmap"])
+def test_batches_are_the_same_in_all_memories(path: Path, memory: str, pairing: str) -> None:
+    source = DemoSource(path, SPEC, limit=3, pairing=pairing)
+    plain = SequenceVLDataset.from_file(
+        path, spec=SPEC, language=LANGUAGE, task_id=3, limit=3, pairing=pairing
+    )
+    held = open_windows(source, language=LANGUAGE, task_id=3, memory=memory)
+    assert len(held) == len(plain) == sum(source.lengths())
+    assert source.nbytes() == plain.images.nbytes
+    assert_same(everything(held), everything(plain))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("memory", ["auto", "host", "pinned", "device", "mmap"])
+def test_batches_are_the_same_on_a_gpu(path: Path, memory: str) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    source = DemoSource(path, SPEC)
+    held = open_windows(source, language=LANGUAGE, device="cuda", memory=memory)
+    batches = [held.batch(torch.arange(4) + k % 8) for k in range(64)]  # page-locked memory is used again
+    assert all(b.actions.is_cuda and b.observation.images.is_cuda for b in batches)
+    plain = open_windows(source, language=LANGUAGE, memory="host")
+    for k, batch in enumerate(batches):
+        assert_same(batch, plain.batch(torch.arange(4) + k % 8))
+
+
+def test_batches_go_where_they_are_wanted(path: Path) -> None:
+    held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, device="meta", memory="host")
+    batch = held.batch(torch.arange(3))
+    assert held.images.device == CPU
+    assert batch.observation.images.device == batch.actions.device == torch.device("meta")
+
+
+def test_frames_are_written_once_and_found_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = DemoSource(path, SPEC)
+    first = open_windows(source, language=LANGUAGE, memory="mmap")
+    monkeypatch.setattr(frame_cache, "_write_arrays", lambda *_: pytest.fail("written again"))
+    again = open_windows(DemoSource(path, PolicySpec(image_size=(6, 8), language_dim=4, seq_len=2)),
+                         language=LANGUAGE, memory="mmap")  # fmt: skip
+    assert torch.equal(again.images, first.images)
+    assert again.batch(torch.arange(3)).actions.shape == (3, 2, 7)
+    assert not list(cache_root().glob("*.part")) and not list(cache_root().glob(".*.part"))
+
+
+def test_other_settings_are_other_frames(path: Path) -> None:
+    expert = write_file(path.with_name("other_demo.hdf5"), expert=True)
+    kinds = [{}, {"limit": 2}, {"pairing": "stored"}, {"labels": "executed"}]
+    for kind in kinds:
+        source = DemoSource(expert, SPEC, **kind)
+        plain = open_windows(source, language=LANGUAGE, memory="host")
+        assert_same(everything(open_windows(source, language=LANGUAGE, memory="mmap")), everything(plain))
+    assert len(list(cache_root().glob("other_demo-*"))) == len(kinds)
+
+
+def test_a_file_that_was_recorded_anew_is_read_anew(path: Path) -> None:
+    source = DemoSource(path, SPEC)
+    before = open_windows(source, language=LANGUAGE, memory="mmap")
+    kept, stat = before.images.clone(), path.stat()
+    write_file(path, seed=1)
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # not even its time tells
+    assert path.stat().st_size == stat.st_size
+    after = open_windows(source, language=LANGUAGE, memory="mmap")
+    assert_same(everything(after), everything(open_windows(source, language=LANGUAGE, memory="host")))
+    assert not torch.equal(after.images, kept)
+    assert torch.equal(before.images, kept)  # whoever has the old frames open keeps them
+    assert len(list(cache_root().glob("task_demo-*"))) == 1
+
+
+def test_what_a_killed_process_left_is_not_taken_for_whole(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = DemoSource(path, SPEC)
+
+    def killed(source: DemoSource, folder: Path) -> None:
+        (folder / "images.u8").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(frame_cache, "_write_arrays", killed)
+        patch.setattr(frame_cache.shutil, "rmtree", lambda *_, **__: None)  # a dead process cleans nothing up
+        with pytest.raises(KeyboardInterrupt):
+            open_windows(source, language=LANGUAGE, memory="mmap")
+    (left,) = cache_root().glob(".*.part")
+    held = open_windows(source, language=LANGUAGE, memory="mmap")
+    assert_same(everything(held), everything(open_windows(source, language=LANGUAGE, memory="host")))
+    assert not left.exists()
+
+
+def build(path: Path, counter: Path) -> None:
+    """In a process of its own: map the frames, and say so where they had to be written."""
+    write = frame_cache._write_arrays
+
+    def counted(source: DemoSource, folder: Path) -> tuple[int, ...]:
+        with open(counter, "a") as file:
+            file.write("written\n")
+        return write(source, folder)
+
+    frame_cache._write_arrays = counted
+    held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="mmap")
+    assert_same(everything(held), everything(open_windows(DemoSource(path, SPEC), language=LANGUAGE)))
+
+
+@pytest.mark.slow
+def test_of_several_processes_one_writes(path: Path, tmp_path: Path) -> None:
+    counter, context = tmp_path / "written", multiprocessing.get_context("spawn")
+    processes = [context.Process(target=build, args=(path, counter)) for _ in range(3)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(120)
+    assert [p.exitcode for p in processes] == [0, 0, 0]
+    assert counter.read_text() == "written\n"
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = type("Usage", (), {"free": 10})
+    monkeypatch.setattr(frame_cache.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(DataError, match=r"cannot be written.*LIBERO_CACHE.*data\.memory=host"):
+        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="mmap")
+    assert [p.suffix for p in cache_root().iterdir()] == [".lock"]
+
+
+def test_broken_files_are_refused_in_all_memories(path: Path) -> None:
+    with h5py.File(path, "a") as file:
+        del file["data/demo_1/obs/gripper_states"]
+    for memory in ("host", "mmap"):
+        with pytest.raises(DemoError, match=r"task_demo\.hdf5.*demo_1.*gripper_states"):
+            open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory)
+
+
+@pytest.mark.parametrize(
+    ("gpu", "host", "expected"),
+    [
+        ((90, 100), (90, 100), "device"),
+        ((60, 100), (90, 100), "pinned"),  # 40 % of the GPU is left to training
+        ((60, 100), (44, 100), "mmap"),
+        (None, (90, 100), "host"),
+        (None, (44, 100), "mmap"),
+    ],
+)
+def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
+    gib = 2**30
+    monkeypatch.setattr(loading, "host_memory", lambda: tuple(gib * n for n in host))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: tuple(gib * n for n in gpu))
+    assert choose(21 * gib, GPU if gpu else CPU) == expected
+
+
+def test_the_memory_of_this_machine_is_known() -> None:
+    free, total = loading.host_memory()
+    assert 0 < free < total
+
+
+def test_unknown_memories_and_backends_name_the_valid_ones(path: Path) -> None:
+    source = DemoSource(path, SPEC)
+    with pytest.raises(DataError, match="valid: auto, host, pinned, device, mmap"):
+        open_windows(source, language=LANGUAGE, memory="disk")
+    with pytest.raises(DataError, match="valid: native, robomimic"):
+        open_windows(source, language=LANGUAGE, backend="lerobot")
+    with pytest.raises(DataError, match="valid: auto, host, mmap"):
+        open_windows(source, language=LANGUAGE, memory="pinned")
+
+
+def test_a_memory_of_past_tasks_takes_windows_held_on_disk(path: Path) -> None:
+    def drawn(memory: str) -> Batch:
+        replay, draws = ReplayMemory(9), torch.Generator().manual_seed(0)
+        replay.add(open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory), draws)
+        return replay.sample(6, draws)
+
+    assert_same(drawn("mmap"), drawn("host"))
+
+
+def test_lengths_are_those_of_the_demonstrations(path: Path) -> None:
+    for pairing in ("stored", "aligned"):
+        for limit in (None, 2):
+            found: list[Demo] = read_demos(path, [], limit, pairing=pairing)
+            assert demo_lengths(path, limit, pairing=pairing) == [len(demo) for demo in found]
+
+
+@pytest.fixture
+def robomimic() -> None:
+    pytest.importorskip("robomimic.utils.dataset")
+
+
+@pytest.mark.parametrize("file_pairing", ["libero", "aligned"])
+@pytest.mark.parametrize("pairing", ["aligned", "stored"])
+@pytest.mark.parametrize("labels", ["expert", "executed"])
+def test_robomimic_gives_the_same_windows(robomimic, tmp_path, capfd, file_pairing, pairing, labels) -> None:
+    path = write_file(
+        tmp_path / "x_demo.hdf5", lengths=(*LENGTHS, *[3] * 8), pairing=file_pairing, expert=True
+    )
+    source = DemoSource(path, SPEC, limit=11, pairing=pairing, labels=labels)
+    plain = open_windows(source, language=LANGUAGE, task_id=2)
+    theirs = open_windows(source, language=LANGUAGE, task_id=2, backend="robomimic")
+    assert (len(theirs), theirs.demos) == (len(plain), plain.demos)
+    assert_same(everything(theirs), everything(plain))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_robomimic_refuses_what_it_cannot_read(robomimic, path: Path) -> None:
+    read = lambda: open_windows(DemoSource(path, SPEC), language=LANGUAGE, backend="robomimic")  # noqa: E731
+    with pytest.raises(DataError, match="must lie in"):
+        read().batch(torch.tensor([sum(LENGTHS)]))
+    with h5py.File(path, "a") as file:
+        file["data/demo_0/expert_actions"] = file["data/demo_0/actions"][()]
+    with pytest.raises(DataError, match=r"labels=executed"):
+        read()
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/expert_actions"], file["data/demo_3"].attrs["num_samples"]
+    with pytest.raises(DataError, match=r"num_samples.*backend=native"):
+        read()
+
+
+def test_without_robomimic_the_remedy_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "robomimic", None)
+    monkeypatch.setitem(__import__("sys").modules, "robomimic.utils", None)
+    with pytest.raises(DataError, match=r"pip install --no-deps robomimic.*backend=native"):
+        open_windows(DemoSource(path, SPEC), language=LANGUAGE, backend="robomimic")
+
+
+def test_the_index_says_what_frames_were_made_from(path: Path) -> None:
+    open_windows(DemoSource(path, SPEC, limit=2), language=LANGUAGE, memory="mmap")
+    (index,) = cache_root().glob("*/index.json")
+    found = json.loads(index.read_text())
+    assert found["source"] == str(path.resolve()) and found["read"]["limit"] == 2
+    assert found["shape"] == [7, 2, 6, 8, 3]
