@@ -27,8 +27,10 @@ SLIPPED = 0.035  # m, between the hand and the hold
 AWAY = 0.06  # m, from the handle, where the hand counts as withdrawn
 AROUND = 0.07  # m, within which things count as in the way
 AJAR, PULLED = 0.5, 0.85  # rad; a door is drawn until it is that far open, and beyond AJAR pushed
-KNOB = 0.3, 0.8  # rad, of the hand ahead of a knob at its stop; what is left of that a step later
-STUCK = 90  # steps of one phase
+KNOB = 0.45  # rad, of the hand ahead of a knob, at most
+BRAKE = 2.0, 0.05  # 1/s and rad/s: speed of a knob before its stop by what is left, and when it gets there
+STUCK = {"move": 180}  # steps of one phase, else
+STUCK_ELSE = 90
 
 
 class MoveJoint:
@@ -59,8 +61,7 @@ class MoveJoint:
         self._before: np.ndarray | None = None
         self._velocity = np.zeros(3)
         self._steps, self._still = 0, 0
-        self._opening, self._value, self._aim = 0.0, 0.0, 0.0
-        self._wind = 0.0  # rad, of the hand ahead of a knob
+        self._opening, self._begun, self._value, self._aim = 0.0, 0.0, 0.0, 0.0  # m; m or rad, of the joint
         self._drawn = False  # a door, as far as by its handle
         self._left: Pose | None = None  # where the hand let go
         self._failed: list[Pose] = []  # holds of earlier attempts
@@ -86,7 +87,7 @@ class MoveJoint:
             self._again()
         if self._hold is None and not self._plan(view):
             return self._stay()
-        if self._steps > STUCK:
+        if self._steps > STUCK.get(self.phase, STUCK_ELSE):
             return self._retreat(view)
         return getattr(self, f"_{self.phase}")(view)
 
@@ -128,8 +129,13 @@ class MoveJoint:
         self._around = surroundings(view, -1, hold.held.pos, view.scene.things)
         frame = part.pose(view)
         self._hold = Hold(
-            _within(frame, hold.ready), _within(frame, hold.held), frame.mat.T @ hold.back, hold.grips
+            _within(frame, hold.ready),
+            _within(frame, hold.held),
+            frame.mat.T @ hold.back,
+            hold.grips,
+            hold.follow,
         )
+        self._begun = value
         self._failed.append(hold.ready)
         self._drawn = False
         self._enter("reach")
@@ -210,7 +216,7 @@ class MoveJoint:
         if self._steps > 4 + self.style.pause and still or self._steps > 16:
             if opening < 0.004:
                 return self._retreat(view)
-            self._value, self._wind = self._part.value(view), 0.0
+            self._value = self._part.value(view)
             self._enter("move")
             return self._move(view)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
@@ -229,7 +235,7 @@ class MoveJoint:
         if self.state in ("open", "turnon"):
             settled = abs(left) < (0.003 if part.slides else 0.05) or self._still > 3
         if self.state == "turnoff":
-            settled = self._wind < 0.02 and abs(speed) < 0.005
+            settled = abs(speed) < 0.004
         if self._moved(view) and settled or self._still > 30 or self._stage(left):
             self._drawn = self._stage(left)
             self._enter("release")
@@ -237,14 +243,18 @@ class MoveJoint:
         if self._hold.grips and np.linalg.norm(view.eef_pos - hold.pos) > SLIPPED:
             return self._retreat(view)
         lead = min(LEAD / arm, 0.5)
-        if self.state == "turnoff":  # a knob is heavy, and its stop throws it back
-            quiet = self._moved(view) and abs(speed) < 0.02
-            self._wind = self._wind * KNOB[1] if quiet else min(self._wind + 0.03, KNOB[0])
-            ahead = np.sign(left or -1.0) * self._wind
-        else:
-            ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
-        goal = part.moved(view, hold, ahead)
+        ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
+        if self.state == "turnoff":
+            ahead = np.sign(left) * self._brake(left, speed)
+        then = value + ahead - self._begun
+        begun = part.moved(view, hold, self._begun - value)
+        goal = part.moved(view, begun, then, turn=self._hold.follow * then)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
+
+    def _brake(self, left: float, speed: float) -> float:
+        """How far the hand is ahead of a heavy knob, rad, so that it comes to its stop slowly and stays there."""
+        wanted = min(BRAKE[0] * abs(left) + BRAKE[1], 0.9)
+        return float(np.clip(0.6 * wanted + wanted - speed, -0.15, KNOB))
 
     def _stage(self, left: float) -> bool:
         """Whether a door is as far open as it is drawn; the rest of the way it is pushed."""

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import mujoco
 import numpy as np
 
-from libero_env.expert.geometry import Pose, surface_points
+from libero_env.expert.geometry import Pose, body_points, surface_points
 from libero_env.predicates import StateView
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -42,13 +43,40 @@ class Part:
         """Pose of the body."""
         return _body_pose(view, self.body)
 
-    def moved(self, view: StateView, pose: Pose, delta: float) -> Pose:
-        """Where what is fixed to the part comes to when the joint moves by `delta`, m or rad."""
+    def cloud(self, view: StateView, spacing: float) -> np.ndarray:
+        """Points on it and on what hangs on it, world frame, (N, 3)."""
+        return self.pose(view).apply(_part_points(view.scene.model, self.body, spacing))
+
+    def moved(self, view: StateView, pose: Pose, delta: float, turn: float | None = None) -> Pose:
+        """Where what is fixed to the part comes to when the joint moves by `delta`, m or rad.
+
+        Args:
+            view: the state.
+            pose: of what is fixed.
+            delta: of the joint.
+            turn: rad, by which it turns, where that is not `delta`.
+        """
+        pos, mat = self.moved_all(view, pose.pos[None], pose.mat[None], delta)
+        if turn is not None and not self.slides:
+            mat = turned(self.axis(view)[1], turn) @ pose.mat[None]
+        return Pose(pos[0], mat[0])
+
+    def moved_all(
+        self,
+        view: StateView,
+        pos: np.ndarray,
+        mat: np.ndarray,
+        delta: float,
+        follow: np.ndarray | float = 1.0,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same of many poses, (N, 3) and (N, 3, 3), of which each turns by its share `follow` (N,) of `delta`."""
         anchor, axis = self.axis(view)
         if self.slides:
-            return Pose(pose.pos + delta * axis, pose.mat)
-        turn = _turn(axis, delta)
-        return Pose(anchor + turn @ (pose.pos - anchor), turn @ pose.mat)
+            return pos + delta * axis, mat
+        angles = np.broadcast_to(np.asarray(follow) * delta, len(mat))
+        shares, which = np.unique(angles, return_inverse=True)
+        turns = np.stack([turned(axis, float(angle)) for angle in shares])[which]
+        return anchor + (pos - anchor) @ turned(axis, delta).T, turns @ mat
 
 
 @dataclass(frozen=True)
@@ -72,7 +100,7 @@ def find_handle(view: StateView, part: Part, way: float) -> Handle:
         part: what moves.
         way: sign of the joint's motion that opens.
     """
-    points = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.004))
+    points = part.cloud(view, 0.004)
     out = opening_direction(view, part, way, points)
     front = points @ out
     slab = points[front > front.max() - 0.003]
@@ -94,7 +122,7 @@ def find_handle(view: StateView, part: Part, way: float) -> Handle:
 
 def inner_side(view: StateView, part: Part, way: float) -> Handle:
     """The side of a door that is pushed to open it further, near its upper edge."""
-    points = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.005))
+    points = part.cloud(view, 0.005)
     anchor, axis = part.axis(view)
     inward = -opening_direction(view, part, way, points)
     outer = (
@@ -128,7 +156,7 @@ def is_knob(view: StateView, part: Part) -> bool:
     if part.slides:
         return False
     anchor, axis = part.axis(view)
-    arms = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.01)) - anchor
+    arms = part.cloud(view, 0.01) - anchor
     return bool(abs(axis[2]) > 0.9 and np.linalg.norm(np.cross(arms, axis), axis=1).max() < KNOB_RADIUS)
 
 
@@ -143,14 +171,14 @@ def surroundings(view: StateView, body: int, centre: np.ndarray, names: Iterable
     return np.concatenate(clouds)
 
 
+@lru_cache(maxsize=512)
 def _own_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray:
-    """Points on the geoms of a body alone; those of a whole tree begin with them."""
-    if not model.body_geomnum[body]:
-        return np.zeros((0, 3))
-    children = np.flatnonzero(model.body_parentid == body)
-    below = sum(len(surface_points(model, int(child), spacing)) for child in children if child != body)
-    points = surface_points(model, body, spacing)
-    return points[: len(points) - below]
+    return body_points(model, body, spacing)
+
+
+@lru_cache(maxsize=64)
+def _part_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray:
+    return surface_points(model, body, spacing)
 
 
 def _body_pose(view: StateView, body: int) -> Pose:
@@ -163,7 +191,8 @@ def _field(view: StateView, name: str) -> np.ndarray:
     return view.simulations.fields[name][view.index]
 
 
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+def turned(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation (3, 3) by an angle, rad, about a unit axis (3,)."""
     quat, mat = np.zeros(4), np.zeros(9)
     mujoco.mju_axisAngle2Quat(quat, axis, angle)
     mujoco.mju_quat2Mat(mat, quat)

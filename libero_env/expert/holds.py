@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numba import njit
 
-from libero_env.expert.geometry import Pose, surface_points
+from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import FINGER_HALF_WIDTH, TIP_BELOW, GraspError, choose_grasp
-from libero_env.expert.handles import UP, Handle, Part, surroundings
+from libero_env.expert.handles import UP, Handle, Part, surroundings, turned
 from libero_env.expert.motion import downward, finger_axis
+from libero_env.expert.posture import strain, unease
 from libero_env.predicates import StateView
 
 TAKES = 0.06  # m, widest handle that is taken between the fingers
@@ -17,14 +19,17 @@ OPEN_HALF = 0.04  # m, of an open finger from the middle
 TIP = 0.0145  # m, thickness of a finger at its tip
 _WIDENS = 0.41  # m of thickness for each m further up
 _TILTS = np.radians([90, 75, 65, 55, 45, 35, 25])  # of the approach below the horizontal
+_STEEP = np.radians(60)  # from there on closed fingers need not turn with the door that they push
 _ROLLS = (0.0, 0.8, -0.8)  # rad, of the fingers from across a level bar
-_ASIDE = (0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026)  # m, of the open hand from the middle of the bar
+_SHORT = 0.022  # m, half a bar that is so short that it is taken by its ends too
+_FOLLOWS = (1.0, 0.5, 0.0)  # shares of a door's turn that a pushing hand makes too
+_ASIDE = np.array(
+    [0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026]
+)  # m, of the open hand from the middle of the bar
 _FORTH = (0.0, -0.005)  # m, of the grip site beyond the middle of the bar
 _SPARE = 0.002  # m, around the hand
-_SHOULDER = np.array([-0.66, 0.0, 0.333])  # m, of the arm, height above its base
-_HAND_LENGTH = 0.21  # m, from the flange to the grip site
-_REACH = 0.42, 0.74  # m, from the shoulder to the flange, without folding or stretching the arm
-_WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
+_TWISTED = 0.5 * np.pi + 0.4  # rad, of strain that is too much
+_LEANS = (0.0, 0.2, -0.2, 0.35, -0.35, 0.5, -0.5)  # rad, of the hand over a knob
 
 
 @dataclass(frozen=True)
@@ -35,23 +40,37 @@ class Hold:
     held: Pose
     back: np.ndarray  # (3,) unit, where the hand comes from and withdraws to
     grips: bool
+    follow: float = 1.0  # share of the part's turn that the hand makes too
 
 
 def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
     """How to take a knob from above in order to turn it by `delta`, rad.
 
+    The hand leans along the knob where the wrist would be bent back, close to the arm's base.
+
     Raises:
         GraspError: it is too thick for the fingers.
     """
-    cloud = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.004))
+    cloud = part.cloud(view, 0.004)
     high = cloud[cloud[:, 2] > cloud[:, 2].max() - 0.03]
     around = surroundings(view, part.body, cloud.mean(axis=0), view.scene.things)
     grasp = choose_grasp(high, around, cloud[:, 2].min(), finger_axis(view.eef_mat), "knob")
-    mats = [
-        downward(grasp.yaw, sign * np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0])) for sign in (1, -1)
+    fingers = np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0.0])
+    ways = [
+        (lean, turned(fingers, lean) @ downward(grasp.yaw, sign * fingers))
+        for lean, sign in product(_LEANS, (1.0, -1.0))
     ]
-    poses = [Pose(grasp.pos_world, mat) for mat in mats]
-    best = min(poses, key=lambda pose: strain(pose) ** 2 + strain(part.moved(view, pose, delta)) ** 2)
+    mat = np.stack([mat for _, mat in ways])
+    pos, end = (
+        np.tile(grasp.pos_world, (len(ways), 1)),
+        part.moved_all(view, grasp.pos_world[None], mat, delta),
+    )
+    base = np.array(view.scene.workspace.robot_base_pos)
+    cost = unease(pos, mat, base) + unease(np.tile(end[0], (len(ways), 1)), end[1], base)
+    for k, (lean, _) in enumerate(ways):
+        depths = [crowding(around, Pose(p[k % len(p)], m[k]), 0.0, OPEN_HALF) for p, m in ((pos, mat), end)]
+        cost[k] += 0.3 * abs(lean) + _blocked(max(depths))
+    best = Pose(grasp.pos_world, mat[int(np.argmin(cost))])
     return Hold(best, best, UP, True)
 
 
@@ -73,37 +92,79 @@ def handle_hold(
     Raises:
         GraspError: the handle is thicker than the fingers take.
     """
-    fixed = surroundings(view, part.body, handle.pos, view.scene.fixtures)
-    loose = surroundings(view, part.body, handle.pos, view.scene.objects)
-    own = part.pose(view).apply(surface_points(view.scene.model, part.body, 0.012))
-    floor, half = view.scene.workspace.surface_height, OPEN_HALF if grips else 0.0
-    spans = [(own, (half, half)), (np.concatenate([fixed, loose]), (0.0, half))]
-    base, ranked = view.scene.workspace.robot_base_pos[2], []
-    for cost, hold in _candidates(handle, grips):
-        for pose in (hold.ready, part.moved(view, hold.held, delta)):
-            cost += 0.12 * strain(pose) ** 2 + 20.0 * stretch(pose, base)
-        turn = 0.5 * (np.sum(view.eef_mat * hold.ready.mat) - 1.0)
-        cost += 0.1 * float(np.arccos(np.clip(turn, -1.0, 1.0)))
-        ranked.append((cost + sum(0.5 * _alike(hold.ready, pose) for pose in failed), hold))
-    best: tuple[float, Hold] | None = None
-    for cost, hold in sorted(ranked, key=lambda pair: pair[0]):
-        if best is not None and cost >= best[0]:
-            break
-        ready, worst = hold.ready, np.inf if best is None else best[0]
-        moved = [part.moved(view, hold.held, share * delta) for share in (0.5, 1.0)]
-        backs = [Pose(ready.pos + back * hold.back, ready.mat) for back in (0.0, 0.03, 0.07)]
-        depth = max(under(floor, pose, grips) for pose in (ready, *moved))
-        checks = [(points, pose, *span) for pose in backs for points, span in spans]
-        for points, pose, *span in checks + [(fixed, pose, 0.0, 0.0) for pose in moved]:
-            if cost + _blocked(depth) >= worst:
-                break
-            depth = max(depth, crowding(points, pose, *span))
-        cost += _blocked(depth)
-        if best is None or cost < best[0]:
-            best = cost, hold
-    if best is None:
+    base = np.array(view.scene.workspace.robot_base_pos)
+    ways = _candidates(handle, grips, not part.slides, base)
+    if not len(ways.cost):
         raise GraspError(f"no way to take the handle: it is more than {100 * TAKES:.0f} cm thick")
-    return best[1]
+    moved = [part.moved_all(view, ways.held, ways.mat, share * delta, ways.follow) for share in (0.5, 1.0)]
+    cost = ways.cost + unease(ways.ready, ways.mat, base) + unease(*moved[1], base)
+    turn = 0.5 * (np.einsum("ij,nij->n", view.eef_mat, ways.mat) - 1.0)
+    cost += 0.1 * np.arccos(np.clip(turn, -1.0, 1.0))
+    for pose in failed:
+        cost += 0.5 * ways.like(pose)
+    check = _Check(view, part, handle, grips)
+    best, least = -1, np.inf
+    for k in np.argsort(cost, kind="stable"):
+        if cost[k] >= least:
+            break
+        poses = [(pos[k], mat[k]) for pos, mat in moved]
+        price = check.price(ways.hold(k, grips), poses, delta, least - cost[k])
+        if cost[k] + price < least:
+            best, least = int(k), cost[k] + price
+    return ways.hold(best, grips)
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """Candidates, one a row."""
+
+    cost: np.ndarray  # (N,)
+    ready: np.ndarray  # (N, 3)
+    held: np.ndarray  # (N, 3)
+    mat: np.ndarray  # (N, 3, 3)
+    back: np.ndarray  # (N, 3)
+    follow: np.ndarray  # (N,)
+
+    def hold(self, k: int, grips: bool) -> Hold:
+        ready, held = Pose(self.ready[k], self.mat[k]), Pose(self.held[k], self.mat[k])
+        return Hold(ready, held, self.back[k], grips, float(self.follow[k]))
+
+    def like(self, pose: Pose) -> np.ndarray:
+        """Which are nearly the same as a pose, (N,) bool."""
+        near = np.linalg.norm(self.ready - pose.pos, axis=1) < 0.012
+        return near & (np.einsum("ij,nij->n", pose.mat, self.mat) > 2.9)
+
+
+class _Check:
+    """What holds cost because of what the hand would be in."""
+
+    def __init__(self, view: StateView, part: Part, handle: Handle, grips: bool):
+        self._floor, self._grips = view.scene.workspace.surface_height, grips
+        self._fixed = surroundings(view, part.body, handle.pos, view.scene.fixtures)
+        loose = surroundings(view, part.body, handle.pos, view.scene.objects)
+        self._others = np.concatenate([self._fixed, loose])
+        self._own = part.cloud(view, 0.012)
+        self._part, self._view, self._out = part, view, handle.out
+
+    def price(
+        self, hold: Hold, moved: list[tuple[np.ndarray, np.ndarray]], delta: float, enough: float
+    ) -> float:
+        """Cost of how deep the hand is in something at the hold, before it and on its way; `enough` or more early."""
+        half = OPEN_HALF if self._grips else 0.0
+        ends = [Pose(pos, mat) for pos, mat in moved]
+        depth = max(under(self._floor, pose, self._grips) for pose in (hold.ready, *ends))
+        backs = [Pose(hold.ready.pos + back * hold.back, hold.ready.mat) for back in (0.0, 0.03, 0.07)]
+        checks = [(pts, p, i, half) for p in backs for pts, i in ((self._own, half), (self._others, 0.0))]
+        checks += [(self._fixed, pose, 0.0, 0.0) for pose in ends]
+        if hold.follow < 1.0:  # the door turns under the hand
+            lag, out = (hold.follow - 1.0) * delta, Pose(hold.held.pos + 0.01 * self._out, hold.held.mat)
+            askew = [self._part.moved(self._view, out, 0.0, turn=share * lag) for share in (0.5, 1.0)]
+            checks += [(self._own, pose, 0.0, 0.0) for pose in askew]
+        for points, pose, inner, outer in checks:
+            if _blocked(depth) >= enough:
+                break
+            depth = max(depth, crowding(points, pose, inner, outer))
+        return _blocked(depth)
 
 
 def _blocked(depth: float) -> float:
@@ -111,46 +172,51 @@ def _blocked(depth: float) -> float:
     return 150.0 * depth + 0.8 * (depth > 0.001)
 
 
-def _alike(pose: Pose, other: Pose) -> bool:
-    return bool(np.linalg.norm(pose.pos - other.pos) < 0.012 and np.trace(pose.mat.T @ other.mat) > 2.9)
-
-
-def _candidates(handle: Handle, grips: bool) -> Iterator[tuple[float, Hold]]:
-    """(cost, hold) for each approach, what is around not yet considered."""
+def _candidates(handle: Handle, grips: bool, swings: bool, base: np.ndarray) -> _Ways:
+    """All approaches, what is around not yet considered."""
+    rows: list[tuple] = []
     upright = abs(handle.along[2]) > 0.7
-    for tilt, roll, sign in product(_TILTS, (0.0,) if upright else _ROLLS, (1.0, -1.0)):
+    rolls = (0.0,) if upright else _ROLLS
+    if grips and not upright and handle.half < _SHORT:
+        rolls = (*rolls, 0.5 * np.pi)
+    for tilt, roll, sign in product(_TILTS, rolls, (1.0, -1.0)):
         approach = -np.cos(tilt) * handle.out - np.sin(tilt) * UP
         fingers = np.cross(handle.along, -handle.out if upright else approach)
         fingers = sign * (np.cos(roll) * fingers + np.sin(roll) * handle.along)
         mat = np.column_stack([fingers, np.cross(approach, fingers), approach])
-        if strain(Pose(handle.pos, mat)) < 0.5 * np.pi + 0.4:
-            for cost, hold in (_grips if grips else _pushes)(handle, mat):
-                yield cost + 0.3 * abs(roll), hold
+        if strain(handle.pos[None], mat[None], base)[0] > _TWISTED:
+            continue
+        if grips:
+            found = _grips(handle, mat)
+        else:
+            found = _pushes(handle, mat, _FOLLOWS if swings and tilt > _STEEP else (1.0,))
+        rows += [(cost + 0.3 * abs(roll), ready, held, mat, back, f) for cost, ready, held, back, f in found]
+    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 6
+    return _Ways(*columns)
 
 
-def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
+def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple]:
+    """(cost, ready, held, back, follow) of ways to have the bar between the fingers."""
     fingers, across, approach = mat.T
     upright = abs(handle.along[2]) > 0.7
-    reach = max(handle.half - 0.012, 0.0)
-    for shift in (reach, 0.5 * reach, 0.0, -0.5 * reach) if upright else (0.0, 0.3 * reach, -0.3 * reach):
+    ends = abs(fingers @ handle.along) > 0.9  # it is taken by its ends
+    reach = 0.0 if ends else max(handle.half - 0.012, 0.0)
+    shifts = (reach, 0.5 * reach, 0.0, -0.5 * reach) if upright else (0.0, 0.3 * reach, -0.3 * reach)
+    for shift in dict.fromkeys(shifts):
         pos = handle.pos + shift * handle.along
         strip = handle.points[np.abs((handle.points - pos) @ across) < 0.01] @ fingers
         width = float(np.ptp(strip)) if len(strip) else 1.0
         if width > TAKES:
             continue
-        backs = {0.0: -approach, 0.02: handle.out}
-        for aside, forth, (extra, back) in product(_ASIDE, _FORTH, backs.items()):
-            if abs(aside) + 0.5 * width + 0.003 < OPEN_HALF:
-                held = Pose(pos + forth * approach, mat)
-                ready = Pose(held.pos + aside * fingers, mat)
-                yield (
-                    0.5 * abs(shift) + 2.0 * abs(aside) + 4.0 * abs(forth) + extra,
-                    Hold(ready, held, back, True),
-                )
+        asides = _ASIDE[np.abs(_ASIDE) + 0.5 * width + 0.003 < OPEN_HALF]
+        for aside, forth, (extra, back) in product(asides, _FORTH, ((0.0, -approach), (0.02, handle.out))):
+            held = pos + forth * approach
+            cost = 0.5 * abs(shift) + 2.0 * abs(aside) + 4.0 * abs(forth) + extra
+            yield cost, held + aside * fingers, held, back, 1.0
 
 
-def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
-    """Closed fingers against the bar, or against the front beside it."""
+def _pushes(handle: Handle, mat: np.ndarray, follows: Sequence[float]) -> Iterator[tuple]:
+    """(cost, ready, held, back, follow) of closed fingers against the bar, or against the front beside it."""
     fingers, across, approach = mat.T
     offset = handle.part - handle.pos
     beside = np.cross(handle.along, handle.out)
@@ -166,11 +232,9 @@ def _pushes(handle: Handle, mat: np.ndarray) -> Iterator[tuple[float, Hold]]:
             continue
         front = float((offset[near] @ handle.out).max())
         pos = handle.pos + shift * handle.along + side * beside + (front + forward + 0.004) * handle.out
-        hold = Pose(pos, mat)
-        yield (
-            0.5 * (abs(shift) + abs(side)) + 0.2 * abs(tilt - np.radians(65)),
-            Hold(hold, hold, -approach, False),
-        )
+        cost = 0.5 * (abs(shift) + abs(side)) + 0.2 * abs(tilt - np.radians(65))
+        for follow in follows:
+            yield cost + 0.02 * (1.0 - follow), pos, pos, -approach, follow
 
 
 def _spread(values: np.ndarray, number: int) -> list[float]:
@@ -183,42 +247,35 @@ def crowding(points: np.ndarray, pose: Pose, inner: float, outer: float) -> floa
 
     Its fingers take what is from `inner` to `outer` on both sides, m, and their thickness beyond.
     """
-    offset = points - pose.pos
-    near = offset[(offset * offset) @ np.ones(3) < 0.17**2]
-    x, y, z = (near @ pose.mat).T  # fingers and palm
-    x, y = np.abs(x), np.abs(y)
-    sides = outer + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
-    finger = np.minimum.reduce(
-        [sides - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z]
-    )
-    finger = np.where(z > -0.04, finger, 0.0)
-    half = np.clip(0.0175 - 0.22 * (z + 0.031), 0.0, 0.032) + _SPARE  # of the palm, which is thinner in front
-    palm = np.minimum.reduce([0.104 + _SPARE - x, half - y, -0.031 + _SPARE - z, z + 0.13])
-    x, y, z = (offset[::3] @ pose.mat).T
-    wrist = np.minimum.reduce([0.06 - np.abs(x), 0.06 - np.abs(y), -0.12 - z, z + 0.3])
-    return float(max(finger.max(initial=0.0), palm.max(initial=0.0), wrist.max(initial=0.0)))
+    return _depth(points, pose.pos, np.ascontiguousarray(pose.mat), inner, outer)
+
+
+@njit(cache=True, nogil=True)
+def _depth(points: np.ndarray, pos: np.ndarray, mat: np.ndarray, inner: float, outer: float) -> float:
+    deepest = 0.0
+    for i in range(len(points)):
+        a, b, c = points[i, 0] - pos[0], points[i, 1] - pos[1], points[i, 2] - pos[2]
+        z = a * mat[0, 2] + b * mat[1, 2] + c * mat[2, 2]
+        if z > TIP_BELOW + _SPARE or z < -0.3:
+            continue
+        x = abs(a * mat[0, 0] + b * mat[1, 0] + c * mat[2, 0])
+        y = abs(a * mat[0, 1] + b * mat[1, 1] + c * mat[2, 1])
+        if z > -0.04:  # fingers
+            side = outer + TIP + _WIDENS * (TIP_BELOW - z) + _SPARE
+            depth = min(side - x, x - inner + _SPARE, FINGER_HALF_WIDTH + _SPARE - y, TIP_BELOW + _SPARE - z)
+            deepest = max(deepest, depth)
+        if z > -0.13:  # the palm, which is thinner in front
+            half = min(max(0.0175 - 0.22 * (z + 0.031), 0.0), 0.032) + _SPARE
+            deepest = max(deepest, min(0.104 + _SPARE - x, half - y, -0.031 + _SPARE - z, z + 0.13))
+        deepest = max(deepest, min(0.06 - x, 0.06 - y, -0.12 - z, z + 0.3))  # the wrist
+    return deepest
 
 
 def under(floor: float, pose: Pose, opened: bool) -> float:
     """How deep a hand reaches under a height, m."""
     wide = (OPEN_HALF if opened else 0.0) + TIP
-    levels = ((wide, FINGER_HALF_WIDTH, TIP_BELOW), (0.104, 0.018, -0.031), (0.104, 0.032, -0.1))
-    corners = [(s * w, t * h, z) for s in (1, -1) for t in (1, -1) for w, h, z in levels]
-    return max(0.0, floor + 0.004 - float(pose.apply(np.array(corners))[:, 2].min()))
-
-
-def strain(pose: Pose) -> float:
-    """How far a hand is turned from where the wrist's joints are in the middle, rad."""
-    yaw = _WRIST_MIDDLE + np.arctan2(pose.pos[1], pose.pos[0] - _SHOULDER[0])
-    c, s = np.cos(yaw), np.sin(yaw)
-    trace = np.sum(
-        pose.mat * [[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]]
-    )  # of the turn from fingers along yaw
-    return float(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
-
-
-def stretch(pose: Pose, base_height: float) -> float:
-    """How far a hand is out of easy reach, m."""
-    offset = pose.pos - _HAND_LENGTH * pose.mat[:, 2] - _SHOULDER - [0.0, 0.0, base_height]
-    distance = float(np.linalg.norm(offset))
-    return max(0.0, distance - _REACH[1], _REACH[0] - distance)
+    lowest = np.inf
+    for w, h, z in ((wide, FINGER_HALF_WIDTH, TIP_BELOW), (0.104, 0.018, -0.031), (0.104, 0.032, -0.1)):
+        row = pose.mat[2]
+        lowest = min(lowest, pose.pos[2] - w * abs(row[0]) - h * abs(row[1]) + z * row[2])
+    return max(0.0, floor + 0.004 - float(lowest))
