@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lifelong.errors import LifelongError
 from lifelong.metrics import METRIC_NAMES, Curve, Scores, lifelong_metrics, wilson_interval
 from lifelong.records import (
+    CostRecord,
     EvalRecord,
     LossRecord,
     PhaseRecord,
@@ -28,6 +29,7 @@ from lifelong.records import (
     from_line,
     to_line,
 )
+from lifelong.subgoals import Subgoals, subgoals
 
 
 class ResultsError(LifelongError):
@@ -190,6 +192,21 @@ class Results:
         used = tuple(curves.get(task, nothing) for task in range(size))
         return Scores(used, rates[:size, :size], episodes[:size, :size])
 
+    def costs(self, task: int) -> dict[str, float]:
+        """What learning a task cost, by the names of `lifelong.costs`; empty where nothing is recorded."""
+        return {k: v for r in self.of(CostRecord) if r.task == task for k, v in r.costs.items()}
+
+    def task_seconds(self, task: int) -> dict[str, float]:
+        """Wall time in seconds of a task: of training on it, of evaluating while and after learning it."""
+        return {
+            "training": sum(r.seconds for r in self.of(LossRecord) if r.task == task),
+            "evaluation": sum(r.seconds for r in self.of(EvalRecord) if r.learned == task),
+        }
+
+    def subgoals(self) -> Subgoals:
+        """Which parts of the goals of the tasks learned so far were reached, and forgotten."""
+        return subgoals(self.of(EvalRecord), self.learned_tasks())
+
     def seconds_by_phase(self) -> dict[str, float]:
         """Wall time in seconds: the recorded phases (such as demos), then training and evaluation."""
         times: dict[str, float] = {}
@@ -197,6 +214,9 @@ class Results:
             times[r.phase] = times.get(r.phase, 0.0) + r.seconds
         times["training"] = sum(r.seconds for r in self.of(LossRecord))
         times["evaluation"] = sum(r.seconds for r in self.of(EvalRecord))
+        between = sum(r.costs.get("end_task_seconds", 0.0) for r in self.of(CostRecord))
+        if between:
+            times["between tasks"] = between
         return times
 
 
@@ -258,6 +278,12 @@ def summarize(results: Results) -> dict[str, Any]:
             for task, (epochs, losses) in sorted(results.losses().items())
         },
         "best_epochs": {str(task): ends[task] for task in sorted(ends)},
+        "subgoals": asdict(results.subgoals()),
+        "costs": {
+            str(task): results.costs(task) | {f"{k}_seconds": v for k, v in results.task_seconds(task).items()}
+            for task in range(len(run.tasks))
+            if results.costs(task)
+        },
         "seconds_by_phase": results.seconds_by_phase(),
         "problems": list(results.problems),
     }

@@ -15,12 +15,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lifelong import checkpoints
+from lifelong import checkpoints, costs
 from lifelong.algorithms.base import Algorithm, JoinedWindows, Phase, WindowDataset
 from lifelong.distributed import Ranks
 from lifelong.evaluation import EnvPool, EvalSettings, rollout, save_animation
 from lifelong.policies.base import Policy
-from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.rundir import RunDirectory
 from lifelong.tracking import Tracker
 from lifelong.training import BatchAugmentation, EpochEnd, FitSettings, fit, generator, seeded
@@ -109,6 +109,7 @@ class TaskSequence:
             numbers, what = f"Tasks {stage[0] + 1}-{task + 1}", "together"
         self._say(f"{numbers}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
         p.ranks.wait()  # all have read what is saved
+        costs.reset_peak(p.device)
         if saved is None:
             p.algorithm.begin_task(task, dataset, p.policy)
         else:
@@ -126,8 +127,13 @@ class TaskSequence:
     def _end_task(self, task: int, dataset: WindowDataset) -> None:
         """What the algorithm does after a task, and the checkpoint of it."""
         p, draws = self.parts, generator(self.parts.seed, END_TASK, task)
+        began = time.perf_counter()
         with seeded(p.seed, END_TASK, task, 1, device=p.device):  # for dropout
             p.algorithm.end_task(task, dataset, p.policy, draws)
+        spent = {"end_task_seconds": time.perf_counter() - began, "stored_bytes": costs.stored_bytes(p.algorithm)}
+        with p.algorithm.policy_for(task, p.policy) as acting:
+            spent |= costs.action_costs(acting) | costs.peak_costs(p.device)
+        self.log.append(CostRecord(task=task, costs=spent))
         state = {"task": task, "policy": p.policy.state_dict(), "algorithm": p.algorithm.state_dict()}
         checkpoints.save(p.directory.task_path(task), state)
 
@@ -184,6 +190,9 @@ class TaskSequence:
         if end.epoch and not self.log.read().has_loss(task, epoch):
             self.log.append(LossRecord(task=task, epoch=epoch, loss=end.loss, seconds=end.seconds))
             p.tracker.log({"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty})
+        if (stretch.number, end.epoch) == (0, stretch.epochs) and not self.log.read().costs(task):
+            spent = costs.step_costs(p.policy, p.algorithm, p.datasets[task], p.fit.batch_size)
+            self.log.append(CostRecord(task=task, costs=spent))
         due = end.epoch in p.eval.curve_epochs(stretch.epochs)
         if due or time.monotonic() - self._saved > SAVE_EVERY:
             self._save(task, stretch.number, end.state())
@@ -272,6 +281,10 @@ class TaskSequence:
             lengths=tuple(e.length for e in rollouts.episodes),
             init_states=tuple(e.init_state for e in rollouts.episodes),
             seconds=rollouts.seconds,
+            atoms=rollouts.atoms,
+            atoms_at_start=tuple(e.at_start for e in rollouts.episodes),
+            atoms_ever=tuple(e.ever for e in rollouts.episodes),
+            atoms_at_end=tuple(e.at_end for e in rollouts.episodes),
         )
         self.log.append(record)
         return record

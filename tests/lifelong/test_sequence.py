@@ -8,10 +8,11 @@ import torch
 
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet, Sequential
+from lifelong.costs import COSTS
 from lifelong.data import SequenceVLDataset
 from lifelong.evaluation import EnvPool, EvalSettings
 from lifelong.policies import BCTransformer
-from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.rundir import RunDirectory
 from lifelong.sequence import Parts, TaskSequence
 from lifelong.tracking import Tracker
@@ -98,7 +99,10 @@ def outcome(path, log):
     kept = {}
     for record in log.read().records:
         values = {k: v for k, v in asdict(record).items() if k != "seconds"}
+        if isinstance(record, CostRecord):  # what is counted, not what is measured
+            values["costs"] = {k: v for k, v in record.costs.items() if not k.endswith("seconds") and "peak" not in k}
         key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
+        key += tuple(values.get("costs", ()))
         assert kept.setdefault(key, values) == values, "a record was made twice, and differs"
     return kept, checkpoints.load(RunDirectory(path).task_path(TASKS - 1))
 
@@ -171,6 +175,7 @@ def test_the_records_are_complete(tmp_path):
         (task, epoch) for task in range(TASKS) for epoch in (0, 1, 2)
     ]
     assert {r.epoch for r in results.of(LossRecord)} == {1, 2, 3, 4}  # training and retraining
+    assert all(set(results.costs(task)) >= set(COSTS) - {"peak_gpu_bytes"} for task in range(TASKS))
     assert all(set(r.init_states) == ({0, 1, 2} if r.phase == "matrix" else {48, 49}) for r in evals)
 
 

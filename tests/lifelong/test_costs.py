@@ -1,0 +1,146 @@
+"""What algorithms cost: operations against the formulas, and nothing is changed by counting them."""
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from lifelong.algorithms import EWC, Algorithm, Sequential
+from lifelong.algorithms.agem import AGEM
+from lifelong.algorithms.er import ER
+from lifelong.costs import COSTS, action_costs, counting, peak_costs, step_costs, stored_bytes
+from lifelong.data import SequenceVLDataset
+from lifelong.policies import BCTransformer
+from lifelong.policies.bc_rnn import BCRNN
+from lifelong.training import generator, seeded
+from lifelong.types import PolicySpec
+
+pytestmark = pytest.mark.unit
+SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)
+
+
+def dataset(task: int = 0, frames: int = 20) -> SequenceVLDataset:
+    draws = generator(task)
+    return SequenceVLDataset(
+        torch.randint(0, 256, (frames, 1, 16, 16, 3), generator=draws, dtype=torch.uint8),
+        {"x": torch.randn(frames, 2, generator=draws)},
+        torch.rand(frames, 7, generator=draws) * 2 - 1,
+        torch.tensor([frames - 1] * frames),
+        torch.randn(4, generator=draws),
+        task,
+        SPEC.seq_len,
+    )
+
+
+def transformer() -> BCTransformer:
+    with seeded(7):
+        return BCTransformer(
+            spec=SPEC, embed_dim=8, image_width=8, stage_blocks=[1], stem_pool=False, layers=1, heads=2,
+            head_dim=4, mlp_dim=8, head_hidden=8, head_layers=1, modes=2, min_std=0.05,
+        )  # fmt: skip
+
+
+def counted(work) -> int:
+    with counting() as counter:
+        work()
+    return counter.get_total_flops()
+
+
+def test_attention_and_recurrence_count_as_the_products_they_are():
+    lstm, x = nn.LSTM(5, 7, batch_first=True), torch.randn(2, 3, 5)
+    assert counted(lambda: lstm(x)) == 2 * 2 * 3 * 4 * 7 * (5 + 7)
+    q = torch.randn(2, 4, 6, 8)  # (B, heads, T, dim): q k' and the weighted sum
+    attend = nn.functional.scaled_dot_product_attention
+    assert counted(lambda: attend(q, q, q)) == 2 * (2 * 2 * 4 * 6 * 6 * 8)
+    assert counted(lambda: lstm(x)[0].sum().backward()) == 3 * 2 * 2 * 3 * 4 * 7 * (5 + 7)
+    linear = nn.Linear(5, 4)
+    assert counted(lambda: linear(x[0]).sum().backward()) == 2 * (2 * 3 * 5 * 4)  # no gradient of the input
+
+
+KINDS = [Sequential(), ER(budget=9), AGEM(budget=9), EWC()]
+
+
+@pytest.mark.parametrize("algorithm", KINDS, ids=lambda a: type(a).__name__)
+def test_a_step_of_any_size_is_told_by_two_small_ones(algorithm: Algorithm):
+    policy, first, second = transformer(), dataset(0), dataset(1)
+    algorithm.begin_task(0, first, policy)
+    algorithm.end_task(0, first, policy, generator(0))
+    algorithm.begin_task(1, second, policy)
+    whole = copy.deepcopy((policy, algorithm))
+    algorithm.begin_phase(algorithm.phases()[0], policy)
+
+    def step() -> None:
+        whole[1].mode_train(whole[0])
+        batch = whole[1].mix(second.batch(torch.arange(9)), generator(0))
+        loss, penalty = whole[0].loss(batch), whole[1].penalty(whole[0])
+        (loss if penalty is None else loss + penalty).backward()
+        whole[1].after_backward(whole[0])
+
+    assert step_costs(policy, algorithm, second, 9)["flops_per_step"] == counted(step)
+
+
+def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
+    policy, first, second = transformer(), dataset(0), dataset(1)
+    costs = {}
+    for algorithm in (Sequential(), ER(budget=9)):
+        algorithm.end_task(0, first, policy, generator(0))
+        costs[type(algorithm)] = step_costs(policy, algorithm, second, 8)["flops_per_step"]
+    assert costs[ER] == 2 * costs[Sequential]
+    forward = counted(lambda: policy.loss(second.batch(torch.arange(8))))
+    assert 2.5 * forward < costs[Sequential] < 3 * forward  # the images need no gradient
+
+
+def test_counting_changes_neither_policy_nor_algorithm():
+    policy, algorithm, windows = transformer(), AGEM(budget=9), dataset(1)
+    algorithm.end_task(0, dataset(0), policy, generator(0))
+    policy.train()
+    before, state = copy.deepcopy(policy.state_dict()), torch.random.get_rng_state()
+    step_costs(policy, algorithm, windows, 8)
+    action_costs(policy)
+    assert policy.training and all(p.grad is None for p in policy.parameters())
+    assert algorithm._reference is None
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert all(torch.equal(v, before[k]) for k, v in policy.state_dict().items())
+
+
+def test_parameters_and_those_that_are_trained():
+    policy = transformer()
+    everything = sum(p.numel() for p in policy.parameters())
+    for p in policy.encoders.parameters():
+        p.requires_grad_(False)
+    costs = step_costs(policy, Sequential(), dataset(), 4)
+    frozen = sum(p.numel() for p in policy.encoders.parameters())
+    assert costs["parameters"] == everything
+    assert costs["parameters_trained"] == everything - frozen
+
+
+def test_an_action_of_a_recurrent_policy_costs_less_if_its_memory_is_carried():
+    sizes = {"image_embed": 8, "image_width": 8, "stage_blocks": [1], "stem_pool": False, "text_embed": 4}
+    sizes |= {"rnn_hidden": 16, "rnn_layers": 1, "head_hidden": 8, "head_layers": 1, "modes": 2}
+    with seeded(1):
+        window, carried = (BCRNN(spec=SPEC, **sizes, memory=m) for m in ("window", "reset"))
+    read_anew = SPEC.seq_len - 1  # steps of the window that a carried memory has behind it
+    step = 2 * sum(w.numel() for w in window.rnn.parameters() if w.dim() == 2)
+    costs = [action_costs(p)["flops_per_action"] for p in (window, carried)]
+    assert costs[0] - costs[1] == read_anew * step
+
+
+def test_what_is_stored():
+    policy, first = transformer(), dataset(0)
+    assert stored_bytes(Sequential()) == 0
+    ewc = EWC()
+    ewc.begin_task(0, first, policy)
+    ewc.end_task(0, first, policy, generator(0))
+    weights = 4 * sum(p.numel() for p in policy.parameters())
+    assert stored_bytes(ewc) == pytest.approx(2 * weights, rel=0.01)  # Fisher and anchor
+    er = ER(budget=9)
+    er.end_task(0, first, policy, generator(0))
+    window = 3 * (16 * 16 * 3 + 4 * 2 + 4 * 7)
+    assert stored_bytes(er) == 9 * (window + 8)  # and an index each
+
+
+def test_peaks_are_of_this_process():
+    assert Path("/proc/self/status").exists() is False or peak_costs(torch.device("cpu"))["peak_memory_bytes"] > 2**26
+    assert set(peak_costs(torch.device("cpu"))) <= set(COSTS)
