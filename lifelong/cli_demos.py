@@ -44,6 +44,7 @@ def _register_generate(commands: "argparse._SubParsersAction") -> None:
     add("--n", type=positive, default=50, help="demonstrations of each task (default: 50)")
     add("--size", type=size, default=(128, 128), help="of the pictures, 128 or 120x160 (default: 128)")
     add("--cameras", nargs="+", default=CAMERAS, help=f"what is drawn (default: {' '.join(CAMERAS)})")
+    add("--no-images", action="store_true", help="states, proprioception and actions alone; rerender draws later")
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
     add("--seed", type=int, default=0, help="of starts and manners (default: 0)")
@@ -78,6 +79,8 @@ def size(text: str) -> tuple[int, int]:
 
 def pictures(args: argparse.Namespace) -> tuple[str, ...]:
     """Kinds of picture that the options ask for."""
+    if getattr(args, "no_images", False):
+        return ()
     depth = ("depth",) if args.depth else ()
     return ("rgb", *depth, *((f"segmentation_{args.segmentation}",) if args.segmentation else ()))
 
@@ -109,8 +112,9 @@ def recipes(args: argparse.Namespace) -> "list[Recipe]":
     else:
         tasks = (read_task(args.bddl) if args.bddl else get_task(args.task),)
     disturb, varied = bool({"noise", "pushes"} & set(args.variation)), variation(args)
+    cameras = () if args.no_images else tuple(args.cameras)
     return [
-        Recipe(task, args.size, args.seed, args.pairing, disturb, varied, tuple(args.cameras), pictures(args))
+        Recipe(task, args.size, args.seed, args.pairing, disturb, varied, cameras, pictures(args))
         for task in tasks
     ]
 

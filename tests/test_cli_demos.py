@@ -116,3 +116,15 @@ def test_wrong_input_is_one_line_and_a_status(argv, hint, tmp_path, monkeypatch,
     err = capsys.readouterr().err
     lines = [line for line in err.splitlines() if line.startswith("libero: error:")]
     assert len(lines) == 1 and hint in lines[0]
+
+
+def test_pictures_can_be_left_out_and_drawn_later(tmp_path, monkeypatch):
+    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    argv = ["demos", "generate", "--task", "libero_goal/3", "--n", "1", "--no-images", "--workers", "1"]
+    assert cli.main([*argv, "--folder", str(tmp_path)]) == 0
+    (file,) = tmp_path.rglob("*.hdf5")
+    assert not [key for key in h5py.File(file)["data/demo_0/obs"] if key.endswith("rgb")]
+    drawn = tmp_path / "drawn.hdf5"
+    assert cli.main(["demos", "rerender", str(file), str(drawn), "--size", "16"]) == 0
+    (demo,) = read_demos(drawn, ["agentview_rgb", "joint_states"])
+    assert demo.obs["agentview_rgb"].shape[1:] == (16, 16, 3)

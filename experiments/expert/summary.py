@@ -1,0 +1,56 @@
+"""Sum up certificates in the README: a line for each suite, and the tasks that are not perfect.
+
+libero tasks certify libero_spatial libero_object libero_goal libero_10 libero_90 --out experiments/expert/builtin
+python experiments/expert/summary.py
+"""
+
+import json
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+from statistics import median
+
+HERE = Path(__file__).parent
+MARKS = "<!-- {}: results -->", "<!-- {}: end of results -->"
+
+
+def table(results: dict) -> Iterator[str]:
+    """Lines: each suite, all of them, and what failed."""
+    yield "| suite | success | weakest task | steps, median of tasks (longest success) | retries |"
+    yield "| --- | ---: | ---: | ---: | ---: |"
+    rows = results["tasks"]
+    groups = [(k, list(g)) for k, g in groupby(rows, lambda row: row["id"].partition("/")[0])]
+    for suite, own in [*groups, ("all", rows)]:
+        good, total = sum(r["successes"] for r in own), sum(r["states"] for r in own)
+        weakest = min(own, key=lambda r: r["successes"] / r["states"])
+        lengths = [r["median_length"] for r in own if r["successes"]]
+        yield (
+            f"| {suite}, {len(own)} tasks | **{good}/{total} = {100 * good / total:.1f} %** "
+            f"| {weakest['id']}: {weakest['successes']}/{weakest['states']} "
+            f"| {median(lengths):.0f} ({max(r['max_length'] or 0 for r in own)}) | {sum(r['retries'] for r in own)} |"
+        )
+    yield ""
+    perfect = sum(r["successes"] == r["states"] for r in rows)
+    yield f"{perfect} of {len(rows)} tasks from every start. The others:"
+    yield ""
+    for r in sorted(rows, key=lambda r: r["successes"] / r["states"]):
+        if r["successes"] < r["states"]:
+            yield f"- {r['id']} {r['task'].replace('_', ' ')}: {r['successes']}/{r['states']}"
+
+
+def main() -> None:
+    readme = HERE / "README.md"
+    for name in ("builtin", "builtin-disturbed", "original"):
+        folder, _, kind = name.partition("-")
+        path = HERE / folder / f"results{'-' + kind if kind else ''}.json"
+        if not path.exists():
+            continue
+        start, end = (mark.format(name) for mark in MARKS)
+        before, rest = readme.read_text(encoding="utf-8").split(start)
+        after = rest.split(end)[1]
+        lines = [start, *table(json.loads(path.read_text(encoding="utf-8"))), end]
+        readme.write_text(before + "\n".join(lines) + after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Demonstrations per hour, with and without pictures, on all cores or so many processes.
+
+python experiments/expert/throughput.py [--suites libero_object libero_10] [--n 10] [--size 128] [--workers 2]
+
+Each line is one `libero demos generate` into an empty folder, start of the processes, compilation of the scenes and
+writing of the files included; the two kinds take turns, and the best of `--rounds` counts.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from libero_env.demos_generate import cores, make_demos
+from libero_env.demos_studio import Recipe
+from libero_env.tasks import get_suite
+
+
+def seconds(suite: str, n: int, size: int, workers: int, images: bool) -> float:
+    """Wall time of recording n demonstrations of each task."""
+    with tempfile.TemporaryDirectory() as folder:
+        shots = {} if images else {"cameras": (), "pictures": ()}
+        recipes = [Recipe(task, (size, size), **shots) for task in get_suite(suite).tasks]
+        jobs = [(recipe, Path(folder) / f"{recipe.task.name}_demo.hdf5") for recipe in recipes]
+        started = time.perf_counter()
+        tallies = make_demos(jobs, n, workers=workers)
+        took = time.perf_counter() - started
+    for path, tally in tallies.items():
+        if tally.error:
+            raise SystemExit(f"{path.name}: {tally.error}")
+    return took
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--suites", nargs="+", default=["libero_object", "libero_10"])
+    parser.add_argument("--n", type=int, default=10, help="demonstrations of each task")
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--workers", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=2)
+    args = parser.parse_args()
+    workers = args.workers or cores()
+    print(f"| suite, {workers} processes | without pictures, demos/h | two {args.size}x{args.size} views | ratio |")
+    print("| --- | ---: | ---: | ---: |")
+    for suite in args.suites:
+        best = {False: float("inf"), True: float("inf")}
+        for _ in range(args.rounds):
+            for images in best:
+                best[images] = min(best[images], seconds(suite, args.n, args.size, workers, images))
+        number = args.n * len(get_suite(suite).tasks)
+        rates = [3600 * number / best[images] for images in best]
+        print(f"| {suite} | {rates[0]:.0f} | {rates[1]:.0f} | {best[True] / best[False]:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
