@@ -59,6 +59,15 @@ def object_xml(path: Path, category: str) -> str:
     body = world.find("body/body[@name='object']")
     if body is None:
         raise LiberoError(f"{path}: no body named 'object' below the outer body; {REMEDY}")
+    return attachable_xml(category, assets, body)
+
+
+def attachable_xml(category: str, assets: Iterable[ET.Element], body: ET.Element) -> str:
+    """MJCF of an object as scenes attach it, from its body, which is changed, and the assets of its file.
+
+    Raises:
+        LiberoError: a file that is needed is missing.
+    """
     body.attrib = {"name": ROOT_BODY}  # where it stands is up to the scene
     _keep(body, _OF_BODIES)
     for joint in body.findall("joint"):
@@ -100,9 +109,8 @@ def to_xml(name: str, assets: Iterable[ET.Element], bodies: Iterable[ET.Element]
     for asset in assets:
         asset = copy.copy(asset)
         if asset.tag == "mesh":
-            asset.set(
-                "inertia", "shell"
-            )  # of visual meshes, which weigh nothing: the volume need not be closed
+            # of visual meshes, which weigh nothing: the volume need not be closed
+            asset.attrib.setdefault("inertia", "shell")
         section.append(asset)
     ET.SubElement(root, "worldbody").extend(bodies)
     return ET.tostring(root, encoding="unicode")

@@ -1,25 +1,23 @@
 """Classes of objects by category, as the original registers them, over the models of `libero_env`."""
 
 import re
-from collections.abc import Mapping
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
-import mujoco
 import numpy as np
 
-from libero_env.assets import select_pack
+from libero.libero.envs.mjcf_models import STATES, accept_plain_files, model_of
+from libero_env.assets import chosen_assets, select_pack
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
+from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.builtin.facts import Facts, load_facts
-from libero_env.original_mjcf import object_xml
 
 OBJECTS_DICT: dict[str, Any] = {}
 VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
-_STATES = ("open", "close", "turnon", "turnoff")
 
 
 def category_of(name: str) -> str:
@@ -30,9 +28,11 @@ def category_of(name: str) -> str:
 def register_object(target_class: Any) -> Any:
     """Make a class known by its name; a class with an MJCF file of its own also to the scenes built from now on."""
     category = category_of(target_class.__name__)
-    OBJECTS_DICT[category] = target_class
-    if not issubclass(target_class, BuiltinObject):
+    if hasattr(target_class, "_get_object_subtree"):
+        accept_plain_files(target_class)
+    if not (issubclass(target_class, BuiltinObject) and category in BUILDERS):
         register_model(category, lambda: model_of(target_class(name=category), category))
+    OBJECTS_DICT[category] = target_class
     return target_class
 
 
@@ -179,24 +179,51 @@ class BaseObject:
 
 
 class BuiltinObject(BaseObject):
-    """A category of the benchmark; its model comes from the pack in use."""
+    """A category of the benchmark; its model comes from the pack in use. Or one of your own, from an MJCF file.
+
+    Args:
+        name: of the instance; the category by default.
+        obj_name: stem of the file of a category of your own in the folder of its family below the assets, or its path.
+        joints: as in `MujocoXMLObject`.
+        model: what a scene has built.
+    """
+
+    family = ""
+    in_folders = True  # whether each object of the family has a folder
 
     def __init__(
-        self, name: str | None = None, obj_name: str | None = None, model: ObjectModel | None = None, **_: Any
+        self,
+        name: str | None = None,
+        obj_name: str | None = None,
+        joints: Any = "default",
+        model: ObjectModel | None = None,
+        **_: Any,
     ):
         self.category_name = category_of(type(self).__name__)
         self.name = name or self.category_name
+        if model is not None:
+            self.__dict__["model"] = model
+        if self.family and self.category_name not in BUILDERS:
+            self._own_file(obj_name or self.category_name, joints)
+            return
         facts = model or _figures(self.category_name)
         self.rotation = dict(facts.rotation) or None
         self.rotation_axis = facts.rotation_axis
         if self.rotation and self.rotation_axis in self.rotation and len(self.rotation) == 1:
             self.rotation = self.rotation[self.rotation_axis]
         articulation = {
-            f"default_{state}_ranges": list(facts.articulation.get(state, ())) for state in _STATES
+            f"default_{state}_ranges": list(facts.articulation.get(state, ())) for state in STATES
         }
         self.object_properties = {"articulation": articulation, "vis_site_names": {}}
-        if model is not None:
-            self.__dict__["model"] = model
+
+    def _own_file(self, obj_name: str, joints: Any) -> None:
+        folder = Path(chosen_assets().value) / self.family
+        stem = Path(obj_name)
+        if stem.suffix != ".xml":
+            stem = folder / (stem if self.in_folders else "") / f"{stem.name}.xml"
+        self.file, self.joint_specs, self._fixed = str(stem), joints, joints is None
+        empty: dict[str, list[float]] = {f"default_{state}_ranges": [] for state in STATES}
+        self.object_properties = {"articulation": empty, "vis_site_names": {}}
 
     @cached_property
     def model(self) -> ObjectModel:
@@ -216,21 +243,30 @@ class MujocoXMLObject(BaseObject):
     """An object from an MJCF file, with the interface of robosuite's class of that name.
 
     Args:
-        fname: MJCF file: below an outer body, with its offset sites, the body `object`.
+        fname: MJCF file, see `libero.libero.envs.mjcf_models`; `custom_path` is another name for it.
         name: of the instance.
         joints: `[{"type": "free", "damping": "0.0005"}]`, or None for one that does not move.
-        obj_type, duplicate_collision_geoms: accepted, of no effect.
+        obj_type: accepted, of no effect.
+        duplicate_collision_geoms: collision geoms are seen, too.
+
+    Raises:
+        TypeError: no file is given.
     """
 
     def __init__(
         self,
-        fname: str,
-        name: str,
+        fname: str | PathLike = "",
+        name: str = "",
         joints: Any = "default",
         obj_type: str = "all",
         duplicate_collision_geoms: bool = True,
+        *,
+        custom_path: str | PathLike = "",
     ):
-        self.file, self.name, self.joint_specs = str(fname), name, joints
+        if not (fname or custom_path):
+            raise TypeError(f"{type(self).__name__}: no MJCF file; give its path as fname")
+        self.file, self.name, self.joint_specs = str(fname or custom_path), name, joints
+        self.duplicate_collision_geoms = duplicate_collision_geoms
         self.category_name = category_of(type(self).__name__)
         self.object_properties = {"vis_site_names": {}}
         self._fixed = joints is None
@@ -239,46 +275,6 @@ class MujocoXMLObject(BaseObject):
     def model(self) -> ObjectModel:
         """The file's model."""
         return model_of(self, self.category_name)
-
-
-def model_of(item: Any, category: str) -> ObjectModel:
-    """The model of an object that has an MJCF file: ours, or one of a subclass of robosuite's class.
-
-    Raises:
-        LiberoError: the file is missing or not laid out as expected.
-    """
-    path = Path(item.file)
-    spec = mujoco.MjSpec.from_string(object_xml(path, category))
-    sites = {
-        s.get("name"): s.get("pos", "0 0 0") for s in ElementTree.parse(path).iterfind("worldbody/body/site")
-    }
-    place: dict[str, Any] = {
-        name: tuple(map(float, sites.get(f"{name}_site", "0 0 0").split())) for name in _OFFSETS
-    }
-    joints = [joint for joint in _listed(getattr(item, "joint_specs", None)) if joint.get("type") == "free"]
-    rotation = getattr(item, "rotation", None)
-    if rotation is not None and not isinstance(rotation, Mapping):
-        rotation = {getattr(item, "rotation_axis", None) or "z": rotation}
-    given = getattr(item, "object_properties", {}).get("articulation", {})
-    articulation = {state: given.get(f"default_{state}_ranges") for state in _STATES}
-    return ObjectModel(
-        category=category,
-        spec=spec,
-        joint_damping=float(joints[0].get("damping", 0.0005)) if joints else 0.0005,
-        rotation={axis: (float(low), float(high)) for axis, (low, high) in (rotation or {}).items()},
-        rotation_axis=getattr(item, "rotation_axis", None),
-        bottom_offset=place["bottom"],
-        top_offset=place["top"],
-        horizontal_radius=max(map(abs, place["horizontal_radius"][:2])),
-        articulation={state: (float(r[0]), float(r[1])) for state, r in articulation.items() if r},
-    )
-
-
-_OFFSETS = ("bottom", "top", "horizontal_radius")
-
-
-def _listed(joints: Any) -> list[dict[str, str]]:
-    return [{"type": "free"}] if joints == "default" else [j for j in joints or () if isinstance(j, dict)]
 
 
 def declare(base: type[BaseObject], module: str, names: str) -> list[type]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
 from libero.libero.envs.objects.site_object import SiteObject
+from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.model import ObjectModel
 from libero_env.scene import Scene
 
@@ -31,7 +32,8 @@ def _instance(name: str, model: ObjectModel) -> BaseObject:
     found = OBJECTS_DICT.get(model.category)
     if found is None:
         return _anonymous(model)(name=name, model=model)
-    return found(name=name, model=model) if issubclass(found, BuiltinObject) else found(name=name)
+    ours = issubclass(found, BuiltinObject) and model.category in BUILDERS
+    return found(name=name, model=model) if ours else found(name=name)
 
 
 def _anonymous(model: ObjectModel) -> type[BuiltinObject]:

@@ -6,6 +6,9 @@ from libero.libero.envs.base_object import BuiltinObject, declare, register_visu
 class ArticulatedObject(BuiltinObject):
     """What opens, closes and turns; see `libero.libero.envs.base_object.BaseObject`."""
 
+    family = "articulated_objects"
+    in_folders = False
+
 
 (
     BasinFaucet, Faucet, FlatStove, Microwave, ShortCabinet, ShortFridge, SlideCabinet, WhiteCabinet,

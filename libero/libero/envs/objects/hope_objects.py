@@ -6,6 +6,8 @@ from libero.libero.envs.base_object import BuiltinObject, declare
 class HopeBaseObject(BuiltinObject):
     """Groceries of the HOPE data set; see `libero.libero.envs.base_object.BaseObject`."""
 
+    family = "stable_hope_objects"
+
 
 (
     AlphabetSoup, BbqSauce, Butter, Cherries, ChocolatePudding, Cookies, Corn, CreamCheese, Ketchup,

@@ -6,6 +6,8 @@ from libero.libero.envs.base_object import BuiltinObject, declare
 class TurbosquidObjects(BuiltinObject):
     """Furniture, books and tableware; see `libero.libero.envs.base_object.BaseObject`."""
 
+    family = "turbosquid_objects"
+
 
 (
     BlackBook, BowlDrainer, DeskCaddy, DiningSetGroup, MokaPot, PorcelainMug, RedCoffeeMug,

@@ -1,0 +1,50 @@
+"""Which places things have: the drawers of a cabinet, the inside of a basket."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import mujoco
+
+from libero_env.assets import select_pack
+from libero_env.errors import LiberoError
+
+# Category -> its places, where they shall be others than its model's.
+EXCEPTION_DICT: dict[str, list[str]] = {}
+
+
+def update_exception_dict(exceptions: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Say for some categories which places they have; all that was said so far is returned."""
+    EXCEPTION_DICT.update({category: list(regions) for category, regions in exceptions.items()})
+    return EXCEPTION_DICT
+
+
+def get_affordance_regions(objects: Iterable[str], verbose: bool = False) -> dict[str, list[str]]:
+    """Places of categories: the box-shaped sites of their models, or what `EXCEPTION_DICT` says.
+
+    Args:
+        objects: categories, or a mapping of them such as `get_object_dict()`.
+        verbose: whether they are printed.
+
+    Returns:
+        Category -> names, for the categories that have places; those without a model have none.
+
+    Raises:
+        UnknownNameError: no such category.
+    """
+    pack, found = select_pack(), {}
+    for category in objects:
+        if category in EXCEPTION_DICT:
+            names = EXCEPTION_DICT[category]
+        else:
+            try:
+                sites = pack.build(category).spec.sites
+            except LookupError:
+                raise
+            except LiberoError:  # the original's files lack a few
+                continue
+            names = [site.name for site in sites if site.type == mujoco.mjtGeom.mjGEOM_BOX]
+        if names:
+            found[category] = list(names)
+    if verbose:
+        for category, names in found.items():
+            print(f"{category}: {', '.join(names)}")
+    return found

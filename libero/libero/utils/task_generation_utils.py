@@ -1,0 +1,214 @@
+"""Tasks on registered scenes, and their task files."""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from libero.libero.envs.predicates import get_predicate_fn
+from libero.libero.utils.bddl_generation_utils import (
+    get_goal_state,
+    get_result,
+    save_to_file,
+    suite_generator,
+)
+from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
+from libero_env.arena import WORKSPACES
+from libero_env.assets import select_pack
+from libero_env.bddl import parse
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.lint import KINDS
+from libero_env.predicates import atoms_of
+
+# What may go wrong in a scene or task that somebody else wrote, and is told of that task alone.
+_FAULTS = (
+    LiberoError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    NotImplementedError,
+    TypeError,
+    ValueError,
+)
+
+
+class TaskInfoTuple(NamedTuple):
+    """A task on a scene. `file_name` is that of its task file without ending, empty for the usual one."""
+
+    scene_name: str
+    language: str
+    objects_of_interest: Sequence[str]
+    goal_states: Sequence[Any]
+    file_name: str = ""
+
+
+class Failure(NamedTuple):
+    """A task file that could not be made, and why."""
+
+    scene_name: str
+    language: str
+    cause: Exception
+
+
+TASK_INFO: dict[str, list[TaskInfoTuple]] = {}
+
+
+def register_task_info(
+    language: Any,
+    scene_name: str = "",
+    objects_of_interest: Sequence[str] = (),
+    goal_states: Sequence[Any] = (),
+) -> Any:
+    """Define a task on a scene; one of the same scene and instruction takes the place of an earlier one.
+
+    Args:
+        language: the instruction. Or, as a class decorator, a class without arguments whose instances have
+            `scene_name`, `language_instruction` and `goal`, perhaps `task_name` and `objects_of_interest`.
+        scene_name: of a registered scene, in any spelling.
+        objects_of_interest: names; without any, those that the goal speaks of.
+        goal_states: conditions that must all hold, such as `("On", "plate_1", "flat_stove_1_cook_region")`.
+
+    Returns:
+        The task; as a decorator, the class.
+
+    Raises:
+        LiberoError: scene, instruction or goal are missing.
+    """
+    if isinstance(language, type):
+        info = _info_of(language())
+    else:
+        info = TaskInfoTuple(scene_key(scene_name), language, tuple(objects_of_interest), tuple(goal_states))
+        _check_whole(info)
+    tasks = TASK_INFO.setdefault(info.scene_name, [])
+    tasks[:] = [task for task in tasks if task.language != info.language] + [info]
+    return language if isinstance(language, type) else info
+
+
+def get_task_info(scene_name: str | None = None) -> Any:
+    """Scene -> tasks; or the tasks of one scene.
+
+    Raises:
+        UnknownNameError: no task is defined on it.
+    """
+    if scene_name is None:
+        return TASK_INFO
+    if scene_key(scene_name) not in TASK_INFO:
+        raise UnknownNameError("scene with tasks", scene_name, TASK_INFO)
+    return TASK_INFO[scene_key(scene_name)]
+
+
+def get_suite_generator_func(workspace_name: str) -> Callable[..., str]:
+    """The function that writes task files for a workspace.
+
+    Raises:
+        UnknownNameError: no such workspace.
+    """
+    return suite_generator(workspace_name)
+
+
+def generate_bddl_from_task_info(
+    folder: str | os.PathLike | Any = "", output_dir: str | os.PathLike = ""
+) -> Any:
+    """Write the task files of all registered tasks; or of one.
+
+    Args:
+        folder: for the files. Or one task: an instance of a class given to `register_task_info`, or a `TaskInfoTuple`.
+        output_dir: folder for the file of one task.
+
+    Returns:
+        (paths, failures): a `Failure` has scene, instruction and cause. For one task its path.
+
+    Raises:
+        LiberoError: the one task that was asked for cannot be written; the cause says why.
+    """
+    if not isinstance(folder, str | os.PathLike):
+        return _write(folder if isinstance(folder, TaskInfoTuple) else _info_of(folder), output_dir)
+    paths: list[str] = []
+    failures: list[Failure] = []
+    for task in [task for tasks in TASK_INFO.values() for task in tasks]:
+        try:
+            paths.append(_write(task, folder or output_dir))
+        except _FAULTS as error:
+            failures.append(Failure(task.scene_name, task.language, error))
+    return paths, failures
+
+
+def bddl_text(task: TaskInfoTuple) -> str:
+    """The task file of a task.
+
+    Raises:
+        UnknownNameError: a scene, category or predicate that does not exist.
+        BDDLError: a condition speaks of a name that the scene does not have.
+        LiberoError: a condition has too few or too many names.
+    """
+    scene: InitialSceneTemplates = get_scene_class(task.scene_name)()
+    text = get_result(
+        suite_generator(scene.workspace_name)(
+            language=task.language,
+            xy_region_kwargs_list=scene.xy_region_kwargs_list,
+            affordance_region_kwargs_list=scene.affordance_region_kwargs_list,
+            fixture_object_dict=scene.fixture_object_dict,
+            movable_object_dict=scene.movable_object_dict,
+            objects_of_interest=task.objects_of_interest or _interest(scene, task),
+            init_states=scene.init_states,
+            goal_states=task.goal_states,
+        )
+    )
+    problem = parse(text)
+    categories = {*select_pack().categories(), *WORKSPACES}
+    for category in [*problem.fixtures.values(), *problem.objects.values()]:
+        if category not in categories:
+            raise UnknownNameError("object category", category, categories)
+    for atom in [*problem.init, *atoms_of(problem.goal)]:
+        get_predicate_fn(atom.predicate)
+        count = len(KINDS.get(atom.predicate, atom.args))
+        if len(atom.args) != count:
+            raise LiberoError(
+                f"({atom.predicate} {' '.join(atom.args)}): {atom.predicate} takes {count} names"
+            )
+    return text
+
+
+def _write(task: TaskInfoTuple, folder: str | os.PathLike) -> str:
+    text = bddl_text(task)
+    if not task.file_name:
+        return save_to_file(text, task.scene_name, task.language, Path(folder))
+    path = Path(folder) / f"{task.file_name}.bddl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def _interest(scene: InitialSceneTemplates, task: TaskInfoTuple) -> list[str]:
+    """The things that a goal speaks of, a drawer's cabinet for the drawer."""
+    targets = {
+        f"{k['target_name']}_{k['region_name']}": k["target_name"]
+        for k in scene.affordance_region_kwargs_list
+    }
+    goal = get_goal_state(task.goal_states)
+    spoken = {targets.get(name, name) for atom in atoms_of(goal) for name in atom.args}
+    return [name for name in (*scene.movable_objects, *scene.fixtures) if name in spoken]
+
+
+def _info_of(task: Any) -> TaskInfoTuple:
+    """What an instance of a task class says."""
+    goal = next((getattr(task, name) for name in ("goal", "goal_states") if hasattr(task, name)), ())
+    words = ("language_instruction", "language", "task_description")
+    info = TaskInfoTuple(
+        scene_name=scene_key(str(getattr(task, "scene_name", ""))),
+        language=str(next((getattr(task, name) for name in words if getattr(task, name, "")), "")),
+        objects_of_interest=tuple(getattr(task, "objects_of_interest", ())),
+        goal_states=tuple(goal() if callable(goal) else goal),
+        file_name=str(getattr(task, "task_name", "")),
+    )
+    _check_whole(info)
+    return info
+
+
+def _check_whole(task: TaskInfoTuple) -> None:
+    named = {"scene_name": task.scene_name, "language": task.language, "goal_states": task.goal_states}
+    if missing := [name for name, value in named.items() if not value]:
+        raise LiberoError(
+            f"task {task.language or task.file_name!r}: no {' and no '.join(missing)}; expected scene_name, an "
+            "instruction, and a goal such as [('On', 'plate_1', 'flat_stove_1_cook_region')]"
+        )

@@ -1,0 +1,342 @@
+"""Objects of one's own with meshes: registered as the walkthrough does, used in scenes, task files, environments."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from libero.libero.envs import OffScreenRenderEnv
+from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject, register_object
+from libero.libero.envs.mjcf_models import model_of
+from libero.libero.envs.objects import ArticulatedObject, get_object_fn
+from libero.libero.utils import mu_utils, task_generation_utils
+from libero.libero.utils.mu_utils import InitialSceneTemplates, register_mu
+from libero.libero.utils.object_utils import get_affordance_regions
+from libero.libero.utils.task_generation_utils import generate_bddl_from_task_info, register_task_info
+from libero_env.errors import LiberoError
+from libero_env.objects import catalog, get_object
+
+pytestmark = pytest.mark.sim
+
+# As the walkthrough prints it: one body, one mesh, no groups, no sites.
+PLAIN = """
+<mujoco model="{name}">
+<asset>
+<mesh name="{name}_mesh" file="{name}.obj"/>
+</asset>
+<worldbody>
+<body name="{name}">
+<geom type="mesh" mesh="{name}_mesh"
+rgba="0.8 0.8 0.8 1"
+friction="0.95 0.3 0.1"/>
+</body>
+</worldbody>
+</mujoco>
+"""
+DRAWER = """
+<mujoco model="tool_box">
+  <worldbody><body>
+    <body name="object">
+      <geom type="box" size="0.10 0.10 0.005" group="0"/>
+      <geom type="box" size="0.10 0.10 0.005" group="1" rgba="0.6 0.3 0.1 1" contype="0" conaffinity="0"/>
+      <body name="drawer" pos="0 0 0.05">
+        <joint name="slide" type="slide" axis="1 0 0" range="0 0.15" damping="5"/>
+        <geom type="box" size="0.08 0.08 0.02" group="0"/>
+        <geom type="box" size="0.08 0.08 0.02" group="1" rgba="0.9 0.6 0.3 1" contype="0" conaffinity="0"/>
+        <site name="inner_region" type="box" size="0.07 0.07 0.02" rgba="0 0 0 0"/>
+      </body>
+    </body>
+    <site name="bottom_site" pos="0 0 -0.005"/>
+    <site name="top_site" pos="0 0 0.07"/>
+    <site name="horizontal_radius_site" pos="0.1 0.1 0"/>
+  </body></worldbody>
+</mujoco>
+"""
+
+
+def write_box(path, half, offset=0.0):
+    """A box of 12 triangles as OBJ, its middle `offset` m up."""
+    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    lines = ["v {} {} {}".format(*np.multiply(c, half) + (0, 0, offset)) for c in corners]
+    quads = ((1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4))
+    lines += [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in quads]
+    path.write_text("\n".join(lines))
+
+
+@pytest.fixture
+def assets(tmp_path, monkeypatch):
+    """The folder `custom_assets` of the walkthrough, here."""
+    for name, half in (("libero_mug", 0.03), ("libero_mug_yellow", 0.02)):
+        folder = tmp_path / "custom_assets" / name
+        folder.mkdir(parents=True)
+        (folder / f"{name}.xml").write_text(PLAIN.format(name=name))
+        write_box(folder / f"{name}.obj", half, offset=0.01)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def registries(monkeypatch):
+    """What a test registers is gone after it."""
+    for holder, name in (
+        (mu_utils, "MU_DICT"),
+        (task_generation_utils, "TASK_INFO"),
+        (catalog, "_registered"),
+    ):
+        monkeypatch.setattr(holder, name, dict(getattr(holder, name)))
+    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
+    kept = dict(OBJECTS_DICT)
+    yield
+    OBJECTS_DICT.clear()
+    OBJECTS_DICT.update(kept)
+
+
+class CustomObjects(MujocoXMLObject):
+    def __init__(self, custom_path, name, obj_name, joints=[dict(type="free", damping="0.0005")]):  # noqa: B006, C408
+        assert os.path.isabs(custom_path), "Custom path must be an absolute path"
+        assert custom_path.endswith(".xml"), "Custom path must be an xml file"
+        super().__init__(
+            custom_path,
+            name=name,
+            joints=joints,
+            obj_type="all",
+            duplicate_collision_geoms=False,
+        )
+        self.category_name = "_".join(re.sub(r"([A-Z])", r" \1", self.__class__.__name__).split()).lower()
+        self.object_properties = {"vis_site_names": {}}
+
+
+def register_mugs():
+    @register_object
+    class LiberoMug(CustomObjects):
+        def __init__(self, name="libero_mug", obj_name="libero_mug"):
+            super().__init__(
+                custom_path=os.path.abspath(
+                    os.path.join("./", "custom_assets", "libero_mug", "libero_mug.xml")
+                ),
+                name=name,
+                obj_name=obj_name,
+            )
+            self.rotation = {
+                "x": (-np.pi / 2, -np.pi / 2),
+                "y": (-np.pi, -np.pi),
+                "z": (np.pi, np.pi),
+            }
+            self.rotation_axis = None
+
+    @register_object
+    class LiberoMugYellow(CustomObjects):
+        def __init__(self, name="libero_mug_yellow", obj_name="libero_mug_yellow"):
+            super().__init__(
+                custom_path=os.path.abspath(
+                    os.path.join("./", "custom_assets", "libero_mug_yellow", "libero_mug_yellow.xml")
+                ),
+                name=name,
+                obj_name=obj_name,
+            )
+            self.rotation = (0.0, 0.0)
+            self.rotation_axis = "z"
+
+    return LiberoMug, LiberoMugYellow
+
+
+def kitchen_demo_scene():
+    @register_mu(scene_type="kitchen")
+    class KitchenDemoScene(InitialSceneTemplates):
+        def __init__(self):
+            fixture_num_info = {"kitchen_table": 1, "wooden_cabinet": 1}
+            object_num_info = {"libero_mug": 1, "libero_mug_yellow": 1, "plate": 1}
+            super().__init__(
+                workspace_name="kitchen_table",
+                fixture_num_info=fixture_num_info,
+                object_num_info=object_num_info,
+            )
+
+        def define_regions(self):
+            places = {"libero_mug": (0.0, 0.0), "libero_mug_yellow": (0.2, 0.0), "plate": (-0.2, 0.0)}
+            for name, middle in places.items():
+                self.regions.update(
+                    self.get_region_dict(
+                        region_centroid_xy=middle,
+                        region_name=f"{name}_init_region",
+                        target_name=self.workspace_name,
+                        region_half_len=0.025,
+                    )
+                )
+            self.regions.update(
+                self.get_region_dict([0.0, -0.3], "wooden_cabinet_init_region", self.workspace_name, 0.01)
+            )
+
+        @property
+        def init_states(self):
+            names = ("libero_mug", "libero_mug_yellow", "plate", "wooden_cabinet")
+            return [("On", f"{name}_1", f"kitchen_table_{name}_init_region") for name in names]
+
+
+def test_the_walkthrough_from_class_to_environment(assets):
+    mug, _ = register_mugs()
+    assert get_object_fn("libero_mug") is mug
+    kitchen_demo_scene()
+
+    @register_task_info
+    class KitchenDemoScenePutMugsOnPlate:
+        def __init__(self):
+            self.task_name = "KITCHEN_DEMO_SCENE_put_both_mugs_on_the_plate"
+            self.scene_name = "KitchenDemoScene"
+            self.language_instruction = "put the libero mug and yellow mug on the plate"
+
+        @property
+        def goal(self):
+            return [("On", "libero_mug_1", "plate_1"), ("On", "libero_mug_yellow_1", "plate_1")]
+
+    path = generate_bddl_from_task_info(KitchenDemoScenePutMugsOnPlate(), output_dir="./custom_pddl")
+    env = OffScreenRenderEnv(bddl_file_name=path, camera_heights=64, camera_widths=64)
+    env.seed(1)
+    obs = env.reset()
+    shown = env.env.objects_dict["libero_mug_1"]
+    assert type(shown) is mug
+    assert shown.joints == ["libero_mug_1_joint0"]
+    assert np.allclose(obs["libero_mug_1_pos"][:2], (0.0, 0.0), atol=0.03)
+    before = obs["libero_mug_1_pos"]
+    for _ in range(5):
+        obs, _, done, _ = env.step([0.0] * 7)
+    assert np.allclose(obs["libero_mug_1_pos"], before, atol=0.005), "it stands still on the table"
+    assert not done
+    model = env.sim.model
+    seen = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body_name2id("libero_mug_1_main")]
+    assert {int(model.geom_group[g]) for g in seen} == {0, 1}, "what has no visual geom is seen as it is"
+    env.close()
+
+
+def test_rotation_may_be_a_range_or_one_for_each_axis(assets):
+    register_mugs()
+    assert get_object("libero_mug").rotation.keys() == {"x", "y", "z"}
+    assert get_object("libero_mug_yellow").rotation == {"z": (0.0, 0.0)}
+
+
+def test_what_a_plain_file_leaves_out_is_measured(assets):
+    register_mugs()
+    model = get_object("libero_mug")
+    assert np.allclose([model.bottom_offset[2], model.top_offset[2]], [-0.02, 0.04], atol=1e-6)
+    assert model.horizontal_radius == pytest.approx(0.03)
+    compiled = model.spec.compile()
+    assert compiled.body_mass[1] == pytest.approx(1000 * 0.06**3, rel=1e-6), (
+        "by volume, at the density of water"
+    )
+
+
+def test_files_that_cannot_be_used(tmp_path):
+    class Thing(MujocoXMLObject):
+        def __init__(self, file, name="thing"):
+            super().__init__(file, name=name)
+
+    for text, words in (
+        ("<mujoco><worldbody/></mujoco>", "no body with a geom"),
+        (PLAIN.format(name="thing"), "thing.obj: no such file"),
+        ("<mujoco><worldbody><body><geom size='1 a'/></body></worldbody></mujoco>", "MuJoCo cannot read it"),
+        ("<mujoco", "thing.xml"),
+    ):
+        (tmp_path / "thing.xml").write_text(text)
+        os.utime(tmp_path / "thing.xml", ns=(0, hash(words) & 0xFFFFFFF))
+        with pytest.raises(LiberoError, match=words):
+            model_of(Thing(tmp_path / "thing.xml"), "thing")
+    with pytest.raises(TypeError, match="no MJCF file"):
+        MujocoXMLObject(name="thing")
+    assert Thing(tmp_path / "thing.xml").file == MujocoXMLObject(custom_path=tmp_path / "thing.xml").file
+
+
+def test_articulated_objects_of_ones_own(tmp_path):
+    """A fixture with a drawer that a task opens: the family's base class, with a file that is named by its path."""
+    (tmp_path / "tool_box.xml").write_text(DRAWER)
+
+    @register_object
+    class ToolBox(ArticulatedObject):
+        def __init__(self, name="tool_box", obj_name=str(tmp_path / "tool_box.xml"), joints=None):
+            super().__init__(name, obj_name, joints)
+            self.object_properties["articulation"]["default_open_ranges"] = [0.10, 0.15]
+            self.object_properties["articulation"]["default_close_ranges"] = [0.0, 0.005]
+
+    assert get_affordance_regions(["tool_box"]) == {"tool_box": ["inner_region"]}
+
+    @register_mu(scene_type="kitchen")
+    class Workshop(InitialSceneTemplates):
+        def __init__(self):
+            super().__init__("kitchen_table", {"kitchen_table": 1, "tool_box": 1}, {"butter": 1})
+
+        def define_regions(self):
+            for name, middle in (("tool_box", (0.0, 0.25)), ("butter", (0.0, -0.1))):
+                self.regions.update(self.get_region_dict(middle, f"{name}_region", self.workspace_name, 0.01))
+
+        @property
+        def init_states(self):
+            return [
+                ("On", "tool_box_1", "kitchen_table_tool_box_region"),
+                ("On", "butter_1", "kitchen_table_butter_region"),
+            ]
+
+    info = register_task_info("open the box", "workshop", goal_states=[("Open", "tool_box_1_inner_region")])
+    env = OffScreenRenderEnv(
+        bddl_file_name=generate_bddl_from_task_info(info, tmp_path), camera_heights=32, camera_widths=32
+    )
+    env.seed(0)
+    env.reset()
+    box = env.env.fixtures_dict["tool_box_1"]
+    assert (type(box), box.joints) == (ToolBox, ["tool_box_1_slide"])
+    drawer = env.env.object_states_dict["tool_box_1_inner_region"]
+    assert (drawer.is_open(), drawer.is_close(), env.check_success()) == (False, True, False)
+    drawer.set_joint(0.14)
+    assert (drawer.is_open(), env.check_success()) == (True, True)
+    env.close()
+
+
+ROBOSUITE = """
+import numpy as np, os, sys
+from robosuite.models.objects import MujocoXMLObject
+from libero.libero.envs.base_object import register_object
+from libero.libero.envs.objects import get_object_dict
+from libero_env.objects import get_object
+
+@register_object
+class LiberoMug(MujocoXMLObject):
+    def __init__(self, name="libero_mug", obj_name="libero_mug"):
+        super().__init__(os.path.abspath("custom_assets/libero_mug/libero_mug.xml"), name=name,
+                         joints=[dict(type="free", damping="0.0005")], obj_type="all", duplicate_collision_geoms=False)
+        self.rotation, self.rotation_axis = {"x": (-np.pi/2, -np.pi/2), "y": (0, 0), "z": (0, 2*np.pi)}, None
+
+mug = get_object_dict()["libero_mug"](name="libero_mug_1")
+print(mug.joints, f"{mug.bottom_offset[2]:.3f} {mug.horizontal_radius:.3f}")
+model = get_object("libero_mug")
+print(f"{model.horizontal_radius:.3f}", sorted(model.rotation), model.joint_damping)
+"""
+
+
+def test_subclasses_of_robosuites_own_class(assets):
+    """With robosuite itself; the two packages that it needs for desktops only stand empty here."""
+    (assets / "desktop").mkdir()
+    (assets / "desktop" / "cv2.py").write_text("")
+    (assets / "desktop" / "termcolor.py").write_text("def colored(text, *_, **__):\n    return text\n")
+    root = Path(__file__).parents[2]
+    env = {**os.environ, "PYTHONPATH": f"{assets / 'desktop'}:{root}"}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", ROBOSUITE], env=env, cwd=assets, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.strip().splitlines()[-2:]
+    assert first == "['libero_mug_1_joint0'] -0.020 0.030"
+    assert second == "0.030 ['x', 'y', 'z'] 0.0005"
+
+
+def test_meshes_count_once(assets):
+    """Reading a file again gives the same model; a changed file gives the changed one."""
+    register_mugs()
+    first = get_object("libero_mug").horizontal_radius
+    file = assets / "custom_assets" / "libero_mug" / "libero_mug.xml"
+    file.write_text(file.read_text().replace("libero_mug.obj", "../libero_mug_yellow/libero_mug_yellow.obj"))
+    os.utime(file, (0, 0))
+    assert (first, get_object("libero_mug").horizontal_radius) == (pytest.approx(0.03), pytest.approx(0.02))
+    assert mujoco.MjModel.from_xml_string(get_object("libero_mug").spec.to_xml()).nmesh == 1
