@@ -1,13 +1,23 @@
 """How to take and put something together: the pair of a hold and a place that leaves the hand room at both."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from libero_env.expert.clearance import Voxels, hand_points
 from libero_env.expert.geometry import Pose
-from libero_env.expert.grasp import Grasp, GraspError, crowding, grasps
-from libero_env.expert.motion import finger_axis
+from libero_env.expert.grasp import (
+    FINGER_HALF_WIDTH,
+    MAX_OPENING,
+    PAD_ABOVE,
+    PAD_BELOW,
+    Grasp,
+    GraspError,
+    crowding,
+    grasps,
+)
+from libero_env.expert.motion import finger_axis, rotation_between
 from libero_env.expert.place import DOWN, Place, places
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.predicates import StateView
@@ -23,11 +33,14 @@ def _lean(azimuth: float, tilt: float) -> np.ndarray:
 
 _HAND = hand_points()
 _CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
-_RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.35, 0.6) for k in range(8)]
+_RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.25, 0.35, 0.6) for k in range(8)]
 _GRASPS, _PLACES, _TRIED = 20, 24, 24
+_AGAIN = 0.5  # cost of a hold that failed before, or of a place
+_ALIKE, _ALIKE_TURN = 0.02, 0.4  # m and rad, between holds or places that share their fate
 _LIFTS = np.array(
     [0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18]
 )  # m, over the place, from which a body is let fall
+_BITE = 0.010  # m of a body, along and across the pads, that make a firm hold
 _BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room too
 _TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
 _NEAR = 0.3  # m, around a body: what is further away is in no hand's way
@@ -57,8 +70,27 @@ class Approach:
         return self.place.pos + [0, 0, self.lift] + turn @ (self.grasp.pos_world - self.pose.pos)
 
 
+@dataclass(frozen=True)
+class Failure:
+    """What was tried in vain: a hold, as a pose in the body's frame, and the place if the body got there."""
+
+    hold: Pose
+    place: Place | None = None
+
+    @classmethod
+    def of(cls, way: Approach, placed: bool) -> "Failure":
+        """The failure of an approach, before or after the body was let go."""
+        back = way.pose.mat.T
+        hold = Pose(way.pose.invert(way.grasp.pos_world), back @ way.grasp.mat)
+        return cls(hold, way.place if placed else None)
+
+
 def choose_approach(
-    view: StateView, shapes: Shapes, atom: Atom, share: tuple[int, int] = (0, 1), skip: int = 0
+    view: StateView,
+    shapes: Shapes,
+    atom: Atom,
+    share: tuple[int, int] = (0, 1),
+    failures: Sequence[Failure] = (),
 ) -> Approach:
     """The best way to make an (On thing place) or (In thing place) true; the same input gives the same answer.
 
@@ -67,7 +99,7 @@ def choose_approach(
         shapes: of the scene.
         atom: what shall hold.
         share: see `places`.
-        skip: how many ways failed before; the next ones are taken.
+        failures: what was tried before; something else is preferred.
 
     Raises:
         GraspError: nothing of the body fits between the fingers.
@@ -77,10 +109,9 @@ def choose_approach(
     cloud, pose = shapes.cloud(view, thing), pose_of(view, thing)
     floor = view.scene.workspace.surface_height
     voxels = Voxels(shapes.others(view, thing, spacing=DENSE), floor, pose.pos)
-    spots = places(view, voxels, cloud, pose, atom, share)
-    holds = _free_holds(view, voxels, cloud, thing, _tilts(spots[:_PLACES], pose))
-    pairs = _pairs(voxels, holds, spots[:_PLACES], pose)
-    return _reachable(view, shapes, pairs[skip % len(pairs) :])
+    spots = _places_again(places(view, voxels, cloud, pose, atom, share), failures)[:_PLACES]
+    holds = _free_holds(view, voxels, cloud, pose, thing, _tilts(spots, pose), failures)
+    return _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
 
 
 def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
@@ -97,10 +128,27 @@ def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
     return True
 
 
+def _places_again(spots: list[Place], failures: Sequence[Failure]) -> list[Place]:
+    """Places in order, those like the ones that failed later."""
+    if not any(failure.place for failure in failures):
+        return spots
+    failed = [Pose(f.place.pos, f.place.mat) for f in failures if f.place]
+    dearer = [
+        replace(s, cost=s.cost + _AGAIN * sum(_alike(Pose(s.pos, s.mat), f) for f in failed)) for s in spots
+    ]
+    return sorted(dearer, key=lambda spot: spot.cost)
+
+
+def _alike(pose: Pose, other: Pose) -> bool:
+    near = np.linalg.norm(pose.pos - other.pos) < _ALIKE
+    return bool(near and np.linalg.norm(rotation_between(pose.mat, other.mat)) < _ALIKE_TURN)
+
+
 def _free_holds(
-    view: StateView, voxels: Voxels, cloud: np.ndarray, thing: str, tilts: list[np.ndarray]
-) -> list[Grasp]:
-    """Holds from above and along other approaches, those in the way of others last."""
+    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, thing: str, tilts: list[np.ndarray],
+    failures: Sequence[Failure],
+) -> list[Grasp]:  # fmt: skip
+    """Holds from above and along other approaches, those in the way of others and those that failed last."""
     near = voxels.points[np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1) < _NEAR]
     axis, error = finger_axis(view.eef_mat), None
     found: list[Grasp] = []
@@ -110,21 +158,46 @@ def _free_holds(
         try:
             lean = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
             number = _GRASPS if tilt is None else 4
+            number *= 1 + len(failures)
             own = grasps(cloud, voxels.floor, axis, tilt=tilt, name=thing, number=number, apart=0.015)
         except GraspError as problem:
             error = error or problem
             continue
-        found += [replace(g, cost=g.cost + lean + _crowd_price(voxels, near, g)) for g in own]
+        for g in own:
+            price = _crowd_price(voxels, near, g) + _weak_price(cloud, g) + _failed_price(pose, g, failures)
+            found.append(replace(g, cost=g.cost + lean + price))
     if not found:
         raise error or GraspError(f"{thing} cannot be grasped")
     return sorted(found, key=lambda g: g.cost)
 
 
+def _weak_price(cloud: np.ndarray, grasp: Grasp) -> float:
+    """What it costs that the pads have little of the body between them, or meet its faces askew."""
+    u, v, depth = ((cloud - grasp.pos_world) @ grasp.mat).T
+    pads = (np.abs(v) < FINGER_HALF_WIDTH) & (depth > -PAD_ABOVE) & (depth < PAD_BELOW)
+    pads &= np.abs(u) < 0.5 * MAX_OPENING
+    if not pads.any():
+        return 1.0
+    u, v, depth = u[pads], v[pads], depth[pads]
+    price = 30.0 * max(_BITE - np.ptp(depth), 0.0) + 30.0 * max(_BITE - np.ptp(v), 0.0)
+    parts = [u[np.abs(v - middle) < 0.004] for middle in (-0.007, 0.0, 0.007)]
+    faces = np.array([(part.min(), part.max()) for part in parts if len(part)])
+    askew = np.ptp(faces, axis=0).max() if len(faces) else 0.0
+    return float(price + 30.0 * max(askew - 0.003, 0.0))
+
+
+def _failed_price(pose: Pose, grasp: Grasp, failures: Sequence[Failure]) -> float:
+    """What it costs that holds like this one failed; either finger may be on either side."""
+    hold = Pose(pose.invert(grasp.pos_world), pose.mat.T @ grasp.mat)
+    turned = Pose(hold.pos, hold.mat * [-1.0, -1.0, 1.0])
+    return _AGAIN * sum(_alike(hold, f.hold) or _alike(turned, f.hold) for f in failures)
+
+
 def _crowd_price(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
     """What it costs that others are in the hand's way, at the hold and before it."""
     crowd = crowding(near, grasp.pos_world, grasp.mat)
-    below = (_hand_at(grasp.pos_world, grasp.mat)[:, 2] < voxels.floor).sum()
-    price = 20.0 * crowd + 0.3 * (crowd > 0) + 0.01 * float(below) + 0.3 * (below > 0)
+    below = max(voxels.floor - float(_hand_at(grasp.pos_world, grasp.mat)[:, 2].min()), 0.0)
+    price = 20.0 * crowd + 0.3 * (crowd > 0) + 40.0 * below + 0.1 * (below > 0)
     ways = [crowding(near, grasp.pos_world - back * grasp.mat[:, 2], grasp.mat) for back in _BEFORE]
     return price + 5.0 * max(ways) + 0.1 * (max(ways) > 0)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from libero_env.control import SUBSTEPS
 from libero_env.errors import LiberoError
-from libero_env.expert.approach import ASIDE, Approach, choose_approach
+from libero_env.expert.approach import ASIDE, Approach, Failure, choose_approach
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import TIP_BELOW
@@ -31,6 +31,7 @@ LEVEL = 0.45  # vertical part of an approach below which it counts as level
 AROUND = 0.08  # m, within which bodies count as in the way
 SLIPPED = 0.03  # m, that a body may move between the fingers
 GENTLE = 0.005  # m, over what carries it, where a body is let go
+PATIENCE = 25  # steps, to wait for an object to come to rest
 STUCK = 130  # steps of one phase
 
 
@@ -65,8 +66,11 @@ class PickPlace:
         self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
         self._stuck, self._backings = 0, 0  # steps without motion, and times it backed off
         self._inside = False  # on the last stretch of a way in from the side
+        self._failures: list[Failure] = []
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
+        self._lay: Pose | None = None  # the object's pose one step ago
+        self._waited = 0  # steps, for the object to come to rest
 
     @property
     def steadiness(self) -> float:
@@ -99,8 +103,12 @@ class PickPlace:
             if moved or np.linalg.norm(rotation_between(then.mat, now.mat)) > 0.1:
                 self._way = None
         if self._way is None:
+            if self._moving(now) and self._waited < PATIENCE:
+                self._waited += 1
+                return False
+            self._waited = 0
             try:
-                self._way = choose_approach(view, self.shapes, self.atom, self.share, self.retries)
+                self._way = choose_approach(view, self.shapes, self.atom, self.share, self._failures)
             except LiberoError as error:
                 self.trouble = str(error)
                 return False
@@ -109,12 +117,23 @@ class PickPlace:
             self._rise = float(depth.max()) + TIP_BELOW
         return True
 
+    def _moving(self, now: Pose) -> bool:
+        """Whether the object has moved since the last step; falling and rocking things are not planned for."""
+        before, self._lay = self._lay, now
+        if before is None:
+            return False
+        turn = np.linalg.norm(rotation_between(before.mat, now.mat))
+        return bool(np.linalg.norm(now.pos - before.pos) > 0.001 or turn > 0.015)
+
     def _enter(self, phase: Phase) -> None:
         self.phase, self._steps = phase, 0
         self._pressed, self._backing, self._inside = 0, False, False
         self._stuck, self._backings = 0, 0
 
-    def _again(self) -> None:
+    def _again(self, placed: bool = False) -> None:
+        """Begin again, another way; `placed`: the object was let go of at its place."""
+        if self._way is not None:
+            self._failures.append(Failure.of(self._way, placed))
         self.retries += 1
         self._way = None
         if self.retries > ATTEMPTS:
@@ -260,7 +279,7 @@ class PickPlace:
             if evaluate(self.atom, view):
                 self._enter("rest")
             else:
-                self._again()
+                self._again(placed=True)
         return self._toward(view, self._hold.pos + 0.10 * back, self._hold.mat, OPEN)
 
     def _rest(self, view: StateView) -> np.ndarray:
