@@ -26,7 +26,7 @@ _SPARE_BYTES = 64 << 20  # left free on the disk
 
 
 class DownloadError(LiberoError):
-    """The assets did not arrive; what did is kept, and the message says how to go on."""
+    """Files did not arrive; what did is kept, and the message says how to go on."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def download(dest: Path | None = None, revision: str = REVISION) -> Path:
         for _ in range(2):  # once more for files that arrived broken
             if not wrong:
                 break
-            _check_room(folder, sum(remote[name].size for name in wrong))
+            check_room(folder, sum(remote[name].size for name in wrong))
             for name in wrong:
                 (folder / name).unlink(missing_ok=True)
             hub.snapshot_download(
@@ -128,7 +128,12 @@ def _listing(api: Any, revision: str) -> dict[str, Remote]:
     }
 
 
-def _check_room(folder: Path, needed: int) -> None:
+def check_room(folder: Path, needed: int) -> None:
+    """Look whether so many bytes fit on the disk.
+
+    Raises:
+        DownloadError: they do not.
+    """
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if free < needed + _SPARE_BYTES:

@@ -18,10 +18,11 @@ SHOWN_REASONS = 3  # of failed attempts at a task
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
-    """`libero demos generate|info|check|replay|rerender|filter|export`"""
+    """`libero demos generate|download|info|check|replay|rerender|filter|export`"""
     parser = subparsers.add_parser("demos", help="record demonstrations, look at them, convert them")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _register_generate(commands)
+    _register_download(commands)
     places = "files or folders (default: where demonstrations are kept)"
     info = commands.add_parser("info", help="the demonstration files in a folder")
     info.add_argument("paths", nargs="*", type=Path, help=places)
@@ -44,7 +45,11 @@ def _register_generate(commands: "argparse._SubParsersAction") -> None:
     add("--n", type=positive, default=50, help="demonstrations of each task (default: 50)")
     add("--size", type=size, default=(128, 128), help="of the pictures, 128 or 120x160 (default: 128)")
     add("--cameras", nargs="+", default=CAMERAS, help=f"what is drawn (default: {' '.join(CAMERAS)})")
-    add("--no-images", action="store_true", help="states, proprioception and actions alone; rerender draws later")
+    add(
+        "--no-images",
+        action="store_true",
+        help="states, proprioception and actions alone; rerender draws later",
+    )
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
     add("--seed", type=int, default=0, help="of starts and manners (default: 0)")
@@ -59,6 +64,28 @@ def _register_generate(commands: "argparse._SubParsersAction") -> None:
     add("--workers", type=int, default=0, help="processes (default: one for each core)")
     add("--folder", type=Path, help="where to keep them (default: LIBERO_DEMOS, or in the cache)")
     generate.set_defaults(run=run_generate)
+
+
+def _register_download(commands: "argparse._SubParsersAction") -> None:
+    download = commands.add_parser(
+        "download", help="fetch those that people recorded for the original; goes on where it was stopped"
+    )
+    add = download.add_argument
+    add("names", nargs="+", help="suites such as libero_object, or tasks such as libero_object/3")
+    add("--dest", type=Path, help="the folder (default: where demonstrations are kept)")
+    add("--revision", help="commit, tag or branch of the data set (default: a pinned commit)")
+    add("--overwrite", action="store_true", help="replace files that are there and are others")
+    download.set_defaults(run=run_download)
+
+
+def run_download(args: argparse.Namespace) -> None:
+    """Fetch, then name the files."""
+    from libero_env.demos_download import REVISION, download_demos
+
+    for path in download_demos(
+        args.names, args.dest, revision=args.revision or REVISION, overwrite=args.overwrite
+    ):
+        print(f"{path}: complete and verified")
 
 
 def positive(text: str) -> int:

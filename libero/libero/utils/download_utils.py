@@ -1,0 +1,169 @@
+"""Fetching the demonstrations of the original; see `libero_env.demos_download`."""
+
+import http.client
+import os
+import urllib.error
+import urllib.request
+import zipfile
+from pathlib import Path
+
+from tqdm import tqdm
+
+from libero.libero import get_path_dict
+from libero.libero.benchmark import get_benchmark
+from libero_env.assets_download import DownloadError
+from libero_env.demos_download import REPO as HF_REPO_ID
+from libero_env.demos_download import download_demos
+from libero_env.errors import UnknownNameError
+from libero_env.fetch import fetch
+
+__all__ = [
+    "DATASET_LINKS",
+    "HF_REPO_ID",
+    "DownloadProgressBar",
+    "check_libero_dataset",
+    "download_from_huggingface",
+    "download_url",
+    "libero_dataset_download",
+    "url_is_alive",
+]
+
+# Archives of the demonstrations, without published checksums. That of LIBERO-100 holds libero_90 and libero_10.
+DATASET_LINKS = {
+    "libero_object": "https://utexas.box.com/shared/static/avkklgeq0e1dgzxz52x488whpu8mgspk.zip",
+    "libero_goal": "https://utexas.box.com/shared/static/iv5e4dos8yy2b212pkzkpxu9wbdgjfeg.zip",
+    "libero_spatial": "https://utexas.box.com/shared/static/04k94hyizn4huhbv5sz4ev9p2h1p6s7f.zip",
+    "libero_100": "https://utexas.box.com/shared/static/cv73j8zschq8auh9npzt876fdc1akvmk.zip",
+}
+_SUITES = ("libero_object", "libero_goal", "libero_spatial", "libero_10", "libero_90")
+
+
+class DownloadProgressBar(tqdm):
+    """A bar for `urllib.request.urlretrieve(url, file, reporthook=bar.update_to)`."""
+
+    def update_to(self, b: int = 1, bsize: int = 1, tsize: int | None = None) -> None:
+        """Say that `b` blocks of `bsize` bytes of `tsize` in all have arrived."""
+        if tsize is not None:
+            self.total = tsize
+        self.update(b * bsize - self.n)
+
+
+def url_is_alive(url: str) -> bool:
+    """Whether a server answers for an address."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=30):
+            return True
+    except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError):
+        return False
+
+
+def download_url(
+    url: str, download_dir: str | os.PathLike, check_overwrite: bool = True, is_zipfile: bool = True
+) -> Path:
+    """Fetch a file into a folder, going on where an earlier attempt was broken off.
+
+    Args:
+        url: its address; the last part is the file's name.
+        download_dir: the folder.
+        check_overwrite: keep a file of this name that is there.
+        is_zipfile: unpack it, and remove the archive.
+
+    Returns:
+        The file, or the folder it was unpacked into.
+
+    Raises:
+        DownloadError: it did not arrive, or is no archive.
+    """
+    folder = Path(download_dir)
+    file = folder / url.rpartition("/")[2]
+    if not (check_overwrite and file.is_file()):
+        fetch(url, file)
+    if not is_zipfile:
+        return file
+    try:
+        with zipfile.ZipFile(file) as archive:
+            archive.extractall(folder)
+    except zipfile.BadZipFile as error:
+        file.unlink()
+        raise DownloadError(
+            f"{url}: what arrived is no intact archive and was removed ({error}); try again"
+        ) from error
+    file.unlink()
+    return folder
+
+
+def download_from_huggingface(
+    dataset_name: str, download_dir: str | os.PathLike, check_overwrite: bool = True
+) -> list[Path]:
+    """Fetch a suite's files one by one, each verified by its checksum.
+
+    Args:
+        dataset_name: such as `libero_object`; `libero_100` is `libero_90` and `libero_10`.
+        download_dir: the folder that holds the suites' folders.
+        check_overwrite: do not replace files that are there and are others.
+
+    Raises:
+        DownloadError: they did not arrive, or other files are in the way.
+        UnknownNameError: no such suite.
+    """
+    return download_demos([dataset_name], Path(download_dir), overwrite=not check_overwrite)
+
+
+def libero_dataset_download(
+    datasets: str = "all",
+    download_dir: str | os.PathLike | None = None,
+    check_overwrite: bool = True,
+    use_huggingface: bool = False,
+) -> None:
+    """Fetch demonstrations; suites that are complete are left alone.
+
+    Args:
+        datasets: `all`, or a name of `DATASET_LINKS`.
+        download_dir: the folder that holds the suites' folders; by default that of `get_libero_path("datasets")`.
+        check_overwrite: keep what is there.
+        use_huggingface: verified file by file from the Hub instead of as archives.
+
+    Raises:
+        UnknownNameError: no such data set.
+        DownloadError: something did not arrive.
+    """
+    if datasets not in ("all", *DATASET_LINKS):
+        raise UnknownNameError("data set", datasets, ("all", *DATASET_LINKS))
+    folder = Path(download_dir) if download_dir is not None else datasets_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in DATASET_LINKS if datasets == "all" else (datasets,):
+        if check_overwrite and not use_huggingface and not _missing(folder, name):
+            print(f"{name}: complete in {folder}")
+            continue
+        print(f"{name}: to {folder}")
+        if use_huggingface:
+            download_from_huggingface(name, folder, check_overwrite)
+        else:
+            download_url(DATASET_LINKS[name], folder, check_overwrite)
+
+
+def check_libero_dataset(download_dir: str | os.PathLike | None = None) -> bool:
+    """Print for each suite how many of its files are there; whether all are.
+
+    Args:
+        download_dir: the folder that holds the suites' folders; by default that of `get_libero_path("datasets")`.
+    """
+    folder = Path(download_dir) if download_dir is not None else datasets_folder()
+    absent = {name: _missing(folder, name) for name in _SUITES}
+    for name, files in absent.items():
+        total = get_benchmark(name)().n_tasks
+        print(f"{name}: {total - len(files)} of {total} files" + (f", no {files[0]}" if files else ""))
+    return not any(absent.values())
+
+
+def datasets_folder() -> Path:
+    """Where demonstrations are kept; it need not exist."""
+
+    return Path(get_path_dict()["datasets"])
+
+
+def _missing(folder: Path, suite: str) -> list[str]:
+    """Demonstration files of a suite that are not there."""
+    benchmark = get_benchmark(suite)()
+    names = [benchmark.get_task_demonstration(i) for i in range(benchmark.n_tasks)]
+    return [name for name in names if not (folder / name).is_file()]

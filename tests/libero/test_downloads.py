@@ -1,0 +1,239 @@
+"""Downloads against a server on this machine: one that breaks off, one that lies, one that knows no ranges."""
+
+import hashlib
+import io
+import json
+import threading
+import urllib.request
+import zipfile
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from libero.libero.utils import download_utils
+from libero_env import demos_download
+from libero_env.assets_download import DownloadError
+from libero_env.demos_download import REPO, REVISION, demo_files, download_demos
+from libero_env.errors import UnknownNameError
+from libero_env.fetch import fetch
+from lifelong.cli import main
+
+pytestmark = pytest.mark.unit
+
+FILE = "libero_object/pick_up_the_alphabet_soup_and_place_it_in_the_basket_demo.hdf5"
+CONTENT = bytes(range(256)) * 4000
+
+
+class Server(ThreadingHTTPServer):
+    """Serves `files`; counts on its way to each: `breaks` broken connections after half of what was asked for."""
+
+    def __init__(self):
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files, self.requests, self.breaks, self.ranges = {}, [], 0, True
+
+    @property
+    def url(self):
+        return f"http://127.0.0.1:{self.server_port}"
+
+    def offer(self, name, content, announced=None):
+        """A file of the data set, with the digest of `announced`."""
+        self.files[f"/datasets/{REPO}/resolve/{REVISION}/{name}"] = content
+        listing = f"/api/datasets/{REPO}/tree/{REVISION}/{name.partition('/')[0]}?recursive=true"
+        whole = content if announced is None else announced
+        lfs = {"oid": hashlib.sha256(whole).hexdigest(), "size": len(whole)}
+        entry = {"type": "file", "oid": "0", "size": len(whole), "lfs": lfs, "path": name}
+        entries = json.loads(self.files.get(listing, b"[]")) + [entry]
+        self.files[listing] = json.dumps(entries).encode()
+
+
+class Handler(BaseHTTPRequestHandler):
+    def do_HEAD(self):
+        self.send_response(200 if self.path in self.server.files else 404)
+        self.end_headers()
+
+    def do_GET(self):
+        server, content = self.server, self.server.files.get(self.path)
+        asked = self.headers.get("Range")
+        server.requests.append((self.path.rpartition("/")[2], asked))
+        if content is None:
+            return self.send_error(404)
+        start = int(asked.removeprefix("bytes=").rstrip("-")) if asked and server.ranges else 0
+        if start and start >= len(content):
+            return self.send_error(416)
+        rest = content[start:]
+        self.send_response(206 if start else 200)
+        self.send_header("Content-Length", str(len(rest)))
+        self.end_headers()
+        if server.breaks and not self.path.startswith("/api"):
+            server.breaks -= 1
+            rest = rest[: len(rest) // 2]
+        self.wfile.write(rest)
+        return None
+
+    def log_message(self, *_):
+        """Nothing."""
+
+
+@pytest.fixture
+def server(monkeypatch):
+    with Server() as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def test_a_broken_connection_is_taken_up_again(server, tmp_path):
+    server.files["/big.bin"], server.breaks = CONTENT, 2
+    path = fetch(f"{server.url}/big.bin", tmp_path / "big.bin", pause=0.0)
+    assert path.read_bytes() == CONTENT
+    half, three_quarters = len(CONTENT) // 2, len(CONTENT) * 3 // 4
+    assert [asked for _, asked in server.requests] == [None, f"bytes={half}-", f"bytes={three_quarters}-"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_later_run_goes_on(server, tmp_path):
+    server.files["/big.bin"] = CONTENT
+    (tmp_path / "big.bin.partial").write_bytes(CONTENT[:1000])
+    fetch(f"{server.url}/big.bin", tmp_path / "big.bin", size=len(CONTENT))
+    assert (tmp_path / "big.bin").read_bytes() == CONTENT
+    assert server.requests == [("big.bin", "bytes=1000-")]
+
+
+def test_a_server_without_ranges_begins_again(server, tmp_path):
+    server.files["/big.bin"], server.ranges = CONTENT, False
+    (tmp_path / "big.bin.partial").write_bytes(b"x" * 1000)
+    assert fetch(f"{server.url}/big.bin", tmp_path / "big.bin").read_bytes() == CONTENT
+
+
+def test_what_is_longer_than_the_file_is_thrown_away(server, tmp_path):
+    server.files["/big.bin"] = CONTENT
+    (tmp_path / "big.bin.partial").write_bytes(CONTENT + b"more")
+    assert fetch(f"{server.url}/big.bin", tmp_path / "big.bin", pause=0.0).read_bytes() == CONTENT
+
+
+def test_tries_are_bounded_and_nothing_is_lost(server, tmp_path):
+    server.files["/big.bin"], server.breaks = CONTENT, 10**6
+    with pytest.raises(
+        DownloadError, match=r"the connection was broken off; tried 5 times.*are kept: run it again"
+    ):
+        fetch(f"{server.url}/big.bin", tmp_path / "big.bin", pause=0.0)
+    kept = (tmp_path / "big.bin.partial").read_bytes()
+    assert len(kept) > len(CONTENT) * 0.99
+    assert kept == CONTENT[: len(kept)]
+    with pytest.raises(DownloadError, match="404"):
+        fetch(f"{server.url}/small.bin", tmp_path / "small.bin", pause=0.0)
+    with pytest.raises(DownloadError, match="not an http"):
+        fetch("file:///etc/hosts", tmp_path / "hosts")
+
+
+def test_demonstrations_arrive_verified(server, tmp_path, capsys):
+    server.offer(FILE, CONTENT)
+    server.breaks = 1
+    assert main(["demos", "download", "libero_object/0", "--dest", str(tmp_path)]) == 0
+    assert (tmp_path / FILE).read_bytes() == CONTENT
+    assert capsys.readouterr().out == f"{tmp_path / FILE}: complete and verified\n"
+    requests = len(server.requests)
+    assert download_demos(["libero_object/0"], tmp_path) == [tmp_path / FILE]
+    assert len(server.requests) == requests + 1, "only the listing: the file is there"
+
+
+def test_a_wrong_checksum_is_refused(server, tmp_path, capsys):
+    server.offer(FILE, b"?" * len(CONTENT), announced=CONTENT)
+    assert main(["demos", "download", "libero_object/0", "--dest", str(tmp_path)]) == 2
+    assert "checksum differs" in capsys.readouterr().err
+    assert list((tmp_path / "libero_object").iterdir()) == []
+
+
+def test_other_files_are_not_replaced_unasked(server, tmp_path):
+    server.offer(FILE, CONTENT)
+    (tmp_path / FILE).parent.mkdir()
+    (tmp_path / FILE).write_bytes(b"recorded here")
+    with pytest.raises(DownloadError, match="is there and is another file"):
+        download_demos(["libero_object/0"], tmp_path)
+    assert (tmp_path / FILE).read_bytes() == b"recorded here"
+    download_demos(["libero_object/0"], tmp_path, overwrite=True)
+    assert (tmp_path / FILE).read_bytes() == CONTENT
+
+
+def test_errors_name_the_remedy(server, tmp_path, monkeypatch):
+    server.offer("libero_object/another_demo.hdf5", CONTENT)
+    with pytest.raises(DownloadError, match="has no libero_object/pick_up_the_alphabet_soup"):
+        download_demos(["libero_object"], tmp_path)
+    with pytest.raises(DownloadError, match="404"):
+        download_demos(["libero_goal"], tmp_path)
+    with pytest.raises(UnknownNameError, match="libero_object"):
+        download_demos(["libero_objects"], tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(DownloadError, match="HF_ENDPOINT names another server"):
+        download_demos(["libero_object"], tmp_path)
+
+
+def test_servers_that_list_files_elsewhere_are_not_trusted(server, tmp_path):
+    server.offer("libero_object/../../evil.hdf5", b"")
+    with pytest.raises(DownloadError, match="do not trust it"):
+        download_demos(["libero_object"], tmp_path)
+
+
+def test_every_task_has_a_file():
+    assert len(demo_files(["libero_100"])) == 100
+    assert demo_files(["libero_10", "libero_10/3"]) == demo_files(["libero_10"])
+    assert all(file.endswith("_demo.hdf5") for file in demo_files(["libero_spatial"]))
+
+
+def test_the_facade_fetches_from_the_hub(server, tmp_path, capsys):
+    for file in demo_files(["libero_goal"]):
+        server.offer(file, file.encode())
+    download_utils.libero_dataset_download("libero_goal", tmp_path, use_huggingface=True)
+    assert len(list((tmp_path / "libero_goal").glob("*_demo.hdf5"))) == 10
+    assert not download_utils.check_libero_dataset(tmp_path)
+    out = capsys.readouterr().out
+    assert "libero_goal: 10 of 10 files\n" in out
+    assert "libero_object: 0 of 10 files, no libero_object/pick_up_the_alphabet_soup" in out
+    with pytest.raises(UnknownNameError, match="libero_goal"):
+        download_utils.libero_dataset_download("libero_gaol", tmp_path)
+    assert download_utils.HF_REPO_ID == demos_download.REPO
+    assert len(download_utils.download_from_huggingface("libero_goal", tmp_path)) == 10
+
+
+def _archive(suites):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for file in demo_files(suites):
+            archive.writestr(file, b"demonstrations")
+    return buffer.getvalue()
+
+
+def test_the_facade_fetches_archives(server, tmp_path, monkeypatch, capsys):
+    links = {name: f"{server.url}/{name}.zip" for name in download_utils.DATASET_LINKS}
+    monkeypatch.setattr(download_utils, "DATASET_LINKS", links)
+    for name in links:
+        server.files[f"/{name}.zip"] = _archive([name])
+    server.breaks = 1
+    download_utils.libero_dataset_download("all", tmp_path)
+    assert download_utils.check_libero_dataset(tmp_path)
+    assert not list(tmp_path.glob("*.zip*"))
+    requests = len(server.requests)
+    download_utils.libero_dataset_download("libero_100", tmp_path)
+    assert len(server.requests) == requests
+    assert "libero_100: complete" in capsys.readouterr().out
+
+
+def test_small_pieces(server, tmp_path):
+    server.files["/notes.txt"] = b"hello"
+    assert download_utils.url_is_alive(f"{server.url}/notes.txt")
+    assert not download_utils.url_is_alive(f"{server.url}/nothing.txt")
+    assert not download_utils.url_is_alive("http://127.0.0.1:9/")
+    path = download_utils.download_url(f"{server.url}/notes.txt", tmp_path, is_zipfile=False)
+    assert path.read_bytes() == b"hello"
+    with pytest.raises(DownloadError, match="no intact archive"):
+        download_utils.download_url(f"{server.url}/notes.txt", tmp_path)
+    with download_utils.DownloadProgressBar(unit="B", disable=False) as bar:
+        urllib.request.urlretrieve(
+            f"{server.url}/notes.txt", tmp_path / "again.txt", reporthook=bar.update_to
+        )
+        assert bar.total == 5
+        assert bar.n >= 5
