@@ -16,16 +16,17 @@ import torch
 from torch import Tensor
 
 from lifelong import checkpoints, costs
-from lifelong.algorithms.base import Algorithm, JoinedWindows, Phase, WindowDataset
+from lifelong.algorithms.base import Algorithm, Phase, WindowDataset
 from lifelong.distributed import Ranks
 from lifelong.evaluation import EnvPool, EvalSettings, rollout, save_animation
 from lifelong.policies.base import Policy
 from lifelong.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.rundir import RunDirectory
+from lifelong.streams import StageData, StreamSettings, stages_of
 from lifelong.tracking import Tracker
 from lifelong.training import BatchAugmentation, EpochEnd, FitSettings, fit, generator, seeded
 
-# First words of the seeds derived from the run's seed, one for each use.
+# First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` has another.
 FIT, END_TASK, ROLLOUT = 1, 2, 3
 CONTROL_PERIOD = 0.05  # s
 SAVE_EVERY = 60.0  # s between two saves while learning, but for those at points of the learning curve
@@ -50,18 +51,25 @@ class Parts:
     device: torch.device
     progress: bool
     ranks: Ranks = Ranks()
+    stream: StreamSettings = StreamSettings()
+    group_size: int = 1
 
 
 @dataclass(frozen=True)
 class Stretch:
     """Where in the sequence training stands: a phase of a task, or of tasks that are learned together."""
 
-    task: int  # the last, if there are several
+    stage: Sequence[int]
     number: int
     phase: Phase
     epochs: int
     steps_per_epoch: int | None
     offset: int  # epochs of the task's earlier phases
+
+    @property
+    def task(self) -> int:
+        """The last, if there are several."""
+        return self.stage[-1]
 
 
 class TaskSequence:
@@ -71,24 +79,26 @@ class TaskSequence:
         self.parts = parts
         self.log = parts.directory.log
         self._saved = time.monotonic()
+        self.stages = stages_of(parts.algorithm, len(parts.instructions), parts.group_size)
+        self.data = StageData(parts.datasets, self.stages, parts.stream, parts.seed)
 
-    def run(self) -> None:
-        """Learn and evaluate whatever is not done yet."""
-        stages = self.parts.algorithm.stages(len(self.parts.instructions))
-        done = self._restore(stages)
-        if done:
-            self.parts.ranks.share(self._finish, stages[done - 1])
-        for stage in stages[done:]:
+    def run(self, *, evaluate: bool = True) -> None:
+        """Learn whatever is not learned yet, and evaluate all tasks so far after each stage."""
+        done = self._restore()
+        if done and evaluate:
+            self.parts.ranks.share(self._finish, self.stages[done - 1])
+        for stage in self.stages[done:]:
             self._learn(stage)
-            self.parts.ranks.share(self._finish, stage)
+            if evaluate:
+                self.parts.ranks.share(self._finish, stage)
 
-    def _restore(self, stages: Sequence[Sequence[int]]) -> int:
+    def _restore(self) -> int:
         """Take up the state after the last stage that was learned; how many are."""
         p, done = self.parts, 0
-        while done < len(stages) and p.directory.task_path(stages[done][-1]).exists():
+        while done < len(self.stages) and p.directory.task_path(self.stages[done][-1]).exists():
             done += 1
         if done:
-            self._take_up_task(stages[done - 1][-1])
+            self._take_up_task(self.stages[done - 1][-1])
         return done
 
     def _take_up_task(self, task: int) -> None:
@@ -98,12 +108,12 @@ class TaskSequence:
     def _take_up(self, state: Mapping[str, Any], source: str) -> None:
         if state.get("policy") is not None:
             checkpoints.load_weights(self.parts.policy, state["policy"], source)
-        self.parts.algorithm.load_state_dict(state["algorithm"], self.parts.datasets)
+        self.parts.algorithm.load_state_dict(state["algorithm"], self.data)
 
     def _learn(self, stage: Sequence[int]) -> None:
         """Train on a stage, from its beginning or from what is saved of it, and write its checkpoint."""
         p, task = self.parts, stage[-1]
-        dataset, saved = self._windows(stage), p.directory.progress(task, p.device)
+        dataset, saved = self.data[task], p.directory.progress(task, p.device)
         numbers, what = f"Task {task + 1}", p.instructions[task]
         if len(stage) > 1:
             numbers, what = f"Tasks {stage[0] + 1}-{task + 1}", "together"
@@ -137,17 +147,13 @@ class TaskSequence:
         state = {"task": task, "policy": p.policy.state_dict(), "algorithm": p.algorithm.state_dict()}
         checkpoints.save(p.directory.task_path(task), state)
 
-    def _windows(self, stage: Sequence[int]) -> WindowDataset:
-        datasets = [self.parts.datasets[task] for task in stage]
-        return datasets[0] if len(datasets) == 1 else JoinedWindows(datasets)
-
     def _stretches(self, stage: Sequence[int]) -> list[Stretch]:
         stretches, offset = [], 0
         steps = self.parts.fit.steps_per_epoch
         steps = steps and steps * len(stage)  # as many for each task, together or not
         for number, phase in enumerate(self.parts.algorithm.phases()):
             epochs = max(1, round(self.parts.fit.epochs * phase.share))
-            stretches.append(Stretch(stage[-1], number, phase, epochs, steps, offset))
+            stretches.append(Stretch(stage, number, phase, epochs, steps, offset))
             offset += epochs
         return stretches
 
@@ -191,16 +197,16 @@ class TaskSequence:
             self.log.append(LossRecord(task=task, epoch=epoch, loss=end.loss, seconds=end.seconds))
             p.tracker.log({"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty})
         if (stretch.number, end.epoch) == (0, stretch.epochs) and not self.log.read().costs(task):
-            spent = costs.step_costs(p.policy, p.algorithm, p.datasets[task], p.fit.batch_size)
+            spent = costs.step_costs(p.policy, p.algorithm, self.data[task], p.fit.batch_size)
             self.log.append(CostRecord(task=task, costs=spent))
         due = end.epoch in p.eval.curve_epochs(stretch.epochs)
         if due or time.monotonic() - self._saved > SAVE_EVERY:
             self._save(task, stretch.number, end.state())
         if not (due and stretch.phase.measures_transfer):
             return
-        record = self._evaluate("curve", task, task, epoch)
+        success = _mean([self._evaluate("curve", task, one, epoch) for one in stretch.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
-        self._say(f"  epoch {epoch:3d}: {loss}success {record.rate:4.0%}")
+        self._say(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
         if self._selects(stretch) and self._best_epoch(stretch, end.epoch) == end.epoch:
             best = {"task": task, "epoch": end.epoch, "policy": p.policy.state_dict(), "own": self._own()}
             checkpoints.save(p.directory.best_path, best)
@@ -218,9 +224,10 @@ class TaskSequence:
         results = self.log.read()
         rates = {}
         for epoch in self.parts.eval.curve_epochs(stretch.epochs):
-            key = ("curve", stretch.task, stretch.task, stretch.offset + epoch)
-            if epoch <= until and (record := results.evaluation(*key)) is not None:
-                rates[epoch] = record.rate
+            keys = [("curve", stretch.task, task, stretch.offset + epoch) for task in stretch.stage]
+            found = [record for key in keys if (record := results.evaluation(*key)) is not None]
+            if epoch <= until and len(found) == len(keys):
+                rates[epoch] = _mean(found)
         return max(rates, key=lambda e: (rates[e], -e))
 
     def _save(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
@@ -242,9 +249,9 @@ class TaskSequence:
             spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in row)
             spent += sum(r.seconds for r in row)
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
-        mean = sum(r.rate for r in row) / len(row)
-        p.tracker.log({"success/just_learned": row[-1].rate, "success/mean": mean, "tasks": task + 1})
-        text = f"  learned: success {row[-1].rate:.0%} on it, {mean:.0%} over {task + 1} so far"
+        new, mean = _mean([r for r in row if r.task in stage]), _mean(row)
+        p.tracker.log({"success/just_learned": new, "success/mean": mean, "tasks": task + 1})
+        text = f"  learned: success {new:.0%} on it, {mean:.0%} over {task + 1} so far"
         self._say(text + self._left(task))
 
     def _evaluate(self, phase: Literal["curve", "matrix"], learned: int, task: int, epoch: int) -> EvalRecord:
@@ -255,7 +262,8 @@ class TaskSequence:
             return found
         states = p.eval.init_states(phase)
         shown = phase == "matrix" and (task == learned or learned == len(p.instructions) - 1)
-        with p.algorithm.policy_for(task, p.policy) as acting:
+        stage = next(stage for stage in self.stages if task in stage)
+        with p.algorithm.policy_for(stage[-1], p.policy) as acting:
             rollouts = rollout(
                 acting,
                 p.envs.get((task, len(states))),
@@ -307,10 +315,15 @@ class TaskSequence:
         cells = [r.seconds for r in evals if r.phase == "matrix"]
         once = sum(r.seconds for r in results.of(LossRecord))
         once += sum(r.seconds for r in evals if r.phase == "curve")
-        todo = size * (size + 1) // 2 - learned * (learned + 1) // 2
+        todo = sum(stage[-1] + 1 for stage in self.stages if stage[-1] > task)
         seconds = left * once / learned + todo * sum(cells) / len(cells)
         return f"; about {max(1, round(seconds / 60))} min left"
 
     def _say(self, text: str) -> None:
         if self.parts.ranks.first:
             print(text, flush=True)
+
+
+def _mean(records: Sequence[EvalRecord]) -> float:
+    """The mean success of evaluations."""
+    return sum(r.rate for r in records) / len(records)

@@ -54,8 +54,8 @@ class Batch:
         moved = Observation(move(obs.images), {k: move(v) for k, v in obs.proprio.items()}, move(obs.language))
         return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids))
 
-    def rows(self, rows: slice) -> "Batch":
-        """Some of the windows, as views."""
+    def rows(self, rows: slice | Tensor) -> "Batch":
+        """Some of the windows: of a slice as views, of indices as copies in their order."""
         obs = self.observation
         part = Observation(obs.images[rows], {k: v[rows] for k, v in obs.proprio.items()}, obs.language[rows])
         return Batch(part, self.actions[rows], self.task_ids[rows], self.window_ids[rows])
