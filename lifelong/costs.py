@@ -36,7 +36,9 @@ COSTS: Mapping[str, str] = {
 _FEW = 2  # windows of the smaller batch that is counted
 
 
-def step_costs(policy: Policy, algorithm: Algorithm, windows: WindowDataset, batch_size: int) -> dict[str, float]:
+def step_costs(
+    policy: Policy, algorithm: Algorithm, windows: WindowDataset, batch_size: int
+) -> dict[str, float]:
     """Parameters, and the operations of one training step.
 
     Steps are really made, on copies and in float32, with everything that an algorithm adds to them; optimiser and

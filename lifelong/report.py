@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from lifelong.comparison import compare, write_comparison
 from lifelong.errors import LifelongError
 from lifelong.figures import (
     Line,
@@ -21,12 +22,9 @@ from lifelong.figures import (
     save,
 )
 from lifelong.heat_table import mean_heatmap, run_heatmap
-from lifelong.metrics import (
-    METRIC_NAMES,
-    average_success,
-    mean_and_standard_error,
-)
+from lifelong.metrics import METRIC_NAMES, average_success
 from lifelong.records import RunRecord
+from lifelong.report_tables import atom_rows, cost_table, duration, most_forgotten, task_costs
 from lifelong.runs import Group, Run, group_runs, load_run, short_labels
 
 METRIC_TEXTS = {
@@ -47,7 +45,7 @@ MEDIA_LIMIT = 48 * 2**20  # bytes of rollout pictures in one page
 
 
 def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
-    """Writes report.html, heatmap.png and heatmap.pdf (for several runs also forgetting.png and .pdf).
+    """Writes report.html, heatmap.png and heatmap.pdf; for several runs also forgetting.png, .pdf, comparison.json.
 
     Args:
         run_dirs: One run to describe, or several to compare. Unfinished runs count as far as they are.
@@ -97,9 +95,14 @@ def _single(run: Run, folder: Path) -> dict[str, Any]:
         "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
         "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
         "tasks": _task_rows(run, rates),
-        "times": [(name, _duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
-        "total_time": _duration(sum(times.values())),
+        "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
+        "total_time": duration(sum(times.values())),
+        "subgoals": run.results.subgoals().predicates,
+        "atoms": atom_rows(run.results.subgoals(), labels),
+        "most_forgotten": most_forgotten(run.results.subgoals().atoms),
+        "costs": task_costs(run, labels),
         "media": _media(run.path / "videos"),
+        "saliency": _media(run.path / "saliency"),
         "config_text": run.config_text,
         "versions": dict(record.versions),
         "run_dir": run.path.resolve().name,
@@ -107,11 +110,13 @@ def _single(run: Run, folder: Path) -> dict[str, Any]:
 
 
 def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
-    """What the template shows of several runs; writes heatmaps and forgetting curves beside the page."""
+    """What the template shows of several runs; writes heatmaps, forgetting curves and numbers beside the page."""
     groups = group_runs(runs)
+    found = compare(groups)
+    write_comparison(found, folder / "comparison.json")
     panels, heatmaps, lines = [], [], []
     for group in groups:
-        labels = short_labels(group.runs[0].record.instructions)
+        labels = group.labels
         matrices = np.stack([r.results.success_matrix()[0] for r in group.runs])
         present = ~np.isnan(matrices)
         mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
@@ -134,7 +139,11 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "title": f"{len(groups)} methods on {', '.join(benchmarks)}" if len(groups) > 1 else groups[0].label,
         "facts": [("runs", len(runs)), ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs}))))],
         "notes": [f"{r.path}: {note}" for r in runs for note in r.notes],
-        "groups": _group_rows(groups),
+        "groups": _group_rows(groups, found),
+        "differences": found["differences"],
+        "forgotten_tasks": _forgotten_tasks(groups, found),
+        "forgotten_subgoals": _forgotten_subgoals(found),
+        "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
         "heatmaps": heatmaps,
         "forgetting": as_svg(forgetting_figure(lines)),
         "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
@@ -156,24 +165,41 @@ def _metric_rows(run: Run) -> list[dict[str, Any]]:
     return [{"name": n, "estimate": getattr(run.metrics, n)} for n in METRIC_NAMES]
 
 
-def _group_rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    """Mean and standard error of each metric over a group's runs, the best of each column marked."""
-    rows = []
+def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every metric of a group over its runs, the best of each column marked."""
+    rows: list[dict[str, Any]] = []
     for group in groups:
-        measured = [r.metrics for r in group.runs if r.metrics is not None]
-        cells = {n: mean_and_standard_error([getattr(m, n).value for m in measured]) for n in METRIC_NAMES}
-        only = {n: getattr(measured[0], n) for n in METRIC_NAMES} if len(measured) == 1 else None
-        rows.append(
-            {"label": group.label, "count": len(measured), "cells": cells, "single": only, "best": set()}
-        )
+        measured = found["groups"][group.label]
+        cells = measured["metrics"]
+        rows.append({"label": group.label, "count": measured["measured"], "cells": cells, "best": set()})
     for name in METRIC_NAMES:
-        means = np.array([row["cells"][name][0] for row in rows])
+        means = np.array([row["cells"][name]["mean"] for row in rows])
         if len(rows) > 1 and not np.isnan(means).all():
             best = np.nanmax(means) if METRIC_TEXTS[name][2] == "up" else np.nanmin(means)
             for row, mean in zip(rows, means, strict=True):
                 if np.isclose(mean, best):
                     row["best"].add(name)
     return rows
+
+
+def _forgotten_tasks(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """NBT of every task, a cell for each method; tasks as they come in the first run."""
+    texts: dict[str, str] = {}
+    for run in (run for group in groups for run in group.runs):
+        texts |= dict(zip(run.record.tasks, short_labels(run.record.instructions), strict=True))
+    tables = [group["forgetting_by_task"] for group in found["groups"].values()]
+    return [
+        {"label": text, "cells": [table.get(name) for table in tables]}
+        for name, text in texts.items()
+        if any(name in table for table in tables)
+    ]
+
+
+def _forgotten_subgoals(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """What is lost of every predicate, a cell for each method."""
+    tables = [group["subgoals"] for group in found["groups"].values()]
+    names = dict.fromkeys(name for table in tables for name in table)
+    return [{"label": name, "cells": [table.get(name) for table in tables]} for name in names]
 
 
 def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
@@ -183,7 +209,7 @@ def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
         "seed": run.record.seed,
         "metrics": run.metrics,
         "learned": f"{run.learned} of {len(run.record.tasks)}",
-        "time": _duration(sum(run.results.seconds_by_phase().values())),
+        "time": duration(sum(run.results.seconds_by_phase().values())),
         "path": str(run.path),
         "link": os.path.relpath(page, folder) if page.is_file() else None,
     }
@@ -203,7 +229,7 @@ def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
                 "final": rates[run.learned - 1, task] if done else np.nan,
                 "fwt": run.metrics.fwt_by_task[task] if done and run.metrics else np.nan,
                 "nbt": run.metrics.nbt_by_task[task] if done and run.metrics and not last else np.nan,
-                "seconds": _duration(end.seconds) if end else None,
+                "seconds": duration(end.seconds) if end else None,
             }
         )
     return rows
@@ -227,16 +253,6 @@ def _media(folder: Path) -> dict[str, Any]:
             {"url": f"data:{kind};base64,{data}", "video": kind.startswith("video"), "caption": caption}
         )
     return {"items": items, "left_out": left_out}
-
-
-def _duration(seconds: float) -> str:
-    """Seconds for people: 42 s, 3 min 20 s, 2 h 05 min."""
-    seconds = round(seconds)
-    if seconds < 60:
-        return f"{seconds} s"
-    if seconds < 3600:
-        return f"{seconds // 60} min {seconds % 60:02d} s"
-    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
 
 
 def _percent(value: float | None, digits: int = 1) -> str:

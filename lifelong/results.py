@@ -233,7 +233,7 @@ def write_summary(path: Path | str, results: Results, config: Mapping[str, Any])
     Returns:
         What was written. Rates are in [0, 1]; NaN is null.
     """
-    summary = _finite(summarize(results) | {"config": dict(config)})
+    summary = plain(summarize(results) | {"config": dict(config)})
     path = Path(path)
     part = path.with_name(path.name + ".part")
     try:
@@ -280,7 +280,8 @@ def summarize(results: Results) -> dict[str, Any]:
         "best_epochs": {str(task): ends[task] for task in sorted(ends)},
         "subgoals": asdict(results.subgoals()),
         "costs": {
-            str(task): results.costs(task) | {f"{k}_seconds": v for k, v in results.task_seconds(task).items()}
+            str(task): results.costs(task)
+            | {f"{k}_seconds": v for k, v in results.task_seconds(task).items()}
             for task in range(len(run.tasks))
             if results.costs(task)
         },
@@ -295,12 +296,12 @@ def _metrics(results: Results, diagonal: Literal["matrix", "curve"]) -> dict[str
     return {name: asdict(getattr(found, name)) for name in METRIC_NAMES} | {"by_task": by_task}
 
 
-def _finite(value: Any) -> Any:
-    """The same plain data with None for numbers that are not finite: JSON has no NaN."""
+def plain(value: Any) -> Any:
+    """The same data with None for numbers that are not finite: JSON has no NaN."""
     if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [plain(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

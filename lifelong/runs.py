@@ -1,4 +1,4 @@
-"""Run directories read back: one run as far as it went, or groups of runs that differ in their seed."""
+"""Run directories read back: one run as far as it went, or groups of runs that differ in seed and order."""
 
 import os
 from collections.abc import Sequence
@@ -33,10 +33,18 @@ class Run:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in nothing but their seed."""
+    """Runs that differ in nothing but their seed and the order of their tasks."""
 
     label: str
     runs: tuple[Run, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """Short names of the positions in the sequence: the tasks there, or numbers if they differ."""
+        first = self.runs[0].record
+        if all(r.record.tasks == first.tasks for r in self.runs):
+            return short_labels(first.instructions)
+        return [f"task {i + 1}" for i in range(len(first.tasks))]
 
 
 def load_run(path: Path) -> Run:
@@ -74,7 +82,7 @@ def short_labels(instructions: Sequence[str]) -> list[str]:
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
-    """Runs that differ only in their seed together, in the order given; labels name what differs."""
+    """Runs that differ only in seed and order of tasks together, as they come; labels name what differs."""
     groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
     for run in runs:
         groups.setdefault(_identity(run), []).append(run)
@@ -103,7 +111,8 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
     record = run.record
     basic = {n: getattr(record, n) for n in _BASICS}
     flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
-    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(("seed", "_target_", "dir", "path"))}
+    passed = ("seed", "_target_", "dir", "path", "benchmark.order")
+    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(passed)}
     return tuple((basic | dict(sorted(flat.items()))).items())
 
 

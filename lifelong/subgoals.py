@@ -79,7 +79,9 @@ def subgoals(evaluations: Iterable[EvalRecord], tasks: int) -> Subgoals:
         evaluations: Records of a run; those of learning curves are passed over. Of equal keys the last one counts.
         tasks: Number of tasks learned.
     """
-    cells = {(r.learned, r.task): r for r in evaluations if r.phase == "matrix" and r.atoms and r.learned < tasks}
+    cells = {
+        (r.learned, r.task): r for r in evaluations if r.phase == "matrix" and r.atoms and r.learned < tasks
+    }
     pairs: list[tuple[EvalRecord, EvalRecord]] = []
     for task in range(tasks):
         rows = [learned for learned, other in cells if other == task]
@@ -89,7 +91,13 @@ def subgoals(evaluations: Iterable[EvalRecord], tasks: int) -> Subgoals:
 
 
 def _atoms(learned: EvalRecord, final: EvalRecord) -> list[AtomRates]:
-    held = (learned.atoms_at_start, learned.atoms_ever, learned.atoms_at_end, final.atoms_ever, final.atoms_at_end)
+    held = (
+        learned.atoms_at_start,
+        learned.atoms_ever,
+        learned.atoms_at_end,
+        final.atoms_ever,
+        final.atoms_at_end,
+    )
     columns = [np.asarray(rows, float).mean(0) for rows in held]
     return [AtomRates(learned.task, a, *(float(c[i]) for c in columns)) for i, a in enumerate(learned.atoms)]
 

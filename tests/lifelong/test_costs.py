@@ -142,5 +142,8 @@ def test_what_is_stored():
 
 
 def test_peaks_are_of_this_process():
-    assert Path("/proc/self/status").exists() is False or peak_costs(torch.device("cpu"))["peak_memory_bytes"] > 2**26
+    assert (
+        Path("/proc/self/status").exists() is False
+        or peak_costs(torch.device("cpu"))["peak_memory_bytes"] > 2**26
+    )
     assert set(peak_costs(torch.device("cpu"))) <= set(COSTS)

@@ -1,6 +1,7 @@
 """Reports of made-up runs: everything on one page, nothing fetched, unfinished and broken runs included."""
 
 import base64
+import json
 import os
 import re
 from html.parser import HTMLParser
@@ -12,7 +13,16 @@ import yaml
 from PIL import Image
 
 from lifelong.errors import LifelongError
-from lifelong.records import EvalRecord, LossRecord, PhaseRecord, RunEndRecord, TaskEndRecord, start_record
+from lifelong.metrics import METRIC_NAMES
+from lifelong.records import (
+    CostRecord,
+    EvalRecord,
+    LossRecord,
+    PhaseRecord,
+    RunEndRecord,
+    TaskEndRecord,
+    start_record,
+)
 from lifelong.report import write_report
 from lifelong.results import ResultLog
 from lifelong.runs import group_runs, load_run, short_labels
@@ -40,14 +50,19 @@ def make_run(
     tasks: int = 10,
     done: int | None = None,
     epochs: tuple[int, ...] = (0, 2, 4, 6, 8, 10),
+    order: int = 0,
     **settings: object,
 ) -> Path:
     """A run directory as an experiment leaves it, with made-up but likely numbers."""
     rng = np.random.default_rng([seed, *algo.encode()])
     names = GROCERIES[:tasks] if tasks <= 10 else [f"thing {i}" for i in range(tasks)]
-    config = yaml.safe_dump(
-        {"algo": {"name": algo, **settings}, "seed": seed, "train": {"epochs": epochs[-1]}}
-    )
+    names = names[order:] + names[:order]
+    sections = {
+        "algo": {"name": algo, **settings},
+        "train": {"epochs": epochs[-1]},
+        "benchmark": {"order": order},
+    }
+    config = yaml.safe_dump({"seed": seed, **sections})
     log = ResultLog(folder / "results.jsonl")
     log.append(
         start_record(
@@ -69,6 +84,14 @@ def make_run(
         best = _learn(log, rng, i, level[i], epochs)
         for j in range(i + 1):
             log.append(_evaluation(rng, "matrix", i, best, j, level[j] * kept ** (i - j)))
+        counted = {
+            "parameters": 1.2e6,
+            "parameters_trained": 1.1e6,
+            "flops_per_step": 3.4e10,
+            "flops_per_action": 5e7,
+        }
+        log.append(CostRecord(task=i, costs=counted))
+        log.append(CostRecord(task=i, costs={"end_task_seconds": 0.7, "stored_bytes": 2e6 * (i + 1)}))
         log.append(TaskEndRecord(task=i, best_epoch=best, seconds=float(rng.uniform(200, 260))))
     if done is None:
         log.append(RunEndRecord(seconds=2600.0, finished="2026-01-01T12:00:00+00:00"))
@@ -94,6 +117,7 @@ def _evaluation(
     rng: np.random.Generator, phase: str, learned: int, epoch: int, task: int, rate: float
 ) -> EvalRecord:
     wins = rng.random(20) < rate
+    lifted = wins | (rng.random(20) < 0.5)
     return EvalRecord(
         phase=phase,
         learned=learned,
@@ -103,6 +127,10 @@ def _evaluation(
         lengths=tuple(int(x) for x in rng.integers(90, 280, 20)),
         init_states=tuple(range(20)),
         seconds=4.0,
+        atoms=(f"(In thing_{task} basket_1_contain_region)", f"(Up thing_{task})", "(Close drawer_1)"),
+        atoms_at_start=((False, False, True),) * 20,
+        atoms_ever=tuple((bool(w), bool(u), True) for w, u in zip(wins, lifted, strict=True)),
+        atoms_at_end=tuple((bool(w), bool(w), True) for w in wins),
     )
 
 
@@ -229,8 +257,72 @@ def test_several_runs_side_by_side(tmp_path: Path):
     assert len(re.findall(r"± \d", page.text)) >= 4 * 5
     assert {p.name for p in out.parent.iterdir()} == {
         "report.html",
+        "comparison.json",
         *(f"{stem}.{kind}" for stem in ("heatmap", "forgetting") for kind in ("png", "pdf")),
     }
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Two methods, one with three seeds and the other with two orders of two seeds."""
+    folder = tmp_path_factory.mktemp("compared")
+    runs = [make_run(folder / f"ewc{s}", "ewc", s, tasks=3) for s in (1, 2, 3)]
+    runs += [make_run(folder / f"er{s}{o}", "er", s, tasks=3, order=o) for s in (1, 2) for o in (0, 1)]
+    page = write_report(runs, folder / "all")
+    return page, json.loads((page.parent / "comparison.json").read_text())
+
+
+def test_means_and_intervals_of_the_comparison(compared: tuple[Path, dict]):
+    _, found = compared
+    assert [(len(g["runs"]), g["orders"]) for g in found["groups"].values()] == [(3, 1), (4, 2)]
+    for group in found["groups"].values():
+        for name in METRIC_NAMES:
+            metric = group["metrics"][name]
+            values = np.array(metric["values"])
+            assert metric["mean"] == pytest.approx(values.mean())
+            assert metric["standard_error"] == pytest.approx(values.std(ddof=1) / np.sqrt(len(values)))
+            assert metric["low"] < metric["mean"] < metric["high"]
+    (difference,) = found["differences"]
+    assert (difference["of"], difference["less"]) == ("ewc", "er")
+    final = difference["metrics"]["final_success"]
+    means = [found["groups"][n]["metrics"]["final_success"]["mean"] for n in ("ewc", "er")]
+    assert final["value"] == pytest.approx(means[0] - means[1])
+    assert final["low"] < final["value"] < final["high"] < 0  # made so: er keeps more
+
+
+def test_forgetting_is_told_by_task_and_by_part_of_the_goal(compared: tuple[Path, dict]):
+    page, found = compared
+    er = found["groups"]["er"]
+    soup = "pick_up_the_alphabet_soup_and_place_it_in_the_basket"
+    runs = [load_run(Path(p)) for p in er["runs"]]
+    places = [(r, r.record.tasks.index(soup)) for r in runs]
+    drops = [r.metrics.nbt_by_task[k] for r, k in places if k < 2]
+    assert er["forgetting_by_task"][soup]["mean"] == pytest.approx(np.mean(drops))
+    assert set(er["subgoals"]) == {"In", "Up"}  # the drawer is closed from the start
+    assert found["groups"]["ewc"]["subgoals"]["In"]["forgotten"]["mean"] > 0.1
+    text = Page(page.read_text()).text
+    assert "Forgetting by task" in text and "Differences of each two methods" in text and "task 2" not in text
+
+
+def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: Path):
+    page, found = compared
+    assert found["groups"]["er"]["costs"]["stored_bytes"] == 6e6  # after the last of three tasks
+    for text in (Page(page.read_text()).text, Page((finished / "report.html").read_text()).text):
+        for said in ("Costs", "34.0 GFLOP", "50.0 MFLOP", "1.20 M", "6.00 MB", "0.7 s"):
+            assert said in text, said
+
+
+def test_parts_of_the_goals_are_on_the_page_and_old_records_go_without(finished: Path, tmp_path: Path):
+    text = Page((finished / "report.html").read_text()).text
+    assert "Parts of the goals" in text and "In thing_0 basket_1_contain_region" in text
+    assert "held from the start" in text
+    old = make_run(tmp_path / "old", tasks=2)
+    lines = [json.loads(line) for line in (old / "results.jsonl").read_text().splitlines()]
+    kept = [{k: v for k, v in r.items() if not k.startswith("atoms")} for r in lines if r["kind"] != "cost"]
+    (old / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in kept))
+    assert load_run(old).results.problems == ()
+    text = Page(write_report([old]).read_text()).text
+    assert "Parts of the goals" not in text and "Costs" not in text and "FWT" in text
 
 
 def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Path):

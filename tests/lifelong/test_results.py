@@ -9,6 +9,7 @@ import pytest
 
 from lifelong.records import (
     RECORD_TYPES,
+    CostRecord,
     EvalRecord,
     LossRecord,
     PhaseRecord,
@@ -52,6 +53,7 @@ RUN = [
     LossRecord(task=0, epoch=1, loss=-3.25, seconds=2.0),
     evaluation("curve", 0, 1, 0, 3),
     evaluation("matrix", 0, 1, 0, 2),
+    CostRecord(task=0, costs={"stored_bytes": 12.0}),
     TaskEndRecord(task=0, best_epoch=1, seconds=10.0),
     evaluation("curve", 1, 0, 1, 1),
     LossRecord(task=1, epoch=1, loss=-4.0, seconds=2.0),
@@ -206,7 +208,7 @@ def test_the_best_of_the_curve_stands_in_for_a_diagonal_that_was_not_evaluated()
 
 
 def test_an_unfinished_run_is_measured_over_the_tasks_it_learned():
-    results = Results(tuple(RUN[:11]))  # the second task's row is half there
+    results = Results(tuple(RUN[:12]))  # the second task's row is half there
     assert results.learned_tasks() == 1 and not results.finished
     summary = summarize(results)
     assert summary["tasks_learned"] == 1
