@@ -20,7 +20,7 @@ from lifelong.errors import ConfigError, LifelongError
 from lifelong.results import ResultLog
 
 # What may differ between the start of a run and its resumption: it changes no result.
-VOLATILE = ("device", "progress", "resume", "run_id", "runs_dir", "threads", "wandb")
+VOLATILE = ("device", "progress", "resume", "run_id", "runs_dir", "threads", "wandb", "data.memory", "data.backend")
 
 
 class RunDirectory:
@@ -48,6 +48,8 @@ class RunDirectory:
             if not resume and self.path.exists():
                 os.rename(self.path, _free_name(self.path))
             self.path.mkdir(exist_ok=True)
+            for part in self.path.rglob("*.part"):  # half written by a process that was killed
+                part.unlink()
             self._agree(dict(config))
             yield self
 
@@ -59,7 +61,7 @@ class RunDirectory:
             os.replace(part, file)
             return
         old = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        was, now = (_flat({k: v for k, v in c.items() if k not in VOLATILE}) for c in (old, config))
+        was, now = decisive(old), decisive(config)
         changed = [k for k in {**was, **now} if was.get(k, "absent") != now.get(k, "absent")]
         if changed:
             pairs = [(k, was.get(k, "absent"), now.get(k, "absent")) for k in changed[:4]]
@@ -69,6 +71,11 @@ class RunDirectory:
                 f"{self.path} holds a run of another configuration ({listed}{more}). Give this one a name of "
                 "its own with run_id=NAME, or start afresh with resume=false (the old run is kept beside it)"
             )
+
+    @property
+    def started(self) -> bool:
+        """Whether anything is saved of a task."""
+        return any((self.path / "checkpoints").glob("*.safetensors"))
 
     def task_path(self, task: int) -> Path:
         """The checkpoint made after a task."""
@@ -97,6 +104,12 @@ class RunDirectory:
             return None
         state = checkpoints.load(self.progress_path, device)
         return state if state["task"] == task else None
+
+
+def decisive(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a configuration decides the results, by dotted key."""
+    volatile = tuple(f"{key}." for key in VOLATILE)
+    return {k: v for k, v in _flat(dict(config)).items() if not f"{k}.".startswith(volatile)}
 
 
 @contextmanager
