@@ -3,6 +3,7 @@
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.base import Algorithm, Phase
 from lifelong.algorithms.derpp import DERpp
+from lifelong.algorithms.dmpel import DMPEL
 from lifelong.algorithms.er import ER
 from lifelong.algorithms.ewc import EWC
 from lifelong.algorithms.lora import LoRA
@@ -15,6 +16,6 @@ from lifelong.algorithms.si import SI
 from lifelong.algorithms.single_task import SingleTask
 
 __all__ = [
-    "AGEM", "ER", "EWC", "MAS", "SI", "Algorithm", "DERpp", "LoRA", "LwF", "Multitask", "PackNet", "Phase",
+    "AGEM", "DMPEL", "ER", "EWC", "MAS", "SI", "Algorithm", "DERpp", "LoRA", "LwF", "Multitask", "PackNet", "Phase",
     "Sequential", "SingleTask",
 ]  # fmt: skip

@@ -54,7 +54,9 @@ class LoRA(Algorithm):
             ConfigError: A rank below 1 or fewer than 0 tasks.
         """
         if rank < 1 or base_tasks < 0:
-            raise ConfigError(f"algo.rank={rank}, algo.base_tasks={base_tasks}; valid: at least 1, at least 0")
+            raise ConfigError(
+                f"algo.rank={rank}, algo.base_tasks={base_tasks}; valid: at least 1, at least 0"
+            )
         self.rank, self.scale = rank, alpha / rank
         self.adapted, self.own = tuple(adapted), tuple(own)
         self.task_index, self._base_left, self._base_last = -1, base_tasks, -1
@@ -66,11 +68,12 @@ class LoRA(Algorithm):
     def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
         """Freeze the base when it is learned, and start the task's adapter from it."""
         self.task_index = task_index
+        names = self._choose(policy) if not self._base else []
         if self._base_left:
             self._base_left, self._base_last = self._base_left - 1, task_index
             return
         if not self._base:
-            self._base = self._take_base(policy)
+            self._base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
         draws = torch.Generator().manual_seed(self._seed)
         pairs = self._pairs[task_index] = {}
         for name, base in self._base.items():
@@ -170,13 +173,13 @@ class LoRA(Algorithm):
             for task, of_task in state["pairs"].items()
         }
 
-    def _take_base(self, policy: Policy) -> dict[str, Tensor]:
-        """Copies of all parameters that tasks may change, by name."""
+    def _choose(self, policy: Policy) -> list[str]:
+        """Names of all parameters that tasks may change."""
         learned = {n: p for n, p in policy.named_parameters() if p.requires_grad}
         matrices = [n for n, p in learned.items() if p.dim() >= 2 and not matches(n, self.own)]
         found = [n for n in matrices if matches(n, self.adapted)]
         check_found(found, self.adapted, matrices, "matrix")
-        return {n: p.detach().clone() for n, p in learned.items() if n in found or matches(n, self.own)}
+        return [n for n in learned if n in found or matches(n, self.own)]
 
     @torch.no_grad()
     def _sum(self, name: str, pair: Mapping[str, Tensor]) -> Tensor:

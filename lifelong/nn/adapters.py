@@ -33,7 +33,9 @@ def check_found(found: Sequence[str], patterns: Sequence[str], names: Sequence[s
     """
     if not found:
         some = ", ".join(list(names)[:5])
-        raise ConfigError(f"algo.adapted={list(patterns)} fits no {kind} of the policy, which has {some}, ...")
+        raise ConfigError(
+            f"algo.adapted={list(patterns)} fits no {kind} of the policy, which has {some}, ..."
+        )
 
 
 def freeze_statistics(policy: nn.Module) -> None:

@@ -5,22 +5,34 @@ import dataclasses
 
 import pytest
 import torch
+from torch import nn
 
 from lifelong import checkpoints
-from lifelong.algorithms import LoRA
-from lifelong.errors import ConfigError
+from lifelong.algorithms import DMPEL, LoRA
+from lifelong.algorithms.dmpel import _padded
+from lifelong.errors import ConfigError, PolicyError
+from lifelong.nn.experts import Router, change
 from lifelong.policies import BCRNN, BCTransformer, BCViLT
-from lifelong.records import LossRecord
 from lifelong.sequence import TaskSequence
+from lifelong.streams import SomeWindows, StageWindows
 from lifelong.training import FitSettings, fit, generator, seeded
+from lifelong.types import Observation
 from tests.lifelong import test_sequence as walk
 from tests.lifelong.fakes import DeepPolicy, Windows
-from tests.lifelong.test_algorithms import SETTINGS, learn, outputs
+from tests.lifelong.test_algorithms import learn, outputs
 from tests.lifelong.test_algorithms_more import killed_again_and_again
 
-ALL = {"lora": lambda: LoRA(rank=2, alpha=4.0)}
+ALL = {"lora": lambda: LoRA(rank=2, alpha=4.0), "dmpel": lambda: DMPEL(rank=2, alpha=4.0, pool=2)}
 _CONV = {"image_width": 8, "stage_blocks": [1], "stem_pool": False}
-_HEAD = {"head_hidden": 8, "head_layers": 1, "modes": 2, "min_std": 0.05, "chunk": 2, "execute": 1, "flow_steps": 2}
+_HEAD = {
+    "head_hidden": 8,
+    "head_layers": 1,
+    "modes": 2,
+    "min_std": 0.05,
+    "chunk": 2,
+    "execute": 1,
+    "flow_steps": 2,
+}
 _TIME = {"embed_dim": 8, "layers": 1, "heads": 2, "head_dim": 4, "mlp_dim": 8}
 _PATCH = {"patch_embed": 8, "patch_width": 8, "stem_kernel": 3, "stem_stride": 1, "patch": 4}
 _SPACE = {"spatial_layers": 1, "spatial_heads": 2, "spatial_head_dim": 4, "spatial_mlp_dim": 8}
@@ -155,9 +167,8 @@ def test_adapters_grow_by_the_same_number_with_each_task(make):
 def test_patterns_that_fit_nothing_are_named(make):
     algorithm = make()
     algorithm.adapted, policy = ("wings.*",), make_policy()
-    learn_small(algorithm, policy, 0)
     with pytest.raises(ConfigError, match=r"wings.*which has encoders"):
-        algorithm.begin_task(1, walk.dataset(1), policy)
+        algorithm.begin_task(0, walk.dataset(0), policy)
 
 
 # --- LoRA
@@ -275,3 +286,208 @@ def test_lora_tasks_learned_together_share_an_adapter():
 def test_lora_settings_that_cannot_work_are_named(change):
     with pytest.raises(ConfigError, match="at least 1"):
         LoRA(**change)
+
+
+# --- DMPEL
+
+
+def everything(task: int):
+    return walk.dataset(task).batch(torch.arange(20))
+
+
+@pytest.mark.parametrize(
+    "layer", [nn.Linear(4, 6), nn.Conv2d(4, 6, 3, stride=2, padding=1)], ids=["linear", "conv"]
+)
+def test_dmpel_changes_each_sample_by_its_own_weights(layer):
+    """Against one dense weight for each sample; three adjacent rows belong to a sample."""
+    draws = generator(0)
+    inputs = layer.weight[0].numel()
+    tasks = [
+        {"a": torch.randn(4, inputs, generator=draws), "b": torch.randn(6, 4, generator=draws)} for _ in "ab"
+    ]
+    c = torch.rand(2, 4, generator=draws)  # two samples; two experts of rank 2 for each of two tasks
+    x = torch.randn(6, *((5, 4) if isinstance(layer, nn.Linear) else (4, 5, 5)), generator=draws)
+    given = layer(x) + change(layer, x, tasks, c.repeat_interleave(2, dim=1))
+    for sample in range(2):
+        dense, weight = copy.deepcopy(layer), layer.weight.detach().flatten(1)
+        for expert in range(4):
+            a, b = (tasks[expert // 2][k] for k in "ab")
+            rows = slice(2 * (expert % 2), 2 * (expert % 2) + 2)
+            weight = weight + c[sample, expert] * b[:, rows] @ a[rows]
+        dense.weight.data = weight.view(layer.weight.shape)
+        mine = slice(3 * sample, 3 * sample + 3)
+        torch.testing.assert_close(given[mine], dense(x[mine]), rtol=1e-4, atol=1e-4)
+    with pytest.raises(PolicyError, match="5 rows for 2 samples"):
+        change(layer, x[:5], tasks, c.repeat_interleave(2, dim=1))
+
+
+def test_dmpel_coefficients_are_shares_of_the_best_choices():
+    draws = generator(1)
+    sizes = {"enter": (8, 5), "keys": (6, 2, 8), "bias": (6, 2)}
+    router = Router(**{k: torch.randn(v, generator=draws) for k, v in sizes.items()}, top_k=3)
+    query = torch.randn(10, 5, generator=draws)
+    c = router(query)
+    torch.testing.assert_close(c.sum(-1), torch.ones(10, 2))
+    assert ((c > 0).sum(-1) == 3).all()
+    assert torch.equal(c.argmax(-1), router.logits(query).argmax(-1))
+    router.grow(1, query)
+    logits = router.logits(query)
+    torch.testing.assert_close(logits[..., 6].mean(0), logits[..., :6].amax(-1).mean(0))
+
+
+def test_dmpel_a_new_expert_begins_as_nothing_and_old_ones_never_move():
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    learn_small(algorithm, policy, 0)
+    base, kept = copy.deepcopy(policy.state_dict()), {}
+    begun = copy.deepcopy(algorithm)
+    begun.begin_task(1, walk.dataset(1), policy)
+    with begun.policy_for(1, policy) as acting, torch.no_grad():
+        begun_answers = acting.eval().predict(everything(1))
+    assert torch.equal(begun_answers, policy.predict(everything(1)))
+    for task in (1, 2, 3):
+        learn_small(algorithm, policy, task)
+        library = algorithm.state_dict()["library"]
+        for old, experts in kept.items():
+            walk.assert_same(library[old], experts)
+        kept[task] = copy.deepcopy(library[task])
+        assert all(pair["b"].any() for pair in library[task].values())
+    walk.assert_same(dict(policy.state_dict()), dict(base))
+
+
+def test_dmpel_replay_keeps_the_coefficients_of_earlier_tasks():
+    drift, settings = {}, dataclasses.replace(SMALL, batch_size=2, epochs=1, steps_per_epoch=40)
+    for replay in (0.0, 10.0):
+        policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, replay=replay)
+        for task in range(3):
+            learn_small(algorithm, policy, task, settings)
+        memory = algorithm.state_dict()["memory"]
+        now = {t: algorithm._router(m["queries"]) for t, m in memory.items()}
+        gaps = {t: (_padded(memory[t]["coefficients"], now[t]) - now[t]).abs().max().item() for t in now}
+        assert gaps[2] == 0
+        drift[replay] = max(gaps.values())
+    assert drift[10.0] < 0.1 < 0.3 < drift[0.0], drift
+
+
+def test_dmpel_sees_the_first_frame_of_a_demonstration():
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    for task in (0, 1):
+        learn_small(algorithm, policy, task)
+    algorithm.begin_task(2, walk.dataset(2), policy)
+    later = walk.dataset(3).batch(torch.tensor([4]))  # of a task whose demonstrations are not known
+    mixed = algorithm.mix(everything(2).join(later), generator(0))
+    queries = mixed.observation.proprio["routing_query"][:, 0]
+    first = algorithm.query(everything(2).observation)
+    assert torch.equal(queries[:10], first[[0] * 10]) and torch.equal(queries[10:20], first[[10] * 10])
+    assert torch.equal(queries[20:], algorithm.query(later.observation))
+    assert not torch.equal(first[0], first[10])
+
+
+def test_dmpel_finds_demonstrations_in_datasets_made_of_others():
+    algorithm, parts = DMPEL(pool=2), [walk.dataset(t) for t in (0, 1)]
+    some = SomeWindows(parts[1], torch.tensor([3, 12, 15]))
+    queries, of_window = algorithm._contexts(StageWindows([parts[0], some], 1))
+    expected = [0] * 10 + [1] * 10 + [2, 3, 3]
+    assert of_window.tolist() == expected
+    starts = [parts[k // 2].batch(torch.tensor([10 * (k % 2)])).observation for k in range(4)]
+    assert torch.equal(queries, torch.cat([algorithm.query(o) for o in starts]))
+
+
+def test_dmpel_copies_of_a_policy_in_training_mix_experts_of_their_own_weights():
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    for task in (0, 1):
+        learn_small(algorithm, policy, task)
+    with algorithm.policy_for(1, policy) as acting, torch.no_grad():
+        other = copy.deepcopy(acting).eval()
+        assert torch.equal(other.predict(everything(1)), acting.eval().predict(everything(1)))
+        for p in policy.parameters():
+            p.zero_()
+        assert not torch.equal(other.predict(everything(1)), acting.predict(everything(1)))
+
+
+@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("head", ["gmm", "flow"])
+def test_dmpel_acts_as_it_was_trained(kind, head):
+    """The frames of a demonstration one by one give what its first window gives; and rows do not mix."""
+    policy, algorithm = make_policy(kind, head), DMPEL(rank=2, pool=2)
+    policy.stochastic = False
+    for task in (0, 1, 2):
+        learn_small(algorithm, policy, task)
+    batch = walk.dataset(2).batch(torch.tensor([0, 10]))
+    steps = policy.memory_steps
+    with algorithm.policy_for(2, policy) as acting, torch.no_grad():
+        acting.eval()
+        if head == "flow":  # only the last frame that it may look back to has a whole chunk ahead
+            whole = acting.predict(batch)
+        else:
+            whole = policy.head.mode(policy.distribution(batch.observation))
+        acting.reset(2)
+        for step in range(steps):
+            action = acting.act(frame(batch.observation, step))
+            if head == "gmm":
+                torch.testing.assert_close(action, whole[:, step], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(action, whole[:, steps - 1], rtol=1e-4, atol=1e-5)
+        alone = acting.predict(walk.dataset(2).batch(torch.tensor([10])))
+        torch.testing.assert_close(acting.predict(batch)[1:], alone, rtol=1e-4, atol=1e-5)
+
+
+def frame(observation: Observation, step: int) -> Observation:
+    at = slice(step, step + 1)
+    proprio = {k: v[:, at] for k, v in observation.proprio.items()}
+    return Observation(observation.images[:, at], proprio, observation.language)
+
+
+def test_dmpel_routes_once_in_an_episode():
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    for task in (0, 1):
+        learn_small(algorithm, policy, task)
+    observation, seen = everything(1).rows(slice(0, 3)).observation, []
+    spied = algorithm.coefficients
+    algorithm.coefficients = lambda o: seen.append(o) or spied(o)
+    with algorithm.policy_for(0, policy) as acting:
+        acting.eval()
+        for _ in range(2):
+            acting.reset(3)
+            for step in range(3):
+                acting.act(frame(observation, step), [generator(i) for i in range(3)])
+    assert len(seen) == 2
+
+
+def test_dmpel_leaves_the_policy_as_it_was():
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    for task in (0, 1):
+        learn_small(algorithm, policy, task)
+    plain = make_policy().eval()
+    plain.load_state_dict(policy.state_dict())
+    with algorithm.policy_for(1, policy):
+        assert "encode" in vars(policy)
+    assert "encode" not in vars(policy)
+    assert not any(module._forward_hooks for module in policy.modules())
+    policy.eval()
+    assert torch.equal(policy.predict(everything(1)), plain.predict(everything(1)))
+    assert not torch.equal(answers(algorithm, policy, 1), plain.predict(everything(1)))
+
+
+def test_dmpel_needs_no_task_number():
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    for task in (0, 1, 2):
+        learn_small(algorithm, policy, task)
+    predicted = []
+    for task in (0, 2, 7):
+        with algorithm.policy_for(task, policy) as acting, torch.no_grad():
+            predicted.append(acting.eval().predict(everything(1)))
+    assert torch.equal(predicted[0], predicted[1]) and torch.equal(predicted[0], predicted[2])
+
+
+def test_dmpel_names_policies_that_it_cannot_route():
+    policy, algorithm = DeepPolicy(), DMPEL()
+    algorithm._router = Router(
+        enter=torch.zeros(1, 1), keys=torch.zeros(1, 1, 1), bias=torch.zeros(1, 1), top_k=0
+    )
+    with pytest.raises(ConfigError, match="DeepPolicy has no encode"), algorithm.policy_for(0, policy):
+        pass
+
+
+@pytest.mark.parametrize("name", ["rank", "experts", "pool", "replay_size"])
+def test_dmpel_settings_that_cannot_work_are_named(name):
+    with pytest.raises(ConfigError, match=f"algo.{name} is 0"):
+        DMPEL(**{name: 0})

@@ -1,0 +1,363 @@
+"""A growing library of low-rank experts and a router that mixes them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from types import MethodType
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils.hooks import RemovableHandle
+
+from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.errors import ConfigError
+from lifelong.nn.adapters import freeze_statistics, start_pair
+from lifelong.nn.experts import Router, change, expert_shape, routed_layers
+from lifelong.nn.tokens import standardise
+from lifelong.policies.base import Policy
+from lifelong.types import Batch, Observation
+
+_QUERY = "routing_query"  # stands among the readings of a batch; policies read those of their spec only
+_CHUNK = 8  # windows of which queries are made at a time
+
+
+class DMPEL(Algorithm):
+    """Add a few low-rank experts with each task, and let a router mix all there are (Lei et al. 2025).
+
+    "Dynamic mixture of progressive parameter-efficient expert library for lifelong robot learning",
+    arXiv:2506.05985: layers compute `W x + (alpha / rank) sum_i c_i B_i A_i x` with W frozen; the coefficients c come
+    from a router that sees the context (instruction, images, proprioception), not the task's number, and are a
+    softmax over the best `top_k`; layers form groups with coefficients of their own. Only the newest experts and
+    the router learn. What the router must not forget is replayed: its inputs on earlier tasks and the coefficients
+    that it gave then, which are far smaller than demonstrations.
+
+    Departures:
+
+    * c is fixed for an episode and computed from its first frame. A policy keeps features of earlier frames while it
+      acts, which other coefficients would belie; so windows in training and single steps compute the same. A window
+      belongs to the first frame of its demonstration.
+    * The paper's router sees features of a frozen CLIP; this one the image in `pool` by `pool` pixels.
+    * Choice 0 is the base alone, without an expert: the task that the base was learned with needs none.
+    * Replay is a penalty while a task is learned, not a stage after it: the divergence of the coefficients, over all
+      choices, from those kept. Squared errors would hardly move a router that is sure of itself.
+    * Linear layers and convolutions have experts. An LSTM stays as the base left it; what goes into it and what
+      comes out passes through layers that have.
+    """
+
+    def __init__(
+        self,
+        *,
+        rank: int = 16,
+        alpha: float = 32.0,
+        experts: int = 1,
+        top_k: int = 3,
+        adapted: Sequence[str] = ("*",),
+        hidden: int = 64,
+        pool: int = 4,
+        replay: float = 10.0,
+        replay_size: int = 50,
+        base_tasks: int = 1,
+    ):
+        """Make the algorithm.
+
+        Args:
+            rank: Of an expert.
+            alpha: The experts' scale is alpha / rank.
+            experts: Added for each task.
+            top_k: So many choices share the weight; 0: all.
+            adapted: Patterns of names of the weights whose layers get experts, e.g. `transformer.*`, `head.*`.
+            hidden: Units of the router.
+            pool: The router sees every image in so many pixels by so many.
+            replay: Weight of the earlier coefficients.
+            replay_size: Contexts kept of each task.
+            base_tasks: So many tasks train the whole policy, which is frozen afterwards; 0: it is pretrained.
+
+        Raises:
+            ConfigError: A number below the least that can work.
+        """
+        for name, value in {
+            "rank": rank,
+            "experts": experts,
+            "pool": pool,
+            "replay_size": replay_size,
+        }.items():
+            if value < 1:
+                raise ConfigError(f"algo.{name} is {value}; it must be at least 1")
+        self.rank, self.scale, self.experts, self.top_k = rank, alpha / rank, experts, top_k
+        self.adapted, self.hidden, self.pool = tuple(adapted), hidden, pool
+        self.replay, self.replay_size = replay, replay_size
+        self.task_index, self._base_left, self._seed = -1, base_tasks, 0
+        self._library: dict[
+            int, dict[str, dict[str, Tensor]]
+        ] = {}  # task -> layer -> a (e r, in), b (out, e r)
+        self._router: Router | None = None
+        self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
+        self._episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
+        self._now: Tensor | None = None  # (B, G, N), what layers mix with
+        self._held: Tensor | None = None  # (B, G, N), of episodes that are acted out
+        self._handles: list[RemovableHandle] = []
+
+    # --- hooks
+
+    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+        """Note the episodes' contexts; after the base, add experts and choices of the router."""
+        self.task_index, layers = task_index, routed_layers(policy, self.adapted)
+        queries, of_window = self._contexts(dataset)
+        self._episodes = {"queries": queries.to(next(policy.parameters()).device), "of_window": of_window}
+        if self._base_left:
+            self._base_left -= 1
+            return
+        policy.zero_grad()
+        draws = torch.Generator().manual_seed(self._seed)
+        queries = self._episodes["queries"]
+        if self._router is None:
+            self._router = self._make_router(len(_groups(layers)), queries, draws)
+        self._router.grow(self.experts, queries)
+        self._library[task_index] = {n: self._make_experts(layer, draws) for n, layer in layers.items()}
+
+    def trained(self, policy: Policy) -> list[nn.Parameter]:
+        """The router and the task's experts; everything while the base is learned."""
+        if self._router is None or self.task_index not in self._library:
+            return super().trained(policy)
+        policy.requires_grad_(False)
+        self._attach(policy)
+        pairs: Any = self._library[self.task_index].values()
+        return [*self._router.parameters(), *(p for pair in pairs for p in pair.values())]
+
+    def mode_train(self, policy: Policy) -> None:
+        """Training mode, with running statistics frozen with the base."""
+        policy.train()
+        if self._library:
+            freeze_statistics(policy)
+
+    def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """The batch, in which each window carries the query of its episode."""
+        if self._router is None:
+            return batch
+        known, device = batch.task_ids == self.task_index, batch.actions.device
+        queries = batch.actions.new_empty(len(batch), self._router.enter.shape[1])
+        of_window, contexts = self._episodes["of_window"], self._episodes["queries"].to(device)
+        queries[known] = contexts[of_window.to(device)[batch.window_ids[known]]]
+        if not known.all():
+            queries[~known] = self.query(batch.observation)[~known]
+        proprio = {**batch.observation.proprio, _QUERY: queries[:, None]}
+        return replace(batch, observation=replace(batch.observation, proprio=proprio))
+
+    def penalty(self, policy: Policy) -> Tensor | None:
+        """`replay * KL(c_then | c)`, mean over the contexts of earlier tasks, a scalar; None without any."""
+        if self._router is None or not self._memory:
+            return None
+        logits = self._router.logits(torch.cat([m["queries"] for m in self._memory.values()]))
+        then = torch.cat([_padded(m["coefficients"], logits) for m in self._memory.values()])
+        return self.replay * functional.kl_div(logits.log_softmax(-1), then, reduction="none").sum(-1).mean()
+
+    def end_phase(self, phase: Any, policy: Policy) -> None:
+        """Take the experts off the policy's layers."""
+        self._detach(policy)
+
+    @torch.no_grad()
+    def end_task(
+        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Keep some of the task's contexts, with the coefficients that they are answered with."""
+        queries = self._episodes["queries"]
+        chosen = torch.randperm(len(queries), generator=generator)[: self.replay_size]
+        queries = queries[chosen.to(queries.device)]
+        if self._router is None:
+            groups = len(_groups(routed_layers(policy, self.adapted)))
+            coefficients = queries.new_ones(len(queries), groups, 1)
+        else:
+            coefficients = self._router(queries)
+        self._memory[task_index] = {"queries": queries, "coefficients": coefficients}
+        self._episodes = {}
+        self._seed = int(torch.randint(2**62, (), generator=generator))
+
+    @contextmanager
+    def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
+        """The policy with routed experts, the same for every task."""
+        if self._router is None:
+            yield policy
+            return
+        attached = "encode" in policy.__dict__
+        self._attach(policy)
+        try:
+            yield _Routed(policy, self)
+        finally:
+            self._now = None
+            if not attached:
+                self._detach(policy)
+
+    # --- routing
+
+    def query(self, observation: Observation) -> Tensor:
+        """The context in the first frame of windows, (B, Q): instruction, images, proprioception."""
+        images = observation.images[:, 0].flatten(0, 1).movedim(-1, 1).float()  # (B V, C, H, W)
+        seen = functional.adaptive_avg_pool2d(images, self.pool) / 64 - 2  # of order one
+        seen = seen.reshape(len(observation.images), -1)
+        felt = [observation.proprio[name][:, 0] for name in sorted(observation.proprio) if name != _QUERY]
+        return torch.cat([standardise(observation.language), seen, *felt], dim=1)
+
+    def coefficients(self, observation: Observation) -> Tensor:
+        """How much of each choice each group of layers takes, (B, G, N)."""
+        assert self._router is not None
+        given = observation.proprio.get(_QUERY)
+        return self._router(self.query(observation) if given is None else given[:, 0])
+
+    @contextmanager
+    def holding(self, coefficients: Tensor) -> Iterator[None]:
+        """Within the context, these coefficients hold whatever is observed."""
+        self._held = coefficients
+        try:
+            yield
+        finally:
+            self._held = None
+
+    def _attach(self, policy: Policy) -> None:
+        """Let the policy's layers mix experts, with coefficients found when it encodes an observation.
+
+        A copy of the policy mixes them as well: functions and methods know no policy but the one they are called on.
+        """
+        if "encode" in policy.__dict__:
+            return
+        encode = getattr(type(policy), "encode", None)
+        if encode is None:
+            raise ConfigError(
+                f"{type(policy).__name__} has no encode(observation), where experts are routed; use algo=lora"
+            )
+
+        def routed(self_: Policy, observation: Observation) -> Tensor:
+            self._now = self.coefficients(observation) if self._held is None else self._held
+            return encode(self_, observation)
+
+        policy.__dict__["encode"] = MethodType(routed, policy)
+        layers = routed_layers(policy, self.adapted)
+        groups = _groups(layers)
+        self._handles = [
+            layer.register_forward_hook(self._hook(name, groups.index(name.partition(".")[0])))
+            for name, layer in layers.items()
+        ]
+
+    def _detach(self, policy: Policy) -> None:
+        for handle in self._handles:
+            handle.remove()
+        policy.__dict__.pop("encode", None)
+        self._handles, self._now = [], None
+
+    def _hook(self, name: str, group: int) -> Callable[[nn.Module, Any, Tensor], Tensor]:
+        """What adds to a layer's output what the experts give."""
+
+        def add(layer: nn.Module, args: Any, output: Tensor) -> Tensor:
+            if self._now is None:
+                return output
+            pairs = [of_task[name] for of_task in self._library.values()]
+            rank = pairs[0]["a"].shape[0] // self.experts
+            weights = self.scale * self._now[:, group, 1:].repeat_interleave(rank, dim=1)
+            return output + change(layer, args[0], pairs, weights)
+
+        return add
+
+    # --- making and keeping
+
+    @torch.no_grad()
+    def _contexts(self, dataset: Any) -> tuple[Tensor, Tensor]:
+        """The query of every demonstration (D, Q), and which of them each window belongs to (W,).
+
+        Read from `last`, the last frame of each window's demonstration, through datasets that are made of others
+        (`datasets`, or `chosen` windows of a `dataset`). Without it every window is a demonstration.
+        """
+        if hasattr(dataset, "datasets"):
+            parts = [self._contexts(part) for part in dataset.datasets]
+            offsets = torch.tensor([0] + [len(queries) for queries, _ in parts]).cumsum(0).tolist()
+            moved = [of_window + offset for (_, of_window), offset in zip(parts, offsets, strict=False)]
+            return torch.cat([queries for queries, _ in parts]), torch.cat(moved)
+        if hasattr(dataset, "chosen"):
+            queries, of_window = self._contexts(dataset.dataset)
+            return queries, of_window[dataset.chosen.to(of_window.device)]
+        ends, of_window = getattr(dataset, "last", torch.arange(len(dataset))).unique(return_inverse=True)
+        starts = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
+        found = [self.query(dataset.batch(indices).observation) for indices in starts.split(_CHUNK)]
+        return torch.cat(found), of_window
+
+    def _make_router(self, groups: int, queries: Tensor, draws: torch.Generator) -> Router:
+        enter, _ = start_pair(1, queries.shape[1], self.hidden, draws)
+        keys, bias = torch.zeros(1, groups, self.hidden), torch.zeros(1, groups)
+        return Router(enter=enter, keys=keys, bias=bias, top_k=self.top_k).to(queries.device)
+
+    def _make_experts(self, layer: nn.Module, draws: torch.Generator) -> dict[str, Tensor]:
+        out, inputs = expert_shape(layer)
+        rank = min(self.rank, out, inputs)
+        a, b = start_pair(out, inputs, self.experts * rank, draws)
+        device = next(layer.parameters()).device
+        return {"a": nn.Parameter(a.to(device)), "b": nn.Parameter(b.to(device))}
+
+    def sizes(self) -> dict[int, int]:
+        """Numbers that each task's experts consist of; the router's are not among them."""
+        tensors = {task: [t for p in of.values() for t in p.values()] for task, of in self._library.items()}
+        return {task: sum(t.numel() for t in of_task) for task, of_task in tensors.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Experts, router, contexts kept, and those of the present task's windows."""
+        library = {
+            task: {name: {k: t.detach() for k, t in pair.items()} for name, pair in of_task.items()}
+            for task, of_task in self._library.items()
+        }
+        router = {} if self._router is None else {n: p.detach() for n, p in self._router.named_parameters()}
+        place = {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
+        kept = {"memory": _copied(self._memory), "episodes": dict(self._episodes)}
+        return {**place, "library": library, "router": router, **kept}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+        """Take up what `state_dict` gave."""
+        self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
+        self._seed = int(state["seed"])
+        self._memory, self._episodes = _copied(state["memory"]), dict(state["episodes"])
+        self._router = Router(**state["router"], top_k=self.top_k) if state["router"] else None
+        self._library = {
+            task: {name: {k: nn.Parameter(t) for k, t in pair.items()} for name, pair in of_task.items()}
+            for task, of_task in state["library"].items()
+        }
+
+
+class _Routed(Policy):
+    """A policy whose experts are routed once, at the first step of each episode."""
+
+    def __init__(self, inner: Policy, algorithm: DMPEL) -> None:
+        super().__init__(inner.spec)
+        self.inner, self._algorithm = inner, algorithm
+        self._coefficients: Tensor | None = None
+        self.training = inner.training
+
+    def window_losses(self, batch: Batch) -> Tensor:
+        """See `Policy`; windows that carry no query are routed by their own first frame."""
+        return self.inner.window_losses(batch)
+
+    def predict(self, batch: Batch) -> Tensor:
+        """See `Policy`; windows that carry no query are routed by their own first frame."""
+        return self.inner.predict(batch)
+
+    def reset(self, num_envs: int) -> None:
+        """See `Policy`."""
+        self._coefficients = None
+        self.inner.reset(num_envs)
+
+    def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
+        if self._coefficients is None:
+            self._coefficients = self._algorithm.coefficients(observation)
+        with self._algorithm.holding(self._coefficients):
+            return self.inner._act(observation, generators)
+
+
+def _groups(layers: Mapping[str, nn.Module]) -> list[str]:
+    """Layers below the same attribute of the policy (`encoders`, `transformer`, `head`) form a group."""
+    return sorted({name.partition(".")[0] for name in layers})
+
+
+def _padded(coefficients: Tensor, like: Tensor) -> Tensor:
+    """Coefficients (n, G, N then) with zeros for the choices that came later."""
+    return functional.pad(coefficients, (0, like.shape[-1] - coefficients.shape[-1]))
+
+
+def _copied(tables: Mapping[int, Mapping[str, Tensor]]) -> dict[int, dict[str, Tensor]]:
+    return {task: dict(table) for task, table in tables.items()}

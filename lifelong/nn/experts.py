@@ -1,0 +1,105 @@
+"""A library of low-rank experts on the layers of a network, mixed anew for every row of a batch.
+
+Shape legend: B batch, G groups of layers, N choices (the base and every expert), Q query, r rank.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lifelong.errors import PolicyError
+from lifelong.nn.adapters import check_found, matches
+
+
+class Router(nn.Module):
+    """From a query to how much of each expert every group of layers takes.
+
+    A hidden layer, a key for each choice and group, and a softmax over the `top_k` best choices. Choice 0 is the
+    base alone; experts are appended with `grow`.
+
+    Args:
+        enter: (hidden, Q) weight of the hidden layer.
+        keys: (N, G, hidden).
+        bias: (N, G).
+        top_k: so many choices share the weight; 0: all.
+    """
+
+    def __init__(self, *, enter: Tensor, keys: Tensor, bias: Tensor, top_k: int) -> None:
+        super().__init__()
+        self.enter, self.top_k = nn.Parameter(enter), top_k
+        self.keys, self.bias = nn.Parameter(keys), nn.Parameter(bias)
+
+    def logits(self, query: Tensor) -> Tensor:
+        """(B, Q) -> (B, G, N), float32."""
+        with torch.autocast(query.device.type, enabled=False):
+            hidden = functional.gelu(query.float() @ self.enter.T)
+            return torch.einsum("bh,ngh->bgn", hidden, self.keys) + self.bias.T
+
+    def forward(self, query: Tensor) -> Tensor:
+        """(B, Q) -> coefficients (B, G, N), which sum to one over N and are zero beyond the best."""
+        logits = self.logits(query)
+        if 0 < self.top_k < logits.shape[-1]:
+            least = logits.topk(self.top_k, dim=-1).values[..., -1:]
+            logits = logits.masked_fill(logits < least, -math.inf)
+        return logits.softmax(-1)
+
+    @torch.no_grad()
+    def grow(self, count: int, queries: Tensor) -> None:
+        """Append `count` choices, which on these queries (B, Q) start level with the best there are."""
+        level = self.logits(queries).amax(-1).mean(0)  # (G,)
+        keys = torch.cat([self.keys, self.keys.new_zeros(count, *self.keys.shape[1:])])
+        bias = torch.cat([self.bias, level.expand(count, -1)])
+        self.keys, self.bias = nn.Parameter(keys), nn.Parameter(bias)
+
+
+def routed_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:
+    """The linear layers and convolutions whose weight's name fits one of the patterns, by name.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    layers = {
+        name: module
+        for name, module in policy.named_modules()
+        if isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and module.groups == 1)
+    }
+    found = [name for name in layers if matches(f"{name}.weight", patterns)]
+    check_found(found, patterns, [f"{name}.weight" for name in layers], "linear layer or convolution")
+    return {name: layers[name] for name in found}
+
+
+def expert_shape(layer: nn.Module) -> tuple[int, int]:
+    """Rows and columns of a layer's weight as a matrix."""
+    out, inputs = layer.weight.flatten(1).shape  # type: ignore[operator, union-attr]
+    return out, inputs
+
+
+def change(layer: nn.Module, x: Tensor, pairs: Sequence[Mapping[str, Tensor]], weights: Tensor) -> Tensor:
+    """What the experts add to a layer's output: `sum_i c_i B_i A_i x`, another mixture for each row.
+
+    Args:
+        layer: Linear or convolution.
+        x: Its input; the first axis has B rows, or a multiple with the rows of one sample adjacent.
+        pairs: For one task's experts each, `a` (experts r, inputs) and `b` (out, experts r).
+        weights: (B, sum of experts r), c with each coefficient repeated r times.
+
+    Raises:
+        PolicyError: The first axis is no multiple of B.
+    """
+    rows, samples = len(x), len(weights)
+    if rows % samples:
+        raise PolicyError(
+            f"a layer has {rows} rows for {samples} samples: their experts cannot be told apart"
+        )
+    a, b = torch.cat([p["a"] for p in pairs]), torch.cat([p["b"] for p in pairs], dim=1)
+    weights = weights.repeat_interleave(rows // samples, dim=0)
+    if isinstance(layer, nn.Conv2d):
+        kernel = a.view(len(a), *layer.weight.shape[1:])
+        h = functional.conv2d(x, kernel, None, layer.stride, layer.padding, layer.dilation)
+        return functional.conv2d(h * weights[:, :, None, None].to(h.dtype), b[:, :, None, None])
+    h = functional.linear(x, a)
+    shape = (rows, *[1] * (h.dim() - 2), h.shape[-1])
+    return functional.linear(h * weights.view(shape).to(h.dtype), b)
