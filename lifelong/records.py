@@ -42,6 +42,7 @@ class RunRecord:
     commit: str | None
     cpu_count: int
     started: str  # ISO 8601, UTC
+    group_size: int = 1  # tasks learned together as one step of the sequence
 
     def __post_init__(self) -> None:
         if len(self.tasks) != len(self.instructions):
@@ -93,7 +94,9 @@ class EvalRecord:
         for name in ("atoms_at_start", "atoms_ever", "atoms_at_end"):
             shape = [len(row) for row in getattr(self, name)]
             if self.atoms and shape != [len(self.atoms)] * len(self.successes):
-                raise ValueError(f"{name} of an evaluation has a row for each episode, a column for each atom")
+                raise ValueError(
+                    f"{name} of an evaluation has a row for each episode, a column for each atom"
+                )
 
     @property
     def rate(self) -> float:
@@ -158,6 +161,7 @@ def start_record(
     tasks: Sequence[str],
     instructions: Sequence[str],
     config: str,
+    group_size: int = 1,
 ) -> RunRecord:
     """The record of a start, now and on this machine.
 
@@ -165,6 +169,7 @@ def start_record(
         tasks: Names in learning order.
         instructions: What the policy is told, in the same order.
         config: The resolved configuration as text; its SHA-256 is kept.
+        group_size: Tasks learned together.
     """
     return RunRecord(
         algo=algo,
@@ -179,6 +184,7 @@ def start_record(
         commit=source_commit(),
         cpu_count=os.cpu_count() or 1,
         started=utc_now(),
+        group_size=group_size,
     )
 
 
