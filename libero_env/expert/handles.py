@@ -14,7 +14,7 @@ from libero_env.predicates import StateView
 UP = np.array([0.0, 0.0, 1.0])
 KNOB_RADIUS = 0.08  # m, from its axis; what is wider swings like a door
 _FINE, _NEAR = 0.11, 0.32  # m, around the handle: looked at closely, and at all
-_BEHIND = 0.008  # m without points: the space behind a handle's bar
+_BEHIND = 0.0055  # m without points: the space behind a handle's bar
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def find_handle(view: StateView, part: Part, way: float) -> Handle:
     sideways = np.cross(UP, out)
     spans = [np.ptp(slab @ axis) for axis in (sideways, UP)]
     along, across = (sideways, UP) if spans[0] >= spans[1] else (UP, sideways)
-    core = np.abs((points - middle) @ along) < 0.012
+    core = np.abs((points - middle) @ along) < 0.006
     core &= np.abs((points - middle) @ across) < 0.5 * min(spans) + 0.012
     depths = np.sort(front.max() - front[core])
     gaps = np.flatnonzero(np.diff(depths) > _BEHIND)

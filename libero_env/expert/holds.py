@@ -11,7 +11,7 @@ from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import FINGER_HALF_WIDTH, TIP_BELOW, GraspError, choose_grasp
 from libero_env.expert.handles import UP, Handle, Part, surroundings, turned
 from libero_env.expert.motion import downward, finger_axis
-from libero_env.expert.posture import strain, unease
+from libero_env.expert.posture import strain, stretch, unease
 from libero_env.predicates import StateView
 
 TAKES = 0.06  # m, widest handle that is taken between the fingers
@@ -26,7 +26,8 @@ _FOLLOWS = (1.0, 0.5, 0.0)  # shares of a door's turn that a pushing hand makes 
 _ASIDE = np.array(
     [0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026]
 )  # m, of the open hand from the middle of the bar
-_FORTH = (0.0, -0.005)  # m, of the grip site beyond the middle of the bar
+_FORTH = (0.0, -0.005, -0.0075)  # m, of the grip site beyond the middle of the bar
+_CLEAR = 0.10  # m, that a hand withdraws
 _SPARE = 0.002  # m, around the hand
 _TWISTED = 0.5 * np.pi + 0.4  # rad, of strain that is too much
 _LEANS = (0.0, 0.2, -0.2, 0.35, -0.35, 0.5, -0.5)  # rad, of the hand over a knob
@@ -98,6 +99,8 @@ def handle_hold(
         raise GraspError(f"no way to take the handle: it is more than {100 * TAKES:.0f} cm thick")
     moved = [part.moved_all(view, ways.held, ways.mat, share * delta, ways.follow) for share in (0.5, 1.0)]
     cost = ways.cost + unease(ways.ready, ways.mat, base) + unease(*moved[1], base)
+    end, mat = moved[1]
+    cost += 20.0 * stretch(end - _CLEAR * mat[:, :, 2], mat, base)  # it withdraws from there
     turn = 0.5 * (np.einsum("ij,nij->n", view.eef_mat, ways.mat) - 1.0)
     cost += 0.1 * np.arccos(np.clip(turn, -1.0, 1.0))
     for pose in failed:
@@ -175,6 +178,20 @@ def _blocked(depth: float) -> float:
 def _candidates(handle: Handle, grips: bool, swings: bool, base: np.ndarray) -> _Ways:
     """All approaches, what is around not yet considered."""
     rows: list[tuple] = []
+    for mat, steep, extra in _orientations(handle, grips):
+        if strain(handle.pos[None], mat[None], base)[0] > _TWISTED:
+            continue
+        if grips:
+            found = _grips(handle, mat)
+        else:
+            found = _pushes(handle, mat, _FOLLOWS if swings and steep else (1.0,))
+        rows += [(cost + extra, ready, held, mat, back, follow) for cost, ready, held, back, follow in found]
+    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 6
+    return _Ways(*columns)
+
+
+def _orientations(handle: Handle, grips: bool) -> Iterator[tuple[np.ndarray, bool, float]]:
+    """(orientation of the hand (3, 3), whether it is steep, cost)."""
     upright = abs(handle.along[2]) > 0.7
     rolls = (0.0,) if upright else _ROLLS
     if grips and not upright and handle.half < _SHORT:
@@ -184,15 +201,7 @@ def _candidates(handle: Handle, grips: bool, swings: bool, base: np.ndarray) -> 
         fingers = np.cross(handle.along, -handle.out if upright else approach)
         fingers = sign * (np.cos(roll) * fingers + np.sin(roll) * handle.along)
         mat = np.column_stack([fingers, np.cross(approach, fingers), approach])
-        if strain(handle.pos[None], mat[None], base)[0] > _TWISTED:
-            continue
-        if grips:
-            found = _grips(handle, mat)
-        else:
-            found = _pushes(handle, mat, _FOLLOWS if swings and tilt > _STEEP else (1.0,))
-        rows += [(cost + 0.3 * abs(roll), ready, held, mat, back, f) for cost, ready, held, back, f in found]
-    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 6
-    return _Ways(*columns)
+        yield mat, tilt > _STEEP, 0.3 * abs(roll)
 
 
 def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple]:

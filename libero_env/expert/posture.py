@@ -5,7 +5,7 @@ import numpy as np
 # Franka Emika Panda, m: from its data sheet, and the hand down to the grip site.
 _SHOULDER = np.array([0.0, 0.0, 0.333])  # over the base
 _UPPER, _FOREARM, _ELBOW, _WRIST, _HAND = 0.316, 0.384, 0.0825, 0.088, 0.2104
-_REACH = 0.42, 0.74  # m, from the shoulder to the flange, without folding or stretching the arm
+_REACH = 0.32, 0.66  # m, from the shoulder to the wrist; from 0.20 to 0.70 the elbow is within its limits
 _WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
 _BENT = (
     2.75  # rad, of joint 6, up to which the wrist bends with ease; at pi joints 5 and 7 turn about one line
@@ -36,8 +36,8 @@ def strain(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
 
 
 def stretch(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """How far hands are out of easy reach, (N,), m."""
-    distance = np.linalg.norm(pos - _HAND * mat[:, :, 2] - base - _SHOULDER, axis=1)
+    """How far wrists are out of easy reach, too close or too far, (N,), m."""
+    distance = np.linalg.norm(_wrist(pos, mat, base), axis=1)
     return np.maximum(0.0, np.maximum(distance - _REACH[1], _REACH[0] - distance))
 
 
@@ -47,9 +47,7 @@ def bend(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     At pi the hand points along the forearm and the wrist is singular; far beyond, at 3.75, is the joint's limit.
     """
     approach = mat[:, :, 2]
-    flange = pos - _HAND * approach - base - _SHOULDER
-    ahead = _unit(flange * [1.0, 1.0, 0.0])
-    wrist = flange - _WRIST * _unit(ahead - np.sum(ahead * approach, axis=1)[:, None] * approach)
+    wrist = _wrist(pos, mat, base)
     ahead, level = _unit(wrist * [1.0, 1.0, 0.0]), np.hypot(wrist[:, 0], wrist[:, 1])
     upper, lower, side = np.hypot(_UPPER, _ELBOW), np.hypot(_FOREARM, _ELBOW), np.linalg.norm(wrist, axis=1)
     lift = np.arccos(np.clip((upper**2 + side**2 - lower**2) / (2 * upper * np.maximum(side, 1e-9)), -1, 1))
@@ -61,6 +59,14 @@ def bend(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
         out * np.cos(forearm) - approach[:, 2] * np.sin(forearm),
         out * np.sin(forearm) + approach[:, 2] * np.cos(forearm),
     )
+
+
+def _wrist(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Where the axes of joints 5 and 6 meet, from the shoulder, (N, 3), m; the arm's plane is upright."""
+    approach = mat[:, :, 2]
+    flange = pos - _HAND * approach - base - _SHOULDER
+    ahead = _unit(flange * [1.0, 1.0, 0.0])
+    return flange - _WRIST * _unit(ahead - np.sum(ahead * approach, axis=1)[:, None] * approach)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
