@@ -1,0 +1,14 @@
+"""The original's algorithms: hooks of `lifelong.algorithms` in a loop over dictionaries."""
+
+from libero.lifelong.algos.agem import AGEM
+from libero.lifelong.algos.base import REGISTERED_ALGOS, Sequential, get_algo_class, get_algo_list
+from libero.lifelong.algos.er import ER
+from libero.lifelong.algos.ewc import EWC
+from libero.lifelong.algos.multitask import Multitask
+from libero.lifelong.algos.packnet import PackNet
+from libero.lifelong.algos.single_task import SingleTask
+
+__all__ = [
+    "AGEM", "ER", "EWC", "REGISTERED_ALGOS", "Multitask", "PackNet", "Sequential", "SingleTask", "get_algo_class",
+    "get_algo_list",
+]  # fmt: skip

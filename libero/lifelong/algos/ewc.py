@@ -1,0 +1,24 @@
+"""Online elastic weight consolidation."""
+
+from typing import Any
+
+from libero.lifelong.algos.base import Sequential
+from lifelong import algorithms
+
+
+class EWC(Sequential):
+    """Weights are pulled to where earlier tasks left them; see `lifelong.algorithms.EWC`.
+
+    Fisher information is the original's estimate from whole batches of all windows, which `lifelong.e_lambda` goes
+    with.
+    """
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.EWC(
+            strength=float(cfg.lifelong.e_lambda),
+            gamma=cfg.lifelong.gamma,
+            fisher="batch",
+            fisher_windows=0,
+            fisher_batch_size=cfg.train.batch_size,
+        )

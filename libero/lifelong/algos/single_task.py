@@ -1,0 +1,14 @@
+"""A policy for each task."""
+
+from typing import Any
+
+from libero.lifelong.algos.base import Sequential
+from lifelong import algorithms
+
+
+class SingleTask(Sequential):
+    """Every task begins with the first weights, and is acted on with its own; see `lifelong.algorithms.SingleTask`."""
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.SingleTask()

@@ -1,0 +1,195 @@
+"""Demonstrations as the original's datasets: windows as dictionaries of tensors.
+
+Shape legend: T time, C H W image, D one reading's dimension, A action, L language embedding.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import ConcatDataset, Dataset
+
+from libero.lifelong.observations import picture
+from libero_env.demos import demo_files, demo_names, opened, read_demos
+from libero_env.errors import DemoError
+from lifelong.data import SequenceVLDataset as Windows
+from lifelong.types import PolicySpec
+
+_DEFAULT_KEYS = {
+    "rgb": ["agentview_rgb", "eye_in_hand_rgb"],
+    "depth": [],
+    "low_dim": ["gripper_states", "joint_states"],
+}
+
+
+class SequenceDataset(Dataset):
+    """All windows of a demonstration file; every frame begins one, and past the end the last repeats.
+
+    A window is `{"obs": {view: (T, C, H, W) in [0, 1] lowest row first, reading: (T, D)}, "actions": (T, A)}`. Frames
+    are held in memory as bytes.
+
+    Attributes:
+        n_demos, total_num_sequences: demonstrations and windows.
+    """
+
+    def __init__(self, windows: Windows, views: Sequence[str], frame_stack: int = 1):
+        self.windows, self.views, self.frame_stack = windows, tuple(views), frame_stack
+        ends, lengths = torch.unique_consecutive(windows.last, return_counts=True)
+        self._first = (ends - lengths + 1).repeat_interleave(lengths)
+        self.n_demos, self.total_num_sequences = len(ends), len(windows)
+        self.seq_length = windows.seq_len
+
+    def __len__(self) -> int:
+        return self.total_num_sequences
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        index = range(len(self))[index]
+        w, steps = self.windows, torch.arange(1 - self.frame_stack, self.seq_length)
+        frames = (index + steps).clamp(int(self._first[index]), int(w.last[index]))
+        images = w.images[frames].flip(-3)  # (T, V, H, W, C)
+        obs = {view: picture(images[:, k]) for k, view in enumerate(self.views)}
+        obs.update({name: values[frames] for name, values in w.proprio.items()})
+        return {"actions": w.actions[frames[self.frame_stack - 1 :]], "obs": obs}
+
+
+class SequenceVLDataset(Dataset):
+    """Windows with their task's language embedding (L,) under `task_emb`."""
+
+    def __init__(self, sequence_dataset: Dataset, task_emb: Tensor):
+        self.sequence_dataset, self.task_emb = sequence_dataset, task_emb
+        self.n_demos, self.total_num_sequences = _counts([sequence_dataset])
+
+    def __len__(self) -> int:
+        return len(self.sequence_dataset)  # type: ignore[arg-type]
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return {**self.sequence_dataset[index], "task_emb": self.task_emb}
+
+
+class GroupedTaskDataset(Dataset):
+    """The windows of several tasks that are learned together, each with its task's embedding."""
+
+    def __init__(self, sequence_datasets: Sequence[Dataset], task_embs: Sequence[Tensor]):
+        parts = [SequenceVLDataset(*pair) for pair in zip(sequence_datasets, task_embs, strict=True)]
+        self.sequence_datasets, self.task_embs = list(sequence_datasets), task_embs
+        self.n_demos, self.total_num_sequences = _counts(parts)
+        self._joined: ConcatDataset = ConcatDataset(parts)
+
+    def __len__(self) -> int:
+        return len(self._joined)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self._joined[index]
+
+
+class TruncatedSequenceDataset(Dataset):
+    """The first `buffer_size` windows of a dataset, or all if it has fewer."""
+
+    def __init__(self, sequence_dataset: Dataset, buffer_size: int):
+        self.sequence_dataset = sequence_dataset
+        self.buffer_size = min(int(buffer_size), len(sequence_dataset))  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return self.buffer_size
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self.sequence_dataset[range(self.buffer_size)[index]]
+
+
+def get_dataset(
+    dataset_path: str | Path,
+    obs_modality: Mapping[str, Sequence[str]] | Sequence[str],
+    initialize_obs_utils: bool = True,
+    seq_len: int = 1,
+    frame_stack: int = 1,
+    filter_key: str | None = None,
+    hdf5_cache_mode: str | None = "low_dim",
+    *,
+    pairing: str = "stored",
+    labels: str = "expert",
+) -> tuple[SequenceDataset, dict[str, Any]]:
+    """The windows of a demonstration file.
+
+    Args:
+        dataset_path: HDF5 in the original's layout.
+        obs_modality: `rgb` and `low_dim` -> keys of the observation; or a list of these two, for the usual keys.
+        initialize_obs_utils: without a meaning here: nothing global is set up.
+        seq_len: T.
+        frame_stack: observations begin so many frames, less one, before the window.
+        filter_key: a subset of the demonstrations that the file names in its group `mask`.
+        hdf5_cache_mode: without a meaning here: pictures are in memory as bytes.
+        pairing: `stored` takes the file as it is, which in the original's files pairs an action with the
+            observation after it; `aligned` with the one before it.
+        labels: see `libero_env.demos.read_demos`.
+
+    Returns:
+        The windows, and what a policy is built from: `ac_dim`, `all_shapes` (key -> shape), `all_obs_keys`,
+        `use_images`, and `obs.rgb_shape`.
+
+    Raises:
+        DemoError: no such file, a broken one, or no such key or subset.
+    """
+    views, readings, depths = (_keys(obs_modality, kind) for kind in ("rgb", "low_dim", "depth"))
+    if depths:
+        raise DemoError(f"depth ({', '.join(depths)}) is not read here; leave obs_modality['depth'] empty")
+    shapes = _shapes(Path(dataset_path), [*views, *readings])
+    spec = PolicySpec(
+        views=tuple(views),
+        image_size=tuple(shapes[views[0]][:2]) if views else (0, 0),  # type: ignore[arg-type]
+        proprio={name: shapes[name][0] for name in readings},
+        language_dim=1,
+        seq_len=seq_len,
+    )
+    windows = _read(Path(dataset_path), spec, filter_key, pairing, labels)
+    all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in readings}
+    shape_meta = {
+        "ac_dim": spec.action_dim,
+        "all_shapes": all_shapes,
+        "all_obs_keys": [*views, *readings],
+        "use_images": bool(views),
+        "obs": {"rgb_shape": (3, *spec.image_size)},
+    }
+    return SequenceDataset(windows, views, frame_stack), shape_meta
+
+
+def _keys(obs_modality: Mapping[str, Sequence[str]] | Sequence[str], kind: str) -> list[str]:
+    if isinstance(obs_modality, Mapping) or hasattr(obs_modality, "get"):
+        return list(obs_modality.get(kind) or [])
+    return _DEFAULT_KEYS[kind] if kind in obs_modality else []
+
+
+def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """Shapes of one frame's observations."""
+    file = next(iter(demo_files(path)), path)
+    with opened(file) as handle:
+        names = demo_names(handle, file)
+        obs = handle["data"][names[0]]["obs"] if names else {}
+        missing = [key for key in keys if key not in obs]
+        if missing:
+            raise DemoError(
+                f"{file}: {', '.join(missing)} missing from obs; it has {', '.join(obs) or 'nothing'}"
+            )
+        return {key: tuple(obs[key].shape[1:]) for key in keys}
+
+
+def _read(path: Path, spec: PolicySpec, filter_key: str | None, pairing: str, labels: str) -> Windows:
+    language = torch.zeros(1)
+    if filter_key is None:
+        return Windows.from_file(path, spec=spec, language=language, pairing=pairing, labels=labels)
+    with opened(path) as handle:
+        if filter_key not in handle.get("mask", {}):
+            known = ", ".join(handle.get("mask", {})) or "none"
+            raise DemoError(f"{path}: no subset {filter_key!r}; there is {known}")
+        wanted = {name.decode() for name in handle["mask"][filter_key][()]}
+    keys = [*spec.views, *(spec.proprio or ())]
+    demos = read_demos(path, keys, pairing=pairing, labels=labels)  # type: ignore[arg-type]
+    kept = [demo for demo in demos if demo.name in wanted]
+    return Windows.from_demos(kept, spec=spec, language=language, source=str(path))
+
+
+def _counts(datasets: Sequence[Dataset]) -> tuple[int, int]:
+    """Demonstrations, where the datasets say how many, and windows."""
+    demos = sum(getattr(dataset, "n_demos", 0) for dataset in datasets)
+    return demos, sum(len(dataset) for dataset in datasets)  # type: ignore[arg-type]

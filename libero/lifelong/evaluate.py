@@ -1,0 +1,70 @@
+"""Evaluate a stored policy: `python libero/lifelong/evaluate.py --benchmark libero_spatial --task_id 0 ...`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+BENCHMARKS = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90", "libero_100")
+ALGOS = {
+    "base": "Sequential",
+    "single_task": "SingleTask",
+    "multitask": "Multitask",
+    "er": "ER",
+    "agem": "AGEM",
+    "ewc": "EWC",
+    "packnet": "PackNet",
+}
+POLICIES = {
+    "bc_rnn_policy": "BCRNNPolicy",
+    "bc_transformer_policy": "BCTransformerPolicy",
+    "bc_vilt_policy": "BCViLTPolicy",
+}
+
+
+def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments, by default of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="lifelong.eval", description="Success of a stored policy on a task."
+    )
+    parser.add_argument("--experiment_dir", default="experiments", help="where runs are kept")
+    parser.add_argument(
+        "--benchmark", required=True, help=f"{', '.join(BENCHMARKS)}, or one that is registered"
+    )
+    parser.add_argument("--task_id", type=int, required=True, help="position of the task to act on")
+    parser.add_argument("--algo", required=True, choices=ALGOS)
+    parser.add_argument("--policy", required=True, choices=POLICIES)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument(
+        "--ep", type=int, help="of a multitask run: the checkpoint of this epoch; default: the last"
+    )
+    parser.add_argument("--load_task", type=int, help="the checkpoint made after this task; default: task_id")
+    parser.add_argument("--run", type=int, help="number of the run; default: the newest")
+    parser.add_argument("--device_id", type=int, default=0, help="of the GPU, if there is one")
+    parser.add_argument("--n_eval", type=int, help="episodes; default: as in the run")
+    parser.add_argument("--max_steps", type=int, help="most steps of an episode; default: as in the run")
+    parser.add_argument("--save-videos", action="store_true")
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Evaluate what the arguments name.
+
+    Returns:
+        Exit status: 0, or 1 where something went wrong (told in one line).
+    """
+    from libero.lifelong.run_evaluation import evaluate
+    from libero_env.errors import LiberoError
+
+    args = parse_args(argv)
+    try:
+        evaluate(args)
+    except (LiberoError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder, whose modules have common names
+    sys.exit(main())

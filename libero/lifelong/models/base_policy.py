@@ -1,0 +1,119 @@
+"""What every policy of the original's kind gives, and the registry of them.
+
+Shape legend: B batch, T time, C H W image, A action, L language embedding.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor, nn
+
+from libero.lifelong.batches import DictBatch, map_tensors
+from libero.lifelong.config import named, plain
+from libero.lifelong.models.modules.data_augmentation import AUGMENTATIONS, DataAugGroup
+
+REGISTERED_POLICIES: dict[str, type["BasePolicy"]] = {}
+
+
+def register_policy(policy_class: type["BasePolicy"]) -> None:
+    """Make a policy known by its name; subclasses of BasePolicy are when they are defined."""
+    REGISTERED_POLICIES[policy_class.__name__] = policy_class
+
+
+def get_policy_class(policy_name: str) -> type["BasePolicy"]:
+    """The policy of this name; case does not count.
+
+    Raises:
+        UnknownNameError: no such policy.
+    """
+    return named(REGISTERED_POLICIES, "policy", policy_name)
+
+
+def get_policy_list() -> dict[str, type["BasePolicy"]]:
+    """Name -> class of all policies."""
+    return dict(REGISTERED_POLICIES)
+
+
+class PolicyMeta(type):
+    """Registers every subclass of BasePolicy, but for those defined with `registered=False`."""
+
+    def __new__(mcs, name: str, bases: tuple, namespace: dict[str, Any], registered: bool = True) -> Any:
+        cls = super().__new__(mcs, name, bases, namespace)
+        if registered:
+            register_policy(cls)  # type: ignore[arg-type]
+        return cls
+
+    def __init__(cls, name: str, bases: tuple, namespace: dict[str, Any], registered: bool = True):
+        super().__init__(name, bases, namespace)
+
+
+class BasePolicy(nn.Module, metaclass=PolicyMeta, registered=False):
+    """A policy trained on dictionaries of windows.
+
+    A subclass sets `policy_head` and gives `forward` and `get_action`; `reset` forgets an episode. A batch is never
+    changed. Data in training: `obs` {view: (B, T, C, H, W) in [0, 1], reading: (B, T, D)}, `actions` (B, T, A),
+    `task_emb` (B, L); when acting without T.
+
+    Args:
+        cfg: the configuration: `policy`, `data`, `train` and `device`.
+        shape_meta: from `get_dataset`.
+    """
+
+    policy_head: Any
+
+    def __init__(self, cfg: Any, shape_meta: Mapping[str, Any]):
+        super().__init__()
+        self.cfg, self.device, self.shape_meta = cfg, cfg.device, shape_meta
+        self.img_names = [key for key in shape_meta["all_shapes"] if "rgb" in key]
+        self.use_augmentation = bool(cfg.train.use_augmentation)
+        self.img_aug = DataAugGroup(_augmentations(cfg.policy) if self.use_augmentation else [])
+
+    @abstractmethod
+    def forward(self, data: Mapping[str, Any]) -> Any:
+        """The distribution of actions (B, T, A) that `policy_head` gives."""
+        raise NotImplementedError(f"{type(self).__name__} has no forward(data)")
+
+    @abstractmethod
+    def get_action(self, data: Mapping[str, Any]) -> np.ndarray:
+        """The next actions (B, A) from observations without a time axis."""
+        raise NotImplementedError(f"{type(self).__name__} has no get_action(data)")
+
+    def reset(self) -> None:
+        """Forget what was seen: the next observation begins an episode."""
+
+    def preprocess_input(self, data: Mapping[str, Any], train_mode: bool = True) -> dict[str, Any]:
+        """Augmented in training; when acting, with a time axis of one step."""
+        if train_mode:
+            if not self.use_augmentation:
+                return dict(data)
+            obs = {**data["obs"], **self._get_aug_output_dict(self.img_aug(self._get_img_tuple(data)))}
+            return {**data, "obs": obs}
+        stepped = map_tensors(dict(data), lambda x: x.unsqueeze(1))
+        return {**stepped, "task_emb": data["task_emb"]} if "task_emb" in data else stepped
+
+    def compute_loss(self, data: Mapping[str, Any], reduction: str = "mean") -> Tensor:
+        """The head's loss on a batch."""
+        data = self.preprocess_input(data, train_mode=True)
+        return self.policy_head.loss_fn(self.forward(data), data["actions"], reduction)
+
+    def loss(self, batch: DictBatch) -> Tensor:
+        """The mean loss, as the algorithms of `lifelong` ask for it."""
+        return self.compute_loss(batch.data)
+
+    def _get_img_tuple(self, data: Mapping[str, Any]) -> tuple[Tensor, ...]:
+        return tuple(data["obs"][name] for name in self.img_names)
+
+    def _get_aug_output_dict(self, out: Sequence[Tensor]) -> dict[str, Tensor]:
+        return dict(zip(self.img_names, out, strict=True))
+
+
+def _augmentations(policy_cfg: Any) -> list[nn.Module]:
+    """Those that the configuration names, colours first."""
+    nodes = [policy_cfg.get(key) for key in ("color_aug", "translation_aug")]
+    return [
+        named(AUGMENTATIONS, "augmentation", node["network"])(**plain(node["network_kwargs"]))
+        for node in nodes
+        if node
+    ]

@@ -1,0 +1,128 @@
+"""What `evaluate.py` does: a checkpoint of a run, rolled out on one task."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from libero.libero.benchmark import get_benchmark
+from libero.libero.utils.video_utils import VideoWriter
+from libero.lifelong.algos import PackNet, Sequential, get_algo_class
+from libero.lifelong.datasets import SequenceVLDataset
+from libero.lifelong.evaluate import ALGOS, POLICIES
+from libero.lifelong.metric import evaluate_loss, rollouts
+from libero.lifelong.run import fill_in, task_dataset
+from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
+from lifelong.errors import CheckpointError
+from lifelong.metrics import wilson_interval
+
+
+def evaluate(args: argparse.Namespace) -> dict[str, Any]:
+    """Loss and success of a checkpoint on a task; they are printed, and written beside the run's checkpoints.
+
+    Returns:
+        `loss`, `success_rate`, its 95 % interval (Wilson), and which episodes succeeded.
+
+    Raises:
+        CheckpointError: no such run or checkpoint.
+        LiberoError: no such benchmark or task.
+    """
+    path = checkpoint_path(args)
+    control_seed(args.seed)
+    weights, cfg, masks = torch_load_model(path)
+    if cfg is None:
+        raise CheckpointError(f"{path} holds no configuration: it was not written by a run")
+    cfg.device, cfg.experiment_dir = args.device_id, str(path.parent)
+    cfg.eval.n_eval, cfg.eval.max_steps = args.n_eval or cfg.eval.n_eval, args.max_steps or cfg.eval.max_steps
+    fill_in(cfg)
+    benchmark = get_benchmark(args.benchmark)(cfg.data.task_order_index)
+    task = benchmark.get_task(args.task_id)
+    benchmark.set_task_embs(get_task_embs(cfg, [t.language for t in benchmark.tasks]))
+    algo = _algorithm(args, cfg, benchmark, weights, masks)
+    emb = benchmark.get_task_emb(args.task_id)
+
+    windows, _ = task_dataset(cfg, benchmark, args.task_id)
+    loss = float(evaluate_loss(cfg, algo, benchmark, [SequenceVLDataset(windows, emb)])[0])
+    film = VideoWriter(
+        path.parent / f"{path.stem}_on{args.task_id}_videos", args.save_videos, single_video=False
+    )
+    with film:
+        episodes = rollouts(
+            cfg, algo, task, emb, args.task_id, range(cfg.eval.n_eval),
+            watch=_camera(film, cfg.data.obs.modality.rgb[0]) if args.save_videos else None,
+        )  # fmt: skip
+    successes = [e.success for part in episodes for e in part.episodes]
+    return _told(path, args, task, loss, successes)
+
+
+def checkpoint_path(args: argparse.Namespace) -> Path:
+    """The checkpoint that the arguments name.
+
+    Raises:
+        CheckpointError: no such run or file.
+    """
+    name = f"{POLICIES[args.policy]}_seed{args.seed}"
+    found = sorted(p for p in Path(args.experiment_dir).glob(f"*/{ALGOS[args.algo]}/{name}") if p.is_dir())
+    roots = [p for p in found if p.parts[-3].lower() == args.benchmark.lower()]
+    if not roots:
+        raise CheckpointError(
+            f"no run {args.benchmark}/{ALGOS[args.algo]}/{name} in {args.experiment_dir}; there is "
+            f"{', '.join(map(str, found)) or 'none of this name'}"
+        )
+    folder = roots[0] / f"run_{args.run:03d}" if args.run else latest_run(roots[0])
+    if args.algo == "multitask":
+        file = "multitask_model.pth" if args.ep is None else f"multitask_model_ep{args.ep}.pth"
+    else:
+        file = f"task{args.task_id if args.load_task is None else args.load_task}_model.pth"
+    path = Path(folder or roots[0], file)
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint {path}; there is {', '.join(_models(path.parent)) or 'none'}")
+    return path
+
+
+def _algorithm(args: argparse.Namespace, cfg: Any, benchmark: Any, weights: Any, masks: Any) -> Sequential:
+    """The stored policy in its algorithm, ready to act on the task."""
+    algo = get_algo_class(ALGOS[args.algo])(benchmark.n_tasks, cfg)
+    algo.policy.load_state_dict(weights)
+    if isinstance(algo, PackNet):
+        size = int(cfg.data.task_group_size)
+        algo.take_masks(masks, args.task_id if args.load_task is None else args.load_task)
+        algo = algo.get_eval_algo(args.task_id // size)
+    return safe_device(algo, cfg.device)
+
+
+def _camera(film: VideoWriter, view: str) -> Any:
+    """Adds what is seen at each step to a film of each episode."""
+
+    def watch(start: int, obs: Any, over: np.ndarray) -> None:
+        for i, done in enumerate(over):
+            film.append_obs({view: obs[view][i][::-1]}, bool(done), start + i, view)
+
+    return watch
+
+
+def _told(
+    path: Path, args: argparse.Namespace, task: Any, loss: float, successes: list[bool]
+) -> dict[str, Any]:
+    low, high = wilson_interval(sum(successes), len(successes))
+    found = {
+        "loss": loss,
+        "success_rate": sum(successes) / len(successes),
+        "interval": [float(low), float(high)],
+        "successes": successes,
+        "task": task.name,
+        "checkpoint": str(path),
+    }
+    stats = path.with_name(f"{path.stem}_on{args.task_id}.stats")
+    torch.save(found, stats)
+    print(
+        f"{task.name}: success {sum(successes)}/{len(successes)} = {found['success_rate']:.0%} "
+        f"(95 %: {low:.0%} to {high:.0%}), loss {loss:.3f}; {stats}"
+    )
+    return found
+
+
+def _models(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.glob("*_model*.pth"))

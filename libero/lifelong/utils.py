@@ -1,0 +1,190 @@
+"""The original's helpers around a run: seeds, devices, checkpoints, costs."""
+
+import copy
+import json
+import os
+import pickle
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset, default_collate, random_split
+from torch.utils.flop_counter import FlopCounterMode
+
+from libero.lifelong.config import Config, assign, plain
+from libero_env.paths import cache_dir
+from lifelong.errors import CheckpointError
+from lifelong.language import embed
+from lifelong.metrics import wilson_interval
+
+__all__ = [
+    "NpEncoder",
+    "compute_flops",
+    "confidence_interval",
+    "control_seed",
+    "create_experiment_dir",
+    "get_task_embs",
+    "get_train_test_loader",
+    "safe_device",
+    "torch_load_model",
+    "torch_save_model",
+]
+
+
+def control_seed(seed: int) -> None:
+    """Seed the global generators of Python, NumPy and PyTorch."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - what the name promises
+    torch.manual_seed(seed)
+
+
+def present(device: Any) -> torch.device:
+    """A device that this machine has: the one asked for (a number is a GPU's), or the CPU."""
+    wanted = torch.device(f"cuda:{device}" if isinstance(device, int) else device or "cpu")
+    return torch.device("cpu") if wanted.type == "cuda" and not torch.cuda.is_available() else wanted
+
+
+def safe_device(x: Any, device: str | torch.device = "cpu") -> Any:
+    """A tensor or a module on a device; on the CPU where a GPU is asked for and there is none."""
+    return x.to(present(device))
+
+
+class NpEncoder(json.JSONEncoder):
+    """JSON of what NumPy and PyTorch compute with."""
+
+    def default(self, o: Any) -> Any:
+        """Arrays as lists, scalars as numbers."""
+        if isinstance(o, np.ndarray | Tensor | np.generic):
+            return o.tolist()
+        return super().default(o)
+
+
+def torch_save_model(
+    model: nn.Module, model_path: str | Path, cfg: Any = None, previous_masks: Any = None
+) -> None:
+    """Write a model's weights, with its configuration and PackNet's masks as plain data.
+
+    The file is there whole or not at all.
+    """
+    path = Path(model_path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    stored = {"state_dict": dict(model.state_dict()), "cfg": plain(cfg), "previous_masks": previous_masks}
+    torch.save(stored, partial)
+    os.replace(partial, path)
+
+
+def torch_load_model(
+    model_path: str | Path, map_location: Any = None
+) -> tuple[dict[str, Tensor], Config | None, Any]:
+    """What `torch_save_model` wrote: weights, configuration, masks. Nothing in the file is executed.
+
+    Raises:
+        CheckpointError: no such file, a broken one, or one with objects that would have to be executed.
+    """
+    try:
+        stored = torch.load(model_path, map_location=present(map_location), weights_only=True)
+        cfg = stored.get("cfg")
+        return stored["state_dict"], None if cfg is None else Config(cfg), stored.get("previous_masks")
+    except (OSError, pickle.UnpicklingError, EOFError, KeyError, RuntimeError) as error:
+        first = next(iter(str(error).splitlines()), type(error).__name__)
+        raise CheckpointError(
+            f"{model_path} cannot be read ({first}); expected a file of torch_save_model, which holds tensors and "
+            "plain data only"
+        ) from error
+
+
+def get_train_test_loader(
+    dataset: Dataset,
+    train_ratio: float,
+    train_batch_size: int,
+    test_batch_size: int,
+    num_workers: tuple[int, int] = (0, 0),
+) -> tuple[DataLoader, DataLoader]:
+    """A dataset parted at random, the same way each time; the training part is shuffled."""
+    size = len(dataset)  # type: ignore[arg-type]
+    first = int(size * train_ratio)
+    parts = random_split(dataset, [first, size - first], torch.Generator().manual_seed(0))
+    train = DataLoader(parts[0], train_batch_size, shuffle=True, num_workers=num_workers[0])
+    return train, DataLoader(parts[1], test_batch_size, num_workers=num_workers[1])
+
+
+def confidence_interval(p: float, n: int) -> float:
+    """Half the width of the 95 % interval of a success rate p of n episodes, after Wilson: above 0 also at 0 and 1."""
+    low, high = wilson_interval(p * n, n)
+    return float(high - low) / 2
+
+
+def compute_flops(algo: Any, dataset: Dataset, cfg: Any) -> tuple[float, float]:
+    """Billions of floating-point operations of one forward pass on a window, and millions of parameters."""
+    policy = copy.deepcopy(algo.policy).eval()
+    window = algo.map_tensor_to_device(default_collate([dataset[0]]))
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        policy(policy.preprocess_input(window, train_mode=True))
+    parameters = sum(p.numel() for p in policy.parameters())
+    gflops, mparams = counter.get_total_flops() / 1e9, parameters / 1e6
+    print(f"[info] policy: {gflops:.3f} GFLOPs, {mparams:.3f} M parameters")
+    return gflops, mparams
+
+
+def create_experiment_dir(cfg: Any) -> str:
+    """A new folder `experiments/<benchmark>/<algorithm>/<policy>_seed<seed>/run_<number>`.
+
+    It is noted in `cfg.experiment_dir`, and as `cfg.experiment_name` on one line. Runs that begin with given weights
+    are in `experiments_finetune`.
+
+    Returns:
+        Its path.
+    """
+    root = experiment_root(cfg)
+    root.mkdir(parents=True, exist_ok=True)
+    number = max((_number(path) for path in root.glob("run_*")), default=0) + 1
+    while True:
+        path = root / f"run_{number:03d}"
+        try:
+            path.mkdir()
+            break
+        except FileExistsError:  # another process was first
+            number += 1
+    assign(cfg, "experiment_dir", str(path))
+    assign(cfg, "experiment_name", "_".join(path.parts[-4:]))
+    return str(path)
+
+
+def experiment_root(cfg: Any) -> Path:
+    """The folder of all runs of a name."""
+    prefix = "experiments_finetune" if cfg.get("pretrain_model_path") else "experiments"
+    return Path(prefix, cfg.benchmark_name, cfg.lifelong.algo, f"{cfg.policy.policy_type}_seed{cfg.seed}")
+
+
+def latest_run(root: Path) -> Path | None:
+    """The newest run in a folder of them."""
+    return max(root.glob("run_*"), key=_number, default=None)
+
+
+def get_task_embs(cfg: Any, descriptions: list[str]) -> Tensor:
+    """Embeddings of instructions, (N, L); L is noted as the language encoder's `input_size`.
+
+    `task_embedding_format`: minilm (comes with the package), bert, clip, gpt2, roberta (their weights are needed),
+    or one-hot: task i is number `task_embedding_one_hot_offset` + i.
+
+    Raises:
+        LanguageError: another format, or weights that cannot be had; the message names the remedy.
+    """
+    kind = cfg.task_embedding_format
+    if kind == "one-hot":
+        offset = int(cfg.task_embedding_one_hot_offset)
+        names = [f"Task {i}" for i in range(offset + len(descriptions))]
+        embs = embed(names, "onehot")[offset:]
+    else:
+        embs = embed(descriptions, kind, cache_dir=cache_dir() / "language")
+    assign(cfg.policy.language_encoder.network_kwargs, "input_size", embs.shape[-1])
+    return embs
+
+
+def _number(path: Path) -> int:
+    text = path.name.rpartition("_")[2]
+    return int(text) if text.isdigit() else 0
