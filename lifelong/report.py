@@ -218,18 +218,19 @@ def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
 def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
     rows = []
     for task, (name, text) in enumerate(zip(run.record.tasks, run.record.instructions, strict=True)):
-        end, done = run.results.task_end(task), task < run.learned
-        last = task == run.learned - 1
+        row = run.results.learned_with(task)
+        end, done = run.results.task_end(row), task < run.learned
+        last = row == run.learned - 1
         rows.append(
             {
                 "name": name,
                 "instruction": text,
                 "best_epoch": end.best_epoch if end else None,
-                "learned": rates[task, task] if done else np.nan,
+                "learned": rates[row, task] if done else np.nan,
                 "final": rates[run.learned - 1, task] if done else np.nan,
                 "fwt": run.metrics.fwt_by_task[task] if done and run.metrics else np.nan,
                 "nbt": run.metrics.nbt_by_task[task] if done and run.metrics and not last else np.nan,
-                "seconds": duration(end.seconds) if end else None,
+                "seconds": duration(end.seconds) if end and row == task else None,
             }
         )
     return rows
@@ -259,7 +260,8 @@ def _percent(value: float | None, digits: int = 1) -> str:
     """A share as percent with a true minus sign; a dash where it is undefined."""
     if value is None or np.isnan(value):
         return "–"
-    return f"{100 * value:.{digits}f}".replace("-", "−")
+    text = f"{100 * value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
 
 
 def _template() -> jinja2.Template:
