@@ -27,6 +27,7 @@ _ASIDE = np.array(
     [0.0, 0.012, -0.012, 0.02, -0.02, 0.026, -0.026]
 )  # m, of the open hand from the middle of the bar
 _FORTH = (0.0, -0.005, -0.0075)  # m, of the grip site beyond the middle of the bar
+_SIDEWAYS = (0.35, -0.35)  # rad, of the hand at a bar that stands
 _CLEAR = 0.10  # m, that a hand withdraws
 _SPARE = 0.002  # m, around the hand
 _TWISTED = 0.5 * np.pi + 0.4  # rad, of strain that is too much
@@ -202,6 +203,9 @@ def _orientations(handle: Handle, grips: bool) -> Iterator[tuple[np.ndarray, boo
         fingers = sign * (np.cos(roll) * fingers + np.sin(roll) * handle.along)
         mat = np.column_stack([fingers, np.cross(approach, fingers), approach])
         yield mat, tilt > _STEEP, 0.3 * abs(roll)
+        if upright and grips:  # across a bar that stands the hand may lean sideways
+            for lean in _SIDEWAYS:
+                yield turned(handle.out, lean) @ mat, tilt > _STEEP, 0.3 * abs(lean)
 
 
 def _grips(handle: Handle, mat: np.ndarray) -> Iterator[tuple]:

@@ -5,7 +5,7 @@ import numpy as np
 # Franka Emika Panda, m: from its data sheet, and the hand down to the grip site.
 _SHOULDER = np.array([0.0, 0.0, 0.333])  # over the base
 _UPPER, _FOREARM, _ELBOW, _WRIST, _HAND = 0.316, 0.384, 0.0825, 0.088, 0.2104
-_REACH = 0.32, 0.66  # m, from the shoulder to the wrist; from 0.20 to 0.70 the elbow is within its limits
+_REACH = 0.32, 0.64  # m, from the shoulder to the wrist; from 0.20 to 0.70 the elbow is within its limits
 _WRIST_MIDDLE = 2.33  # rad, yaw of the fingers straight ahead of the arm with its last joint in the middle
 _BENT = (
     2.75  # rad, of joint 6, up to which the wrist bends with ease; at pi joints 5 and 7 turn about one line
