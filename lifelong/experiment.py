@@ -1,38 +1,45 @@
 """A run: everything built from its configuration, the task sequence walked, the results summed up."""
 
+import hashlib
+import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from weakref import WeakValueDictionary
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from libero_env.demos_generate import ensure_demos
 from libero_env.tasks import Task
 from libero_env.vector import BatchEnv
 from lifelong.algorithms import Algorithm
-from lifelong.data import SequenceVLDataset
+from lifelong.checkpoints import load_weights
+from lifelong.demonstrations import DemoDatasets, find_demos
 from lifelong.distributed import Ranks
 from lifelong.evaluation import EnvPool, EvalSettings
 from lifelong.nn.precision import check_compiler, deterministic
 from lifelong.policies import Policy
+from lifelong.pretraining import pretrain, weights_of
 from lifelong.records import PhaseRecord, RunEndRecord, TaskEndRecord, start_record, utc_now
 from lifelong.report import write_report
 from lifelong.results import write_summary
-from lifelong.rundir import RunDirectory
+from lifelong.rundir import RunDirectory, decisive
 from lifelong.sequence import Parts, TaskSequence
-from lifelong.settings import CAMERAS, BenchmarkSettings, DataSettings, RunSettings
+from lifelong.settings import CAMERAS, BenchmarkSettings, DataSettings, PretrainSettings, RunSettings
+from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
 from lifelong.training import BatchAugmentation, FitSettings, seeded
 from lifelong.types import PolicySpec
 
-GROUPS = ("algo", "benchmark", "policy", "data", "augmentation", "train", "eval", "language", "wandb")
+GROUPS = (
+    *("algo", "benchmark", "stream", "pretrain", "policy", "data"),
+    *("augmentation", "train", "eval", "language", "wandb"),
+)
+PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
 INIT = 0  # first word of the seed of the policy's initial weights, see lifelong.sequence
 
 
@@ -60,7 +67,9 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
 def _run(config: DictConfig, names: Mapping[str, str], settings: RunSettings, ranks: Ranks) -> Path:
     # before anything is written: what cannot work leaves no trace
     built = _build_all(config, settings, ranks)
-    label = "_".join([names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])])
+    label = "_".join(
+        [names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])]
+    )
     name = f"{names['benchmark']}/{names['algo']}/{label}"
     directory = RunDirectory(Path(settings.runs_dir) / name)
     plain: Any = OmegaConf.to_container(config, resolve=True)
@@ -70,9 +79,9 @@ def _run(config: DictConfig, names: Mapping[str, str], settings: RunSettings, ra
             print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
         if not finished and ranks.first:
             built.tracker.start(name, str(directory.path), plain)
-            _record_start(directory, names, settings.seed, built.tasks, plain)
+            _record_start(directory, names, settings.seed, built.tasks, plain, built.group_size)
         if not finished:
-            _walk(built, settings, directory, ranks)
+            _walk(built, settings, directory, ranks, plain)
         if ranks.first:
             built.tracker.finish()
             _sum_up(directory, plain)
@@ -86,6 +95,12 @@ class Built:
     tasks: tuple[Task, ...]
     data: DataSettings
     languages: torch.Tensor  # (K, L)
+    group_size: int
+    stream: StreamSettings
+    counts: tuple[int, ...]  # demonstrations of each task
+    pretrain: PretrainSettings
+    first_tasks: tuple[Task, ...]  # learned before the sequence
+    first_languages: torch.Tensor
     spec: PolicySpec
     policy: Policy
     algorithm: Algorithm
@@ -99,18 +114,30 @@ class Built:
 def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built:
     benchmark: BenchmarkSettings = _build(config.benchmark)
     tasks, device = benchmark.sequence(), ranks.device(settings.device)
+    stream: StreamSettings = _build(config.stream)
+    before: PretrainSettings = _build(config.pretrain)
+    first = before.sequence()
     data: DataSettings = _build(config.data)
     fit: FitSettings = _build(config.train)
     if fit.compile != "off":
         check_compiler(device)
-    languages = ranks.share(lambda: _build(config.language).embed([t.language for t in tasks]))
+    languages = ranks.share(lambda: _build(config.language).embed([t.language for t in (*first, *tasks)]))
     spec = data.spec(languages.shape[1])
     with seeded(settings.seed, INIT):
         policy = _build(config.policy, spec=spec).to(device)
+    if settings.init_from is not None:
+        weights, file = weights_of(Path(settings.init_from).expanduser())
+        load_weights(policy, weights, file)
     return Built(
         tasks=tasks,
         data=data,
-        languages=languages,
+        languages=languages[len(first) :],
+        group_size=benchmark.group_size,
+        stream=stream,
+        counts=stream.demos(data.demos, len(tasks), benchmark.group_size),
+        pretrain=before,
+        first_tasks=first,
+        first_languages=languages[: len(first)],
         spec=spec,
         policy=policy,
         algorithm=_build(config.algo),
@@ -128,7 +155,12 @@ def _build(node: DictConfig, **more: Any) -> Any:
 
 
 def _record_start(
-    directory: RunDirectory, names: Mapping[str, str], seed: int, tasks: tuple[Task, ...], config: Any
+    directory: RunDirectory,
+    names: Mapping[str, str],
+    seed: int,
+    tasks: tuple[Task, ...],
+    config: Any,
+    group_size: int,
 ) -> None:
     directory.log.append(
         start_record(
@@ -140,21 +172,24 @@ def _record_start(
             tasks=[t.name for t in tasks],
             instructions=[t.language for t in tasks],
             config=OmegaConf.to_yaml(OmegaConf.create(config)),
+            group_size=group_size,
         )
     )
 
 
-def _walk(built: Built, settings: RunSettings, directory: RunDirectory, ranks: Ranks) -> None:
+def _walk(
+    built: Built, settings: RunSettings, directory: RunDirectory, ranks: Ranks, plain: Mapping[str, Any]
+) -> None:
     """Make sure of the demonstrations and learn the sequence."""
     began = time.perf_counter()
     progress = sys.stderr.isatty() if settings.progress is None else settings.progress
     progress = progress and ranks.first
-    paths = ranks.share(_demos, built.tasks, built.data, directory, progress)
+    paths = ranks.share(_demos, built.tasks, built.counts, built.data, directory, progress)
     with EnvPool(lambda key: _env(built, key), built.eval.open_environments) as envs:
         parts = Parts(
             instructions=tuple(t.language for t in built.tasks),
             languages=built.languages,
-            datasets=DemoDatasets(paths, built.spec, built.languages, built.data, built.device),
+            datasets=DemoDatasets(paths, built.counts, built.spec, built.languages, built.data, built.device),
             policy=built.policy,
             algorithm=built.algorithm,
             envs=envs,
@@ -167,7 +202,10 @@ def _walk(built: Built, settings: RunSettings, directory: RunDirectory, ranks: R
             device=built.device,
             progress=progress,
             ranks=ranks,
+            stream=built.stream,
+            group_size=built.group_size,
         )
+        _pretrain(built, parts, directory, plain)
         TaskSequence(parts).run()
     if ranks.first:
         directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
@@ -186,52 +224,49 @@ def _env(built: Built, key: tuple[int, int]) -> BatchEnv:
 
 
 def _demos(
-    tasks: tuple[Task, ...], data: DataSettings, directory: RunDirectory, progress: bool
-) -> dict[int, Path]:
-    """The demonstration file of each task; recorded now where there is none."""
+    tasks: tuple[Task, ...],
+    counts: Sequence[int],
+    data: DataSettings,
+    directory: RunDirectory,
+    progress: bool,
+) -> list[Path]:
+    """The demonstration file of each task, and a record of how long that took."""
     began = time.perf_counter()
-    paths = ensure_demos(
-        tasks,
-        data.demos,
-        camera_size=(data.image_size, data.image_size),
-        root=data.folder,
-        progress=progress,
-    )
+    paths = find_demos(tasks, counts, data, progress)
     directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
-    return dict(enumerate(paths))
+    return paths
 
 
-@dataclass(frozen=True)
-class DemoDatasets(Mapping[int, SequenceVLDataset]):
-    """The tasks' windows by position; read when asked for, and kept for as long as somebody holds them."""
-
-    paths: Mapping[int, Path]
-    spec: PolicySpec
-    languages: torch.Tensor  # (K, L)
-    data: DataSettings
-    device: torch.device
-    _held: WeakValueDictionary[int, SequenceVLDataset] = field(default_factory=WeakValueDictionary)
-
-    def __getitem__(self, task: int) -> SequenceVLDataset:
-        dataset = self._held.get(task)
-        if dataset is None:
-            dataset = SequenceVLDataset.from_file(
-                self.paths[task],
-                spec=self.spec,
-                language=self.languages[task],
-                task_id=task,
-                limit=self.data.demos,
-                pairing=self.data.pairing,
-                labels=self.data.labels,
-            ).to(self.device)
-            self._held[task] = dataset
-        return dataset
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self.paths)
-
-    def __len__(self) -> int:
-        return len(self.paths)
+def _pretrain(built: Built, parts: Parts, directory: RunDirectory, plain: Mapping[str, Any]) -> None:
+    """Let the policy learn what comes before the sequence, unless the sequence has begun or nothing does."""
+    tasks, ranks, began = built.first_tasks, parts.ranks, time.perf_counter()
+    if not tasks or ranks.share(lambda: directory.started):
+        return
+    kept = {key: plain[key] for key in PRETRAIN_KEYS}
+    digest = hashlib.sha256(json.dumps(decisive(kept), sort_keys=True).encode()).hexdigest()[:12]
+    own = RunDirectory(Path(plain["runs_dir"]) / "pretrain" / str(built.pretrain.suite) / digest)
+    counts = [built.pretrain.demos or built.data.demos] * len(tasks)
+    with own.opened(kept, resume=True) if ranks.first else nullcontext():
+        done = ranks.share(lambda: own.log.read().finished)
+        if not done and ranks.first:
+            print(
+                f"Before the sequence: {len(tasks)} tasks of {built.pretrain.suite} in {own.path}", flush=True
+            )
+            names = {"algo": "multitask", "benchmark": str(built.pretrain.suite), "policy": "pretrained"}
+            _record_start(own, names, parts.seed, tasks, kept, 1)
+        paths = ranks.share(_demos, tasks, counts, built.data, own, parts.progress)
+        pretrain(
+            parts,
+            instructions=tuple(t.language for t in tasks),
+            languages=built.first_languages,
+            datasets=DemoDatasets(paths, counts, built.spec, built.first_languages, built.data, built.device),
+            directory=own,
+            epochs=built.pretrain.epochs or built.fit.epochs,
+        )
+        if not done and ranks.first:
+            own.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
+    if ranks.first:
+        directory.log.append(PhaseRecord(phase="pretrain", seconds=time.perf_counter() - began))
 
 
 def _sum_up(directory: RunDirectory, config: Mapping[str, Any]) -> None:

@@ -49,11 +49,14 @@ class Scores:
         curves: K learning curves, one for each task; empty ones make FWT and AUC undefined (NaN).
         matrix: (K, K) c[i,j], success on task j after learning task i; NaN above the diagonal.
         episodes: (K, K) rollouts behind each cell, 0 above the diagonal.
+        group_size: Where so many tasks were learned together, K is the number of groups, and a group is one task
+            whose success is the mean over its own.
     """
 
     curves: tuple[Curve, ...]
     matrix: Floats
     episodes: NDArray[np.int64]
+    group_size: int = 1
 
     def __post_init__(self) -> None:
         k = len(self.curves)
@@ -149,6 +152,7 @@ def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
     row = cells(scores)
     low, high = wilson_interval(row.rates * row.episodes, row.episodes, confidence)
     estimates = {name: combine_intervals(w, row.rates, low, high) for name, w in row.weights.items()}
+    fwt, nbt, auc = (np.repeat(values, scores.group_size) for values in (fwt, nbt, auc))  # its group's, each
     return Metrics(**estimates, fwt_by_task=fwt, nbt_by_task=nbt, auc_by_task=auc)
 
 

@@ -7,7 +7,7 @@ already done, and that metrics and reports are made from. Tasks are positions in
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -137,17 +137,23 @@ class Results:
         """The record that closes a task; None while it is being learned."""
         return next((r for r in reversed(self.of(TaskEndRecord)) if r.task == task), None)
 
+    def learned_with(self, task: int) -> int:
+        """The task whose row of the matrix is the first after learning this one: the last of its group."""
+        size = self.run.group_size
+        return (task // size + 1) * size - 1
+
     def learned_tasks(self) -> int:
         """How many tasks, from the first on, have a complete row in the matrix; all of them where the last has one."""
         rates, _ = self.success_matrix()
-        full = [bool(np.isfinite(rates[i, : i + 1]).all()) for i in range(len(rates))]
-        return full.index(False) if False in full and not full[-1] else len(full)
+        size = self.run.group_size
+        full = [bool(np.isfinite(rates[i, : i + 1]).all()) for i in range(size - 1, len(rates), size)]
+        return size * (full.index(False) if False in full and not full[-1] else len(full))
 
     def curves(self) -> dict[int, Curve]:
         """Learning curve of each task that has one."""
         points: dict[int, dict[int, EvalRecord]] = {}
         for r in self.of(EvalRecord):
-            if r.phase == "curve" and r.learned == r.task:
+            if r.phase == "curve" and r.learned == self.learned_with(r.task):
                 points.setdefault(r.task, {})[r.epoch] = r
         return {task: _curve([by_epoch[e] for e in sorted(by_epoch)]) for task, by_epoch in points.items()}
 
@@ -177,20 +183,39 @@ class Results:
         for r in self.of(EvalRecord):
             if r.phase == "matrix" and r.task <= r.learned < size:
                 rates[r.learned, r.task], episodes[r.learned, r.task] = r.rate, len(r.successes)
-        for task, curve in self.curves().items():
-            measured = not math.isnan(rates[task, task])
-            ended = self.task_end(task) is not None
-            if (diagonal == "curve" and measured) or (not measured and ended):
-                rates[task, task], episodes[task, task] = curve.rates[curve.best], curve.episodes[curve.best]
+        curves = self.curves()
+        best = {last: curve.epochs[curve.best] for last, curve in self._group_curves(curves).items()}
+        for task, curve in curves.items():
+            row = self.learned_with(task)
+            measured = not math.isnan(rates[row, task])
+            ended = self.task_end(row) is not None
+            if row in best and ((diagonal == "curve" and measured) or (not measured and ended)):
+                point = curve.epochs.tolist().index(best[row])
+                rates[row, task], episodes[row, task] = curve.rates[point], curve.episodes[point]
         return rates, episodes
 
     def scores(self, diagonal: Literal["matrix", "curve"] = "matrix") -> Scores:
-        """The metrics' input: the tasks learned so far as if they were the whole sequence."""
-        size = self.learned_tasks()
+        """The metrics' input: the tasks learned so far as if they were the whole sequence.
+
+        A group of tasks that were learned together is one task there: its success is the mean over its tasks.
+        """
+        size, group = self.learned_tasks(), self.run.group_size
         rates, episodes = self.success_matrix(diagonal)
-        curves, nothing = self.curves(), _curve([])
-        used = tuple(curves.get(task, nothing) for task in range(size))
-        return Scores(used, rates[:size, :size], episodes[:size, :size])
+        curves, nothing = self._group_curves(self.curves()), _curve([])
+        used = tuple(curves.get(task, nothing) for task in range(group - 1, size, group))
+        cells = (slice(group - 1, size, group), slice(0, size))
+        shape = (size // group, size // group, group)
+        return Scores(
+            used, rates[cells].reshape(shape).mean(-1), episodes[cells].reshape(shape).sum(-1), group
+        )
+
+    def _group_curves(self, curves: Mapping[int, Curve]) -> dict[int, Curve]:
+        """The learning curve of each group by its last task, at the epochs where all its tasks were evaluated."""
+        groups: dict[int, list[Curve]] = {}
+        for task, curve in sorted(curves.items()):
+            groups.setdefault(self.learned_with(task), []).append(curve)
+        size = self.run.group_size
+        return {last: _mean_curve(found) for last, found in groups.items() if len(found) == size}
 
     def costs(self, task: int) -> dict[str, float]:
         """What learning a task cost, by the names of `lifelong.costs`; empty where nothing is recorded."""
@@ -310,6 +335,19 @@ def _curve(records: list[EvalRecord]) -> Curve:
         np.array([r.epoch for r in records], dtype=np.int64),
         np.array([r.rate for r in records], dtype=float),
         np.array([len(r.successes) for r in records], dtype=np.int64),
+    )
+
+
+def _mean_curve(curves: Sequence[Curve]) -> Curve:
+    """The mean of several tasks' curves, over the episodes of all."""
+    if len(curves) == 1:
+        return curves[0]
+    epochs = sorted(set.intersection(*(set(c.epochs.tolist()) for c in curves)))
+    chosen = [np.isin(c.epochs, epochs) for c in curves]
+    return Curve(
+        np.array(epochs, dtype=np.int64),
+        np.mean([c.rates[points] for c, points in zip(curves, chosen, strict=True)], axis=0),
+        np.sum([c.episodes[points] for c, points in zip(curves, chosen, strict=True)], axis=0),
     )
 
 

@@ -1,6 +1,7 @@
 """Run directories read back: one run as far as it went, or groups of runs that differ in seed and order."""
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from lifelong.records import RunRecord
 from lifelong.results import ResultLog, Results, ResultsError
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
-_COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark")  # sections of the config
+# sections of the config
+_COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark", "stream", "pretrain")
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,10 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
     record = run.record
     basic = {n: getattr(record, n) for n in _BASICS}
     flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
-    passed = ("seed", "_target_", "dir", "path", "benchmark.order")
+    passed = ("seed", "_target_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
     flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(passed)}
+    if begun_from := run.config.get("init_from"):  # each seed may begin from a run of its own
+        flat["init_from"] = re.sub(r"seed\d+", "seed", str(begun_from))
     return tuple((basic | dict(sorted(flat.items()))).items())
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 from libero_env.demos import LOW_DIM_KEYS
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Task, get_suite
+from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.errors import ConfigError
 from lifelong.types import PolicySpec
 
@@ -25,6 +26,7 @@ class RunSettings:
     resume: bool
     progress: bool | None
     deterministic: bool
+    init_from: str | None
 
 
 @dataclass(frozen=True)
@@ -36,19 +38,33 @@ class BenchmarkSettings:
         order: One of its published sequences.
         tasks: The first so many of the sequence, or a list of names or indices, in the order to be learned.
         horizon: Control steps in which a quick policy solves any of them, for `eval.horizon` to refer to.
+        group_size: So many tasks, next to each other in the sequence, are learned together as one step of it. They
+            are evaluated one by one; metrics take a group for one task, whose success is the mean over its tasks.
     """
 
     suite: str
     order: int = 0
     tasks: int | Sequence[int | str] | None = None
     horizon: int = 600
+    group_size: int = 1
 
     def sequence(self) -> tuple[Task, ...]:
         """The tasks in learning order.
 
         Raises:
             UnknownNameError: No such suite, order or task.
+            ConfigError: They cannot be learned in groups of that size.
         """
+        tasks = self._chosen()
+        valid = [n for n in range(1, len(tasks) + 1) if len(tasks) % n == 0]
+        if self.group_size not in valid:
+            raise ConfigError(
+                f"benchmark.group_size is {self.group_size}; {len(tasks)} tasks can be learned in groups of "
+                f"{', '.join(map(str, valid))}"
+            )
+        return tasks
+
+    def _chosen(self) -> tuple[Task, ...]:
         suite = get_suite(self.suite)
         tasks = suite.order(self.order)
         if self.tasks is None:
@@ -65,8 +81,43 @@ class BenchmarkSettings:
 
 
 @dataclass(frozen=True)
+class PretrainSettings:
+    """What a policy learns before the sequence, as one joint task.
+
+    Attributes:
+        suite: Name of a suite. None: nothing.
+        tasks: As of `BenchmarkSettings`.
+        demos: Demonstrations of each. None: `data.demos`.
+        epochs: None: `train.epochs`.
+    """
+
+    suite: str | None = None
+    tasks: int | Sequence[int | str] | None = None
+    demos: int | None = None
+    epochs: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("demos", "epochs"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"pretrain.{name} is {value}; it must be at least 1, or null")
+
+    def sequence(self) -> tuple[Task, ...]:
+        """The tasks; none where nothing is learned before.
+
+        Raises:
+            UnknownNameError: No such suite or task.
+        """
+        return () if self.suite is None else BenchmarkSettings(self.suite, tasks=self.tasks).sequence()
+
+
+@dataclass(frozen=True)
 class DataSettings:
-    """What the policy sees and learns from; see configs/data."""
+    """What the policy sees and learns from; see configs/data.
+
+    `memory` and `backend` say where it is held and what reads it, see `lifelong.data.loading`; what comes out is
+    the same.
+    """
 
     demos: int
     image_size: int
@@ -76,11 +127,15 @@ class DataSettings:
     pairing: Literal["aligned", "stored"] = "aligned"
     labels: Literal["expert", "executed"] = "expert"
     folder: str | None = None
+    memory: str = "auto"
+    backend: str = "native"
 
     def __post_init__(self) -> None:
         valid = {
             "pairing": ("aligned", "stored"),
             "labels": ("expert", "executed"),
+            "memory": MEMORY,
+            "backend": BACKENDS,
             "views": CAMERAS,
             "proprio": LOW_DIM_KEYS,
         }

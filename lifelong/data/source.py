@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -29,8 +30,8 @@ class DemoSource:
     path: Path
     spec: PolicySpec
     limit: int | None = None
-    pairing: str = "aligned"
-    labels: str = "expert"
+    pairing: Literal["aligned", "stored"] = "aligned"
+    labels: Literal["expert", "executed"] = "expert"
 
     def lengths(self) -> list[int]:
         """Frames of each demonstration, from the file's headers alone."""

@@ -1,0 +1,347 @@
+"""What is learned in which order: groups, few demonstrations, blurred boundaries, what a policy begins with."""
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lifelong import checkpoints
+from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
+from lifelong.errors import CheckpointError, ConfigError
+from lifelong.metrics import lifelong_metrics
+from lifelong.pretraining import pretrain, weights_of
+from lifelong.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord, start_record, utc_now
+from lifelong.report import write_report
+from lifelong.results import ResultLog
+from lifelong.rundir import RunDirectory
+from lifelong.sequence import Parts, TaskSequence
+from lifelong.settings import BenchmarkSettings, PretrainSettings
+from lifelong.streams import StageData, StageWindows, StreamSettings, stages_of
+from tests.lifelong.fakes import Windows
+from tests.lifelong.test_sequence import Killed, Killer, assert_same, dataset, parts
+
+pytestmark = pytest.mark.unit
+
+
+def stage_data(
+    blur: float, *, sizes=(20, 30, 25, 40), group_size: int = 1, reach: int = 1, seed: int = 0
+) -> StageData:
+    datasets = {task: Windows(task, size) for task, size in enumerate(sizes)}
+    stages = stages_of(Sequential(), len(sizes), group_size)
+    return StageData(datasets, stages, StreamSettings(blur=blur, blur_reach=reach), seed)
+
+
+def contents(windows) -> torch.Tensor:
+    """(W, D) what is in each window."""
+    return windows.batch(torch.arange(len(windows))).observation.proprio["x"][:, 0]
+
+
+def rows(features: torch.Tensor) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in features.tolist()}
+
+
+def test_groups_are_neighbours_and_algorithms_join_groups() -> None:
+    assert stages_of(Sequential(), 3) == ((0,), (1,), (2,))
+    assert stages_of(Sequential(), 6, 2) == ((0, 1), (2, 3), (4, 5))
+    assert stages_of(Multitask(), 6, 2) == ((0, 1, 2, 3, 4, 5),)
+
+
+def test_without_a_stream_a_stage_is_the_task_itself() -> None:
+    data = stage_data(0.0)
+    assert list(data) == [0, 1, 2, 3]
+    assert all(data[task] is data.datasets[task] for task in data)
+    with pytest.raises(KeyError):
+        data[4]
+
+
+def test_a_group_has_its_tasks_windows_in_the_order_asked_for_under_its_last_task() -> None:
+    data = stage_data(0.0, group_size=2)
+    assert list(data) == [1, 3]
+    group = data[3]
+    assert len(group) == 65
+    wanted = torch.tensor([64, 3, 25, 0, 24, 25])
+    batch = group.batch(wanted)
+    assert torch.equal(batch.window_ids, wanted)
+    assert (batch.task_ids == 3).all()
+    both = torch.cat([data.datasets[2].features, data.datasets[3].features])
+    assert torch.equal(batch.observation.proprio["x"][:, 0], both[wanted])
+    assert torch.equal(
+        batch.actions[:, 0], torch.cat([data.datasets[2].targets, data.datasets[3].targets])[wanted]
+    )
+
+
+@pytest.mark.parametrize("reach", [1, 2, 9])
+@pytest.mark.parametrize("group_size", [1, 2])
+def test_with_blurred_boundaries_every_window_is_learned_once(group_size: int, reach: int) -> None:
+    data = stage_data(0.3, group_size=group_size, reach=reach)
+    learned = [contents(data[last]) for last in data]
+    everything = torch.cat([d.features for d in data.datasets.values()])
+    assert sum(map(len, learned)) == len(everything)
+    assert rows(torch.cat(learned)) == rows(everything)
+
+
+def test_the_blurred_share_goes_to_the_neighbours_in_even_parts() -> None:
+    data, sizes = stage_data(0.3), (20, 30, 25, 40)
+    own = {task: rows(windows.features) for task, windows in data.datasets.items()}
+    found = {
+        (task, stage): len(own[task] & rows(contents(data[stage]))) for task in range(4) for stage in range(4)
+    }
+    for task, size in enumerate(sizes):
+        assert found[task, task] == size - round(0.3 * size)
+        away = [found[task, stage] for stage in (task - 1, task + 1) if 0 <= stage < 4]
+        assert sum(away) == round(0.3 * size) and max(away) - min(away) <= 1
+        assert all(not found[task, stage] for stage in range(4) if abs(stage - task) > 1)
+
+
+def test_the_seed_alone_decides_what_is_blurred() -> None:
+    def draw(seed: int) -> torch.Tensor:
+        return contents(stage_data(0.3, seed=seed)[1])
+
+    state = torch.random.get_rng_state()
+    assert torch.equal(draw(0), draw(0))
+    assert rows(draw(0)) != rows(draw(1))
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+def test_a_memory_of_stages_is_found_again_by_what_batches_say() -> None:
+    data = stage_data(0.3, group_size=2)
+    memory, draws = ER(budget=30).memory, torch.Generator().manual_seed(0)
+    for last in data:
+        memory.add(data[last], draws)
+    batch = memory.sample(30, draws)
+    assert set(batch.task_ids.tolist()) == {1, 3}
+    for task, window, seen in zip(
+        batch.task_ids.tolist(), batch.window_ids, batch.observation.proprio["x"], strict=True
+    ):
+        assert torch.equal(data[task].batch(window[None]).observation.proprio["x"][0], seen)
+
+
+@pytest.mark.parametrize(
+    ("later", "expected"),
+    [
+        (None, (50, 50, 50)),
+        (5, (50, 5, 5)),
+        (1, (50, 1, 1)),
+        (0.1, (50, 5, 5)),
+        (1.0, (50, 50, 50)),
+        (0.001, (50, 1, 1)),
+        ([10, 3], (50, 10, 3)),
+    ],
+)
+def test_demonstrations_of_later_tasks(later, expected) -> None:
+    assert StreamSettings(demos_later=later).demos(50, 3) == expected
+    assert StreamSettings(demos_later=later if not isinstance(later, list) else later[:1]).demos(
+        50, 3, first=2
+    )[:2] == (50, 50)
+
+
+@pytest.mark.parametrize("later", [0, -1, 1.5, 0.0, [1], [1, 0], [1, 0.5], "many"])
+def test_numbers_of_demonstrations_that_cannot_be_are_refused(later) -> None:
+    with pytest.raises(ConfigError, match="stream.demos_later"):
+        StreamSettings(demos_later=later).demos(50, 3)
+
+
+@pytest.mark.parametrize("change", [{"blur": 1.0}, {"blur": -0.1}, {"blur_reach": 0}])
+def test_blur_that_cannot_be_is_refused(change) -> None:
+    with pytest.raises(ConfigError, match=f"stream.{next(iter(change))} is .*at least"):
+        StreamSettings(**change)
+
+
+def test_group_sizes_that_do_not_divide_the_sequence_name_those_that_do() -> None:
+    assert len(BenchmarkSettings("libero_goal", group_size=5).sequence()) == 10
+    with pytest.raises(ConfigError, match="groups of 1, 2, 5, 10"):
+        BenchmarkSettings("libero_goal", group_size=3).sequence()
+    with pytest.raises(ConfigError, match="groups of 1, 2, 4"):
+        BenchmarkSettings("libero_goal", tasks=4, group_size=0).sequence()
+
+
+def test_pretraining_takes_a_suite_or_nothing() -> None:
+    assert PretrainSettings().sequence() == ()
+    assert [t.suite for t in PretrainSettings("libero_90", tasks=2).sequence()] == ["libero_90"] * 2
+    with pytest.raises(LookupError, match="libero_90"):
+        PretrainSettings("libero_9").sequence()
+    with pytest.raises(ConfigError, match=r"pretrain\.epochs is 0"):
+        PretrainSettings(epochs=0)
+
+
+def four(path: Path, algorithm, **changes) -> Parts:
+    """Four tasks in groups of two, of one epoch each."""
+    datasets = {task: dataset(task) for task in range(4)}
+    p = parts(path, "sequential")
+    record = start_record(
+        algo="x", benchmark="y", policy="z", seed=1, preset="", tasks="abcd", instructions="abcd", config="",
+        group_size=changes.get("group_size", 2),
+    )  # fmt: skip
+    if not p.directory.log.read().records:
+        p.directory.log.append(record)
+    return replace(
+        p, instructions=tuple("abcd"), languages=torch.stack([d.language for d in datasets.values()]),
+        datasets=datasets, algorithm=algorithm, fit=replace(p.fit, epochs=1, steps_per_epoch=2),
+        **({"group_size": 2} | changes),
+    )  # fmt: skip
+
+
+def kept(path: Path) -> tuple[dict, dict]:
+    records = {}
+    for record in RunDirectory(path).log.read().records:
+        if isinstance(record, EvalRecord | LossRecord | TaskEndRecord):
+            values = {k: v for k, v in asdict(record).items() if k != "seconds"}
+            records[tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))] = values
+    return records, checkpoints.load(RunDirectory(path).task_path(3))
+
+
+@pytest.mark.parametrize("algorithm", [lambda: DERpp(budget=12), SingleTask])
+def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorithm) -> None:
+    blurred = {"stream": StreamSettings(blur=0.2)}
+    TaskSequence(four(tmp_path / "whole", algorithm(), **blurred)).run()
+    results = ResultLog(tmp_path / "whole" / "results.jsonl").read()
+    evals = results.of(EvalRecord)
+    assert {(r.learned, r.task) for r in evals if r.phase == "matrix"} == {
+        (1, 0), (1, 1), (3, 0), (3, 1), (3, 2), (3, 3)
+    }  # fmt: skip
+    assert {(r.learned, r.task, r.epoch) for r in evals if r.phase == "curve"} == {
+        (last, task, epoch)
+        for last, group in ((1, (0, 1)), (3, (2, 3)))
+        for task in group
+        for epoch in (0, 1)
+    }
+    assert [r.task for r in results.of(TaskEndRecord)] == [1, 3]
+    for writes in (3, 9, 12):
+        with monkeypatch.context() as patch:
+            p = four(tmp_path / "killed", algorithm(), **blurred)
+            killer = Killer(patch, writes)
+            patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
+            with pytest.raises(Killed):
+                TaskSequence(p).run()
+    TaskSequence(four(tmp_path / "killed", algorithm(), **blurred)).run()
+    (records, state), (again, end) = kept(tmp_path / "whole"), kept(tmp_path / "killed")
+    assert again == records
+    assert_same(end, state)
+
+
+def test_metrics_take_a_group_for_one_task(tmp_path) -> None:
+    log = ResultLog(tmp_path / "results.jsonl")
+    log.append(
+        start_record(
+            algo="er", benchmark="b", policy="p", seed=1, preset="", tasks="abcd", instructions="abcd",
+            config="", group_size=2,
+        )
+    )  # fmt: skip
+
+    def evaluated(phase: str, learned: int, epoch: int, rates: dict[int, float]) -> None:
+        for task, rate in rates.items():
+            successes = tuple(k < round(10 * rate) for k in range(10))
+            log.append(
+                EvalRecord(
+                    phase=phase, learned=learned, epoch=epoch, task=task, successes=successes, lengths=(1,) * 10,
+                    init_states=tuple(range(10)), seconds=1.0,
+                )
+            )  # fmt: skip
+
+    evaluated("curve", 1, 0, {0: 0.0, 1: 0.0})
+    evaluated("curve", 1, 5, {0: 0.6, 1: 0.8})  # the best of the group: 0.7
+    evaluated("curve", 1, 10, {0: 0.2, 1: 1.0})
+    evaluated("matrix", 1, 5, {0: 0.5, 1: 0.9})
+    log.append(TaskEndRecord(task=1, best_epoch=5, seconds=1.0))
+    assert log.read().learned_tasks() == 2
+    evaluated("curve", 3, 0, {2: 0.0, 3: 0.2})
+    evaluated("curve", 3, 5, {2: 0.4, 3: 0.6})
+    evaluated("matrix", 3, 5, {0: 0.1, 1: 0.5, 2: 0.4, 3: 0.8})
+    assert log.read().learned_tasks() == 4
+    results = log.read()
+    found = lifelong_metrics(results.scores())
+    fwt = ((0.0 + 0.7 + 0.7) / 3, (0.1 + 0.5) / 2)
+    np.testing.assert_allclose(found.fwt_by_task, np.repeat(fwt, 2))
+    np.testing.assert_allclose(found.nbt_by_task, [0.4, 0.4, 0, 0])
+    assert math.isclose(found.nbt.value, 0.2)
+    assert math.isclose(found.auc.value, ((fwt[0] + 0.3) / 2 + fwt[1]) / 2)
+    assert math.isclose(found.final_success.value, (0.1 + 0.5 + 0.4 + 0.8) / 4)
+    assert math.isclose(found.just_learned.value, (0.7 + 0.6) / 2)
+    assert found.final_success.low < found.final_success.value < found.final_success.high
+    curve = results.success_matrix("curve")[0]  # of the group's best epoch, not of each task's own
+    np.testing.assert_allclose(curve[1, :2], [0.6, 0.8])
+    assert np.isnan(curve[0]).all() and np.isnan(curve[2]).all()
+    assert set(results.curves()) == {0, 1, 2, 3}
+    assert write_report([tmp_path]).stat().st_size > 10_000
+
+
+def test_without_groups_nothing_changes(tmp_path) -> None:
+    TaskSequence(p := four(tmp_path, Sequential(), group_size=1)).run()
+    results = p.directory.log.read()
+    scores = results.scores()
+    rates, episodes = results.success_matrix()
+    np.testing.assert_array_equal(scores.matrix, rates)
+    np.testing.assert_array_equal(scores.episodes, episodes)
+    assert [r.task for r in results.of(TaskEndRecord)] == [0, 1, 2, 3]
+
+
+def before(p: Parts, path: Path) -> None:
+    """Learn two other tasks first."""
+    datasets = {task: dataset(task + 7) for task in range(2)}
+    pretrain(
+        p,
+        instructions=("u", "v"),
+        languages=torch.stack([d.language for d in datasets.values()]),
+        datasets=datasets,
+        directory=RunDirectory(path),
+        epochs=2,
+    )
+
+
+def test_pretraining_learns_jointly_evaluates_nothing_and_is_not_done_twice(tmp_path, monkeypatch) -> None:
+    first, second, third = (parts(tmp_path / name, "sequential") for name in "abc")
+    untrained = {k: v.clone() for k, v in first.policy.state_dict().items()}
+    before(first, tmp_path / "whole")
+    results = RunDirectory(tmp_path / "whole").log.read()
+    assert {r.epoch for r in results.of(LossRecord)} == {1, 2} and not results.of(EvalRecord)
+    trained = first.policy.state_dict()
+    assert any(not torch.equal(untrained[k], v) for k, v in trained.items())
+    assert len(StageWindows([dataset(7), dataset(8)], 1)) == 40
+    with monkeypatch.context() as patch:
+        Killer(patch, 2)
+        with pytest.raises(Killed):
+            before(second, tmp_path / "killed")
+    before(third, tmp_path / "killed")
+    assert_same(dict(third.policy.state_dict()), dict(trained))
+    monkeypatch.setattr(TaskSequence, "_learn", lambda *_: pytest.fail("done already"))
+    again = parts(tmp_path / "d", "sequential")
+    before(again, tmp_path / "whole")
+    assert_same(dict(again.policy.state_dict()), dict(trained))
+
+
+def test_a_policy_may_begin_with_a_finished_runs_weights(tmp_path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    for task in (0, 1, 10):
+        state = {"task": task, "policy": {"w": torch.full((2,), float(task))}, "algorithm": {}}
+        checkpoints.save(run.task_path(task), state)
+    run.log.append(LossRecord(task=0, epoch=1, loss=1.0, seconds=1.0))
+    with pytest.raises(CheckpointError, match=r"not finished.*init_from=.*task_10\.safetensors"):
+        weights_of(run.path)
+    run.log.append(RunEndRecord(seconds=1.0, finished=utc_now()))
+    weights, file = weights_of(run.path)
+    assert weights["w"].tolist() == [10.0, 10.0] and file == run.task_path(10)
+    assert weights_of(run.task_path(1))[0]["w"].tolist() == [1.0, 1.0]
+
+
+def test_what_holds_no_weights_is_refused(tmp_path) -> None:
+    with pytest.raises(CheckpointError, match=r"no run, or has learned nothing"):
+        weights_of(tmp_path)
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        weights_of(tmp_path / "absent")
+    progress = RunDirectory(tmp_path).progress_path
+    checkpoints.save(progress, {"task": 0, "policy": None, "fit": {}})
+    with pytest.raises(CheckpointError, match="holds no policy's weights"):
+        weights_of(progress)
+
+
+def test_single_task_begins_each_task_with_what_was_there_before(tmp_path) -> None:
+    p = parts(tmp_path, "sequential")
+    p = replace(p, algorithm=SingleTask(), fit=replace(p.fit, epochs=1, steps_per_epoch=1))
+    before(p, tmp_path / "first")
+    trained = {k: v.clone() for k, v in p.policy.state_dict().items()}
+    TaskSequence(p).run()
+    initial = checkpoints.load(p.directory.task_path(2))["algorithm"]["initial"]
+    assert_same(dict(initial), trained)
