@@ -30,6 +30,7 @@ class Voxels:
         self._coarse = np.zeros(self._shape // 2 + 1, bool)
         self._coarse[tuple(cells[inside].T // 2)] = True
         self._tops: dict[float, np.ndarray] = {}  # heights by what lies below
+        self._roofs: dict[float, np.ndarray] = {}  # and by what lies above
 
     def hits(self, points: np.ndarray) -> np.ndarray:
         """How many of the points (..., N, 3) lie in something, (...)."""
@@ -55,6 +56,24 @@ class Voxels:
         where = xy[:, None] + profile[None, :, :2]  # (S, N, 2)
         cells = np.clip(((where - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
         return (heights[cells[..., 0], cells[..., 1]] - profile[:, 2]).max(axis=1)
+
+    def overhead(self, profile: np.ndarray, origins: np.ndarray, above: float) -> np.ndarray:
+        """Share of a body's columns that reach into what hangs over them, for origins (S, 3); (S,).
+
+        Args:
+            profile: points of the upper side relative to the origin, (N, 3).
+            origins: where the body's origin is.
+            above: what lies higher than this hangs, m.
+        """
+        if above not in self._roofs:
+            cells, inside = self._cells(self.points)
+            keep = inside & (self.points[:, 2] >= above)
+            heights = np.full(self._shape[:2], np.inf)
+            np.minimum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
+            self._roofs[above] = heights
+        where = origins[:, None] + profile
+        cells = np.clip(((where[..., :2] - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
+        return (self._roofs[above][cells[..., 0], cells[..., 1]] < where[..., 2]).mean(axis=1)
 
     def roofed(self, points: np.ndarray) -> np.ndarray:
         """Which of the points (..., 3) have something over them, (...) bool."""
@@ -102,6 +121,11 @@ def underside(points: np.ndarray) -> np.ndarray:
     order = points[np.argsort(points[:, 2])]
     _, first = np.unique(np.floor(order[:, :2] / _CELL), axis=0, return_index=True)
     return order[first]
+
+
+def upper_side(points: np.ndarray) -> np.ndarray:
+    """The highest point in each cell of the ground plan; (N, 3) -> (M, 3)."""
+    return underside(points * [1, 1, -1]) * [1, 1, -1]
 
 
 def hand_points(opening: float = MAX_OPENING) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.expert.clearance import Voxels, underside
+from libero_env.expert.clearance import Voxels, underside, upper_side
 from libero_env.expert.geometry import Pose
 from libero_env.expert.shapes import pose_of
 from libero_env.predicates import Box, StateView, _boxes, _inside, _over
@@ -19,6 +19,8 @@ _SIDEWAYS = tuple(np.arange(0.02, 0.29, 0.025))  # m, of the way in from a side 
 _NEAR = 0.024  # m, between the origins of things that stand on one another
 _LEANS = (0.45, 1.3)  # rad, of a body that fits nowhere upright
 _CROWDED = 0.04  # share of a body's points that may seem to lie in others, as voxels are coarse
+_UNDER = 0.15  # share of a body's columns that may reach into what hangs over them
+_UNCARRIED = 2.0  # cost of a lean with nothing under the middle of the body
 _ENOUGH = 80  # points of a body that are tested
 
 
@@ -59,14 +61,17 @@ def places(
     """
     frame = _directions(view, atom.args[1])
     crowded = _CROWDED if not view.is_thing(atom.args[1]) else 3 * _CROWDED
+    square = _square(cloud, frame[0])
     upright = [(turn, 0.1 * abs(angle), None) for angle, turn in _turns(_YAWS)]
     found = _found(view, voxels, cloud, pose, atom, share, upright, frame, crowded)
+    if not found:
+        upright += [(turn, 0.1 * abs(angle), None) for angle, turn in square]
+        found = _found(view, voxels, cloud, pose, atom, share, upright[_YAWS:], frame, crowded)
     if not found and not _flat_region(view, atom.args[1]):
+        yaws = [*square, *_turns(_YAWS // 2)]
         for angle in _LEANS:
-            turns = [
-                (_lean(d, angle) @ turn, 0.1 * abs(a), d) for d in frame for a, turn in _turns(_YAWS // 2)
-            ]
-            found = found or _found(view, voxels, cloud, pose, atom, share, turns, frame, crowded)
+            turns = [(_lean(d, angle) @ turn, 0.1 * abs(a), d) for d in frame for a, turn in yaws]
+            found += _found(view, voxels, cloud, pose, atom, share, turns, frame, crowded)
     if not found:
         found = _found(view, voxels, cloud, pose, atom, share, upright, frame, 8 * crowded)
     if not found:
@@ -98,9 +103,16 @@ def _found(
             if not keep:
                 continue
             origins = np.column_stack([spots, heights])[keep]
+            under = voxels.overhead(upper_side(body) + [0, 0, _LIFT], origins, below)
+            costs, origins = (costs[keep] + 2.0 * under)[under < _UNDER], origins[under < _UNDER]
+            if not len(origins):
+                continue
+            if only is not None:  # it falls back: its middle should have something under it
+                middle = body.mean(axis=0)[None] * [1, 1, 0] + [0, 0, body[:, 2].min()]
+                costs = costs + _UNCARRIED * (origins[:, 2] - voxels.drop(middle, origins[:, :2], below) > 0.01)
             ways = directions if only is None else [only]
             entries, crowd = _ways_in(voxels, body[::step], origins, ways, crowded)
-            for pos, cost, entry, full in zip(origins, costs[keep], entries, crowd, strict=True):
+            for pos, cost, entry, full in zip(origins, costs, entries, crowd, strict=True):
                 if entry is not None:
                     aside = 0.5 * (entry[2] > -0.5)
                     found.append(Place(pos, turn @ pose.mat, entry, cost + price + 8.0 * full + aside))
@@ -111,6 +123,16 @@ def _turns(number: int) -> list[tuple[float, np.ndarray]]:
     """Turns about the vertical: (angle, (3, 3))."""
     angles = [2 * np.pi * k / number for k in range(number)]
     angles = [a - 2 * np.pi if a > np.pi else a for a in angles]
+    return [(a, _about_vertical(a)) for a in angles]
+
+
+def _square(cloud: np.ndarray, side: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Turns about the vertical that put the narrowest way through a body along or across a direction."""
+    plan = np.unique(np.round(cloud[:, :2], 3), axis=0)
+    yaws = np.pi * np.arange(90) / 90
+    widths = np.ptp(plan @ [np.cos(yaws), np.sin(yaws)], axis=0)
+    first = np.arctan2(side[1], side[0]) - yaws[widths.argmin()]
+    angles = [(first + k * np.pi / 2 + np.pi) % (2 * np.pi) - np.pi for k in range(4)]
     return [(a, _about_vertical(a)) for a in angles]
 
 
