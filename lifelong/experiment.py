@@ -112,19 +112,19 @@ class Built:
 
 
 def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built:
-    benchmark: BenchmarkSettings = _build(config.benchmark)
+    benchmark: BenchmarkSettings = build(config.benchmark)
     tasks, device = benchmark.sequence(), ranks.device(settings.device)
-    stream: StreamSettings = _build(config.stream)
-    before: PretrainSettings = _build(config.pretrain)
+    stream: StreamSettings = build(config.stream)
+    before: PretrainSettings = build(config.pretrain)
     first = before.sequence()
-    data: DataSettings = _build(config.data)
-    fit: FitSettings = _build(config.train)
+    data: DataSettings = build(config.data)
+    fit: FitSettings = build(config.train)
     if fit.compile != "off":
         check_compiler(device)
-    languages = ranks.share(lambda: _build(config.language).embed([t.language for t in (*first, *tasks)]))
+    languages = ranks.share(lambda: build(config.language).embed([t.language for t in (*first, *tasks)]))
     spec = data.spec(languages.shape[1])
     with seeded(settings.seed, INIT):
-        policy = _build(config.policy, spec=spec).to(device)
+        policy = build(config.policy, spec=spec).to(device)
     if settings.init_from is not None:
         weights, file = weights_of(Path(settings.init_from).expanduser())
         load_weights(policy, weights, file)
@@ -140,16 +140,16 @@ def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built
         first_languages=languages[: len(first)],
         spec=spec,
         policy=policy,
-        algorithm=_build(config.algo),
+        algorithm=build(config.algo),
         fit=fit,
-        eval=_build(config.eval),
-        augment=_build(config.augmentation),
-        tracker=_build(config.wandb),
+        eval=build(config.eval),
+        augment=build(config.augmentation),
+        tracker=build(config.wandb),
         device=device,
     )
 
 
-def _build(node: DictConfig, **more: Any) -> Any:
+def build(node: DictConfig, **more: Any) -> Any:
     """The object a node of the configuration describes, with plain lists and dictionaries inside."""
     return instantiate(node, _convert_="all", _partial_=True)(**more)
 
