@@ -77,6 +77,7 @@ class TaskSequence:
 
     def __init__(self, parts: Parts):
         self.parts = parts
+        parts.algorithm.augment = parts.augment
         self.log = parts.directory.log
         self._saved = time.monotonic()
         self.stages = stages_of(parts.algorithm, len(parts.instructions), parts.group_size)

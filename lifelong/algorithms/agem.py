@@ -6,9 +6,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm, WindowDataset, as_libero
 from lifelong.data.dataset import SequenceVLDataset
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import FirstWindows, ReplayMemory
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -19,23 +19,35 @@ class AGEM(Algorithm):
     With g the gradient on the present task and g_ref that on windows drawn from the memory: where
     `g . g_ref < 0`, `g <- g - (g . g_ref / g_ref . g_ref) g_ref` (Chaudhry et al. 2019, "Efficient lifelong
     learning with A-GEM", eq. 11). The memory is ER's; its windows are taken without augmentation.
+
+    With `compat="libero"` it is the memory of LIBERO's code (see `ER`), and its windows are augmented. No results of
+    that are published.
     """
 
-    def __init__(self, *, budget: int = 10_000, ratio: float = 1.0):
+    def __init__(
+        self, *, budget: int = 10_000, ratio: float = 1.0, per_task: int = 1000, compat: str | None = None
+    ):
         """Make the algorithm.
 
         Args:
-            budget: Largest number of windows kept over all tasks. LIBERO's code keeps 1000 of each of ten.
+            budget: Largest number of windows kept over all tasks; not used with `compat="libero"`.
             ratio: Windows of the reference for each window of the batch; more make g_ref less noisy.
+            per_task: Windows kept of each task with `compat="libero"`; not used without.
+            compat: None, or `libero` for the choices of LIBERO's code.
+
+        Raises:
+            ConfigError: Another `compat`.
         """
-        self.ratio = ratio
-        self.memory = ReplayMemory(budget)
+        self.ratio, self.compat = ratio, compat
+        self.memory = FirstWindows(per_task) if as_libero(compat) else ReplayMemory(budget)
         self._reference: Batch | None = None  # drawn by `mix`, used up by `after_backward`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """The batch as it is; the windows of the reference are drawn here."""
         if len(self.memory):
             self._reference = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
+            if self.compat and self.augment is not None:
+                self._reference = self.augment(self._reference, generator)
         return batch
 
     def after_backward(self, policy: Policy) -> None:

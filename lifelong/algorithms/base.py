@@ -10,7 +10,7 @@ The order in which they are called, for every task (or every stage of `stages`):
     policy_for                                  around every rollout
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -68,8 +69,26 @@ class Phase:
     measures_transfer: bool = True
 
 
+def as_libero(compat: str | None) -> bool:
+    """Whether an algorithm's `compat` setting asks for the choices of LIBERO's code.
+
+    Raises:
+        ConfigError: It is neither None nor `libero`.
+    """
+    if compat not in (None, "libero"):
+        raise ConfigError(f"compat is {compat!r}; valid: null, libero")
+    return compat == "libero"
+
+
 class Algorithm:
-    """Sequential fine-tuning; a base for algorithms, which override the hooks they need."""
+    """Sequential fine-tuning; a base for algorithms, which override the hooks they need.
+
+    Attributes:
+        augment: What training does to the images of a batch, for an algorithm that wants it elsewhere too; the walk
+            through the sequence sets it.
+    """
+
+    augment: Callable[[Batch, torch.Generator], Batch] | None = None
 
     def stages(self, tasks: int) -> tuple[tuple[int, ...], ...]:
         """Which tasks are learned together, stage after stage: by default one at a time.

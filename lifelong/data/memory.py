@@ -121,3 +121,25 @@ class ReplayMemory:
                     f"{len(held[task])}: its demonstrations are not those of the interrupted run"
                 )
         self.budget, self._indices, self._datasets = int(state["budget"]), indices, held
+
+
+class FirstWindows(ReplayMemory):
+    """The first windows of each past task, in the order of its file: the memory of LIBERO's code.
+
+    A thousand of them are the first eight or so demonstrations, not a sample of the task.
+
+    Args:
+        per_task: windows kept of each task.
+    """
+
+    def __init__(self, per_task: int) -> None:
+        super().__init__(per_task)
+        self.per_task = per_task
+
+    def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
+        """Takes a task in; nothing is drawn, and no other task shrinks."""
+        super().add(dataset, generator)
+        self._indices[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
+
+    def _shrink(self) -> None:
+        self.budget = self.per_task * len(self._indices)

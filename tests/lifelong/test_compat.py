@@ -1,0 +1,226 @@
+"""The choices of LIBERO's code, each told apart from ours by what it does."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from lifelong import checkpoints
+from lifelong.algorithms import AGEM, ER, EWC, PackNet
+from lifelong.errors import ConfigError
+from lifelong.sequence import TaskSequence
+from lifelong.training import FitSettings, fit, generator
+from tests.lifelong import test_sequence as walk
+from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
+from tests.lifelong.test_algorithms import by_hand, learn, outputs
+from tests.lifelong.test_algorithms_more import killed_again_and_again
+from tests.lifelong.test_configs import FILES, composed
+
+WITH_COMPAT = ("er", "agem", "ewc", "packnet")
+
+
+def mirrored(batch, draws):
+    """Stands for an augmentation: actions change sign."""
+    return dataclasses.replace(batch, actions=-batch.actions)
+
+
+# --- ER and A-GEM
+
+
+@pytest.mark.parametrize("make", [ER, AGEM])
+def test_memory_is_the_first_windows_of_each_task_in_file_order(make):
+    ours, theirs = make(budget=14), make(per_task=7, compat="libero")
+    for task in range(3):
+        for algorithm in (ours, theirs):
+            algorithm.end_task(task, Windows(task), LinearPolicy(), generator(task))
+    kept = {name: a.state_dict()["memory"]["indices"] for name, a in (("ours", ours), ("theirs", theirs))}
+    assert {t: len(i) for t, i in kept["theirs"].items()} == {"0": 7, "1": 7, "2": 7}  # they do not shrink
+    assert all(torch.equal(i, torch.arange(7)) for i in kept["theirs"].values())
+    assert len(ours.memory) == 14
+    assert not any(torch.equal(i.sort().values, torch.arange(len(i))) for i in kept["ours"].values())
+
+
+def test_memory_may_be_longer_than_a_task_and_is_taken_up_again():
+    algorithm = ER(per_task=30, compat="libero")
+    algorithm.end_task(0, Windows(0, size=20), LinearPolicy(), generator(0))
+    algorithm.end_task(1, Windows(1, size=40), LinearPolicy(), generator(0))
+    assert algorithm.memory.shares == {0: 20, 1: 30}
+    other = ER(per_task=30, compat="libero")
+    other.load_state_dict(algorithm.state_dict(), {0: Windows(0, size=20), 1: Windows(1, size=40)})
+    batch = Windows(2).batch(torch.arange(8))
+    mixed = [a.mix(batch, generator(5)) for a in (algorithm, other)]
+    assert len(mixed[0]) == 16 and torch.equal(mixed[0].actions, mixed[1].actions)
+    other.end_task(2, Windows(2, size=40), LinearPolicy(), generator(0))
+    assert other.memory.shares == {0: 20, 1: 30, 2: 30}
+
+
+@pytest.mark.parametrize("compat", [None, "libero"])
+def test_agem_augments_its_reference_as_the_original_only(compat):
+    algorithm = AGEM(budget=20, per_task=20, compat=compat)
+    algorithm.augment = mirrored
+    algorithm.end_task(0, Windows(0), LinearPolicy(), generator(0))
+    algorithm.mix(Windows(1).batch(torch.arange(20)), generator(0))
+    reference, stored = algorithm._reference, Windows(0)
+    sign = -1 if compat else 1
+    assert torch.equal(reference.actions[:, 0], sign * stored.targets[reference.window_ids])
+
+
+# --- EWC
+
+
+def test_ewc_strength_goes_with_the_estimate():
+    assert EWC().strength == 1500 and EWC(fisher="batch").strength == 5e4
+    theirs = EWC(compat="libero")
+    assert (theirs.strength, theirs.gamma, theirs.fisher, theirs.fisher_windows) == (5e4, 0.9, "batch", 0)
+    assert EWC(compat="libero", strength=3.0, fisher="per_sample").strength == 3.0
+
+
+def test_ewc_fisher_is_of_augmented_batches_of_all_windows_in_training_mode():
+    policy, data, modes = LinearPolicy(), Windows(size=600), []
+    loss = policy.loss
+    policy.loss = lambda batch: modes.append((policy.training, len(batch))) or loss(batch)
+    theirs = EWC(compat="libero", fisher_batch_size=300)
+    theirs.augment = mirrored
+    fisher = theirs.estimate(data, policy.eval(), generator(0))
+    assert modes == [(True, 300), (True, 300)] and not policy.training
+    order = torch.randperm(600, generator=generator(0))
+    data.targets.neg_()
+    halves = [by_hand(policy, data)[half].mean(0).square() for half in order.split(300)]
+    torch.testing.assert_close(fisher["linear.weight"], (halves[0] + halves[1]) / 2)
+
+    modes.clear()
+    ours = EWC(fisher="batch", fisher_batch_size=300)
+    ours.augment = mirrored
+    assert not torch.allclose(
+        ours.estimate(data, policy, generator(0))["linear.weight"], fisher["linear.weight"]
+    )
+    assert [size for _, size in modes] == [300, 212]
+
+
+# --- PackNet
+
+
+def learned(compat, weight_decay: float, tasks: int = 2):
+    """A policy after so many tasks, what it was before each, and the algorithm."""
+    torch.manual_seed(0)
+    policy, algorithm, states = DeepPolicy(), PackNet(prune_perc=0.5, compat=compat), []
+    settings = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=weight_decay, precision="fp32")
+    for task in range(tasks):
+        states.append((copy.deepcopy(policy.state_dict()), copy.deepcopy(algorithm)))
+        algorithm.begin_task(task, Windows(task), policy)
+        for number, phase in enumerate(algorithm.phases()):
+            algorithm.begin_phase(phase, policy)
+            fit(policy, Windows(task), algorithm, settings=settings, seed=(task, number))
+            algorithm.end_phase(phase, policy)
+        algorithm.end_task(task, Windows(task), policy, generator(task))
+    return policy, algorithm, states
+
+
+def test_packnet_divides_weights_of_linear_layers_and_image_convolutions_only():
+    owners = {c: set(learned(c, 0.0, tasks=1)[1].state_dict()["owner"]) for c in (None, "libero")}
+    assert owners["libero"] == {"head.weight"}  # the convolution of the fake policy has one dimension
+    assert owners[None] > {"head.weight", "inner.weight", "memory.weight_hh_l0", "place.weight"}
+
+
+def test_packnet_masks_keep_frozen_weights_but_for_weight_decay():
+    for decay in (0.0, 0.1):
+        policy, algorithm, states = learned("libero", decay)
+        owned = algorithm.state_dict()["owner"]["head.weight"] == 1
+        before, after = states[1][0]["head.weight"][owned], policy.head.weight[owned]
+        assert torch.equal(before, after) == (decay == 0.0)
+        assert (after.abs() <= before.abs()).all()
+        ours, algorithm, states = learned(None, decay)
+        owned = algorithm.state_dict()["owner"]["head.weight"] == 1
+        assert torch.equal(states[1][0]["head.weight"][owned], ours.head.weight[owned])
+
+
+def test_packnet_never_trains_biases_and_layer_norms_but_all_else_with_every_task():
+    policy, _, states = learned("libero", 0.0)
+    fresh, first, second = states[0][0], states[1][0], policy.state_dict()
+    for name in ("head.bias", "layer_norm.weight", "norm.bias", "norm.running_mean"):
+        assert torch.equal(fresh[name], first[name]) and torch.equal(first[name], second[name]), name
+    for name in ("memory.weight_ih_l0", "memory.bias_hh_l0", "place.weight", "inner.weight"):
+        assert not torch.equal(fresh[name], first[name]) and not torch.equal(first[name], second[name]), name
+
+
+@pytest.mark.parametrize("compat", [None, "libero"])
+def test_packnet_forgets_as_the_original_only(compat):
+    policy, algorithm, states = learned(compat, 0.1)
+    then, before = states[1]
+    old = DeepPolicy()
+    old.load_state_dict(then)
+    assert torch.equal(outputs(before, old, 0), outputs(algorithm, policy, 0)) == (compat is None)
+
+
+# --- all of them
+
+
+@pytest.mark.parametrize("make", [ER, AGEM, EWC, PackNet])
+def test_another_choice_is_refused(make):
+    with pytest.raises(ConfigError, match="valid: null, libero"):
+        make(compat="robomimic")
+
+
+def test_the_walk_tells_algorithms_the_augmentation(tmp_path):
+    p = walk.parts(tmp_path, "ewc")
+    assert TaskSequence(dataclasses.replace(p, augment=mirrored)).parts.algorithm.augment is mirrored
+
+
+@pytest.mark.parametrize("make", [lambda: ER(per_task=5, compat="libero"), lambda: PackNet(compat="libero")])
+def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+    torch.manual_seed(1)
+    policy, algorithm = DeepPolicy(), make()
+    learn(algorithm, policy, 0)
+    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
+    learn(algorithm, policy, 1)
+
+    state = checkpoints.load(tmp_path / "s")
+    other_policy, other = DeepPolicy(), make()
+    other_policy.load_state_dict(state["policy"])
+    other.load_state_dict(state["algorithm"], {0: Windows(0)})
+    learn(other, other_policy, 1)
+    walk.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
+
+
+def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
+    """EWC's estimate needs the augmentation even where a process was killed just before it."""
+    parts = walk.parts
+    monkeypatch.setitem(walk.ALGORITHMS, "ewc", lambda: EWC(compat="libero"))
+    monkeypatch.setattr(walk, "parts", lambda *a: dataclasses.replace(parts(*a), augment=mirrored))
+    TaskSequence(p := walk.parts(tmp_path / "whole", "ewc")).run()
+    records, state = walk.outcome(tmp_path / "whole", p.directory.log)
+    starts, p = killed_again_and_again(tmp_path / "killed", "ewc", monkeypatch)
+    assert starts > 2
+    again, end = walk.outcome(tmp_path / "killed", p.directory.log)
+    assert again == records
+    walk.assert_same(end, state)
+
+
+# --- the switch
+
+
+@pytest.mark.parametrize("name", sorted(f.stem for f in FILES if str(f.parent) == "algo"))
+@pytest.mark.parametrize("preset", ["paper", "laptop"])
+def test_one_flag_sets_every_choice(name, preset):
+    config = composed(f"algo={name}", f"preset={preset}", "compat=libero")
+    assert config.eval.selection == "reporting" and config.eval.select == "best" and config.policy.stochastic
+    assert ("compat" in config.algo) == (name in WITH_COMPAT)
+    assert config.algo.get("compat", "libero") == "libero"
+    instantiate(config.algo, _convert_="all")
+
+
+def test_without_it_choices_are_ours():
+    for name in WITH_COMPAT:
+        config = composed(f"algo={name}")
+        assert (
+            config.algo.compat is None and config.eval.selection == "apart" and not config.policy.stochastic
+        )
+
+
+def test_values_on_the_command_line_win_over_it():
+    config = composed(
+        "algo=ewc", "compat=libero", "eval.selection=apart", "policy.stochastic=false", "algo.strength=7"
+    )
+    assert (config.eval.selection, config.policy.stochastic, config.algo.strength) == ("apart", False, 7)
