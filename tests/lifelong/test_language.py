@@ -69,6 +69,14 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     sizes = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
     bert = transformers.BertConfig(vocab_size=len(words), max_position_embeddings=80, **sizes)
     clip = transformers.CLIPTextConfig(vocab_size=len(words), projection_dim=6, eos_token_id=3, **sizes)
+    roberta = transformers.RobertaConfig(
+        vocab_size=len(words),
+        max_position_embeddings=90,
+        pad_token_id=0,
+        bos_token_id=2,
+        eos_token_id=3,
+        **sizes,
+    )
     gpt2 = transformers.GPT2Config(vocab_size=len(words), n_embd=8, n_layer=1, n_head=2, n_positions=80)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -76,6 +84,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             "bert": transformers.BertModel(bert),
             "clip": transformers.CLIPTextModelWithProjection(clip),
             "gpt2": transformers.GPT2Model(gpt2),
+            "roberta": transformers.RobertaModel(roberta),
         }
     paths = {}
     for name, model in made.items():
@@ -86,24 +95,46 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return paths
 
 
-@pytest.mark.parametrize(("name", "size"), [("bert", 8), ("clip", 6), ("gpt2", 8)])
+@pytest.mark.parametrize(("name", "size"), [("bert", 8), ("clip", 6), ("gpt2", 8), ("roberta", 8)])
 def test_transformers_encode_each_text_by_itself(models: dict[str, Path], name: str, size: int) -> None:
     texts = ["turn on the stove", "close"]
     together = embed(texts, str(models[name]))
     assert together.shape == (2, size)
     assert not torch.allclose(together[0], together[1])
-    for text, row in zip(texts, together, strict=True):  # padding does not change an embedding
-        torch.testing.assert_close(embed([text], str(models[name]))[0], row, atol=1e-5, rtol=1e-5)
+    for text, row in zip(texts, together, strict=True):  # to the bit, so that it may be kept
+        assert torch.equal(embed([text], str(models[name]))[0], row)
 
 
 def test_embeddings_are_cached_by_model_and_text(
     models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = embed(TEXTS, str(models["bert"]), cache_dir=tmp_path)
-    assert len(list(tmp_path.glob("*.npy"))) == 2
+    made = {name: embed(TEXTS, str(path), cache_dir=tmp_path) for name, path in models.items()}
+    assert len(list(tmp_path.glob("*.npy"))) == 2 * len(models) == 8
     assert not list(tmp_path.glob("*.part"))
     monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
-    assert torch.equal(embed(TEXTS[::-1], str(models["bert"]), cache_dir=tmp_path), made.flip(0))
+    for name, path in models.items():
+        assert torch.equal(embed(TEXTS[::-1], str(path), cache_dir=tmp_path), made[name].flip(0))
+
+
+def test_texts_that_are_not_shipped_are_cached_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(language, "minilm_folder", lambda: tmp_path)
+    monkeypatch.setattr(language, "encode_minilm", lambda texts, folder: torch.ones(len(texts), 384))
+    texts = ["fly to the moon", *TEXTS]
+    made = embed(texts, cache_dir=tmp_path / "cache")
+    monkeypatch.setattr(language, "encode_minilm", lambda *_: pytest.fail("encoded what was cached"))
+    assert torch.equal(embed(texts, cache_dir=tmp_path / "cache"), made)
+    assert len(list((tmp_path / "cache").glob("*.npy"))) == 1
+
+
+def test_an_encoder_of_the_configuration_keeps_what_it_computed(
+    models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    encoder = LanguageEncoder(str(models["roberta"]))
+    made = encoder.embed(TEXTS)
+    assert len(list((tmp_path / "language").glob("*.npy"))) == 2
+    monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
+    assert torch.equal(encoder.embed(TEXTS), made)
 
 
 def test_weights_that_cannot_be_had_name_the_remedy(tmp_path: Path) -> None:
