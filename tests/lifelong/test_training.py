@@ -1,14 +1,22 @@
 """The training loop: exact when resumed, silent about randomness, loud about what cannot work."""
 
 import copy
+import os
 
 import pytest
 import torch
+from torch import nn
 
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Sequential
+from lifelong.data import fake_batch
+from lifelong.distributed import Ranks
 from lifelong.errors import ConfigError, TrainingError
-from lifelong.training import FitSettings, fit, learning_rate
+from lifelong.nn.precision import check_compiler, compiled, deterministic
+from lifelong.policies import BCRNN, BCTransformer, BCViLT
+from lifelong.training import FitSettings, fit, generator, learning_rate
+from lifelong.types import Batch, PolicySpec
+from tests.lifelong import ranks_worker as worker
 from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
 
 SETTINGS = FitSettings(epochs=5, batch_size=8, lr=1e-2, warmup_steps=3, precision="fp32")
@@ -118,7 +126,193 @@ def test_an_empty_dataset_is_an_error():
         fit(LinearPolicy(), Windows(size=0), Sequential(), settings=SETTINGS, seed=(0,))
 
 
-@pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("batch_size", 0), ("precision", "fp8")])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("epochs", 0), ("batch_size", 0), ("precision", "fp8"), ("accumulate", 0), ("compile", "max-autotune")],
+)
 def test_settings_that_cannot_work_are_named(key, value):
     with pytest.raises(ConfigError, match=key):
         FitSettings(**{key: value})
+
+
+def test_an_unquoted_off_in_yaml_means_off():
+    assert FitSettings(compile=False).compile == "off"
+
+
+# --- cut into micro-batches
+
+
+def test_rows_of_a_batch_join_to_the_batch():
+    batch = fake_batch(PolicySpec(image_size=(8, 8), seq_len=2), 5, generator(0))
+    joined = batch.rows(slice(0, 2)).join(batch.rows(slice(2, 5)))
+    assert len(batch.rows(slice(0, 2))) == 2
+    for part, whole in ((joined.actions, batch.actions), (joined.window_ids, batch.window_ids)):
+        assert torch.equal(part, whole)
+    assert torch.equal(joined.observation.images, batch.observation.images)
+    assert all(torch.equal(joined.observation.proprio[k], v) for k, v in batch.observation.proprio.items())
+
+
+@pytest.mark.parametrize(("algo", "parts"), [("er", 3), ("derpp", 2), ("agem", 2)])
+def test_micro_batches_learn_as_the_whole_batch_does(algo, parts, tmp_path):
+    whole, _ = worker.learn(algo, tmp_path / "whole", Ranks(), epochs=4)
+    cut, _ = worker.learn(algo, tmp_path / "cut", Ranks(), epochs=4, accumulate=parts)
+    assert cut == pytest.approx(whole, rel=1e-5)
+
+
+@pytest.mark.parametrize(("parts", "expected"), [(1, [10]), (4, [2, 3, 2, 3]), (100, [1] * 10)])
+def test_no_more_windows_are_computed_at_once_than_asked_for(parts, expected):
+    sizes = []
+
+    class Spy(LinearPolicy):
+        def loss(self, batch: Batch):
+            sizes.append(len(batch))
+            return super().loss(batch)
+
+    settings = FitSettings(epochs=1, batch_size=10, steps_per_epoch=2, accumulate=parts, precision="fp32")
+    fit(Spy(), Windows(), Sequential(), settings=settings, seed=(0,))
+    assert sizes == expected * 2
+
+
+def test_a_policy_that_normalises_over_the_batch_refuses_to_have_it_cut():
+    cut = FitSettings(epochs=1, accumulate=2)
+    with pytest.raises(ConfigError, match=r"norm takes its statistics over the batch.*policy\.norm=group"):
+        fit(DeepPolicy(), Windows(), Sequential(), settings=cut, seed=(0,))
+    with pytest.raises(ConfigError, match="several processes"):
+        fit(
+            DeepPolicy(),
+            Windows(),
+            Sequential(),
+            settings=FitSettings(epochs=1),
+            seed=(0,),
+            ranks=Ranks(0, 2),
+        )
+
+
+# --- compiled
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """torch.compile without its compiler: what is traced runs as it is, one graph but for recurrent layers."""
+    real, functions = torch.compile, []
+
+    def trace(function, mode=None):
+        functions.append((function, mode))
+        recurrent = any(isinstance(m, nn.RNNBase) for m in function.__self__.modules())
+        return real(function, backend="eager", fullgraph=not recurrent)
+
+    monkeypatch.setattr(torch, "compile", trace)
+    yield functions
+    torch.compiler.reset()
+
+
+SMALL = PolicySpec(image_size=(32, 32), language_dim=8, seq_len=2)
+POLICIES = {
+    "bc_transformer": lambda: BCTransformer(
+        spec=SMALL, embed_dim=8, image_width=8, stage_blocks=[1], layers=1, head_hidden=8, dropout=0.0
+    ),
+    "bc_rnn": lambda: BCRNN(spec=SMALL, image_width=8, rnn_hidden=8, rnn_layers=1, head_hidden=8),
+    "bc_vilt": lambda: BCViLT(spec=SMALL, patch=4, spatial_layers=1, head_hidden=8, dropout=0.0),
+}
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # torch hides it, unless it is an error
+@pytest.mark.parametrize("name", POLICIES)
+def test_a_policys_loss_can_be_compiled_and_is_the_same(name, traced):
+    torch.manual_seed(0)
+    policy = POLICIES[name]().train()
+    batch = fake_batch(SMALL, 3, generator(0))
+    assert torch.equal(compiled(policy.loss, "default")(batch), policy.loss(batch))
+    assert [mode for _, mode in traced] == [None]
+
+
+def test_compiled_training_keeps_names_and_numbers(traced):
+    torch.manual_seed(0)
+    fresh = LinearPolicy()
+    results = []
+    for mode in ("off", "reduce-overhead"):
+        policy = copy.deepcopy(fresh)
+        settings = FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32", compile=mode)
+        fit(policy, Windows(), Sequential(), settings=settings, seed=(1,))
+        results.append(policy.state_dict())
+    assert results[0].keys() == results[1].keys()
+    assert all(torch.equal(value, results[1][name]) for name, value in results[0].items())
+    assert [mode for _, mode in traced] == ["reduce-overhead"]
+
+
+def test_a_missing_compiler_is_told_with_the_remedy(monkeypatch):
+    def fail(*args, **kwargs):
+        raise RuntimeError("No working C++ compiler found")
+
+    monkeypatch.setattr(torch, "compile", fail)
+    with pytest.raises(ConfigError, match=r"No working C\+\+ compiler found.*train\.compile=off"):
+        check_compiler(torch.device("cpu"))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.filterwarnings("ignore")  # of the compiler about itself
+@pytest.mark.parametrize("mode", ["default", "reduce-overhead"])
+@pytest.mark.parametrize("parts", [1, 3])
+def test_compiled_training_on_a_gpu(mode, parts):
+    losses = []
+    for compile, accumulate in (("off", 1), (mode, parts)):
+        torch.manual_seed(0)
+        policy, ends = POLICIES["bc_transformer"]().cuda(), []
+        settings = FitSettings(
+            epochs=12, batch_size=6, lr=1e-3, precision="fp32", compile=compile, accumulate=accumulate
+        )
+        fit(
+            policy,
+            Pictures(),
+            Sequential(),
+            settings=settings,
+            seed=(1,),
+            device="cuda",
+            on_epoch=ends.append,
+        )
+        losses.append([end.loss for end in ends[1:]])
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+
+
+class Pictures:
+    """Twelve random windows."""
+
+    whole = fake_batch(SMALL, 12, generator(0))
+
+    def __len__(self):
+        return 12
+
+    def batch(self, indices):
+        return self.whole.rows(indices)
+
+
+# --- deterministic
+
+
+def test_deterministic_kernels_are_asked_for_and_the_setting_put_back(monkeypatch):
+    monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
+    with deterministic(False):
+        assert not torch.are_deterministic_algorithms_enabled()
+    with deterministic(True):
+        assert torch.are_deterministic_algorithms_enabled()
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"
+    assert not torch.are_deterministic_algorithms_enabled()
+    assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
+
+
+def test_an_operation_that_cannot_is_told_with_the_remedy():
+    message = "some_backward_cuda does not have a deterministic implementation, but you set it."
+    with pytest.raises(TrainingError, match="some_backward_cuda.*deterministic=false"), deterministic(True):
+        raise RuntimeError(message)
+    assert not torch.are_deterministic_algorithms_enabled()
+
+
+def test_on_a_cpu_the_bits_are_the_same_anyway(tmp_path):
+    results = []
+    for on in (False, True):
+        with deterministic(on):
+            results.append(worker.learn("ewc", tmp_path / str(on), Ranks(), epochs=2))
+    (losses, weights), (losses_again, weights_again) = results
+    assert losses == losses_again
+    assert all(torch.equal(value, weights_again[name]) for name, value in weights.items())
