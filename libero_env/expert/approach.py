@@ -34,7 +34,11 @@ def _lean(azimuth: float, tilt: float) -> np.ndarray:
 _HAND = hand_points()
 _CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
 _RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.25, 0.35, 0.6) for k in range(8)]
-_GRASPS, _PLACES, _TRIED = 20, 24, 24
+_GRASPS, _PLACES, _TRIED = 20, 72, 24
+_EACH, _DEPTH = 2, 0.03  # places at most for one turn of the body and so many m of depth
+_LEANING = 4  # holds for one approach that leans
+_MISSED = 1e-4  # m, by which a pose may be missed that counts as reached
+_RAISED = 0.10  # m, over where a body was taken, where the hand has turned as it will put it down
 _AGAIN = 0.5  # cost of a hold that failed before, or of a place
 _ALIKE, _ALIKE_TURN = 0.02, 0.4  # m and rad, between holds or places that share their fate
 _LIFTS = np.array(
@@ -45,7 +49,7 @@ _BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room 
 _TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
 _NEAR = 0.3  # m, around a body: what is further away is in no hand's way
 ASIDE = 0.16  # m, before a place that is entered from a side
-_SIDES = 4  # directions of such approaches that are tried
+_SIDES = 8  # directions of such approaches that are tried
 
 
 @dataclass(frozen=True)
@@ -109,9 +113,18 @@ def choose_approach(
     cloud, pose = shapes.cloud(view, thing), pose_of(view, thing)
     floor = view.scene.workspace.surface_height
     voxels = Voxels(shapes.others(view, thing, spacing=DENSE), floor, pose.pos)
-    spots = _places_again(places(view, voxels, cloud, pose, atom, share), failures)[:_PLACES]
-    holds = _free_holds(view, voxels, cloud, pose, thing, _tilts(spots, pose), failures)
-    return _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
+    spots = _varied(_places_again(places(view, voxels, cloud, pose, atom, share), failures))
+    tilts = _tilts(spots, pose)
+    holds = _free_holds(view, voxels, cloud, pose, thing, [None, *tilts], failures)
+    best, miss = _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
+    if holds[0].cost < _CROWDED and miss <= _MISSED:
+        return best
+    try:  # lean away from what is in the way, or towards the arm
+        holds += _free_holds(view, voxels, cloud, pose, thing, _RING, failures)
+    except GraspError:
+        return best
+    other, short = _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
+    return other if short <= max(miss, _MISSED) else best
 
 
 def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
@@ -139,26 +152,38 @@ def _places_again(spots: list[Place], failures: Sequence[Failure]) -> list[Place
     return sorted(dearer, key=lambda spot: spot.cost)
 
 
+def _varied(spots: list[Place]) -> list[Place]:
+    """The best places, few of each turn of the body and each depth that it goes in, so that all are among them."""
+    kept: dict[tuple, list[Place]] = {}
+    for spot in spots:
+        turn, depth = np.round(spot.mat[:2, :2].ravel(), 1), round(float(spot.pos @ spot.entry) / _DEPTH)
+        same = kept.setdefault((*turn, *np.round(spot.entry), depth), [])
+        if len(same) < _EACH:
+            same.append(spot)
+    return sorted((spot for same in kept.values() for spot in same), key=lambda spot: spot.cost)[:_PLACES]
+
+
 def _alike(pose: Pose, other: Pose) -> bool:
     near = np.linalg.norm(pose.pos - other.pos) < _ALIKE
     return bool(near and np.linalg.norm(rotation_between(pose.mat, other.mat)) < _ALIKE_TURN)
 
 
 def _free_holds(
-    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, thing: str, tilts: list[np.ndarray],
+    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, thing: str, tilts: Sequence[np.ndarray | None],
     failures: Sequence[Failure],
 ) -> list[Grasp]:  # fmt: skip
-    """Holds from above and along other approaches, those in the way of others and those that failed last."""
+    """Holds along some approaches, those in the way of others and those that failed last.
+
+    Raises:
+        GraspError: there is none.
+    """
     near = voxels.points[np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1) < _NEAR]
     axis, error = finger_axis(view.eef_mat), None
     found: list[Grasp] = []
-    for tilt in [None, *tilts, *_RING]:
-        if tilt is _RING[0] and any(grasp.cost < _CROWDED for grasp in found):
-            break  # there is a hold that nothing is in the way of
+    for tilt in tilts:
         try:
             lean = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
-            number = _GRASPS if tilt is None else 4
-            number *= 1 + len(failures)
+            number = (_GRASPS if tilt is None else _LEANING) * (1 + len(failures))
             own = grasps(cloud, voxels.floor, axis, tilt=tilt, name=thing, number=number, apart=0.015)
         except GraspError as problem:
             error = error or problem
@@ -251,8 +276,8 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
     return sorted(found, key=lambda approach: approach.cost)
 
 
-def _reachable(view: StateView, shapes: Shapes, pairs: list[Approach]) -> Approach:
-    """The first that the arm reaches, or the one it misses least."""
+def _reachable(view: StateView, shapes: Shapes, pairs: list[Approach]) -> tuple[Approach, float]:
+    """The first that the arm reaches, or the one it misses least; and by how much it does, as `Arm.follow`."""
     angles = view.simulations.fields["qpos"][view.index][:7]
     best: tuple[float, Approach] | None = None
     seen: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
@@ -268,13 +293,17 @@ def _reachable(view: StateView, shapes: Shapes, pairs: list[Approach]) -> Approa
                 continue
             own, tried = replace(pair, grasp=grasp), tried + 1
             clear = 0.08 if pair.place.entry[2] < -0.5 else ASIDE
-            way = [(own.hand_pos - clear * pair.place.entry, own.hand_mat), (own.hand_pos, own.hand_mat)]
+            way = [
+                (grasp.pos_world + [0.0, 0.0, _RAISED], own.hand_mat),
+                (own.hand_pos - clear * pair.place.entry, own.hand_mat),
+                (own.hand_pos, own.hand_mat),
+            ]
             miss = max(missed, shapes.arm.follow(after, way)[1])
             if best is None or miss < best[0]:
                 best = miss, own
-            if miss < 1e-4:
-                return own
+            if miss < _MISSED:
+                return own, miss
         if tried > _TRIED:
             break
     assert best is not None
-    return best[1]
+    return best[1], best[0]

@@ -9,7 +9,12 @@ from libero_env.robot import REST_QPOS
 _STEPS, _GAIN, _REST = 60, 0.5, 0.03
 _POS, _TURN = 0.006, 0.06  # m and rad, what counts as reached
 _MARGIN = 0.08  # rad, kept from the limits of a joint
-_STRAIGHT = -0.9  # rad, of the elbow: at -0.47 the arm is straight, and beyond it bends the other way and does not come back
+_STRAIGHT = -0.9  # rad, of the elbow: straight at -0.47, beyond which it folds over and does not come back
+_FOLDED = -2.85  # rad, of the elbow folded up, short of its limit
+_ROLLS, _SWING = (
+    [0, 2, 4],
+    1.0,
+)  # joints that turn the arm about itself, and rad from which on they count as a miss
 _SITE = "gripper0_grip_site"
 
 
@@ -23,7 +28,7 @@ class Arm:
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dof = np.array([joint.dofadr[0] for joint in joints])
         self._low, self._high = np.array([joint.range for joint in joints]).T + [[_MARGIN], [-_MARGIN]]
-        self._high[3] = _STRAIGHT
+        self._low[3], self._high[3] = _FOLDED, _STRAIGHT
 
     def follow(
         self, start: np.ndarray, poses: list[tuple[np.ndarray, np.ndarray]]
@@ -62,4 +67,5 @@ class Arm:
             step += _REST * (np.eye(7) - inverse @ own) @ (np.array(REST_QPOS) - angles)
             angles = np.clip(angles + _GAIN * np.clip(step, -0.5, 0.5), self._low, self._high)
         miss = max(np.linalg.norm(away) - _POS, 0.0) + 0.1 * max(np.linalg.norm(turn) - _TURN, 0.0)
-        return angles, float(miss)
+        swing = np.abs(angles - start)[_ROLLS].max()
+        return angles, float(miss + 0.02 * max(swing - _SWING, 0.0))

@@ -80,7 +80,7 @@ class Expert:
     @property
     def trouble(self) -> str:
         """Why it cannot go on, or ""."""
-        return "" if self.skill is None else self.skill.trouble
+        return "" if self.skill is None or isinstance(self.skill, IntoContainer) else self.skill.trouble
 
     def act(self, view: StateView) -> np.ndarray:
         """The next action, (7,) in [-1, 1].
@@ -96,6 +96,9 @@ class Expert:
             self.skill = self._skill_for(steps[0], view) if steps else None
         if self.skill is None:
             return np.array([0.0] * 6 + [OPEN])
+        if isinstance(self.skill, IntoContainer) and self.skill.trouble:
+            self._retries = self.retries + 1
+            self.skill = PickPlace(self.skill.atom, style=self.style, shapes=self.shapes)
         return self.skill.act(view)
 
     def _skill_for(self, step: Step, view: StateView) -> Skill:

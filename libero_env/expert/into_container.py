@@ -18,6 +18,7 @@ from libero_env.scene import TIMESTEP
 Phase = Literal["reach", "close", "carry", "release", "rest"]
 
 CONTROL_HZ = 1.0 / (SUBSTEPS * TIMESTEP)
+ATTEMPTS, BACKINGS = 4, 3  # before it gives up
 ARRIVED = (
     0.012  # m; wide, so that the moment to close is passed in motion and not approached for ever by a clone
 )
@@ -25,6 +26,7 @@ ARRIVED_TURN = 0.12  # rad
 STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 AROUND = 0.08  # m, within which bodies count as in the way
+OUT_OF_REACH = 0.005  # m, by which the arm may miss where it should take hold
 HAND_OVER_RIM = 0.045  # m, of the grip site, so that the palm stays above a container
 
 
@@ -44,7 +46,7 @@ class IntoContainer:
     Attributes:
         phase: what it is doing.
         retries: how often it had to start over.
-        trouble: why it cannot go on, or "".
+        trouble: why it cannot go on, or ""; `PickPlace` may, which looks further for holds.
     """
 
     def __init__(self, atom: Atom, container: str, *, style: Style, shapes: Shapes):
@@ -59,12 +61,13 @@ class IntoContainer:
         self._offset = np.zeros(3)  # of the object from the grip site when it was taken
         self._steps, self._opening = 0, 0.0
         self._pressed, self._backing = 0, False  # steps that something resisted the way down; going up again
+        self._backings = 0  # times that the hand went up again
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
 
     @classmethod
     def container_of(cls, view: StateView, shapes: Shapes, atom: Atom) -> str | None:
-        """The container, where this skill can do it: it is movable, and the object fits between the fingers."""
+        """The container, where this skill can do it: it is movable, and the object in reach fits between the fingers."""
         region = view.scene.problem.region(atom.args[-1])
         if (
             atom.predicate != "In"
@@ -74,10 +77,12 @@ class IntoContainer:
         ):
             return None
         try:
-            cls(atom, region.target, style=Style(), shapes=shapes)._grasp_pose(view)
+            pos, mat = cls(atom, region.target, style=Style(), shapes=shapes)._grasp_pose(view)
         except GraspError:
             return None
-        return region.target
+        angles = view.simulations.fields["qpos"][view.index][:7]
+        _, miss = shapes.arm.follow(angles, [(pos + [0.0, 0.0, 0.1], mat), (pos, mat)])
+        return region.target if miss < OUT_OF_REACH else None
 
     @property
     def steadiness(self) -> float:
@@ -104,6 +109,8 @@ class IntoContainer:
 
     def _again(self) -> None:
         self.retries += 1
+        if self.retries > ATTEMPTS:
+            self.trouble = f"{self.atom.args} not reached in {self.retries} attempts"
         self._grasp = None
         self._enter("reach")
 
@@ -135,8 +142,10 @@ class IntoContainer:
         """The lift, or all of it while a finger that came to stand on something goes up and to the middle."""
         standing = height > goal_height + lift + STANDING and np.linalg.norm(self._velocity) < STILL
         self._pressed = self._pressed + 1 if standing and self._steps > 5 else 0
-        if self._pressed >= 3:
-            self._backing = True
+        if self._pressed >= 3 and not self._backing:
+            self._backing, self._backings = True, self._backings + 1
+            if self._backings > BACKINGS:
+                self.trouble = f"something is in the way of taking {self.thing} from above"
         clear = height > goal_height + self._rise - TIP_BELOW + 0.01
         if away < 0.006 and clear:
             self._backing = False

@@ -26,6 +26,7 @@ ARRIVED = (
 )
 ARRIVED_TURN = 0.12  # rad
 STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
+BESIDE = 0.05  # m, to either side of the hand that carries
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 LEVEL = 0.45  # vertical part of an approach below which it counts as level
 AROUND = 0.08  # m, within which bodies count as in the way
@@ -232,7 +233,7 @@ class PickPlace:
         funnel = style.slope * (away - near) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
         over[2] += np.clip(funnel, 0.0, 0.04)
         if away > 0.03 or turn > 0.4:
-            high = self._in_the_way(view, goal, self._radius(view)) + hang + 0.7 * style.margin
+            high = self._carried_over(view, goal) + hang + 0.7 * style.margin
             there = (
                 obstacle_height(self._others(view), goal, goal, 0.05, self._floor(view)) + hang + style.margin
             )
@@ -253,14 +254,15 @@ class PickPlace:
                 self._inside = True
             over = pre.copy()
             if away > 0.04 or turn > 0.4:
-                high = self._in_the_way(view, pre, self._radius(view)) + hang + 0.7 * self.style.margin
+                high = self._carried_over(view, pre) + hang + 0.7 * self.style.margin
                 over[2] = max(over[2], high)
             lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0)
             return self._toward(view, over, mat, CLOSE, lateral)
         left = float((goal - pos) @ entry)
         slow = np.linalg.norm(self._velocity) < 0.01
         self._pressed = self._pressed + 1 if slow and self._steps > 20 else 0
-        if left < 0.012 and np.linalg.norm(goal - pos) < 0.03 or self._pressed > 8:
+        short = 0.012 if evaluate(self.atom, view) else 0.004
+        if left < short and np.linalg.norm(goal - pos) < 0.03 or self._pressed > 8:
             self._hold = Pose(pos, mat)
             self._enter("release")
             return self._release(view)
@@ -313,9 +315,15 @@ class PickPlace:
     def _floor(self, view: StateView) -> float:
         return view.scene.workspace.surface_height
 
-    def _radius(self, view: StateView) -> float:
-        points = self.shapes.points(view, self._thing, 0.02)
-        return max(AROUND, float(np.linalg.norm(points[:, :2] - view.eef_pos[:2], axis=1).max()) + 0.01)
+    def _carried_over(self, view: StateView, goal: np.ndarray) -> float:
+        """Height of the highest thing that the object and the hand pass on the way of the hand to a goal, m."""
+        points = self.shapes.points(view, self._thing, 0.02)[:, :2]
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.01
+        aside = np.array([*(middle - view.eef_pos[:2]), 0.0])
+        others, floor = self._others(view), self._floor(view)
+        body = obstacle_height(others, view.eef_pos + aside, goal + aside, radius, floor)
+        return max(body, self._in_the_way(view, goal, BESIDE))
 
     def _in_the_way(self, view: StateView, goal: np.ndarray, radius: float) -> float:
         return obstacle_height(self._others(view), view.eef_pos, goal, radius, self._floor(view))
