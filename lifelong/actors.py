@@ -69,23 +69,50 @@ class PolicyActor:
             return self.policy.act(observation, self.draws).cpu().numpy().astype(np.float64)
 
 
+ORIGINAL_NAMES = {
+    "agentview_rgb": "agentview_image",
+    "eye_in_hand_rgb": "robot0_eye_in_hand_image",
+    "joint_states": "robot0_joint_pos",
+    "joint_velocities": "robot0_joint_vel",
+    "gripper_states": "robot0_gripper_qpos",
+    "gripper_velocities": "robot0_gripper_qvel",
+    "ee_pos": "robot0_eef_pos",
+    "ee_quat": "robot0_eef_quat",
+}
+
+
+def as_original(obs: Obs) -> dict[str, np.ndarray]:
+    """Observations under the names of LIBERO's own environments: pictures bottom up, quaternions xyzw."""
+    found = {}
+    for name, value in obs.items():
+        if name.endswith("_rgb"):
+            value = value[:, ::-1]
+        elif name == "ee_quat":
+            value = np.roll(value, -1, axis=-1)
+        found[ORIGINAL_NAMES.get(name, name)] = value
+    return found
+
+
 @dataclass
 class CallableActor:
     """An object of somebody else's with `predict(observations) -> actions`.
 
     `predict` is given what `libero_env.vector.BatchEnv` observes, (B, ...) arrays by name, with upright pictures,
-    and under "instruction" the text. It returns (B, 7) actions; the gripper opens at -1 and closes at +1. An optional
+    and under "instruction" the text. Rows of episodes that are over stay in it; what is answered for them is not
+    used. It returns (B, 7) actions; the gripper opens at -1 and closes at +1. An optional
     `reset(instruction, num_envs)` is called before each task's episodes.
 
     Attributes:
         policy: The object.
         instruction: What it is told.
         views: Entries of the observation that a recorded rollout shows.
+        original: Give observations as LIBERO's own environments do, see `as_original`.
     """
 
     policy: Any
     instruction: str
     views: tuple[str, ...]
+    original: bool = False
     action_dim: int = ACTION_DIM
 
     def reset(self, num_envs: int) -> None:
@@ -99,7 +126,8 @@ class CallableActor:
         Raises:
             PolicyError: The answer has another shape, or is not finite.
         """
-        answer = self.policy.predict({**obs, "instruction": self.instruction})
+        seen = as_original(obs) if self.original else obs
+        answer = self.policy.predict({**seen, "instruction": self.instruction})
         actions = np.asarray(answer.detach().cpu() if isinstance(answer, Tensor) else answer, np.float64)
         wanted = (len(next(iter(obs.values()))), self.action_dim)
         name = f"{type(self.policy).__name__}.predict"

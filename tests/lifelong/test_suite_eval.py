@@ -1,0 +1,228 @@
+"""Policies evaluated on tasks: fixed starts, what is done is kept, and anybody's policy may act."""
+
+import argparse
+import json
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero_env.tasks import get_suite
+from lifelong import cli
+from lifelong.actors import ORIGINAL_NAMES, CallableActor, as_original
+from lifelong.cli_eval import load_callable
+from lifelong.errors import ConfigError, LifelongError, PolicyError
+from lifelong.metrics import wilson_interval
+from lifelong.suite_eval import PROTOCOLS, Protocol, SuiteEvaluation, overall, starts
+
+pytestmark = pytest.mark.unit
+TASKS = get_suite("libero_goal").tasks[:2]
+MODULE = """
+import numpy as np
+
+class Policy:
+    cameras = ()
+    observations = ("proprioception", "ee_quat")
+    calls = []
+
+    def reset(self, instruction, num_envs):
+        self.calls.append((instruction, num_envs))
+
+    def predict(self, observations):
+        up = np.zeros((len(observations[{key!r}]), 7))
+        up[:, 2] = 1
+        return up
+
+def make():
+    return Policy()
+
+def nothing():
+    return object()
+"""
+
+
+class Countdown:
+    """Simulation i succeeds after as many steps as its start's number says; its goal has two parts."""
+
+    atoms = ("(Turnon stove_1)", "(On pot_1 stove_1)")
+
+    def __init__(self, num_envs: int):
+        self.num_envs = num_envs
+
+    def reset(self, *, seed=None, options=None):
+        self.goal, self.steps = np.asarray(options["init_state"]), 0
+        return {"x": np.zeros((self.num_envs, 1))}, self._info()
+
+    def _info(self):
+        done = self.steps >= self.goal
+        return {"success": done, "progress": np.stack([2 * self.steps >= self.goal, done], 1)}
+
+    def step(self, actions):
+        self.steps += 1
+        reached = self.steps == self.goal
+        return (
+            {"x": np.zeros((self.num_envs, 1))},
+            reached,
+            reached,
+            np.zeros(self.num_envs, bool),
+            self._info(),
+        )
+
+    def close(self):
+        pass
+
+
+class Still:
+    def __init__(self):
+        self.told = []
+
+    def predict(self, observations):
+        self.told.append(observations["instruction"])
+        return np.zeros((len(observations["x"]), 7))
+
+
+def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
+    policy = policy or Still()
+
+    @contextmanager
+    def actor(task):
+        yield CallableActor(policy, task.language, views=())
+
+    arguments = {
+        "what": {"policy": "still"},
+        "tasks": TASKS,
+        "init_states": (3, 4, 9, 20),
+        "protocol": Protocol(horizon=10, settle_steps=0),
+        "env": lambda task: Countdown(4),
+        "versions": {"mujoco": "3"},
+    }
+    return SuiteEvaluation(out=out, actor=actor, **(arguments | changes))
+
+
+def test_success_with_its_interval_in_all_and_by_task(tmp_path):
+    policy = Still()
+    results = evaluation(tmp_path, policy).run()
+    assert [r.successes for r in results] == [(True, True, True, False)] * 2
+    assert results[0].lengths == (3, 4, 9, 10) and results[0].steps == pytest.approx(16 / 3)
+    low, high = wilson_interval(3, 4)
+    assert (results[0].success.low, results[0].success.high) == (low, high)
+    assert set(policy.told) == {t.language for t in TASKS}
+    found = json.loads((tmp_path / "eval.json").read_text())
+    assert found["success"]["value"] == 0.75
+    both = overall(results)
+    assert low < both.low < 0.75 < both.high < high, "two tasks tell more than one"
+    assert found["predicates"] == {"Turnon": 1.0, "On": 0.75}
+    assert found["init_states"] == [3, 4, 9, 20] and found["evaluated"] == {"policy": "still"}
+
+
+def test_what_is_done_is_not_done_again(tmp_path):
+    first = evaluation(tmp_path, tasks=TASKS[:1]).run()
+
+    def env(task):
+        assert task is TASKS[1], "the first task's results are on disk"
+        return Countdown(4)
+
+    assert evaluation(tmp_path, env=env).run()[0] == first[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"what": {"policy": "moving"}},
+        {"protocol": Protocol(horizon=11, settle_steps=0)},
+        {"init_states": (3, 4, 9, 21)},
+        {"versions": {"mujoco": "4"}},
+    ],
+    ids=lambda c: next(iter(c)),
+)
+def test_results_of_something_else_are_not_mixed_in(tmp_path, changes):
+    evaluation(tmp_path).run()
+    with pytest.raises(ConfigError, match=r"libero_goal_00\.json.*--again"):
+        evaluation(tmp_path, **changes).run()
+
+
+def test_selection_and_reporting_are_apart():
+    chosen, reported = starts("selection", None, 15), starts("reporting", None, 15)
+    assert set(chosen).isdisjoint(reported) and set(chosen) | set(reported) == set(starts("all", None))
+    assert len(chosen) == 15 and starts("reporting", 4, 15) == (0, 1, 2, 3)
+    with pytest.raises(ConfigError, match="1 to 15"):
+        starts("selection", 16, 15)
+    with pytest.raises(ConfigError, match="valid: all, selection, reporting"):
+        starts("test", None)
+
+
+def test_protocols_know_every_suite():
+    for protocol in PROTOCOLS.values():
+        assert all(protocol.steps(task) > 0 for task in TASKS)
+    assert PROTOCOLS["openpi"].steps(TASKS[0]) == 300 and PROTOCOLS["libero"].steps(TASKS[0]) == 600
+
+
+def test_names_and_conventions_of_the_original():
+    frames = np.arange(2 * 3 * 4 * 3).reshape(2, 3, 4, 3)
+    found = as_original(
+        {"agentview_rgb": frames, "ee_quat": np.array([[1.0, 0, 0, 0]]), "other": np.zeros(2)}
+    )
+    np.testing.assert_array_equal(found["agentview_image"], frames[:, ::-1])
+    np.testing.assert_array_equal(found["robot0_eef_quat"], [[0, 0, 0, 1]])
+    assert "other" in found and set(ORIGINAL_NAMES) >= {"agentview_rgb", "ee_quat"}
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [(np.zeros((3, 6)), r"\(3, 6\); expected \(3, 7\)"), (np.full((3, 7), np.nan), "not finite")],
+)
+def test_answers_that_are_no_actions_are_refused(answer, said):
+    policy = argparse.Namespace(predict=lambda observations: answer)
+    with pytest.raises(PolicyError, match=said):
+        CallableActor(policy, "do it", ()).act({"x": np.zeros((3, 1))})
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    (tmp_path / "my_own_policy.py").write_text(MODULE.replace("{key!r}", "'robot0_eef_pos'"))
+    monkeypatch.chdir(tmp_path)
+    yield "my_own_policy"
+    sys.modules.pop("my_own_policy", None)
+
+
+def test_a_policy_from_a_module_of_the_working_directory(module):
+    before = list(sys.path)
+    assert load_callable(f"{module}:make").calls == []
+    assert sys.path == before
+    for text, said in (
+        ("nowhere_at_all:make", "No module"),
+        (f"{module}:mend", "mend"),
+        (f"{module}:nothing", "predict"),
+    ):
+        with pytest.raises(LifelongError, match=said):
+            load_callable(text)
+
+
+@pytest.mark.sim
+def test_from_the_command_line_with_a_policy_of_ones_own(module, tmp_path, capsys):
+    command = ["eval", f"{module}:make", "--suite", "libero_object/3", "--episodes", "2", "--horizon", "3"]
+    command += ["--protocol", "openpi", "--out", "found", "--threads", "1"]
+    assert cli.main(command) == 0
+    printed = capsys.readouterr().out
+    assert "libero_object/3" in printed and "0/2" in printed and "mean over tasks" in printed
+    found = json.loads((tmp_path / "found" / "eval.json").read_text())
+    assert found["tasks"][0]["lengths"] == [3, 3] and found["protocol"]["settle_steps"] == 10
+    calls = sys.modules[module].Policy.calls
+    assert calls == [(found["tasks"][0]["instruction"], 2)]
+    assert cli.main(command) == 0 and len(calls) == 1, "it is done"
+    assert cli.main([*command, "--again"]) == 0 and len(calls) == 2
+    assert cli.main([*command[:-4], "--out", "found", "--starts", "selection"]) == 2
+    assert "--again" in capsys.readouterr().err
+
+
+def test_what_cannot_be_evaluated_is_told_in_one_line(module, tmp_path, capsys):
+    for argv, said in (
+        ([f"{module}:make"], "which tasks?"),
+        ([f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"], "Valid: libero, openpi"),
+        ([str(tmp_path / "no_run")], "no run's directory"),
+    ):
+        assert cli.main(["eval", *argv]) == 2
+        err = capsys.readouterr().err
+        assert said in err and err.count("\n") == 1
