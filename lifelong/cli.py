@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from libero_env.errors import LiberoError
-from lifelong import cli_assets, cli_demos, cli_tasks, cli_teleop
+from lifelong import cli_assets, cli_demos, cli_eval, cli_tasks, cli_teleop
 from lifelong.errors import LifelongError
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
@@ -137,6 +137,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     cli_demos.register,
     cli_assets.register,
     cli_teleop.register,
+    cli_eval.register,
     register_report,
 )
 
