@@ -61,7 +61,7 @@ def download_demos(
     """
     folder = (dest or demos_dir()).expanduser().absolute()
     files = demo_files(names)
-    remote = {}
+    remote: dict[str, Remote] = {}
     for suite in dict.fromkeys(file.partition("/")[0] for file in files):
         remote |= dict(_listing(suite, revision))
     if absent := [file for file in files if file not in remote]:

@@ -1,24 +1,38 @@
 """What a file of demonstrations holds."""
 
+from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
+
+from libero_env.demos import demo_names, opened
+from libero_env.errors import DemoError
 
 
 def get_dataset_info(
-    dataset_path: str, filter_key: str | None = None, verbose: bool = True
+    dataset_path: str | Path, filter_key: str | None = None, verbose: bool = True
 ) -> dict[str, Any]:
     """Number and lengths of demonstrations, range of actions, observation keys and attributes of a file.
 
     Args:
         dataset_path: HDF5 file.
         filter_key: name of a subset in `mask`.
-        verbose: whether it is printed.
+        verbose: whether it is printed, without `structure`.
+
+    Returns:
+        `structure` holds for each demonstration the shapes of its arrays.
+
+    Raises:
+        DemoError: it is no file of demonstrations, or has no such subset.
     """
-    with h5py.File(dataset_path, "r") as file:
-        data = file["data"]
-        names = sorted(data) if filter_key is None else [n.decode() for n in file[f"mask/{filter_key}"][()]]
+    path = Path(dataset_path)
+    with opened(path) as file:
+        names, data = demo_names(file, path), file["data"]
+        if filter_key is not None:
+            if (masks := file.get("mask")) is None or filter_key not in masks:
+                known = ", ".join(masks or ()) or "none"
+                raise DemoError(f"{path}: no subset {filter_key!r} in mask; there are: {known}")
+            names = [name.decode() for name in masks[filter_key][()]]
         lengths = np.array([len(data[name]["actions"]) for name in names])
         actions = np.concatenate([data[name]["actions"][()] for name in names])
         info = {
@@ -32,8 +46,16 @@ def get_dataset_info(
             "action_max": float(actions.max()),
             "observations": {key: rows.shape[1:] for key, rows in data[names[0]].get("obs", {}).items()},
             "attributes": {key: value for key, value in data.attrs.items() if key != "bddl_file_content"},
+            "structure": {name: _shapes(data[name]) for name in names},
         }
-    if verbose:
-        for key, value in info.items():
+    for key, value in info.items() if verbose else ():
+        if key != "structure":
             print(f"{key}: {value}")
     return info
+
+
+def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
+    """Path below a group -> shape of the array there."""
+    found: dict[str, tuple[int, ...]] = {}
+    group.visititems(lambda name, item: found.update({name: item.shape}) if hasattr(item, "shape") else None)
+    return found

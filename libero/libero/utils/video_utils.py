@@ -1,14 +1,14 @@
 """Films of episodes."""
 
-import importlib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
-from PIL import Image
+
+from libero_env.demos_video import write_video
+from libero_env.errors import LiberoError
 
 _TINT = np.array([0, 255, 0])  # mixed into the pictures after success
 _SHARE = 0.2
@@ -17,7 +17,7 @@ _SHARE = 0.2
 class VideoWriter:
     """Collects pictures and writes them on `save`, or at the end of its block.
 
-    MP4 where the package imageio-ffmpeg is installed, else GIF.
+    MP4 where PyAV is installed (`pip install libero-lifelong[export]`), else GIF.
 
     Args:
         video_path: folder for the files.
@@ -90,14 +90,8 @@ class VideoWriter:
 
 def _write(path: Path, images: Sequence[np.ndarray], fps: int) -> Path:
     try:
-        importlib.import_module("imageio_ffmpeg")
-        imageio: Any = importlib.import_module("imageio.v2")
-    except ImportError:
-        warnings.warn("for MP4: pip install imageio imageio-ffmpeg; writing GIF", stacklevel=3)
-        first, *rest = map(Image.fromarray, images)
-        film = path.with_suffix(".gif")
-        first.save(film, save_all=True, append_images=rest, duration=1000 / fps, loop=0)
-        return film
-    film = path.with_suffix(".mp4")
-    imageio.mimwrite(film, images, fps=fps)
-    return film
+        return write_video(path.with_suffix(".mp4"), np.stack(images), fps)
+    except LiberoError as error:  # PyAV is missing, or the pictures have an odd size
+        warnings.warn(f"{error}; writing GIF", stacklevel=3)
+        path.with_suffix(".mp4").unlink(missing_ok=True)
+        return write_video(path.with_suffix(".gif"), np.stack(images), fps)

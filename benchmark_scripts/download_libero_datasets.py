@@ -1,0 +1,6 @@
+"""Runs libero.scripts.download_libero_datasets."""
+
+from libero.scripts.download_libero_datasets import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

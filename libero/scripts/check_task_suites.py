@@ -1,0 +1,52 @@
+"""Whether every task of the benchmark has a task file that can be read, and its initial states."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from libero.libero import get_libero_path
+from libero.libero.benchmark import Benchmark, get_benchmark, libero_suites
+from libero.scripts.command import run
+from libero_env import bddl
+from libero_env.errors import LiberoError
+from libero_env.original_states import read_states
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The script."""
+    parser = argparse.ArgumentParser(prog="check_task_suites.py", description=__doc__)
+    parser.add_argument("suites", nargs="*", default=libero_suites, help="such as libero_goal (default: all)")
+    return run(parser, check, argv)
+
+
+def check(args: argparse.Namespace) -> int:
+    """One line for each suite and each fault; 1 where there is one."""
+    bad = 0
+    for name in args.suites:
+        suite = get_benchmark(name)()
+        found = list(faults(suite))
+        for line in found:
+            print(f"FAIL  {line}")
+        print(f"{name}: {suite.n_tasks} tasks, {len(found)} faults")
+        bad += len(found)
+    return int(bad > 0)
+
+
+def faults(suite: Benchmark) -> Iterator[str]:
+    """What is wrong with the files of a suite."""
+    states = Path(get_libero_path("init_states"))
+    for i, task in enumerate(tqdm(suite.tasks, desc=suite.name, disable=None)):
+        try:
+            bddl.read(suite.get_task_bddl_file_path(i))
+            rows = read_states(states / task.problem_folder / task.init_states_file)
+        except (LiberoError, OSError) as error:
+            yield str(error)
+            continue
+        if rows.ndim != 2 or len(rows) < 50:
+            yield f"{task.init_states_file}: {rows.shape}; expected at least 50 states"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

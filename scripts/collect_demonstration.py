@@ -1,0 +1,6 @@
+"""Runs libero.scripts.collect_demonstration."""
+
+from libero.scripts.collect_demonstration import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,6 @@
+"""Runs libero.scripts.create_dataset."""
+
+from libero.scripts.create_dataset import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())
