@@ -67,7 +67,7 @@ def pretrain(
 ) -> None:
     """Train the policy jointly on other tasks, as algo=multitask does, without evaluating it on them.
 
-    Liu et al. 2023 (LIBERO, section 5.3) pretrain on LIBERO-90 and then learn another suite. It can be killed and
+    Liu et al. 2023 (LIBERO, figure 5) pretrain on LIBERO-90 and then learn another suite. It can be killed and
     goes on like a run; where it is done already, its weights are loaded.
 
     Args:

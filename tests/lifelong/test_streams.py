@@ -1,12 +1,15 @@
 """What is learned in which order: groups, few demonstrations, blurred boundaries, what a policy begins with."""
 
 import math
+import shlex
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 from lifelong import checkpoints
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
@@ -24,6 +27,7 @@ from tests.lifelong.fakes import Windows
 from tests.lifelong.test_sequence import Killed, Killer, assert_same, dataset, parts
 
 pytestmark = pytest.mark.unit
+ROOT = Path(__file__).parents[2]
 
 
 def stage_data(
@@ -345,3 +349,21 @@ def test_single_task_begins_each_task_with_what_was_there_before(tmp_path) -> No
     TaskSequence(p).run()
     initial = checkpoints.load(p.directory.task_path(2))["algorithm"]["initial"]
     assert_same(dict(initial), trained)
+
+
+def shown() -> list[list[str]]:
+    """The overrides of every command in docs/streams.md."""
+    lines = (ROOT / "docs" / "streams.md").read_text(encoding="utf-8").splitlines()
+    return [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("python train.py")]
+
+
+@pytest.mark.parametrize("overrides", shown(), ids=" ".join)
+def test_the_commands_of_the_guide_are_valid(overrides) -> None:
+    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
+        config = compose("config", overrides)
+    benchmark, stream, before = (
+        instantiate(config[group], _convert_="all") for group in ("benchmark", "stream", "pretrain")
+    )
+    tasks = benchmark.sequence()
+    assert len(stream.demos(config.data.demos, len(tasks), benchmark.group_size)) == len(tasks)
+    assert bool(before.sequence()) == any(o.startswith("pretrain") for o in overrides)
