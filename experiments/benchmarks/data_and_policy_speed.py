@@ -1,9 +1,8 @@
-"""How fast windows are gathered, images augmented, and policies trained.
+"""How fast windows are gathered, images augmented, and how fast policies act; training_speed.py measures training.
 
     python experiments/benchmarks/data_and_policy_speed.py [--threads 2] [--steps 5] [--only paper|small|data]
 
 Wall time is what counts on an idle machine; CPU time, beside it, hardly changes when others use the machine too.
-bfloat16 is left out where it does not run (see lifelong.nn.precision).
 """
 
 import argparse
@@ -16,7 +15,6 @@ import yaml
 
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.nn import ColorJitter, RandomShift
-from lifelong.nn.precision import bf16_runs_on_cpu
 from lifelong.policies import BCTransformer
 from lifelong.types import PolicySpec
 
@@ -44,21 +42,6 @@ def show(name: str, windows: int, seconds: tuple[float, float]) -> None:
     )
 
 
-def training_step(policy: BCTransformer, batch_size: int, bf16: bool) -> Callable[[], None]:
-    """Forward, backward and one step of AdamW on a fixed batch."""
-    batch = fake_batch(policy.spec, batch_size, torch.Generator().manual_seed(0))
-    optimizer = torch.optim.AdamW(policy.parameters())
-
-    def step() -> None:
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            loss = policy.loss(batch)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-
-    return step
-
-
 def measure_data(repeats: int) -> None:
     """Gathering and augmenting a batch of 32 windows."""
     for name, spec in (("128x128, T=10", PAPER), ("64x64, T=5", SMALL)):
@@ -76,21 +59,15 @@ def measure_data(repeats: int) -> None:
             show(f"{type(augmentation).__name__} of 32 windows, {name}", 32, timed(work, repeats))
 
 
-def measure_policy(name: str, spec: PolicySpec, sizes: dict, batch_size: int, repeats: int) -> None:
-    """A training step in each precision, and a step of acting in ten environments."""
+def measure_policy(name: str, spec: PolicySpec, sizes: dict, repeats: int) -> None:
+    """A step of acting in ten environments."""
     policy = BCTransformer(spec=spec, **sizes)
     count = sum(p.numel() for p in policy.parameters())
     print(f"{name}: {count} parameters")
-    for bf16 in (False, True):
-        label = f"train {name}, batch {batch_size}, {'bf16' if bf16 else 'fp32'}"
-        if bf16 and not bf16_runs_on_cpu():
-            print(f"{label:52} does not run here; try ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16")
-            continue
-        show(label, batch_size, timed(training_step(policy.train(), batch_size, bf16), repeats))
     observation = fake_batch(spec, 10, torch.Generator().manual_seed(0), steps=1).observation
     policy.eval().reset(10)
     act = lambda: policy.act(observation, [torch.Generator() for _ in range(10)])  # noqa: E731
-    show(f"act {name}, 10 environments, fp32", 10, timed(act, 2 * spec.seq_len))
+    show(f"act {name}, 10 environments, fp32", 10, timed(act, repeats * spec.seq_len))
 
 
 def main() -> None:
@@ -107,10 +84,9 @@ def main() -> None:
     if args.only in (None, "data"):
         measure_data(args.steps)
     if args.only in (None, "small"):
-        for batch_size in (32, 64):
-            measure_policy("small, 64x64, T=5", SMALL, SMALL_SIZES, batch_size, args.steps)
+        measure_policy("small, 64x64, T=5", SMALL, SMALL_SIZES, args.steps)
     if args.only in (None, "paper"):
-        measure_policy("paper, 128x128, T=10", PAPER, {}, 32, max(1, args.steps // 5))
+        measure_policy("paper, 128x128, T=10", PAPER, {}, args.steps)
 
 
 if __name__ == "__main__":
