@@ -49,6 +49,7 @@ _BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room 
 _TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
 _NEAR = 0.3  # m, around a body: what is further away is in no hand's way
 ASIDE = 0.16  # m, before a place that is entered from a side
+_WAYS_ROUND = np.ones(3), np.array([-1.0, -1.0, 1.0])  # the hand as it is, and turned by half
 _SIDES = 8  # directions of such approaches that are tried
 
 
@@ -78,7 +79,7 @@ class Approach:
 class Failure:
     """What was tried in vain: a hold, as a pose in the body's frame, and the place if the body got there."""
 
-    hold: Pose
+    hold: Pose | None
     place: Place | None = None
 
     @classmethod
@@ -125,6 +126,26 @@ def choose_approach(
         return best
     other, short = _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
     return other if short <= max(miss, _MISSED) else best
+
+
+def choose_place(
+    view: StateView,
+    shapes: Shapes,
+    atom: Atom,
+    share: tuple[int, int] = (0, 1),
+    failures: Sequence[Failure] = (),
+) -> Approach:
+    """Where to put what the hand holds already, as it holds it; arguments as of `choose_approach`.
+
+    Raises:
+        PlaceError: there is no room for it.
+    """
+    thing = atom.args[0]
+    cloud, pose = shapes.cloud(view, thing), pose_of(view, thing)
+    voxels = Voxels(shapes.others(view, thing, spacing=DENSE), view.scene.workspace.surface_height, pose.pos)
+    spots = _varied(_places_again(places(view, voxels, cloud, pose, atom, share), failures))
+    hold = Grasp(view.eef_pos, view.eef_mat, float(np.abs(view.finger_pos).sum()), 0.0)
+    return _reachable(view, shapes, _pairs(voxels, [hold], spots, pose), both_ways=False)[0]
 
 
 def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
@@ -215,7 +236,9 @@ def _failed_price(pose: Pose, grasp: Grasp, failures: Sequence[Failure]) -> floa
     """What it costs that holds like this one failed; either finger may be on either side."""
     hold = Pose(pose.invert(grasp.pos_world), pose.mat.T @ grasp.mat)
     turned = Pose(hold.pos, hold.mat * [-1.0, -1.0, 1.0])
-    return _AGAIN * sum(_alike(hold, f.hold) or _alike(turned, f.hold) for f in failures)
+    return _AGAIN * sum(
+        f.hold is not None and (_alike(hold, f.hold) or _alike(turned, f.hold)) for f in failures
+    )
 
 
 def _crowd_price(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
@@ -276,14 +299,16 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
     return sorted(found, key=lambda approach: approach.cost)
 
 
-def _reachable(view: StateView, shapes: Shapes, pairs: list[Approach]) -> tuple[Approach, float]:
+def _reachable(
+    view: StateView, shapes: Shapes, pairs: list[Approach], both_ways: bool = True
+) -> tuple[Approach, float]:
     """The first that the arm reaches, or the one it misses least; and by how much it does, as `Arm.follow`."""
     angles = view.simulations.fields["qpos"][view.index][:7]
     best: tuple[float, Approach] | None = None
     seen: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
     tried = 0
     for pair in pairs:
-        for side, flip in enumerate((np.ones(3), np.array([-1.0, -1.0, 1.0]))):  # the hand turned by half
+        for side, flip in enumerate(_WAYS_ROUND[: 1 + both_ways]):
             grasp, key = replace(pair.grasp, mat=pair.grasp.mat * flip), (id(pair.grasp), side)
             if key not in seen:
                 above = grasp.pos_world - 0.10 * grasp.mat[:, 2]

@@ -67,7 +67,7 @@ class IntoContainer:
 
     @classmethod
     def container_of(cls, view: StateView, shapes: Shapes, atom: Atom) -> str | None:
-        """The container, where this skill can do it: it is movable, and the object in reach fits between the fingers."""
+        """The container, where this skill can do it: it is movable, and the object can be taken from above."""
         region = view.scene.problem.region(atom.args[-1])
         if (
             atom.predicate != "In"

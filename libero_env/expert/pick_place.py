@@ -6,7 +6,8 @@ import numpy as np
 
 from libero_env.control import SUBSTEPS
 from libero_env.errors import LiberoError
-from libero_env.expert.approach import ASIDE, Approach, Failure, choose_approach
+from libero_env.expert.approach import Approach, Failure, choose_approach, choose_place
+from libero_env.expert.carry import Carry, Move
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import TIP_BELOW
@@ -26,12 +27,10 @@ ARRIVED = (
 )
 ARRIVED_TURN = 0.12  # rad
 STANDING, STILL = 0.008, 0.04  # m over where it should be, and slower than m/s: the hand stands on something
-BESIDE = 0.05  # m, to either side of the hand that carries
 FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 LEVEL = 0.45  # vertical part of an approach below which it counts as level
 AROUND = 0.08  # m, within which bodies count as in the way
-SLIPPED = 0.03  # m, that a body may move between the fingers
-GENTLE = 0.005  # m, over what carries it, where a body is let go
+DIVERTED = 3  # times that another place is chosen for what is in the hand
 PATIENCE = 25  # steps, to wait for an object to come to rest
 STUCK = 130  # steps of one phase
 
@@ -62,11 +61,11 @@ class PickPlace:
         self._way: Approach | None = None
         self._rise = 0.0  # m, back along the approach, where the fingers are clear of the object
         self._hold: Pose | None = None  # pose to keep while the fingers move
-        self._offset = np.zeros(3)  # of the object from the grip site when it was taken, in the hand's frame
+        self._carrying: Carry | None = None
+        self._diverted = 0  # times that another place was chosen on the way
         self._steps, self._opening = 0, 0.0
         self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
         self._stuck, self._backings = 0, 0  # steps without motion, and times it backed off
-        self._inside = False  # on the last stretch of a way in from the side
         self._failures: list[Failure] = []
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
@@ -128,7 +127,7 @@ class PickPlace:
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._steps = phase, 0
-        self._pressed, self._backing, self._inside = 0, False, False
+        self._pressed, self._backing = 0, False
         self._stuck, self._backings = 0, 0
 
     def _again(self, placed: bool = False) -> None:
@@ -200,73 +199,44 @@ class PickPlace:
             if opening < 0.002:
                 self._again()
                 return self._toward(view, view.eef_pos + [0, 0, 0.05], self._hold.mat, OPEN)
-            self._offset = view.eef_mat.T @ (view.body_pos(self._thing) - view.eef_pos)
+            self._carrying, self._diverted = None, 0
             self._enter("carry")
             return self._carry(view)
         return self._toward(view, self._hold.pos, self._hold.mat, CLOSE)
 
     def _carry(self, view: StateView) -> np.ndarray:
-        pos, style, way = view.eef_pos, self.style, self._way
-        offset = view.eef_mat.T @ (view.body_pos(self._thing) - pos)
-        if np.linalg.norm(offset - self._offset) > SLIPPED + 0.3 * np.linalg.norm(self._offset):
+        if self._carrying is None:
+            self._carrying = self._carry_to(view)
+        move = self._carrying.next(view, self._velocity)
+        if isinstance(move, Move):
+            return self._toward(view, move.pos, move.mat, CLOSE, move.lateral, move.slow)
+        if move == "lost":
             self._again()
-            return self._toward(view, pos, self._hold.mat, OPEN)
-        mat, entry = way.hand_mat, way.place.entry
-        goal = way.place.pos + [0, 0, way.lift + GENTLE] - mat @ offset
-        goal[:2] += (1.0 if way.lift > 0.06 else 0.2) * np.array(style.place_xy)
-        low = self.shapes.span(view, self._thing)[0]
-        hang = max(pos[2] - low, TIP_BELOW)
-        if entry[2] > -0.5:
-            return self._carry_aside(view, goal, mat, entry, hang)
-        away = float(np.linalg.norm(goal[:2] - pos[:2]))
-        turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
-        near = 0.03 if way.lift > 0.06 else 0.012
-        arrived = away < (0.025 if way.lift > 0.06 else 0.014) and turn < 0.2
-        slow = self._steps > 20 and np.linalg.norm(self._velocity) < 0.01
-        self._pressed = self._pressed + 1 if slow and away < 0.04 else 0
-        if arrived and pos[2] < goal[2] + (0.02 if way.lift > 0.06 else 0.006) or self._pressed > 6:
-            self._hold = Pose(np.array([*goal[:2], min(goal[2], pos[2])]) if arrived else pos, mat)
-            self._enter("release")
-            return self._release(view)
-        over = goal.copy()
-        # a funnel over the place
-        funnel = style.slope * (away - near) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
-        over[2] += np.clip(funnel, 0.0, 0.04)
-        if away > 0.03 or turn > 0.4:
-            high = self._carried_over(view, goal) + hang + 0.7 * style.margin
-            there = (
-                obstacle_height(self._others(view), goal, goal, 0.05, self._floor(view)) + hang + style.margin
-            )
-            over[2] = max(over[2], high, there)
-        lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0)
-        return self._toward(view, over, mat, CLOSE, lateral, slow=pos[2] - goal[2] < 0.04 and away < 0.05)
+            return self._toward(view, view.eef_pos, view.eef_mat, OPEN)
+        if move != "there" and self._elsewhere(view, blocked=move == "blocked"):
+            return self._toward(view, view.eef_pos, view.eef_mat, CLOSE)
+        self._hold = Pose(view.eef_pos, view.eef_mat)
+        self._enter("release")
+        return self._release(view)
 
-    def _carry_aside(
-        self, view: StateView, goal: np.ndarray, mat: np.ndarray, entry: np.ndarray, hang: float
-    ):
-        """Up, over to a point before the place, down, and in along the entry."""
-        pos = view.eef_pos
-        pre = goal - ASIDE * entry
-        turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
-        if not self._inside:
-            away = float(np.linalg.norm(pre[:2] - pos[:2]))
-            if np.linalg.norm(pre - pos) < 0.02 and turn < 0.2:
-                self._inside = True
-            over = pre.copy()
-            if away > 0.04 or turn > 0.4:
-                high = self._carried_over(view, pre) + hang + 0.7 * self.style.margin
-                over[2] = max(over[2], high)
-            lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0)
-            return self._toward(view, over, mat, CLOSE, lateral)
-        left = float((goal - pos) @ entry)
-        slow = np.linalg.norm(self._velocity) < 0.01
-        self._pressed = self._pressed + 1 if slow and self._steps > 20 else 0
-        short = 0.012 if evaluate(self.atom, view) else 0.004
-        if left < short and np.linalg.norm(goal - pos) < 0.03 or self._pressed > 8:
-            self._hold = Pose(pos, mat)
-            self._enter("release")
-            return self._release(view)
-        return self._toward(view, goal - max(left - 0.06, 0.0) * entry, mat, CLOSE)
+    def _carry_to(self, view: StateView, out: Pose | None = None) -> Carry:
+        return Carry(view, self.atom, self._way, style=self.style, shapes=self.shapes, out=out)
+
+    def _elsewhere(self, view: StateView, blocked: bool) -> bool:
+        """Choose a place anew for what is in the hand as it is; False where there is none, or it was often enough."""
+        self._diverted += 1
+        if self._diverted > DIVERTED:
+            return False
+        if blocked:
+            self._failures.append(Failure(None, self._way.place))
+        try:
+            way = choose_place(view, self.shapes, self.atom, self.share, self._failures)
+        except LiberoError:
+            return False
+        out = self._carrying.way_out(view)
+        self._way, self._steps = way, 0
+        self._carrying = self._carry_to(view, out)
+        return True
 
     def _release(self, view: StateView) -> np.ndarray:
         if self._steps <= self.style.pause:
@@ -312,21 +282,9 @@ class PickPlace:
     def _others(self, view: StateView) -> np.ndarray:
         return self.shapes.others(view, self._thing)
 
-    def _floor(self, view: StateView) -> float:
-        return view.scene.workspace.surface_height
-
-    def _carried_over(self, view: StateView, goal: np.ndarray) -> float:
-        """Height of the highest thing that the object and the hand pass on the way of the hand to a goal, m."""
-        points = self.shapes.points(view, self._thing, 0.02)[:, :2]
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.01
-        aside = np.array([*(middle - view.eef_pos[:2]), 0.0])
-        others, floor = self._others(view), self._floor(view)
-        body = obstacle_height(others, view.eef_pos + aside, goal + aside, radius, floor)
-        return max(body, self._in_the_way(view, goal, BESIDE))
-
     def _in_the_way(self, view: StateView, goal: np.ndarray, radius: float) -> float:
-        return obstacle_height(self._others(view), view.eef_pos, goal, radius, self._floor(view))
+        floor = view.scene.workspace.surface_height
+        return obstacle_height(self._others(view), view.eef_pos, goal, radius, floor)
 
 
 def _about(axis: np.ndarray, angle: float) -> np.ndarray:
