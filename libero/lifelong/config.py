@@ -68,7 +68,7 @@ def load_config(*overrides: str) -> Config:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             return Config(plain(compose("config", list(overrides))))
     finally:
-        if held.is_initialized():
+        if held.hydra is not None:
             GlobalHydra.instance().initialize(held.hydra)
 
 

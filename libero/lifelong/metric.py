@@ -117,7 +117,7 @@ def rollouts(
             with _opened(cfg, task, len(rows)) as env:
                 env.states = None if sim_states is None else sim_states[start : start + at_once]
                 env.watch = watch and (lambda *seen, s=start: watch(s, *seen))
-                actor = _PolicyActor(own, cfg, task_emb)
+                actor = _PolicyActor(own, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
                 horizon = int(cfg.eval.max_steps)
                 done.append(play(actor, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS))
     return done
@@ -198,20 +198,19 @@ class _PolicyActor:
     algo: Any
     cfg: Any
     task_emb: Tensor
+    views: tuple[str, ...]
     action_dim: int = 7
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        return tuple(self.cfg.data.obs.modality.rgb)
 
     def reset(self, num_envs: int) -> None:
         self.algo.eval()
         self.algo.reset()
 
     def act(self, obs: Obs) -> np.ndarray:
-        stacked = {key: obs[key][:, ::-1] if key in self.views else obs[key] for key in _keys(self.cfg)}
+        stacked = {
+            key: obs[key][:, ::-1] if key in self.views else _reading(obs, key) for key in _keys(self.cfg)
+        }
         actions = self.algo.policy.get_action(as_data(stacked, self.task_emb, self.cfg))
-        return np.asarray(actions, np.float64).reshape(len(stacked[self.views[0]]), -1)
+        return np.asarray(actions, np.float64).reshape(len(next(iter(stacked.values()))), -1)
 
 
 class _WatchedEnv:
@@ -236,7 +235,7 @@ class _WatchedEnv:
         running = self.env.running
         result = self.env.step(actions)
         for i in np.flatnonzero(running) if self.states is not None else ():
-            self.states[i].append(self._state(i))  # type: ignore[index]
+            self.states[i].append(self._state(int(i)))  # type: ignore[index]
         if self.watch is not None:
             self.watch(result[0], ~self.env.running)
         return result
@@ -279,6 +278,11 @@ def _foreign_states(folder: str | None, task: Any) -> np.ndarray | None:
     if not folder or folder == generated_paths()["init_states"] or not path.is_file():
         return None
     return read_states(path)
+
+
+def _reading(obs: Obs, key: str) -> np.ndarray:
+    """A reading under its name in the demonstration files, where position and rotation of the hand are one."""
+    return np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=-1) if key == "ee_states" else obs[key]
 
 
 def _keys(cfg: Any) -> list[str]:

@@ -105,7 +105,8 @@ def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
         raise ConfigError(
             f"data.task_group_size={size} does not divide the {count} tasks of {cfg.benchmark_name}"
         )
-    parts, shape_meta = [], {}
+    parts: list[SequenceDataset] = []
+    shape_meta: dict[str, Any] = {}
     for i in range(count):
         part, shape_meta = task_dataset(cfg, benchmark, i)
         parts.append(part)

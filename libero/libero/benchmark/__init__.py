@@ -178,8 +178,8 @@ class Benchmark:
 class _Suite(Benchmark):
     suite: ClassVar[str]
 
-    def __init__(self, task_order_index: int = 0):
-        super().__init__(task_order_index)
+    def __init__(self, task_order_index: int = 0, *, task_order: int | None = None):
+        super().__init__(task_order_index if task_order is None else task_order)
         self.name = self.suite
         self._make_benchmark()
 

@@ -29,16 +29,15 @@ class BCRNNPolicy(NativePolicy):
             raise PolicyError("rnn_bidirectional: a policy that acts cannot look ahead; set it to false")
         if policy.get("extra_num_layers"):
             raise PolicyError("extra_num_layers: this policy takes readings as they are; set it to 0")
-        network = BCRNN(
-            spec=self.spec,
-            image_embed=policy.image_embed_size,
-            text_embed=policy.text_embed_size,
-            rnn_hidden=policy.rnn_hidden_size,
-            rnn_layers=policy.rnn_num_layers,
-            dropout=policy.rnn_dropout,
+        sizes = {
+            "image_embed": policy.image_embed_size,
+            "text_embed": policy.text_embed_size,
+            "rnn_hidden": policy.rnn_hidden_size,
+            "rnn_layers": policy.rnn_num_layers,
+            "dropout": policy.rnn_dropout,
             **image_sizes(policy),
-            **more,
-        )
+        }
+        network = BCRNN(spec=self.spec, **{**sizes, **more})
         fuse_all(network, policy)
         network.language.linear = build_language(  # type: ignore[assignment]
             policy, "the RNN", policy.text_embed_size

@@ -22,13 +22,12 @@ class BCTransformerPolicy(NativePolicy):
     """Language, readings and cameras as tokens of a step, and a transformer over time."""
 
     def _network(self, policy: Any, more: dict[str, Any]) -> BCTransformer:
-        network = BCTransformer(
-            spec=self.spec,
-            embed_dim=policy.embed_size,
+        sizes = {
+            "embed_dim": policy.embed_size,
             **image_sizes(policy),
             **temporal_sizes(policy, policy.embed_size),
-            **more,
-        )
+        }
+        network = BCTransformer(spec=self.spec, **{**sizes, **more})
         fuse_all(network, policy)
         encode_positions(network, policy)
         network.language.linear = build_language(policy, "a token", policy.embed_size)  # type: ignore[assignment]

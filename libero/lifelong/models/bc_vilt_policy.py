@@ -27,18 +27,17 @@ class BCViLTPolicy(NativePolicy):
         if policy.spatial_transformer_dropout != policy.transformer_dropout:
             raise PolicyError("spatial_transformer_dropout and transformer_dropout must be equal")
         token = policy.spatial_down_sample_embed_size if policy.spatial_down_sample else embed_size
-        network = BCViLT(
-            spec=self.spec,
-            patch_embed=embed_size,
-            patch=square(patches.network_kwargs.patch_size),
-            spatial_layers=policy.spatial_transformer_num_layers,
-            spatial_heads=policy.spatial_transformer_num_heads,
-            spatial_head_dim=policy.spatial_transformer_head_output_size,
-            spatial_mlp_dim=policy.spatial_transformer_mlp_hidden_size,
-            embed_dim=token,
+        sizes = {
+            "patch_embed": embed_size,
+            "patch": square(patches.network_kwargs.patch_size),
+            "spatial_layers": policy.spatial_transformer_num_layers,
+            "spatial_heads": policy.spatial_transformer_num_heads,
+            "spatial_head_dim": policy.spatial_transformer_head_output_size,
+            "spatial_mlp_dim": policy.spatial_transformer_mlp_hidden_size,
+            "embed_dim": token,
             **temporal_sizes(policy, token),
-            **more,
-        )
+        }
+        network = BCViLT(spec=self.spec, **{**sizes, **more})
         encode_positions(network, policy)
         network.language.linear = build_language(policy, "a token", token)  # type: ignore[assignment]
         network.spatial_language.linear = build_language(  # type: ignore[assignment]

@@ -26,8 +26,8 @@ from lifelong.types import Observation
 class NativePolicy(BasePolicy, registered=False):
     """A `HistoryPolicy`, held as `network`; its checkpoints and this one's weights are interchangeable.
 
-    `cfg.policy.native` holds further arguments of the network, such as `norm: batch` or `normalise_proprio: false`,
-    with which it is the original's to the letter.
+    `cfg.policy.native` holds further arguments of the network. With `norm: batch`, `normalise_proprio: false` and
+    `standardise_language: false` it is the original's to the letter.
 
     Raises:
         PolicyError: a configuration that these networks cannot follow.
@@ -151,7 +151,8 @@ def encode_positions(network: Any, policy: Any) -> None:
     kwargs, codes = policy.temporal_position_encoding.network_kwargs, network.transformer.positions
     scale = kwargs.get("factor_ratio")
     codes.copy_(
-        sinusoidal_positions(*codes.shape, kwargs.inv_freq_factor) * (1.0 if scale is None else scale)
+        sinusoidal_positions(codes.shape[0], codes.shape[1], kwargs.inv_freq_factor)
+        * (1.0 if scale is None else scale)
     )
 
 

@@ -43,7 +43,7 @@ class SpatialProjection(nn.Module):
         if out_dim % 2:
             raise PolicyError(f"out_dim is {out_dim}; it must be even: two numbers for each keypoint")
         self.out_dim = out_dim
-        self.spatial_softmax = SpatialSoftmax(*input_shape, num_kp=out_dim // 2)
+        self.spatial_softmax = SpatialSoftmax(input_shape[0], input_shape[1], input_shape[2], out_dim // 2)
         self.projection = nn.Linear(out_dim, out_dim)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -175,9 +175,7 @@ def fuse(encoder: vision.ResNetFiLMEncoder, *, pretrained: bool, freeze: bool, l
         PolicyError: weights that there are not, or an unknown way to bring the instruction in.
     """
     if pretrained:
-        raise PolicyError(
-            "no pretrained ResNet comes with this package: pretrained=False, or load its weights yourself"
-        )
+        raise PolicyError("no pretrained ResNet comes with this package: set pretrained to false")
     if language_fusion not in ("film", "none"):
         raise PolicyError(f"language_fusion is {language_fusion!r}; valid: film, none")
     if language_fusion == "none":

@@ -1,0 +1,217 @@
+"""The facade's learning side: every public name of the original is there and does what it is for."""
+
+import importlib
+import json
+import random
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from libero.lifelong import utils
+from libero.lifelong.config import Config, load_config
+from libero.lifelong.datasets import (
+    GroupedTaskDataset,
+    SequenceVLDataset,
+    TruncatedSequenceDataset,
+    get_dataset,
+)
+from libero_env.errors import LiberoError
+from tests.libero.lifelong_data import LANGUAGE, SIZE, tiny, write_demos
+
+pytestmark = pytest.mark.unit
+
+NAMES = {
+    "libero.lifelong.datasets": "get_dataset SequenceVLDataset GroupedTaskDataset TruncatedSequenceDataset",
+    "libero.lifelong.algos": """Sequential SingleTask Multitask ER AGEM EWC PackNet get_algo_class get_algo_list
+        REGISTERED_ALGOS""",
+    "libero.lifelong.algos.base": "Sequential get_algo_class get_algo_list REGISTERED_ALGOS AlgoMeta register_algo",
+    "libero.lifelong.models": """get_policy_class get_policy_list BCRNNPolicy BCTransformerPolicy BCViLTPolicy
+        BasePolicy""",
+    "libero.lifelong.models.base_policy": """BasePolicy PolicyMeta REGISTERED_POLICIES register_policy get_policy_class
+        get_policy_list""",
+    "libero.lifelong.models.bc_rnn_policy": "BCRNNPolicy ExtraModalities",
+    "libero.lifelong.models.bc_transformer_policy": "BCTransformerPolicy ExtraModalityTokens PerturbationAttention",
+    "libero.lifelong.models.bc_vilt_policy": "BCViLTPolicy ExtraModalityTokens",
+    "libero.lifelong.models.policy_head": "GMMHead DeterministicHead",
+    "libero.lifelong.models.policy": "BasePolicy ResnetEncoder MLPEncoder SinusoidalPositionEncoding GMMHead",
+    "libero.lifelong.models.modules.rgb_modules": "ResnetEncoder PatchEncoder SpatialSoftmax SpatialProjection",
+    "libero.lifelong.models.modules.language_modules": "IdentityEncoder MLPEncoder",
+    "libero.lifelong.models.modules.transformer_modules": """SinusoidalPositionEncoding TransformerDecoder Attention
+        Norm TransformerFeedForwardNN DropPath""",
+    "libero.lifelong.models.modules.data_augmentation": """IdentityAug TranslationAug ImgColorJitterAug
+        BatchWiseImgColorJitterAug ImgColorJitterGroupAug DataAugGroup""",
+    "libero.lifelong.metric": """evaluate_one_task_success evaluate_success evaluate_multitask_training_success
+        evaluate_loss raw_obs_to_tensor_obs""",
+    "libero.lifelong.utils": """control_seed safe_device NpEncoder torch_save_model torch_load_model
+        get_train_test_loader create_experiment_dir compute_flops confidence_interval get_task_embs""",
+    "libero.lifelong.main": "main",
+    "libero.lifelong.evaluate": "main parse_args",
+}
+MODALITY = {
+    "rgb": ["agentview_rgb", "eye_in_hand_rgb"],
+    "depth": [],
+    "low_dim": ["gripper_states", "joint_states"],
+}
+
+
+@pytest.mark.parametrize("module", NAMES)
+def test_names(module):
+    found = importlib.import_module(module)
+    assert [name for name in NAMES[module].split() if not hasattr(found, name)] == []
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return write_demos(tmp_path_factory.mktemp("demos") / "task_demo.hdf5")
+
+
+def test_windows_are_the_files_frames(file):
+    dataset, shape_meta = get_dataset(file, MODALITY, seq_len=3)
+    assert (len(dataset), dataset.n_demos, dataset.total_num_sequences) == (9, 2, 9)
+    assert shape_meta["ac_dim"] == 7 and shape_meta["use_images"]
+    assert shape_meta["all_shapes"]["agentview_rgb"] == (3, SIZE, SIZE)
+    assert shape_meta["all_obs_keys"] == [*MODALITY["rgb"], *MODALITY["low_dim"]]
+    window = dataset[3]  # the last but one of five: one step is repeated
+    with h5py.File(file) as stored:
+        demo = stored["data/demo_0"]
+        image, joints, actions = (demo[k][()] for k in ("obs/agentview_rgb", "obs/joint_states", "actions"))
+    wanted = [3, 4, 4]
+    seen = (window["obs"]["agentview_rgb"] * 255).round().to(torch.uint8)
+    assert window["obs"]["agentview_rgb"].dtype == torch.float32
+    assert (seen.permute(0, 2, 3, 1).numpy() == image[wanted]).all(), "as stored, lowest row first"
+    assert np.allclose(window["obs"]["joint_states"], joints[wanted], atol=1e-6)
+    assert np.allclose(window["actions"], actions[wanted], atol=1e-6)
+    assert {k: tuple(v.shape) for k, v in window["obs"].items()} == {
+        "agentview_rgb": (3, 3, SIZE, SIZE), "eye_in_hand_rgb": (3, 3, SIZE, SIZE), "gripper_states": (3, 2),
+        "joint_states": (3, 7),
+    }  # fmt: skip
+
+
+def test_frames_may_be_stacked(file):
+    dataset, _ = get_dataset(file, ["rgb", "low_dim"], seq_len=2, frame_stack=3)
+    window, plain = dataset[6], get_dataset(file, ["rgb", "low_dim"], seq_len=2)[0]
+    joints = window["obs"]["joint_states"]
+    assert (joints.shape, window["actions"].shape) == ((4, 7), (2, 7))
+    first = plain[5]["obs"]["joint_states"][0]
+    assert (joints[0] == first).all() and (joints[1] == first).all(), "the past begins with the demonstration"
+    assert (joints[2:] == plain[6]["obs"]["joint_states"]).all()
+
+
+def test_a_subset_of_the_demonstrations(file, tmp_path):
+    path = tmp_path / "masked.hdf5"
+    path.write_bytes(file.read_bytes())
+    with h5py.File(path, "a") as stored:
+        stored["mask/valid"] = np.array([b"demo_1"])
+    dataset, _ = get_dataset(path, MODALITY, seq_len=2, filter_key="valid")
+    assert (dataset.n_demos, len(dataset)) == (1, 4)
+    with pytest.raises(LiberoError, match="there is valid"):
+        get_dataset(path, MODALITY, filter_key="train")
+
+
+def test_wrong_demonstrations_are_refused(file, tmp_path):
+    with pytest.raises(LiberoError, match="libero demos generate"):
+        get_dataset(tmp_path / "absent.hdf5", MODALITY)
+    with pytest.raises(LiberoError, match="frontview_rgb missing.*agentview_rgb"):
+        get_dataset(file, {"rgb": ["frontview_rgb"], "low_dim": []})
+
+
+def test_instructions_groups_and_parts(file):
+    dataset, _ = get_dataset(file, MODALITY, seq_len=2)
+    embs = torch.randn(2, LANGUAGE)
+    told = SequenceVLDataset(dataset, embs[0])
+    assert (told.n_demos, told.total_num_sequences, len(told)) == (2, 9, 9)
+    assert (told[1]["task_emb"] == embs[0]).all() and (told[1]["actions"] == dataset[1]["actions"]).all()
+    assert "task_emb" not in dataset[1]
+    group = GroupedTaskDataset([dataset, dataset], embs)
+    assert (len(group), group.n_demos, group.total_num_sequences) == (18, 4, 18)
+    assert (group[10]["task_emb"] == embs[1]).all() and (group[10]["actions"] == dataset[1]["actions"]).all()
+    few = TruncatedSequenceDataset(told, 3)
+    assert [tuple(b["actions"].shape) for b in DataLoader(few, batch_size=2)] == [(2, 2, 7), (1, 2, 7)]
+    with pytest.raises(IndexError):
+        few[3]
+
+
+def test_seeds_and_devices():
+    draws = []
+    for _ in range(2):
+        utils.control_seed(3)
+        draws.append((random.random(), np.random.rand(), torch.rand(()).item()))  # noqa: NPY002
+    assert draws[0] == draws[1]
+    assert utils.safe_device(torch.zeros(2), "cuda:0").device.type in ("cpu", "cuda")
+    assert utils.safe_device(nn.Linear(1, 1)).weight.device.type == "cpu"
+
+
+def test_checkpoints_hold_data_only(tmp_path):
+    model, path = nn.Linear(2, 3), tmp_path / "sub" / "model.pth"
+    cfg = load_config("seed=5")
+    utils.torch_save_model(
+        model, path, cfg=cfg, previous_masks={"weight": torch.ones(3, 2, dtype=torch.uint8)}
+    )
+    weights, loaded, masks = utils.torch_load_model(path, map_location="cuda")
+    assert torch.equal(weights["weight"], model.weight) and masks["weight"].sum() == 6
+    assert (
+        isinstance(loaded, Config) and loaded == cfg and loaded.train.optimizer.kwargs.betas == [0.9, 0.999]
+    )
+
+    class Foreign:
+        pass
+
+    torch.save({"state_dict": {}, "cfg": None, "evil": nn.Linear}, tmp_path / "evil.pth")
+    for broken in (tmp_path / "evil.pth", tmp_path / "absent.pth"):
+        with pytest.raises(LiberoError, match=broken.name):
+            utils.torch_load_model(broken)
+
+
+def test_json_of_numbers():
+    value = {"a": np.arange(2), "b": np.float32(0.5), "c": torch.ones(1), "d": np.bool_(True)}
+    assert json.loads(json.dumps(value, cls=utils.NpEncoder)) == {
+        "a": [0, 1],
+        "b": 0.5,
+        "c": [1.0],
+        "d": True,
+    }
+    with pytest.raises(TypeError):
+        json.dumps(object(), cls=utils.NpEncoder)
+
+
+def test_loaders_part_a_dataset(file):
+    dataset, _ = get_dataset(file, MODALITY)
+    train, test = utils.get_train_test_loader(dataset, 0.7, 2, 3)
+    parts = [
+        {tuple(a) for batch in loader for a in batch["actions"][:, 0].tolist()} for loader in (train, test)
+    ]
+    assert [len(p) for p in parts] == [6, 3] and not parts[0] & parts[1]
+
+
+def test_intervals_have_width():
+    assert utils.confidence_interval(0.5, 100) == pytest.approx(1.96 * 0.05, abs=0.002)
+    assert utils.confidence_interval(0.0, 20) == pytest.approx(utils.confidence_interval(1.0, 20))
+    assert utils.confidence_interval(0.0, 20) > 0.05
+
+
+def test_task_embeddings():
+    cfg = load_config()
+    embs = utils.get_task_embs(cfg, ["pick up the milk and place it in the basket"] * 2)
+    assert embs.shape == (2, 384) and cfg.policy.language_encoder.network_kwargs.input_size == 384
+    cfg = load_config("task_embedding_format=one-hot", "task_embedding_one_hot_offset=2")
+    assert utils.get_task_embs(cfg, ["a", "b", "c"]).argmax(1).tolist() == [2, 3, 4]
+    assert cfg.policy.language_encoder.network_kwargs.input_size == 5
+    cfg.task_embedding_format = "elmo"
+    with pytest.raises(LiberoError, match="roberta"):
+        utils.get_task_embs(cfg, ["a"])
+
+
+def test_experiments_are_numbered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cfg = tiny("lifelong=er", "seed=7")
+    assert (
+        utils.create_experiment_dir(cfg) == "experiments/LIBERO_SPATIAL/ER/BCTransformerPolicy_seed7/run_001"
+    )
+    assert cfg.experiment_name == "LIBERO_SPATIAL_ER_BCTransformerPolicy_seed7_run_001"
+    utils.create_experiment_dir(cfg)
+    assert cfg.experiment_dir.endswith("run_002")
+    assert utils.latest_run(utils.experiment_root(cfg)).name == "run_002"

@@ -1,0 +1,397 @@
+"""The original's algorithms, and classes that users derive from them. Success is given, so nothing is simulated."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import nn
+from torch.utils.data import DataLoader
+
+from libero.lifelong import algos, utils
+from libero.lifelong.algos import base, multitask
+from libero.lifelong.config import Config, plain
+from libero.lifelong.metric import evaluate_loss
+from libero.lifelong.models.base_policy import BasePolicy, get_policy_class
+from libero.lifelong.models.bc_transformer_policy import ExtraModalityTokens
+from libero.lifelong.models.modules.language_modules import MLPEncoder
+from libero.lifelong.models.modules.rgb_modules import ResnetEncoder
+from libero.lifelong.models.modules.transformer_modules import SinusoidalPositionEncoding, TransformerDecoder
+from libero.lifelong.models.policy_head import GMMHead
+from libero_env.errors import LiberoError
+from tests.libero.lifelong_data import tiny, windows, write_demos
+
+pytestmark = pytest.mark.unit
+
+GROUPS = ("base", "single_task", "er", "agem", "ewc", "packnet")
+
+
+class Tasks:
+    """As much of a benchmark as learning asks for."""
+
+    n_tasks = 2
+    task_embs = (None, None)
+
+    def get_task(self, i):
+        return i
+
+    def get_task_emb(self, i):
+        return self.task_embs[i]
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def succeed(monkeypatch):
+    """Successes to be told, one after the other; the calls that asked for them."""
+    asked = []
+
+    def give(*rates):
+        given = iter(rates)
+
+        def success(cfg, algo, task, emb, task_id, sim_states=None, task_str="", *, selecting=False):
+            asked.append((task_id, selecting, sim_states))
+            return next(given)
+
+        monkeypatch.setattr(base, "evaluate_one_task_success", success)
+        return asked
+
+    return give
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demos")
+    return [write_demos(folder / f"{i}.hdf5", seed=i) for i in range(2)]
+
+
+def learner(files, group: str = "base", *overrides: str):
+    cfg = tiny(
+        f"lifelong={group}", "train.use_augmentation=false", "+policy.native.image_width=8", *overrides
+    )
+    data = [windows(file, cfg, seed) for seed, file in enumerate(files)]
+    torch.manual_seed(0)
+    return algos.get_algo_class(cfg.lifelong.algo)(len(data), cfg), data, cfg
+
+
+def weights(algo) -> dict[str, torch.Tensor]:
+    return {name: p.detach().clone() for name, p in algo.policy.named_parameters()}
+
+
+def test_registry():
+    assert algos.get_algo_class("packnet") is algos.PackNet
+    assert {"Sequential", "SingleTask", "Multitask", "ER", "AGEM", "EWC", "PackNet"} <= set(
+        algos.get_algo_list()
+    )
+    with pytest.raises(LiberoError, match="AGEM"):
+        algos.get_algo_class("lwf2")
+
+
+def test_a_step_is_the_optimisers(files):
+    """observe is AdamW on the clipped gradient of the loss."""
+    algo, data, cfg = learner(
+        files, "base", "train.grad_clip=0.1", "policy.transformer_dropout=0", "train.loss_scale=3"
+    )
+    batch = next(iter(DataLoader(data[0], 4)))
+    algo.start_task(0)
+    twin = copy.deepcopy(algo.policy)
+    optimizer = torch.optim.AdamW(twin.parameters(), lr=1e-4, betas=(0.9, 0.999), weight_decay=1e-4)
+    loss = twin.compute_loss(batch)
+    (3 * loss).backward()
+    nn.utils.clip_grad_norm_(twin.parameters(), 0.1)
+    optimizer.step()
+    assert algo.eval_observe(batch) == pytest.approx(algo.observe(batch)) == pytest.approx(loss.item())
+    assert all(torch.equal(a, b) for a, b in zip(twin.parameters(), algo.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_two_tasks(group, files, succeed, capsys):
+    """Every algorithm learns two tasks, keeps the best epoch, and leaves what the original leaves."""
+    asked = succeed(*[0.0, 0.5, 1.0, 0.5] * 4)
+    post = ("lifelong.post_prune_epochs=1", "lifelong.post_eval_every=1") if group == "packnet" else ()
+    algo, data, cfg = learner(files, group, "train.n_epochs=3", *post)
+    algo.train()
+    rows = [algo.learn_one_task(dataset, i, Tasks(), {}) for i, dataset in enumerate(data)]
+    assert rows[0][0] == pytest.approx((0 + 0.5 + 1 + 1) / 4), "what follows the best counts as the best"
+    stored, loaded, masks = utils.torch_load_model(f"{cfg.experiment_dir}/task1_model.pth")
+    assert all(torch.equal(stored[n], p) for n, p in algo.policy.state_dict().items())
+    assert loaded.lifelong.algo == cfg.lifelong.algo and (masks is not None) == (group == "packnet")
+    curve = torch.load(f"{cfg.experiment_dir}/task0_auc.log")
+    assert curve["success"].tolist() == [0.0, 0.5, 1.0, 0.5] and curve["loss"].shape == (4,)
+    assert {task for task, *_ in asked} == {0, 1} and all(selecting for _, selecting, _ in asked)
+    assert "epoch   3" in capsys.readouterr().out
+    assert np.isfinite(evaluate_loss(cfg, algo, Tasks(), data)).all()
+    algo.reset()
+
+
+def test_without_evaluation_the_last_weights_are_kept(files):
+    algo, data, cfg = learner(files, "base", "eval.eval=false", "train.n_epochs=2", "eval.eval_every=5")
+    success, loss = algo.learn_one_task(data[0], 0, Tasks(), {})
+    assert success == 0 and np.isfinite(loss)
+    assert len(torch.load(f"{cfg.experiment_dir}/task0_auc.log")["loss"]) == 2  # before, and at the end
+
+
+def test_the_same_seed_gives_the_same_weights(files, succeed):
+    succeed(*[0.0, 1.0] * 9)
+    results = []
+    for seed in (3, 3, 4):
+        algo, data, _ = learner(files, "er", f"seed={seed}")
+        torch.manual_seed(0)  # dropout
+        algo.learn_all_tasks(data, Tasks(), {})
+        results.append(weights(algo))
+    same = [all(torch.equal(results[0][n], other[n]) for n in other) for other in results[1:]]
+    assert same == [True, False]
+
+
+def test_er_rehearses_a_sample_of_each_task(files, succeed, monkeypatch):
+    succeed(*[0.0, 1.0] * 9)
+    algo, data, _ = learner(files, "er", "lifelong.n_memories=3")
+    algo.learn_one_task(data[0], 0, Tasks(), {})
+    assert algo.hooks.memory.shares == {0: 3}
+    seen = []
+    monkeypatch.setattr(algo.policy, "forward", lambda d, f=algo.policy.forward: seen.append(d) or f(d))
+    algo.start_task(1)
+    algo.observe(next(iter(DataLoader(data[1], 4))))
+    assert seen[0]["actions"].shape[0] == 8, "as many windows again"
+    embs = seen[0]["task_emb"]
+    assert (embs[:4] == data[1].task_emb).all() and (embs[4:] == data[0].task_emb).all()
+    algo.end_task(data[1], 1, Tasks())
+    assert algo.hooks.memory.shares == {0: 3, 1: 3}
+
+
+def test_ewc_pulls_back_and_agem_projects(files, succeed):
+    succeed(*[0.0, 1.0] * 9)
+    algo, data, _ = learner(files, "ewc", "lifelong.e_lambda=7")
+    algo.learn_one_task(data[0], 0, Tasks(), {})
+    assert algo.hooks.penalty(algo.policy).item() == 0
+    with torch.no_grad():
+        next(algo.policy.network.head.means.parameters()).add_(0.1)
+    assert algo.hooks.penalty(algo.policy).item() > 0
+    algo, data, _ = learner(files, "agem")
+    algo.learn_one_task(data[0], 0, Tasks(), {})
+    algo.start_task(1)
+    before = weights(algo)
+    algo.observe(next(iter(DataLoader(data[1], 4))))
+    assert any(not torch.equal(before[n], p) for n, p in algo.policy.named_parameters())
+
+
+def test_packnet_forgets_nothing(files, succeed):
+    succeed(*[0.0, 1.0] * 9)
+    algo, data, cfg = learner(files, "packnet", "lifelong.post_prune_epochs=1", "lifelong.post_eval_every=1")
+    algo.learn_one_task(data[0], 0, Tasks(), {})
+    batch = next(iter(DataLoader(data[0], 4)))
+
+    def means(one):
+        with torch.no_grad():
+            return one.policy.eval()(batch).mean
+
+    first = means(algo.get_eval_algo(0))
+    algo.learn_one_task(data[1], 1, Tasks(), {})
+    assert torch.equal(means(algo.get_eval_algo(0)), first)
+    assert not torch.equal(means(algo.get_eval_algo(1)), first)
+    assert {v for m in algo.previous_masks.values() for v in m.unique().tolist()} == {0, 1, 2}
+    stored, _, masks = utils.torch_load_model(f"{cfg.experiment_dir}/task1_model.pth")
+    fresh, _, _ = learner(files, "packnet")
+    fresh.policy.load_state_dict(stored)
+    fresh.take_masks(masks, 1)
+    assert torch.equal(means(fresh.get_eval_algo(0)), first), "and out of a checkpoint"
+
+
+def test_single_task_keeps_a_policy_for_each(files, succeed):
+    succeed(*[0.0, 1.0] * 9)
+    algo, data, _ = learner(files, "single_task")
+    algo.learn_one_task(data[0], 0, Tasks(), {})
+    first = weights(algo)
+    algo.learn_one_task(data[1], 1, Tasks(), {})
+    with algo.acting_on(0):
+        assert all(torch.equal(first[n], p) for n, p in algo.policy.named_parameters())
+    assert any(not torch.equal(first[n], p) for n, p in algo.policy.named_parameters())
+
+
+def test_multitask_learns_all_at_once(files, monkeypatch):
+    rates = iter([[0.0, 0.0], [1.0, 0.5], [0.0, 0.5]])
+    monkeypatch.setattr(multitask, "evaluate_multitask_training_success", lambda *_: np.array(next(rates)))
+    algo, data, cfg = learner(files, "multitask", "lifelong.eval_in_train=true", "train.n_epochs=2")
+    success, _ = algo.learn_all_tasks(data, Tasks(), {})
+    assert success == pytest.approx((0 + 0.75 + 0.75) / 3)
+    best, _, _ = utils.torch_load_model(f"{cfg.experiment_dir}/multitask_model_ep1.pth")
+    kept, _, _ = utils.torch_load_model(f"{cfg.experiment_dir}/multitask_model.pth")
+    assert all(torch.equal(best[n], kept[n]) for n in best)
+
+
+def test_schedules_and_optimisers_are_torchs(files):
+    algo, _, _ = learner(files, "base", "train.optimizer.name=torch.optim.SGD", "~train.optimizer.kwargs.betas",
+                         "train.scheduler.name=torch.optim.lr_scheduler.StepLR", "~train.scheduler.kwargs.eta_min",
+                         "+train.scheduler.kwargs.step_size=2")  # fmt: skip
+    assert isinstance(algo.optimizer, torch.optim.SGD)
+    assert isinstance(algo.scheduler, torch.optim.lr_scheduler.StepLR)
+    with pytest.raises(LiberoError, match="AdamW"):
+        learner(files, "base", "train.optimizer.name=os.system")
+
+
+# --- what users derive
+
+
+class MyTransformerPolicy(BasePolicy):
+    """A policy put together from the parts, as the original's guide to algorithms does."""
+
+    def __init__(self, cfg, shape_meta):
+        super().__init__(cfg, shape_meta)
+        policy, size = cfg.policy, cfg.policy.embed_size
+        self.image_encoders = nn.ModuleDict(
+            {
+                name: ResnetEncoder(
+                    input_shape=shape,
+                    output_size=size,
+                    language_dim=policy.language_encoder.network_kwargs.input_size,
+                    **policy.image_encoder.network_kwargs,
+                )
+                for name, shape in shape_meta["all_shapes"].items()
+                if "rgb" in name
+            }
+        )
+        policy.language_encoder.network_kwargs.output_size = size
+        self.language_encoder = MLPEncoder(**policy.language_encoder.network_kwargs)
+        self.extra_encoder = ExtraModalityTokens(
+            use_joint=cfg.data.use_joint, use_gripper=cfg.data.use_gripper, use_ee=cfg.data.use_ee,
+            extra_num_layers=policy.extra_num_layers, extra_hidden_size=policy.extra_hidden_size,
+            extra_embedding_size=size,
+        )  # fmt: skip
+        policy.temporal_position_encoding.network_kwargs.input_size = size
+        self.positions = SinusoidalPositionEncoding(**policy.temporal_position_encoding.network_kwargs)
+        self.temporal_transformer = TransformerDecoder(
+            input_size=size,
+            num_layers=policy.transformer_num_layers,
+            num_heads=policy.transformer_num_heads,
+            head_output_size=policy.transformer_head_output_size,
+            mlp_hidden_size=policy.transformer_mlp_hidden_size,
+            dropout=policy.transformer_dropout,
+        )
+        kwargs = policy.policy_head.network_kwargs
+        kwargs.input_size, kwargs.output_size = size, shape_meta["ac_dim"]
+        self.policy_head = GMMHead(**policy.policy_head.loss_kwargs, **kwargs)
+        self.latent_queue = []
+
+    def encode(self, data):
+        extra = self.extra_encoder(data["obs"])
+        b, t = extra.shape[:2]
+        encoded = [self.language_encoder(data).view(b, 1, 1, -1).expand(-1, t, -1, -1), extra]
+        for name, encoder in self.image_encoders.items():
+            x = data["obs"][name]
+            langs = data["task_emb"].reshape(b, 1, -1).repeat(1, t, 1).flatten(0, 1)
+            encoded.append(encoder(x.flatten(0, 1), langs=langs).view(b, t, 1, -1))
+        return torch.cat(encoded, -2)
+
+    def over_time(self, x):
+        x = x + self.positions(x).unsqueeze(1)
+        self.temporal_transformer.compute_mask(x.shape)
+        return self.temporal_transformer(x.flatten(1, 2)).view_as(x)[:, :, 0]
+
+    def forward(self, data):
+        return self.policy_head(self.over_time(self.encode(data)))
+
+    def get_action(self, data):
+        self.eval()
+        with torch.no_grad():
+            data = self.preprocess_input(data, train_mode=False)
+            self.latent_queue = [*self.latent_queue, self.encode(data)][-10:]
+            dist = self.policy_head(self.over_time(torch.cat(self.latent_queue, dim=1))[:, -1])
+        return dist.sample().numpy()
+
+    def reset(self):
+        self.latent_queue = []
+
+
+class MyLifelongAlgo(algos.Sequential):
+    """Sees every batch and every task's end."""
+
+    def __init__(self, n_tasks, cfg, **policy_kwargs):
+        super().__init__(n_tasks=n_tasks, cfg=cfg, **policy_kwargs)
+        self.datasets, self.losses = [], []
+        self.policy = MyTransformerPolicy(cfg, cfg.shape_meta)
+
+    def observe(self, data):
+        self.losses.append(super().observe(data))
+        return self.losses[-1]
+
+    def end_task(self, dataset, task_id, benchmark, env=None):
+        self.datasets.append(dataset)
+
+
+def test_an_algorithm_and_a_policy_of_ones_own(files, succeed):
+    succeed(*[0.0, 1.0] * 9)
+    assert algos.get_algo_class("MyLifelongAlgo") is MyLifelongAlgo
+    assert get_policy_class("MyTransformerPolicy") is MyTransformerPolicy
+    _, data, cfg = learner(files)
+    algo = utils.safe_device(MyLifelongAlgo(2, cfg), cfg.device)
+    before = weights(algo)
+    summary = {"S_fwd": np.zeros(2), "L_fwd": np.zeros(2)}
+    for i in range(2):
+        algo.train()
+        summary["S_fwd"][i], summary["L_fwd"][i] = algo.learn_one_task(data[i], i, Tasks(), summary)
+    assert algo.datasets == data and len(algo.losses) == 2 * 3  # nine windows in batches of four
+    assert all(
+        not torch.equal(before[n], p) for n, p in algo.policy.named_parameters() if "heat.bias" not in n
+    )
+    gflops, mparams = utils.compute_flops(algo, data[0], cfg)
+    assert gflops > 0 and mparams == pytest.approx(sum(p.numel() for p in algo.policy.parameters()) / 1e6)
+
+
+class CustomLifelongAlgorithm(algos.Sequential):
+    """A loop of one's own with replay and EWC, as a teacher of the original writes it."""
+
+    def __init__(self, n_tasks, **kwargs):
+        super().__init__(n_tasks, **kwargs)
+        self.replay_buffer, self.fisher_information, self.old_params = [], {}, {}
+
+    def learn_one_task(self, task_id, train_data, cfg):
+        mixed = [*train_data, *self.replay_buffer] if task_id > 0 else train_data
+        loader = DataLoader(mixed, batch_size=cfg.train.batch_size, shuffle=True)
+        for _ in range(cfg.train.n_epochs):
+            for batch in loader:
+                loss = -self.policy(batch).log_prob(batch["actions"]).mean()
+                if task_id > 0:
+                    loss = loss + 1000 * self._compute_ewc_loss()
+                self.optimizer.zero_grad()
+                loss.backward()
+                self.optimizer.step()
+        self.replay_buffer += [train_data[i] for i in range(2)]
+        for name, param in self.policy.named_parameters():
+            self.old_params[name] = param.data.clone()
+            self.fisher_information[name] = (
+                torch.zeros_like(param) if param.grad is None else param.grad.data**2
+            )
+
+    def _compute_ewc_loss(self):
+        return sum(
+            (self.fisher_information[name] * (param - self.old_params[name]) ** 2).sum()
+            for name, param in self.policy.named_parameters()
+        )
+
+
+def test_a_loop_of_ones_own(files):
+    _, data, cfg = learner(files)
+    algorithm = CustomLifelongAlgorithm(2, cfg=cfg)
+    for task_id in range(2):
+        before = weights(algorithm)
+        algorithm.learn_one_task(task_id, data[task_id], cfg)
+        assert any(not torch.equal(before[n], p) for n, p in algorithm.policy.named_parameters())
+    assert algorithm.n_tasks == 2 and len(algorithm.replay_buffer) == 4
+
+
+def test_configurations_of_other_kinds(files, succeed):
+    """Hydra's own, as composed, and plain attribute dictionaries do as well."""
+    succeed(*[0.0, 1.0] * 9)
+    _, data, cfg = learner(files)
+    composed = OmegaConf.create(plain(cfg))
+    OmegaConf.set_struct(composed, True)
+    del composed.experiment_dir, composed.experiment_name
+    algo = algos.Sequential(2, composed)
+    assert composed.experiment_dir.endswith("run_002")
+    algo.learn_one_task(data[0], 0, Tasks(), {})
+    _, stored, _ = utils.torch_load_model(f"{composed.experiment_dir}/task0_model.pth")
+    assert isinstance(stored, Config) and stored.policy.embed_size == 8

@@ -1,0 +1,305 @@
+"""The original's policies and their parts: sizes, learning, acting, and what they refuse."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from libero.lifelong import models
+from libero.lifelong.config import load_config
+from libero.lifelong.models import bc_rnn_policy, bc_transformer_policy
+from libero.lifelong.models.modules import data_augmentation as aug
+from libero.lifelong.models.modules import language_modules, rgb_modules, transformer_modules
+from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
+from libero_env.errors import LiberoError
+from lifelong.types import Observation
+from tests.libero.lifelong_data import TINY, TINY_TRANSFORMER, windows, write_demos
+
+pytestmark = pytest.mark.unit
+
+VIEWS = ("agentview_rgb", "eye_in_hand_rgb")
+SHAPES = {
+    "ac_dim": 7,
+    "all_shapes": {
+        "agentview_rgb": (3, 128, 128),
+        "eye_in_hand_rgb": (3, 128, 128),
+        "gripper_states": (2,),
+        "joint_states": (7,),
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return write_demos(tmp_path_factory.mktemp("demos") / "task_demo.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("group", "count"),
+    [("bc_rnn_policy", 19_105_707), ("bc_transformer_policy", 5_383_307), ("bc_vilt_policy", 7_917_963)],
+)
+def test_sizes_are_the_originals(group, count):
+    cfg = load_config(f"policy={group}", "device=cpu")
+    policy = models.get_policy_class(cfg.policy.policy_type.lower())(cfg, SHAPES)
+    assert sum(p.numel() for p in policy.parameters()) == count
+    assert models.get_policy_list()[cfg.policy.policy_type] is type(policy)
+
+
+SMALL = {
+    "bc_rnn_policy": (
+        "policy.image_embed_size=8", "policy.text_embed_size=8", "policy.rnn_hidden_size=8", "policy.rnn_num_layers=1",
+        "+policy.native.image_width=8",
+    ),
+    "bc_transformer_policy": ("+policy.native.image_width=8",),
+    "bc_vilt_policy": (
+        "policy.spatial_down_sample_embed_size=8", "policy.spatial_transformer_num_layers=1",
+        "policy.spatial_transformer_num_heads=2", "policy.spatial_transformer_head_output_size=4",
+        "policy.spatial_transformer_mlp_hidden_size=8", "+policy.native.patch_width=8",
+    ),
+}  # fmt: skip
+
+
+def small(group: str, file, *overrides: str):
+    """A policy with few weights, and windows for it."""
+    skip = ("policy.transformer", "policy.embed") if group == "bc_rnn_policy" else ()
+    skip += ("policy.image_encoder",) if group == "bc_vilt_policy" else ()
+    wanted = [o for o in (*TINY, *TINY_TRANSFORMER) if not o.startswith(skip or ("-",))]
+    cfg = load_config(f"policy={group}", *wanted, *SMALL[group], *overrides)
+    dataset = windows(file, cfg)
+    torch.manual_seed(0)
+    return models.get_policy_class(cfg.policy.policy_type)(cfg, cfg.shape_meta), next(
+        iter(DataLoader(dataset, batch_size=4))
+    )
+
+
+@pytest.mark.parametrize("group", SMALL)
+def test_policies_learn_and_act(group, file):
+    policy, batch = small(group, file, "train.use_augmentation=false", "+policy.native.dropout=0.0")
+    kept = copy.deepcopy(batch)
+    each = policy.compute_loss(batch, reduction="none")
+    assert each.shape == batch["actions"].shape[:2]
+    assert torch.allclose(policy.compute_loss(batch), each.mean())
+    assert torch.allclose(-policy(batch).log_prob(batch["actions"]), each)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=1e-2)
+    before = policy.compute_loss(batch).item()
+    for _ in range(12):
+        optimizer.zero_grad()
+        policy.compute_loss(batch).backward()
+        optimizer.step()
+    assert policy.compute_loss(batch).item() < before - 0.5
+    assert all((a == b).all() for a, b in zip(_leaves(batch), _leaves(kept), strict=True)), (
+        "a batch is not changed"
+    )
+    frame = {"obs": {k: v[:, 0] for k, v in batch["obs"].items()}, "task_emb": batch["task_emb"]}
+    policy.reset()
+    action = policy.get_action(frame)
+    assert isinstance(action, np.ndarray) and action.shape == (4, 7) and np.abs(action).max() <= 1
+
+
+def _leaves(node):
+    return [x for v in node.values() for x in _leaves(v)] if isinstance(node, dict) else [node]
+
+
+@pytest.mark.parametrize("group", SMALL)
+def test_acting_sees_what_training_saw(group, file):
+    """The distribution at the third of three frames that come one by one is that of the window's last step."""
+    policy, batch = small(group, file)
+    policy.eval()
+    seen = []
+    policy.policy_head.register_forward_hook(lambda *_: seen.append(_[2]))
+    with torch.no_grad():
+        whole = policy.forward(policy.preprocess_input(batch, train_mode=True))
+    policy.reset()
+    for t in range(3):
+        policy.get_action(
+            {"obs": {k: v[:, t] for k, v in batch["obs"].items()}, "task_emb": batch["task_emb"]}
+        )
+    assert torch.allclose(seen[-1].mean, whole.mean[:, -1], atol=1e-5)
+
+
+def test_the_rnn_carries_its_state_and_empties_it(file):
+    policy, batch = small("bc_rnn_policy", file)
+    frame = {"obs": {k: v[:, 0] for k, v in batch["obs"].items()}, "task_emb": batch["task_emb"]}
+    ages = []
+    for _ in range(5):
+        policy.get_action(frame)
+        ages.append(policy._age)
+    assert ages == [1, 2, 3, 1, 2]
+    _, state = policy(batch, return_state=True)
+    again = policy(batch, init_state=state)
+    assert not torch.allclose(again.mean, policy(batch).mean)
+
+
+def test_weights_are_the_native_networks(file):
+    """A native checkpoint fits, and upright bytes there are the same pictures as floats upside down here."""
+    policy, batch = small("bc_transformer_policy", file)
+    policy.eval()
+    native = copy.deepcopy(policy.network)
+    views = torch.stack([batch["obs"][v].flip(-2) for v in VIEWS], 2).movedim(-3, -1)
+    obs = Observation((views * 255).round().to(torch.uint8), batch["obs"], batch["task_emb"])
+    with torch.no_grad():
+        assert torch.allclose(native.distribution(obs)["means"], policy(batch).component_distribution.mean)
+
+
+def test_configured_variants(file):
+    policy, batch = small(
+        "bc_transformer_policy", file, "policy.extra_num_layers=2", "policy/language_encoder=rnn_encoder",
+        "policy/policy_head=deterministic_head", "policy.policy_head.network_kwargs.hidden_size=8",
+        "policy.image_encoder.network_kwargs.freeze=true", "policy.image_encoder.network_kwargs.language_fusion=none",
+        "policy/data_augmentation@policy.color_aug=img_color_jitter_group_aug",
+        "policy/data_augmentation@policy.translation_aug=translation_aug_group", "data.use_ee=true",
+        "data.obs.modality.low_dim=[gripper_states,joint_states,ee_states]",
+    )  # fmt: skip
+    policy.compute_loss(batch).backward()
+    assert policy(batch).shape == (4, 3, 7)
+    names = {n.split(".")[1] for n, p in policy.named_parameters() if p.requires_grad and p.grad is not None}
+    assert names == {"language", "proprio", "transformer", "head"}, "the image encoders are frozen"
+    assert len(policy.network.proprio.linears) == 3
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["policy.image_encoder.network_kwargs.pretrained=true"], "pretrained"),
+        (["policy.policy_head.network_kwargs.activation=exp"], "softplus"),
+        (["policy.transformer_input_size=5"], "transformer_input_size"),
+        (["policy/language_encoder=identity_encoder"], "IdentityEncoder"),
+        (["policy.color_aug.network=Blur"], "BatchWiseImgColorJitterAug"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(overrides, message, file):
+    with pytest.raises(LiberoError, match=message):
+        small("bc_transformer_policy", file, *overrides)
+
+
+def test_extra_modalities():
+    obs = {
+        "joint_states": torch.randn(2, 3, 7),
+        "gripper_states": torch.randn(2, 3, 2),
+        "ee_states": torch.randn(2, 3, 6),
+    }
+    plain = bc_rnn_policy.ExtraModalities(use_joint=True, use_gripper=True, use_ee=True)
+    assert torch.equal(
+        plain(obs), torch.cat([obs["joint_states"], obs["gripper_states"], obs["ee_states"][..., :3]], -1)
+    )
+    assert bc_rnn_policy.ExtraModalities(use_joint=True, extra_num_layers=1)(obs).shape == (2, 3, 32)
+    tokens = bc_transformer_policy.ExtraModalityTokens(True, True, True, extra_embedding_size=8)
+    assert (tokens.num_extra, tokens(obs).shape) == (3, (2, 3, 3, 8))
+    with pytest.raises(LiberoError, match="use_joint"):
+        bc_transformer_policy.ExtraModalityTokens()
+
+
+class OnePatch(nn.Module):
+    """Acts on the brightness of one patch of one camera."""
+
+    def forward(self, data):
+        value = data["obs"]["agentview_rgb"][..., 8:16, 0:8].mean((-1, -2, -3))
+        return value[..., None].expand(*value.shape, 7)
+
+
+def test_perturbation_attention_finds_what_is_looked_at():
+    obs = {"agentview_rgb": torch.rand(2, 3, 32, 32), "eye_in_hand_rgb": torch.rand(2, 3, 32, 32)}
+    obs["agentview_rgb"][..., 8:16, 0:8] = 1.0
+    found = bc_transformer_policy.PerturbationAttention(OnePatch(), (32, 32), (8, 8))({"obs": obs})
+    assert found["agentview_rgb"].shape == (2, 4, 4)
+    assert (found["agentview_rgb"][:, 1, 0] > 0.1).all()
+    found["agentview_rgb"][:, 1, 0] = 0
+    assert not found["agentview_rgb"].any() and not found["eye_in_hand_rgb"].any()
+
+
+def test_image_modules():
+    x = torch.rand(6, 3, 64, 64)
+    encoder = rgb_modules.ResnetEncoder((3, 64, 64), 16, remove_layer_num=4, language_dim=5)
+    assert encoder(x).shape == encoder(x, torch.randn(2, 5)).shape == (6, 16)
+    assert encoder.output_shape() == (16,)
+    frozen = rgb_modules.ResnetEncoder((3, 64, 64), freeze=True, remove_layer_num=5, no_stride=True)
+    assert not any(p.requires_grad for p in frozen.parameters())
+    deaf = rgb_modules.ResnetEncoder((3, 64, 64), remove_layer_num=5, language_dim=5, language_fusion="none")
+    assert torch.equal(deaf(x, torch.randn(6, 5)), deaf(x))
+    assert rgb_modules.PatchEncoder((3, 64, 32), (8, 8), embed_size=4)(x[..., :32]).shape == (6, 4, 4, 2)
+    heat = torch.full((1, 2, 5, 5), -50.0)
+    heat[0, 0, 0, 4], heat[0, 1, 4, 2] = 50, 50
+    assert torch.allclose(rgb_modules.SpatialSoftmax(2, 5, 5)(heat), torch.tensor([[1.0, -1, 0, 1]]))
+    projection = rgb_modules.SpatialProjection((3, 8, 8), 6)
+    assert projection(torch.rand(2, 3, 8, 8)).shape == projection.output_shape((2, 3, 8, 8)) == (2, 6)
+    with pytest.raises(LiberoError, match="remove_layer_num"):
+        rgb_modules.ResnetEncoder((3, 64, 64), remove_layer_num=7)
+
+
+def test_language_modules():
+    emb = torch.randn(3, 5)
+    assert torch.equal(language_modules.IdentityEncoder()({"task_emb": emb}), emb)
+    encoder = language_modules.MLPEncoder(5, 8, 2, 4)
+    assert torch.equal(encoder({"task_emb": emb}), encoder(emb)) and encoder(emb).shape == (3, 4)
+    assert len(language_modules.MLPEncoder(5, 8, 1, 4).projection) == 1
+    assert language_modules.RNNEncoder(5, 8, 1, 4)(emb).shape == (3, 4)
+    assert language_modules.CLIPEncoder(output_size=4)(torch.randn(3, 512)).shape == (3, 4)
+
+
+def test_transformer_modules():
+    x = torch.randn(2, 3, 4, 8)  # B, T, M, E
+    codes = transformer_modules.SinusoidalPositionEncoding(8)(x)
+    assert codes.shape == (3, 8) and torch.allclose(
+        codes[1, :2], torch.tensor([np.sin(1.0), np.cos(1.0)]).float()
+    )
+    decoder = transformer_modules.TransformerDecoder(8, 2, 2, 4, 16, 0.0).eval()
+    decoder.compute_mask(x.shape)
+    out = decoder(x.flatten(1, 2)).view_as(x)
+    later = x.clone()
+    later[:, 2] += 1
+    changed = decoder(later.flatten(1, 2)).view_as(x)
+    assert torch.allclose(out[:, :2], changed[:, :2], atol=1e-6) and not torch.allclose(
+        out[:, 2], changed[:, 2]
+    )
+    attention = transformer_modules.Attention(8, num_heads=2, head_output_size=4).eval()
+    tokens = x.flatten(1, 2)
+    alone = attention(tokens, torch.eye(12))
+    values = tokens @ attention.qkv.weight[16:].T
+    assert torch.allclose(alone, attention.output_layer(values), atol=1e-5), "a token that sees only itself"
+    assert transformer_modules.TransformerFeedForwardNN(8, 16)(tokens).shape == tokens.shape
+    assert torch.allclose(transformer_modules.Norm(8)(x).mean(-1), torch.zeros(2, 3, 4), atol=1e-5)
+    drop, ones = transformer_modules.DropPath(0.5), torch.ones(64, 3)
+    torch.manual_seed(0)
+    assert set(drop(ones).unique().tolist()) == {0.0, 2.0}
+    assert torch.equal(drop.eval()(ones), ones)
+
+
+def test_heads():
+    latent, actions = torch.randn(4, 3, 6), torch.rand(4, 3, 7) * 2 - 1
+    head = GMMHead(6, 7, hidden_size=8, num_modes=3, low_eval_noise=True, loss_coef=2.0)
+    gmm = head(latent)
+    assert gmm.sample().shape == (4, 3, 7)
+    assert torch.allclose(
+        head.loss_fn(gmm, actions, "none"), 2 * head.head.losses(head.head(latent), actions), atol=1e-4
+    )
+    assert torch.allclose(head.loss_fn(gmm, actions, "sum") / 12, head.loss_fn(gmm, actions))
+    quiet = head.eval()(latent).component_distribution.stddev
+    assert torch.allclose(quiet, torch.full_like(quiet, 1e-4), rtol=1e-3)
+    single = DeterministicHead(6, 7, hidden_size=8)
+    assert single(latent).abs().max() <= 1
+    assert torch.allclose(single.loss_fn(single(latent), actions), (single(latent) - actions).abs().mean())
+    free = DeterministicHead(6, 7, hidden_size=8, action_squash=False)
+    assert torch.allclose(free.head(latent)["means"], free(latent).tanh())
+
+
+def test_augmentation():
+    torch.manual_seed(0)
+    x = (torch.rand(4, 2, 3, 16, 16) * 255).round() / 255
+    x[:, 1] = x[:, 0]  # two equal frames
+    for kind in aug.AUGMENTATIONS.values():
+        layer = aug.DataAugGroup([kind((3, 16, 16))])
+        first, second = layer((x, x))
+        assert first.shape == x.shape and first.dtype == x.dtype and first.min() >= 0 and first.max() <= 1
+        assert torch.equal(first[:, 0], first[:, 1]), "a window changes as a whole"
+        assert torch.equal(first, x) == (kind is aug.IdentityAug)
+        if kind in (aug.ImgColorJitterGroupAug, aug.TranslationAugGroup):
+            assert torch.equal(first, second)
+        assert torch.allclose(layer.eval()((x, x))[0], x, atol=1e-6)
+    same = torch.full((4, 1, 3, 4, 4), 0.3)
+    whole, each = (
+        k(epsilon=0.0)(same)[:, 0, :, 0, 0] for k in (aug.ImgColorJitterAug, aug.BatchWiseImgColorJitterAug)
+    )
+    assert (whole == whole[0]).all() and not (each == each[0]).all()
