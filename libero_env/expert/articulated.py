@@ -29,8 +29,7 @@ AROUND = 0.07  # m, within which things count as in the way
 AJAR, PULLED = 0.5, 0.85  # rad; a door is drawn until it is that far open, and beyond AJAR pushed
 KNOB = 0.45  # rad, of the hand ahead of a knob, at most
 BRAKE = 2.0, 0.05  # 1/s and rad/s: speed of a knob before its stop by what is left, and when it gets there
-STUCK = {"move": 180}  # steps of one phase, else
-STUCK_ELSE = 90
+STUCK, STUCK_MOVING = 90, 180  # steps of one phase, and of moving the part
 
 
 class MoveJoint:
@@ -87,7 +86,7 @@ class MoveJoint:
             self._again()
         if self._hold is None and not self._plan(view):
             return self._stay()
-        if self._steps > STUCK.get(self.phase, STUCK_ELSE):
+        if self._steps > (STUCK_MOVING if self.phase == "move" else STUCK):
             return self._retreat(view)
         return getattr(self, f"_{self.phase}")(view)
 
@@ -127,14 +126,7 @@ class MoveJoint:
             return False
         self._part = part
         self._around = surroundings(view, -1, hold.held.pos, view.scene.things)
-        frame = part.pose(view)
-        self._hold = Hold(
-            _within(frame, hold.ready),
-            _within(frame, hold.held),
-            frame.mat.T @ hold.back,
-            hold.grips,
-            hold.follow,
-        )
+        self._hold = hold.within(part.pose(view))
         self._begun = value
         self._failed.append(hold.ready)
         self._drawn = False
@@ -310,11 +302,6 @@ class MoveJoint:
         along = np.clip(offset @ way / max(way @ way, 1e-12), 0.0, 1.0)
         near = np.linalg.norm(offset - along[:, None] * way, axis=1) < AROUND
         return float(self._around[near, 2].max(initial=view.scene.workspace.surface_height))
-
-
-def _within(frame: Pose, pose: Pose) -> Pose:
-    """A pose of the world in a frame."""
-    return Pose(frame.invert(pose.pos), frame.mat.T @ pose.mat)
 
 
 def _placed(frame: Pose, pose: Pose) -> Pose:

@@ -44,6 +44,13 @@ class Hold:
     grips: bool
     follow: float = 1.0  # share of the part's turn that the hand makes too
 
+    def within(self, frame: Pose) -> "Hold":
+        """The same in a frame, such as the part's, instead of the world."""
+        ready, held = (
+            Pose(frame.invert(pose.pos), frame.mat.T @ pose.mat) for pose in (self.ready, self.held)
+        )
+        return Hold(ready, held, frame.mat.T @ self.back, self.grips, self.follow)
+
 
 def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
     """How to take a knob from above in order to turn it by `delta`, rad.
