@@ -19,6 +19,22 @@ NAMES = {
     "libero.libero.utils.time_utils": "Timer",
     "libero.libero.utils.dataset_utils": "get_dataset_info",
     "libero.libero.utils.log_utils": "get_logger",
+    "libero.libero.utils.download_utils": """DATASET_LINKS HF_REPO_ID libero_dataset_download download_from_huggingface
+        download_url url_is_alive DownloadProgressBar check_libero_dataset""",
+    "libero.libero.utils.mu_utils": """register_mu MU_DICT SCENE_DICT get_scene_dict get_scene_class
+        InitialSceneTemplates""",
+    "libero.libero.utils.task_generation_utils": """register_task_info get_task_info TASK_INFO TaskInfoTuple
+        get_suite_generator_func generate_bddl_from_task_info""",
+    "libero.libero.utils.object_utils": "get_affordance_regions update_exception_dict EXCEPTION_DICT",
+    "libero.libero.utils.bddl_generation_utils": """PDDLDefinition Language LogicalState RegionWrapper Region ObjectDict
+        get_fixtures get_objects get_objects_of_interest get_xy_region get_object_affordance_region region_module
+        get_init_state get_goal_state object_naming_mapping get_object_dict
+        get_affordance_region_kwargs_list_from_fixture_info get_xy_region_kwargs_list_from_regions_info
+        tabletop_task_suites_generator kitchen_table_task_suites_generator living_room_table_task_suites_generator
+        study_table_task_suites_generator coffee_table_task_suites_generator floor_task_suites_generator
+        print_result get_result save_to_file""",
+    "libero.libero.benchmark.mu_creation": """KitchenScene1 KitchenScene10 LivingRoomScene1 LivingRoomScene6 StudyScene1
+        StudyScene4""",
     "libero.libero.utils.utils": """postprocess_model_xml process_image_input reconstruct_image_output
         update_env_kwargs""",
     "libero.libero.benchmark": """BENCHMARK_MAPPING register_benchmark get_benchmark_dict get_benchmark print_benchmark
