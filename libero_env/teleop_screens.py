@@ -14,6 +14,8 @@ from PIL import Image
 
 from libero_env.env import CONTROL_HZ
 from libero_env.errors import LiberoError, RenderError
+from libero_env.objects.model import GLOW_GROUP
+from libero_env.predicates import glowing_sites
 from libero_env.teleop import GRIPPER, HELP, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse, Status
 from libero_env.world import World
 
@@ -158,6 +160,7 @@ class Window:
             )
         area = mujoco.MjrRect(0, 0, *self.glfw.get_framebuffer_size(self.window))
         mujoco.mj_camlight(model, data)
+        self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(world.views[0]))  # a stove that is on
         mujoco.mjv_updateScene(
             model, data, self.option, None, self.view, mujoco.mjtCatBit.mjCAT_ALL, self.scene
         )
