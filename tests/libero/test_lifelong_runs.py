@@ -1,0 +1,223 @@
+"""Whole runs of the original's configuration: from demonstrations to checkpoints, results, and their evaluation."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from libero.libero.benchmark import BENCHMARK_MAPPING, get_benchmark
+from libero.libero.envs import OffScreenRenderEnv
+from libero.lifelong import algos, evaluate, main, metric, utils
+from libero.lifelong.run import run
+from libero_env.original_states import write_states
+from lifelong import checkpoints
+from tests.libero.lifelong_data import (
+    LANGUAGE,
+    SIZE,
+    TINY,
+    TINY_TRANSFORMER,
+    TwoTasks,
+    tiny,
+    windows,
+    write_demos,
+)
+
+pytestmark = pytest.mark.sim
+
+ROOT = Path(__file__).parents[2]
+SMALL = ("train.use_augmentation=false", "+policy.native.image_width=8")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Demonstrations of the ten tasks of a suite, of noise."""
+    root, suite = tmp_path_factory.mktemp("datasets"), get_benchmark("libero_object")()
+    (root / "libero_object").mkdir()
+    for i in range(suite.n_tasks):
+        write_demos(root / suite.get_task_demonstration(i), seed=i)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(BENCHMARK_MAPPING, "two_tasks", TwoTasks)
+
+
+def config(folder: Path, *overrides: str):
+    return tiny(*SMALL, f"folder={folder}", "benchmark_name=two_tasks", *overrides)
+
+
+def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
+    path = run(
+        config(folder, "lifelong=packnet", "lifelong.post_prune_epochs=1", "eval.save_sim_states=true")
+    )
+    assert path == Path("experiments/two_tasks/PackNet/BCTransformerPolicy_seed10000/run_001")
+    result = torch.load(path / "result.pt")
+    assert {k: tuple(result[k].shape) for k in ("L_conf_mat", "S_conf_mat", "L_fwd", "S_fwd")} == {
+        "L_conf_mat": (2, 2), "S_conf_mat": (2, 2), "L_fwd": (2,), "S_fwd": (2,),
+    }  # fmt: skip
+    assert (result["L_conf_mat"] != 0).tolist() == [[True, False], [True, True]]
+    assert (result["S_conf_mat"] == 0).all(), "nobody succeeds in four steps"
+    for key in ("k1_p0", "k0_e1"):
+        ((*states,),) = result[key]
+        assert len(states) == metric.SETTLE_STEPS + 4 and states[0].shape == states[-1].shape
+        assert states[1][0] > states[0][0], "the first number is the time"
+
+    arguments = ["--benchmark", "two_tasks", "--task_id", "0", "--algo", "packnet", "--policy", "bc_transformer_policy",
+                 "--seed", "10000", "--load_task", "1"]  # fmt: skip
+    with pytest.warns(UserWarning, match="imageio"):
+        assert evaluate.main([*arguments, "--save-videos", "--n_eval", "2"]) == 0
+    assert "success 0/2 = 0%" in capsys.readouterr().out
+    stats = torch.load(path / "task1_model_on0.stats")
+    assert stats["successes"] == [False, False] and stats["interval"][1] > 0.3
+    assert stats["loss"] == pytest.approx(result["L_conf_mat"][1, 0].item()), (
+        "the same weights, the same masks"
+    )
+    assert len(list((path / "task1_model_on0_videos").iterdir())) == 2
+    assert evaluate.main([*arguments[:-1], "7"]) == 1
+    assert "task0_model.pth, task1_model.pth" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_goes_on_to_the_same_weights(folder):
+    whole = run(config(folder, "lifelong=er", "eval.eval=false"))
+    first = run(config(folder, "lifelong=er", "eval.eval=false"))
+    for name in ("task1_state.safetensors", "task1_model.pth"):
+        (first / name).unlink()
+    second = run(config(folder, "lifelong=er", "eval.eval=false", "train.resume=true"))
+    assert second == first
+    states = [checkpoints.load(path / "task1_state.safetensors") for path in (whole, second)]
+    assert all(torch.equal(states[0]["policy"][n], states[1]["policy"][n]) for n in states[0]["policy"])
+    assert torch.equal(*[torch.load(path / "result.pt")["L_fwd"] for path in (whole, second)])
+    begun = run(
+        config(folder, f"pretrain_model_path={whole}/task1_model.pth", "train.n_epochs=0", "eval.eval=false")
+    )
+    assert begun.parts[0] == "experiments_finetune"
+    kept = utils.torch_load_model(begun / "task1_model.pth")[0]
+    assert all(torch.equal(kept[n], p) for n, p in states[0]["policy"].items())
+
+
+@pytest.mark.slow
+def test_from_the_command_line(folder, tmp_path):
+    """The script itself, with groups of tasks; its folder's modules do not stand for others of their names."""
+    command = [
+        sys.executable, str(ROOT / "libero/lifelong/main.py"), *TINY, *TINY_TRANSFORMER, *SMALL, f"folder={folder}",
+        "benchmark_name=LIBERO_OBJECT", "lifelong=multitask", "eval.eval=false", "data.task_group_size=5",
+        "train.debug=true", "seed=7",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=dict(os.environ))
+    assert done.returncode == 0, done.stderr
+    assert "train.debug=True has no effect" in done.stdout
+    path = tmp_path / "experiments/LIBERO_OBJECT/Multitask/BCTransformerPolicy_seed7/run_001"
+    assert {p.name for p in path.glob("*.pth")} == {
+        "multitask_model.pth", "multitask_model_ep0.pth", "multitask_model_ep1.pth",
+    }  # fmt: skip
+    assert torch.load(path / "result.pt")["S_conf_mat"].shape == (2, 2)
+
+
+def test_mistakes_are_told_in_a_line(folder, monkeypatch, capsys):
+    for override, message in (
+        ("lifelong=hat", "lifelong 'hat'.*packnet"),
+        ("benchmark_name=LIBERO_1", "libero_spatial"),
+        ("data.task_group_size=3", "task_group_size=3"),
+    ):
+        monkeypatch.setattr(
+            sys, "argv", ["main", f"folder={folder}", "device=cpu", "benchmark_name=LIBERO_OBJECT", override]
+        )
+        assert main.main() == 1
+        error = capsys.readouterr().err
+        assert re.search(message, error) and error.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def acting(folder, tmp_path_factory):
+    """An untrained algorithm on the first two tasks."""
+    cfg = tiny(*SMALL, "eval.n_eval=3", "eval.num_procs=2", "benchmark_name=two_tasks")
+    cfg.experiment_dir = str(tmp_path_factory.mktemp("experiment"))
+    windows(folder / get_benchmark("libero_object")().get_task_demonstration(0), cfg)
+    suite = TwoTasks()
+    suite.set_task_embs(torch.randn(2, LANGUAGE))
+    torch.manual_seed(0)
+    return algos.Sequential(2, cfg), cfg, suite
+
+
+def test_success_is_measured_from_the_first_states(acting, monkeypatch):
+    algo, cfg, suite = acting
+    begun, real = [], metric.play
+    monkeypatch.setattr(
+        metric, "play", lambda a, e, rows, **k: begun.append(list(rows)) or real(a, e, rows, **k)
+    )
+    rate = metric.evaluate_one_task_success(cfg, algo, suite.get_task(1), suite.get_task_emb(1), 1)
+    assert (rate, begun) == (0.0, [[0, 1], [2]])
+    cfg.eval.selection, cfg.eval.use_mp = "apart", False
+    assert metric.evaluate_multitask_training_success(cfg, algo, suite, [0]).tolist() == [0.0]
+    assert begun[2:] == [[47], [48], [49]], "one by one, in states that no report uses"
+
+
+def test_success_counts(acting, monkeypatch):
+    """A policy that is right from the start is: the goal is made to hold in two of three episodes."""
+    algo, cfg, suite = acting
+    cfg.eval.use_mp, cfg.eval.num_procs = True, 3
+    step = metric.BatchEnv.step
+
+    def succeeded(self, actions):
+        obs, rewards, terminated, truncated, info = step(self, actions)
+        info["success"] = np.array([True, False, True])
+        return obs, rewards, info["success"], truncated, info
+
+    monkeypatch.setattr(metric.BatchEnv, "step", succeeded)
+    rates = metric.evaluate_success(cfg, algo, suite, [0], {})
+    assert rates == pytest.approx([2 / 3])
+
+
+def test_what_the_original_environment_observes_is_what_rollouts_show(acting):
+    """`raw_obs_to_tensor_obs` of the facade's environment, beside what the policy is given in a rollout."""
+    algo, cfg, suite = acting
+    seen, act = [], algo.policy.get_action
+    algo.policy.get_action = lambda data: seen.append(data) or act(data)
+    states = suite.get_task_init_states(0)
+    try:
+        metric.rollouts(cfg, algo, suite.get_task(0), suite.get_task_emb(0), 0, [4])
+    finally:
+        del algo.policy.get_action
+    env = OffScreenRenderEnv(
+        bddl_file_name=suite.get_task_bddl_file_path(0), camera_heights=SIZE, camera_widths=SIZE
+    )
+    env.reset()
+    env.set_init_state(states[4])
+    for _ in range(metric.SETTLE_STEPS):
+        obs, *_ = env.step(np.zeros(7))
+    data = metric.raw_obs_to_tensor_obs([obs], suite.get_task_emb(0), cfg)
+    env.close()
+    assert list(data["obs"]) == list(seen[0]["obs"]) and torch.equal(data["task_emb"], seen[0]["task_emb"])
+    for key, value in data["obs"].items():
+        assert value.shape == seen[0]["obs"][key].shape and value.dtype == torch.float32
+        assert (value - seen[0]["obs"][key]).abs().mean() < 0.02, (
+            key
+        )  # the original observes one substep earlier
+    assert algo.policy.get_action(data).shape == (1, 7)
+
+
+def test_states_and_tasks_of_ones_own(acting, tmp_path):
+    """A folder with other initial states, and one with another task file of the same name."""
+    algo, cfg, suite = acting
+    task, states = suite.get_task(0), suite.get_task_init_states(0)
+    moved = states[:2].copy()
+    moved[:, 1] += 0.3  # the first joint
+    write_states(tmp_path / task.problem_folder / task.init_states_file, moved)
+    found = [[]]
+    cfg.init_states_folder = str(tmp_path)
+    try:
+        metric.rollouts(cfg, algo, task, suite.get_task_emb(0), 0, [1], sim_states=found)
+    finally:
+        cfg.init_states_folder = None
+    assert found[0][0][1] == pytest.approx(moved[1, 1], abs=0.05)
+    own = metric.native_task(task, None)
+    assert own.suite == "libero_object" and own.name == task.name
+    (tmp_path / task.problem_folder / task.bddl_file).write_text(own.bddl_text + "\n; mine\n")
+    assert metric.native_task(task, str(tmp_path)).suite == "file"
