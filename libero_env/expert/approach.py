@@ -217,14 +217,25 @@ def _free_holds(
     return sorted(found, key=lambda g: g.cost)
 
 
+def between_fingers(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
+    """How far the middle of what open fingers close on is from the middle between them, m along their opening."""
+    u = _between_pads(cloud, pos, mat)[:, 0]
+    return 0.5 * float(u.min() + u.max()) if len(u) else 0.0
+
+
+def _between_pads(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+    """The points that open fingers have between their pads, in the hand's frame, (M, 3)."""
+    local = (cloud - pos) @ mat
+    u, v, depth = local.T
+    pads = (np.abs(v) < FINGER_HALF_WIDTH) & (depth > -PAD_ABOVE) & (depth < PAD_BELOW)
+    return local[pads & (np.abs(u) < 0.5 * MAX_OPENING)]
+
+
 def _weak_price(cloud: np.ndarray, grasp: Grasp) -> float:
     """What it costs that the pads have little of the body between them, or meet its faces askew."""
-    u, v, depth = ((cloud - grasp.pos_world) @ grasp.mat).T
-    pads = (np.abs(v) < FINGER_HALF_WIDTH) & (depth > -PAD_ABOVE) & (depth < PAD_BELOW)
-    pads &= np.abs(u) < 0.5 * MAX_OPENING
-    if not pads.any():
+    u, v, depth = _between_pads(cloud, grasp.pos_world, grasp.mat).T
+    if not len(u):
         return 1.0
-    u, v, depth = u[pads], v[pads], depth[pads]
     price = 30.0 * max(_BITE - np.ptp(depth), 0.0) + 30.0 * max(_BITE - np.ptp(v), 0.0)
     parts = [u[np.abs(v - middle) < 0.004] for middle in (-0.007, 0.0, 0.007)]
     faces = np.array([(part.min(), part.max()) for part in parts if len(part)])

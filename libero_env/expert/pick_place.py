@@ -6,11 +6,11 @@ import numpy as np
 
 from libero_env.control import SUBSTEPS
 from libero_env.errors import LiberoError
-from libero_env.expert.approach import Approach, Failure, choose_approach, choose_place
+from libero_env.expert.approach import Approach, Failure, between_fingers, choose_approach, choose_place
 from libero_env.expert.carry import Carry, Move
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.geometry import Pose
-from libero_env.expert.grasp import TIP_BELOW
+from libero_env.expert.grasp import MAX_OPENING, TIP_BELOW
 from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.style import Style
@@ -63,6 +63,7 @@ class PickPlace:
         self._hold: Pose | None = None  # pose to keep while the fingers move
         self._carrying: Carry | None = None
         self._diverted = 0  # times that another place was chosen on the way
+        self._aside = np.zeros(3)  # m, from the middle between the fingers to that of what they close on
         self._steps, self._opening = 0, 0.0
         self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
         self._stuck, self._backings = 0, 0  # steps without motion, and times it backed off
@@ -149,6 +150,7 @@ class PickPlace:
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
         if aside < ARRIVED and abs(error @ back) < ARRIVED and turn < ARRIVED_TURN:
             self._hold = Pose(goal, mat)
+            self._aside = between_fingers(self.shapes.cloud(view, self._thing), goal, mat) * mat[:, 0]
             self._enter("close")
             return self._close(view)
         self._stuck = self._stuck + 1 if np.linalg.norm(self._velocity) < 0.008 and self._steps > 12 else 0
@@ -202,7 +204,10 @@ class PickPlace:
             self._carrying, self._diverted = None, 0
             self._enter("carry")
             return self._carry(view)
-        return self._toward(view, self._hold.pos, self._hold.mat, CLOSE)
+        # the finger that is near the object stays, and the other one comes
+        aside = float(np.linalg.norm(self._aside))
+        come = self._aside * min(1.0, 0.5 * max(MAX_OPENING - opening, 0.0) / max(aside, 1e-9))
+        return self._toward(view, self._hold.pos + come, self._hold.mat, CLOSE)
 
     def _carry(self, view: StateView) -> np.ndarray:
         if self._carrying is None:
