@@ -20,8 +20,13 @@ ACTION_DIM = 7
 class Actor(Protocol):
     """Answers the observations of many simulations at once."""
 
-    action_dim: int
-    views: tuple[str, ...]  # entries of the observation that a recorded rollout shows
+    @property
+    def action_dim(self) -> int:
+        """A."""
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Entries of the observation that a recorded rollout shows."""
 
     def reset(self, num_envs: int) -> None:
         """Forget the past; the next observation is the first of new episodes."""

@@ -82,7 +82,7 @@ class Candidate:
     what: Mapping[str, Any]
     out: Path
     tasks: "Sequence[Task]"  # its own, if it has any
-    selection: int  # starts by which it was chosen
+    selection: Sequence[int]  # starts by which it may have been chosen
     protocol: "Callable[[Protocol], Protocol]"  # what it says itself of pictures and steps
     env: "Callable[[Task, int, Protocol, argparse.Namespace], VectorEnv]"
     actor: "Callable[[Task, Sequence[int], Protocol], AbstractContextManager[Actor]]"
@@ -145,22 +145,18 @@ def _run_policy(args: argparse.Namespace) -> Candidate:
     found = restore(Path(args.policy), after=args.after, device=args.device)
     digest = hashlib.sha256(found.checkpoint.read_bytes()).hexdigest()[:16]
     settings = found.eval
-    selection = settings.curve_episodes if settings.selection == "apart" else 20
+
+    def protocol(p: "Protocol") -> "Protocol":
+        if args.protocol == "libero":  # a run may have its own numbers there
+            p = replace(p, horizon=settings.horizon, settle_steps=settings.settle_steps)
+        return replace(p, camera_size=found.policy.spec.image_size, original=False)
+
     return Candidate(
         what={"run": str(found.path), "after": found.learned, "weights": digest},
         out=found.path / "eval" / f"after_{found.learned:02d}",
         tasks=found.tasks,
-        selection=selection,
-        protocol=lambda p: replace(
-            p,
-            camera_size=found.policy.spec.image_size,
-            original=False,
-            **(
-                {}
-                if p.settle_action
-                else {"horizon": settings.horizon, "settle_steps": settings.settle_steps}
-            ),
-        ),
+        selection=tuple(settings.init_states("curve")),
+        protocol=protocol,
         env=lambda task, count, protocol, a: _run_env(found, task, count, protocol, a),
         actor=lambda task, states, _: _run_actor(found, task, states, args.seed),
     )
@@ -197,6 +193,7 @@ def _own_policy(args: argparse.Namespace) -> Candidate:
     """Anybody's policy; see `lifelong.actors.CallableActor` for what it must have."""
     from libero_env.vector import BatchEnv
     from lifelong.actors import CallableActor
+    from lifelong.suite_eval import SELECTION
 
     policy = load_callable(args.policy)
     cameras = tuple(getattr(policy, "cameras", ("agentview", "robot0_eye_in_hand")))
@@ -220,7 +217,7 @@ def _own_policy(args: argparse.Namespace) -> Candidate:
         yield CallableActor(policy, task.language, views, p.original)
 
     name = args.policy.replace(":", ".")
-    return Candidate({"policy": args.policy}, Path("eval") / name, (), 20, protocol, env, actor)
+    return Candidate({"policy": args.policy}, Path("eval") / name, (), SELECTION, protocol, env, actor)
 
 
 def load_callable(text: str) -> Any:

@@ -101,7 +101,8 @@ def _forgetting(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
     found: dict[str, list[float]] = {}
     for run in runs:
         assert run.metrics is not None
-        for name, value in zip(run.record.tasks[: run.learned - 1], run.metrics.nbt_by_task, strict=False):
+        followed = run.learned - run.record.group_size
+        for name, value in zip(run.record.tasks[:followed], run.metrics.nbt_by_task, strict=False):
             found.setdefault(name, []).append(float(value))
     return {name: _mean(values) for name, values in found.items()}
 

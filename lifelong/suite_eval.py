@@ -25,7 +25,7 @@ from lifelong.results import plain
 from lifelong.subgoals import predicate_of
 
 CONTROL_PERIOD = 0.05  # s
-SELECTION = 20  # starts that choose a checkpoint by default, the last of the 50
+SELECTION = range(NUM_INIT_STATES - 20, NUM_INIT_STATES)  # starts that choose a checkpoint by default
 
 
 @dataclass(frozen=True)
@@ -72,21 +72,21 @@ PROTOCOLS = {
 }
 
 
-def starts(which: str, count: int | None, selection: int = SELECTION) -> tuple[int, ...]:
+def starts(which: str, count: int | None, selection: Sequence[int] = SELECTION) -> tuple[int, ...]:
     """Indices of the initial states that are evaluated.
 
     Args:
         which: `all`; `selection`: those by which a checkpoint may have been chosen; `reporting`: the others.
         count: The first so many of them; None: all of them.
-        selection: So many, the last ones, are for selection.
+        selection: Those for selection.
 
     Raises:
         ConfigError: Another word, or more starts than there are.
     """
-    parts = {
+    parts: dict[str, Sequence[int]] = {
         "all": range(NUM_INIT_STATES),
-        "selection": range(NUM_INIT_STATES - selection, NUM_INIT_STATES),
-        "reporting": range(NUM_INIT_STATES - selection),
+        "selection": selection,
+        "reporting": [i for i in range(NUM_INIT_STATES) if i not in selection],
     }
     if which not in parts:
         raise ConfigError(f"starts are {which!r}; valid: {', '.join(parts)}")

@@ -325,6 +325,16 @@ def test_parts_of_the_goals_are_on_the_page_and_old_records_go_without(finished:
     assert "Parts of the goals" not in text and "Costs" not in text and "FWT" in text
 
 
+def test_where_the_policy_looks_is_on_the_page(tmp_path: Path):
+    folder = make_run(tmp_path / "run", tasks=2)
+    assert "What the policy looks at" not in write_report([folder]).read_text()
+    (folder / "saliency").mkdir()
+    Image.new("RGB", (8, 8)).save(folder / "saliency" / "task_01_after_01.png")
+    (folder / "saliency" / "task_01_after_01.txt").write_text("at the cheese")
+    text = Page(write_report([folder]).read_text()).text
+    assert "What the policy looks at" in text and "at the cheese" in text
+
+
 def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Path):
     runs = [
         make_run(tmp_path / "a", "ewc", 1, tasks=2, strength=10),

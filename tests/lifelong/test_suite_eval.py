@@ -144,11 +144,12 @@ def test_results_of_something_else_are_not_mixed_in(tmp_path, changes):
 
 
 def test_selection_and_reporting_are_apart():
-    chosen, reported = starts("selection", None, 15), starts("reporting", None, 15)
+    chosen, reported = (starts(which, None, range(15)) for which in ("selection", "reporting"))
     assert set(chosen).isdisjoint(reported) and set(chosen) | set(reported) == set(starts("all", None))
-    assert len(chosen) == 15 and starts("reporting", 4, 15) == (0, 1, 2, 3)
+    assert len(chosen) == 15 and starts("reporting", 4, range(15)) == (15, 16, 17, 18)
+    assert starts("reporting", 2) == (0, 1) and len(starts("selection", None)) == 20
     with pytest.raises(ConfigError, match="1 to 15"):
-        starts("selection", 16, 15)
+        starts("selection", 16, range(15))
     with pytest.raises(ConfigError, match="valid: all, selection, reporting"):
         starts("test", None)
 
