@@ -14,6 +14,7 @@ from libero_env.expert.grasp import (
 )  # fmt: skip
 
 _CELL, _COARSE = 0.006, 0.012  # m, for what stands close to others, and for the hand
+_WALL = 0.01  # m, between points of what stands and does not hang
 _HALF = np.array([0.75, 0.9, 0.5])  # m, of the space that is looked at
 
 
@@ -70,6 +71,7 @@ class Voxels:
             keep = inside & (self.points[:, 2] >= above)
             heights = np.full(self._shape[:2], np.inf)
             np.minimum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
+            heights[heights < above + _WALL] = np.inf  # a wall that stands there
             self._roofs[above] = heights
         where = origins[:, None] + profile
         cells = np.clip(((where[..., :2] - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
