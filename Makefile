@@ -1,17 +1,18 @@
 # make train   set everything up, then train and evaluate (ARGS="algo=er seed=2" are Hydra overrides)
 # make test    set everything up, then the checks that CI runs
+# make docs    set everything up, then the documentation: build/site/index.html
 PYTHON ?= python3
 ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 GL_STAMP := $(VENV)/.gl
-EXTRAS := train,assets,export,language,robosuite,wandb,dev
+EXTRAS := train,assets,export,language,robosuite,wandb,docs,dev
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl train test lint clean
+.PHONY: help setup gl train test lint docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -50,6 +51,9 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+
+docs: $(STAMP)
+	$(BIN)/mkdocs build --quiet
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

@@ -1,0 +1,206 @@
+"""What the documentation takes from the code while it is built: the two references.
+
+MkDocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A page asks for a part with a line such as
+`<!-- generated: commands -->`. Links to files outside this folder become their paths, as the site has none of these.
+"""
+
+import argparse
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = ROOT / "configs"
+SHORT = 30  # characters; an entry shorter than that may need the comment too
+OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\(\.\./([^)#]+)(?:#[^)]*)?\)")
+
+
+def on_page_markdown(markdown: str, **kwargs: Any) -> str:
+    """The text of a page with what is generated in its place."""
+    for name, part in PARTS.items():
+        marker = f"<!-- generated: {name} -->"
+        if marker in markdown:
+            markdown = markdown.replace(marker, part())
+    return OUTSIDE.sub(lambda m: f"`{m[2]}`" if m[1] in m[2] else f"{m[1]} (`{m[2]}`)", markdown)
+
+
+def commands(parser: argparse.ArgumentParser | None = None) -> Iterator[argparse.ArgumentParser]:
+    """Every subcommand of `libero` that runs something, in the order of its help."""
+    if parser is None:
+        from lifelong.cli import build_parser
+
+        parser = build_parser()
+    groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for group in groups:
+        about = {action.dest: action.help for action in group._choices_actions}
+        for name, child in group.choices.items():
+            child.description = child.description or about.get(name)
+            yield from commands(child)
+    if not groups:
+        yield parser
+
+
+def command_reference() -> str:
+    """A section for each subcommand, with all its arguments."""
+    return "\n".join(_command(parser) for parser in commands())
+
+
+def _command(parser: argparse.ArgumentParser) -> str:
+    about = (parser.description or "").strip()
+    lines = [f"## {parser.prog}", "", f"{about[:1].upper()}{about[1:]}.", ""]
+    rows = [_argument(a) for a in parser._actions if not isinstance(a, argparse._HelpAction)]
+    if rows:
+        lines += ["| argument | what |", "|---|---|", *rows, ""]
+    return "\n".join(lines)
+
+
+def _argument(action: argparse.Action) -> str:
+    value = action.metavar or (action.dest if not action.option_strings else action.dest.upper())
+    if action.choices:
+        value = ",".join(map(str, action.choices))
+    value = "" if action.nargs == 0 else str(value) + ("..." if action.nargs in ("+", "*") else "")
+    names = [f"{flag} {value}".strip() for flag in action.option_strings] or [value]
+    help_text = (action.help or "").replace("%(default)s", str(action.default))
+    needed = "required. " if action.option_strings and action.required else ""
+    return f"| {', '.join(f'`{n}`' for n in names)} | {needed}{_cell(help_text)} |"
+
+
+def groups() -> dict[str, list[Path]]:
+    """The files of each configuration group, in the order of configs/config.yaml."""
+    defaults = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))["defaults"]
+    names = [next(iter(d)) for d in defaults if isinstance(d, dict)]
+    return {name: sorted((CONFIGS / name).glob("*.yaml")) for name in names if (CONFIGS / name).is_dir()}
+
+
+def configuration_reference() -> str:
+    """A section for the keys at the top, and one for each group."""
+    from lifelong.settings import RunSettings
+
+    comments = _comments(CONFIGS / "config.yaml")
+    top = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))
+    rows = [
+        f"| `{k}` | {_value(v)} | {_cell(comments.get(k, ''))} |"
+        for k, v in top.items()
+        if k in RunSettings.__dataclass_fields__
+    ]
+    text = ["## At the top", "", "| key | default | what |", "|---|---|---|", *rows, ""]
+    chosen = {k: v for d in top["defaults"] if isinstance(d, dict) for k, v in d.items()}
+    for name, files in groups().items():
+        text += [f"## {name}", "", _group(name, files, chosen[name]), ""]
+    return "\n".join(text)
+
+
+def _group(name: str, files: list[Path], default: str) -> str:
+    told = [f"- `{name}={f.stem}`{' (default)' if f.stem == default else ''}{_about(f)}" for f in files]
+    parts = ["\n".join(told)]
+    values = {file: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
+    if any(_is_nested(v) for v in values.values()):
+        parts += [f"`configs/{name}/{f.name}`\n\n```yaml\n{f.read_text(encoding='utf-8')}```" for f in files]
+        return "\n\n".join(parts)
+    targets: dict[str, list[Path]] = {}
+    for file, value in values.items():
+        targets.setdefault(value["_target_"], []).append(file)
+    return "\n\n".join([*parts, *(_table(name, target, own) for target, own in targets.items())])
+
+
+def _is_nested(values: Mapping[str, Any]) -> bool:
+    return "_target_" not in values or any(
+        isinstance(v, dict) or (isinstance(v, list) and any(isinstance(x, dict) for x in v))
+        for v in values.values()
+    )
+
+
+def _table(group: str, target: str, files: list[Path]) -> str:
+    """The keys of the files that build one class, with their values in each file."""
+    values = {file.stem: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
+    keys = [k for k in dict.fromkeys(k for v in values.values() for k in v) if k != "_target_"]
+    title = f"`{target}`"
+    if not keys:
+        return f"{title} has no keys."
+    rows = [
+        f"| `{group}.{key}` | {' | '.join(_value(v.get(key)) for v in values.values())} "
+        f"| {_cell(meaning(target, key, files))} |"
+        for key in keys
+    ]
+    head = "| key | " + " | ".join(f"`{stem}`" for stem in values) + " | what |"
+    return "\n".join([title, "", head, "|---" * (len(values) + 2) + "|", *rows])
+
+
+def meaning(target: str, key: str, files: list[Path]) -> str:
+    """What a key means: the docstring of what it builds, and the comment in the file where it has more."""
+    comment = next((c for c in (_comments(f).get(key) for f in files) if c), "")
+    text = _entry(target, key)
+    if len(text) < SHORT:
+        return ". ".join(part for part in (text, comment) if part)
+    values = [yaml.safe_load(f.read_text(encoding="utf-8")).get(key) for f in files]
+    choices = any(isinstance(v, str) and comment.startswith(f"{v},") and f"`{v}`" not in text for v in values)
+    return f"{text.rstrip('.')} ({comment})" if choices else text
+
+
+def _entry(target: str, key: str) -> str:
+    """A docstring's entry; where it says "see `Name`", what that says of the key, whose name there may be shorter."""
+    import lifelong.nn
+
+    text = _documented(target).get(key, "")
+    for name in re.findall(r"see `(\w+)`", text):
+        for file in sorted(Path(lifelong.nn.__path__[0]).glob("*.py")):
+            if f"class {name}(" not in file.read_text(encoding="utf-8"):
+                continue
+            other = f"lifelong.nn.{file.stem}.{name}"
+            names = (key, key.rpartition("_")[0], key.partition("_")[2])
+            found = next((_entry(other, n) for n in names if n != "proprio" and n in _documented(other)), "")
+            if len(found) > 2:  # more than a letter of the legend
+                return found
+    return re.sub(r",? ?[Ss]ee `\w+`[^.;]*", "", text).strip(" .")
+
+
+@cache
+def _documented(target: str) -> dict[str, str]:
+    """The entries under Args and Attributes in the docstrings of a class, by name."""
+    from hydra.utils import get_object
+
+    built = get_object(target)
+    entries: dict[str, str] = {}
+    for doc in (inspect.getdoc(built), inspect.getdoc(built.__init__)):
+        for section in re.findall(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", doc or "", re.M):
+            for entry in re.split(r"\n(?= {4}\S)", section):
+                names, colon, text = entry.partition(":")
+                if colon:
+                    found = " ".join(text.split())
+                    entries.update({n.strip(): found for n in names.split(",")})
+    return entries
+
+
+@cache
+def _comments(file: Path) -> dict[str, str]:
+    """The comment beside each key of a YAML file."""
+    found = re.findall(r"^ *(\w+):[^#\n]*# *(.+)$", file.read_text(encoding="utf-8"), re.M)
+    return dict(found)
+
+
+def _about(file: Path) -> str:
+    """The comment a file begins with."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    said = []
+    for line in lines:
+        if not line.startswith("#"):
+            break
+        said += [] if "@package" in line else [line.lstrip("# ")]
+    return f": {' '.join(said)}" if said else ""
+
+
+def _value(value: Any) -> str:
+    text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return f"`{text}`"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+PARTS = {"commands": command_reference, "configuration": configuration_reference}
