@@ -117,14 +117,16 @@ def choose_approach(
     spots = _varied(_places_again(places(view, voxels, cloud, pose, atom, share), failures))
     tilts = _tilts(spots, pose)
     holds = _free_holds(view, voxels, cloud, pose, thing, [None, *tilts], failures)
-    best, miss = _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
+    pairs = _pairs(voxels, holds, spots, pose)
+    best, miss = _reachable(view, shapes, pairs)
     if holds[0].cost < _CROWDED and miss <= _MISSED:
         return best
     try:  # lean away from what is in the way, or towards the arm
-        holds += _free_holds(view, voxels, cloud, pose, thing, _RING, failures)
+        leaning = _free_holds(view, voxels, cloud, pose, thing, _RING, failures)
     except GraspError:
         return best
-    other, short = _reachable(view, shapes, _pairs(voxels, holds, spots, pose))
+    pairs = sorted([*pairs, *_pairs(voxels, leaning, spots, pose)], key=lambda approach: approach.cost)
+    other, short = _reachable(view, shapes, pairs)
     return other if short <= max(miss, _MISSED) else best
 
 

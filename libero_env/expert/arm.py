@@ -7,6 +7,8 @@ from libero_env.expert.motion import rotation_between
 from libero_env.robot import REST_QPOS
 
 _STEPS, _GAIN, _REST = 60, 0.5, 0.03
+_DAMPED = 1e-3 * np.eye(6)
+_STALLED = 1e-3  # rad, of a step that gets nowhere
 _POS, _TURN = 0.006, 0.06  # m and rad, what counts as reached
 _MARGIN = 0.08  # rad, kept from the limits of a joint
 _STRAIGHT = -0.9  # rad, of the elbow: straight at -0.47, beyond which it folds over and does not come back
@@ -51,21 +53,23 @@ class Arm:
     def reach(self, start: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> tuple[np.ndarray, float]:
         """Joint angles (7,) near a pose, and by how much it is missed (m, and radians tenfold less)."""
         model, data, angles = self._model, self._data, start.copy()
-        jac = np.zeros((6, model.nv))
+        jac, rest = np.zeros((6, model.nv)), np.array(REST_QPOS)
         for _ in range(_STEPS):
             data.qpos[self._qpos] = angles
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             away = pos - data.site_xpos[self._site]
             turn = rotation_between(data.site_xmat[self._site].reshape(3, 3), mat)
-            if np.linalg.norm(away) < 0.3 * _POS and np.linalg.norm(turn) < 0.3 * _TURN:
+            if away @ away < (0.3 * _POS) ** 2 and turn @ turn < (0.3 * _TURN) ** 2:
                 break
             mujoco.mj_jacSite(model, data, jac[:3], jac[3:], self._site)
             own = jac[:, self._dof]
-            inverse = own.T @ np.linalg.inv(own @ own.T + 1e-3 * np.eye(6))
-            step = inverse @ np.concatenate([away, turn])
-            step += _REST * (np.eye(7) - inverse @ own) @ (np.array(REST_QPOS) - angles)
-            angles = np.clip(angles + _GAIN * np.clip(step, -0.5, 0.5), self._low, self._high)
+            back = _REST * (rest - angles)
+            inner = np.linalg.solve(own @ own.T + _DAMPED, np.concatenate([away, turn]) - own @ back)
+            step = np.minimum(np.maximum(own.T @ inner + back, -0.5), 0.5)
+            before, angles = angles, np.minimum(np.maximum(angles + _GAIN * step, self._low), self._high)
+            if np.abs(angles - before).max() < _STALLED:
+                break
         miss = max(np.linalg.norm(away) - _POS, 0.0) + 0.1 * max(np.linalg.norm(turn) - _TURN, 0.0)
         swing = np.abs(angles - start)[_ROLLS].max()
         return angles, float(miss + 0.02 * max(swing - _SWING, 0.0))

@@ -121,7 +121,8 @@ def _touched(
 def underside(points: np.ndarray) -> np.ndarray:
     """The lowest point in each cell of the ground plan; (N, 3) -> (M, 3)."""
     order = points[np.argsort(points[:, 2])]
-    _, first = np.unique(np.floor(order[:, :2] / _CELL), axis=0, return_index=True)
+    x, y = np.floor(order[:, :2] / _CELL).astype(int).T
+    _, first = np.unique((x << 32) + y, return_index=True)  # one number for a cell: far faster than rows
     return order[first]
 
 
