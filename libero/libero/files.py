@@ -1,6 +1,7 @@
 """This package's tasks as the files that the original ships: `<suite>/<task>.bddl`, `<suite>/<task>.pruned_init`."""
 
 import hashlib
+import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -34,6 +35,23 @@ def ensure(key: str, path: str) -> None:
     if key in makers and path == generated_paths()[key] and not (Path(path) / _COMPLETE).exists():
         makers[key](Path(path))
         (Path(path) / _COMPLETE).touch()
+
+
+def task_file(name: str | os.PathLike) -> str:
+    """A task file's path.
+
+    What exists is taken as it is. Else a name without a folder, such as `Task.bddl_file`, and a path into a checkout of
+    the original, `.../bddl_files/<suite>/<task>.bddl`, stand for the benchmark's file.
+    """
+    from libero.libero import get_libero_path
+
+    path = Path(name)
+    into_checkout = path.parts[-3:-2] == ("bddl_files",)
+    if path.exists() or (path.name != str(name) and not into_checkout):
+        return str(name)
+    suites = [path.parent.name] if into_checkout else list(suite_tasks())
+    found = [file for suite in suites if (file := Path(get_libero_path("bddl_files"), suite, path.name)).exists()]
+    return str(found[0]) if len(found) == 1 else str(name)
 
 
 def suite_tasks() -> dict[str, tuple[Task, ...]]:

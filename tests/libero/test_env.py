@@ -52,7 +52,7 @@ def test_step_returns_the_old_four_tuple(make_env):
     env = make_env(**BLIND)
     env.reset()
     obs, reward, done, info = env.step(REST)
-    assert (reward, done, info) == (0.0, False, {})
+    assert (reward, done, info) == (0.0, False, {"success": False})
     assert np.isclose(env.get_sim_state()[0], 0.05)
     with pytest.raises(ActionError, match=r"\(7,\)"):
         env.step([0.0] * 6)

@@ -18,6 +18,8 @@ from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_ob
 from libero.libero.envs.sim import MjSim
 from libero.libero.envs.stepping import ObservedSimulations
 from libero.libero.envs.stored_model import fixtures_of, write_model
+from libero.libero.envs.window import Window
+from libero.libero.files import task_file
 from libero_env.assets import select_pack
 from libero_env.controllers import ControllerState
 from libero_env.errors import LiberoError, UnknownNameError
@@ -64,6 +66,7 @@ class BDDLBaseDomain:
         controller_configs: `{"type": "OSC_POSE"}`, `control_delta` or `use_delta` for absolute actions.
         initialization_noise: None for none; else the arm starts near its rest pose.
         reward_scale: what success is worth.
+        has_renderer, render_camera: whether `render` shows a window, and from where.
         horizon: control steps after which `step` raises, unless `ignore_done`.
         placement_initializer: an object whose `sample()` gives name -> (pos, quat wxyz, object); by default regions are
             sampled as the task file says.
@@ -108,7 +111,7 @@ class BDDLBaseDomain:
             )
         if control_freq != CONTROL_FREQ:
             raise LiberoError(f"control_freq={control_freq}: the benchmark is defined at {CONTROL_FREQ} Hz")
-        self.bddl_file_name, self.control_freq = str(bddl_file_name), control_freq
+        self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
         self.problem = BDDLUtils.read_problem(bddl_file_name)
         self.parsed_problem = BDDLUtils.robosuite_parse_problem(bddl_file_name)
         self.obj_of_interest = self.parsed_problem["obj_of_interest"]
@@ -116,6 +119,7 @@ class BDDLBaseDomain:
         self.use_object_obs, self.use_camera_obs = use_object_obs, use_camera_obs
         self.reward_scale, self.reward_shaping = reward_scale, reward_shaping
         self.horizon, self.ignore_done, self.render_camera = horizon, ignore_done, render_camera
+        self.window = Window(render_camera) if has_renderer else None
         self.initialization_noise = initialization_noise
         self.placement_initializer = placement_initializer
         self.camera_list = cameras(
@@ -241,7 +245,7 @@ class BDDLBaseDomain:
         )
 
     def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
-        """Act for 50 ms: observation, reward, success, and an empty dictionary.
+        """Act for 50 ms: observation, reward, success, and a dictionary that says under `success` the same.
 
         The observation is of 2 ms before the end, as the original's.
 
@@ -259,7 +263,8 @@ class BDDLBaseDomain:
         self.simulations.step([0], command[None], tap=self._tap)
         self.cur_time += 1.0 / self.control_freq
         reward, self.done, info = self._post_action(action)
-        return self._get_observations(), reward, self._check_success(), info
+        success = self._check_success()
+        return self._get_observations(), reward, success, {"success": success, **info}
 
     def _tap(self, _: mujoco.MjData) -> None:
         self._observations = self.observer.observe()
@@ -363,11 +368,15 @@ class BDDLBaseDomain:
         self.timestep, self.cur_time, self.done = 0, 0.0, False
 
     def close(self) -> None:
-        """Free the simulation and its GL contexts. Idempotent."""
+        """Free the simulation, its GL contexts and its window. Idempotent."""
+        if self.window is not None:
+            self.window.close()
         self.sim.free()
 
     def render(self) -> None:
-        """Nothing to do: there is no window."""
+        """Show the present state in a window, if `has_renderer` asked for one and there is a screen."""
+        if self.window is not None:
+            self.window.show(self.sim.model._model, self.sim.data._data)
 
 
 DIR_PATH = os.path.dirname(os.path.realpath(__file__))

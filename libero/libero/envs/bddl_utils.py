@@ -4,6 +4,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from libero.libero.files import task_file
 from libero_env import bddl
 from libero_env.problem import And, Atom, Expression, ForAll, Not, Or, Problem
 
@@ -11,13 +12,14 @@ _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 
 
 def read_problem(problem_filename: str) -> Problem:
-    """A task file; read once as long as it does not change.
+    """A task file, see `libero.libero.files.task_file`; read once as long as it does not change.
 
     Raises:
         BDDLError: it is not a task file.
     """
-    stamp = Path(problem_filename).stat()
-    return _read(str(problem_filename), stamp.st_mtime_ns, stamp.st_size)
+    path = task_file(problem_filename)
+    stamp = Path(path).stat()
+    return _read(path, stamp.st_mtime_ns, stamp.st_size)
 
 
 @lru_cache(maxsize=256)

@@ -10,20 +10,21 @@ from libero.libero.envs import problems  # noqa: F401 - registers the problem cl
 from libero.libero.envs.bddl_base_domain import TASK_MAPPING, BDDLBaseDomain
 from libero.libero.envs.robots.single_arm import SingleArm
 from libero.libero.envs.sim import MjSim
-from libero_env.errors import LiberoError, PlacementError, UnknownNameError
+from libero_env.errors import PlacementError, UnknownNameError
 
 _RESETS = 5
 DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
 
 
 class ControlEnv:
-    """One simulation of a task file. `step` returns (observation, reward, success, {}); there is no `truncated`.
+    """One simulation of a task file. `step` returns (observation, reward, success, info); there is no `truncated`.
 
     Args:
-        bddl_file_name: task file.
+        bddl_file_name: task file; of the benchmark's tasks the name without a folder is enough.
         controller: `OSC_POSE` or `OSC_POSITION`.
         use_camera_obs: whether pictures are drawn.
         camera_names, camera_heights, camera_widths, camera_depths, camera_segmentations: one value, or one per camera.
+        has_renderer, render_camera: whether `env.render()` shows a window, and from where; see `Window`.
         horizon: control steps after which `step` raises.
         kwargs: further arguments of `BDDLBaseDomain`.
 
@@ -59,10 +60,6 @@ class ControlEnv:
         renderer_config: Any = None,
         **kwargs: Any,
     ):
-        if has_renderer:
-            raise LiberoError(
-                "has_renderer=True: there is no window here; draw with sim.render or camera observations"
-            )
         info = BDDLUtils.get_problem_info(bddl_file_name)
         self.problem_name, self.domain_name = info["problem_name"], info["domain_name"]
         self.language_instruction = info["language_instruction"]
@@ -75,6 +72,7 @@ class ControlEnv:
             gripper_types=gripper_types,
             initialization_noise=initialization_noise,
             use_camera_obs=use_camera_obs,
+            has_renderer=has_renderer,
             has_offscreen_renderer=has_offscreen_renderer,
             render_camera=render_camera,
             control_freq=control_freq,
@@ -123,6 +121,10 @@ class ControlEnv:
             except PlacementError:
                 continue
         return self.env.reset()
+
+    def get_observation(self) -> Mapping[str, np.ndarray]:
+        """What was observed last."""
+        return self.env._get_observations()
 
     def check_success(self) -> bool:
         """Whether the goal holds."""

@@ -1,0 +1,97 @@
+"""A reader's folder: demonstrations, meshes, no configuration; and registries that forget what a chapter registers."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero.libero.benchmark import get_benchmark
+from libero.libero.envs import base_object
+from libero.libero.utils import mu_utils, object_utils, task_generation_utils
+from libero.lifelong.algos import REGISTERED_ALGOS
+from libero_env.demos_generate import generate
+from libero_env.demos_write import DemoWriter, Episode
+from libero_env.objects import catalog
+from tests.walkthroughs.blocks import Block, load_blocks
+
+SIZE, STEPS = 128, 6
+
+
+@pytest.fixture(scope="session")
+def texts(shared) -> dict[str, list[str]]:
+    """Lines of each text."""
+    folder = shared / "walkthroughs"
+    if not folder.is_dir():
+        pytest.skip(f"the texts are not at {folder} (set LIBERO_SHARED)")
+    names = dict.fromkeys(block.text for block in load_blocks())
+    return {name: (folder / name).read_text(encoding="utf-8").splitlines() for name in names}
+
+
+@pytest.fixture(scope="session")
+def blocks() -> list[Block]:
+    return load_blocks()
+
+
+@pytest.fixture(scope="session")
+def demos(tmp_path_factory) -> Path:
+    """A demonstration of noise for each task of libero_object, and one by the expert of the task that is replayed."""
+    root = tmp_path_factory.mktemp("demos")
+    suite = get_benchmark("libero_object")()
+    for i in range(suite.n_tasks):
+        write_noise(root / suite.get_task_demonstration(i))
+    drawer = get_benchmark("libero_goal")().get_task_demonstration(0)
+    generate("libero_goal/0", 1, path=root / drawer, camera_size=(64, 64), workers=1, progress=False)
+    return root
+
+
+def write_noise(path: Path) -> None:
+    rng = np.random.default_rng(0)
+    pictures = {
+        k: rng.integers(0, 255, (STEPS, SIZE, SIZE, 3), np.uint8)
+        for k in ("agentview_rgb", "eye_in_hand_rgb")
+    }
+    sizes = {"joint_states": 7, "gripper_states": 2, "ee_pos": 3, "ee_ori": 3}
+    readings = {key: rng.normal(size=(STEPS, size)) for key, size in sizes.items()}
+    writer = DemoWriter(path, {"pairing": "aligned"}, compression=None)
+    writer.write(
+        0, Episode(rng.uniform(-1, 1, (STEPS, 7)), np.zeros((STEPS, 5)), None, {**pictures, **readings})
+    )
+    writer.finish()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, demos) -> Path:
+    """Where the reader is: `custom_assets` with meshes, demonstrations in the datasets folder, no screen."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    for name, half in (("my_object", 0.02), ("libero_mug", 0.03), ("libero_mug_yellow", 0.02)):
+        (tmp_path / "custom_assets" / name / "textures").mkdir(parents=True)
+        write_box(tmp_path / "custom_assets" / name / f"{name}.obj", half)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path / ".libero"))
+    monkeypatch.setenv("LIBERO_DEMOS", str(demos))
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(mu_utils, "MU_DICT", dict(mu_utils.MU_DICT))
+    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
+    monkeypatch.setattr(task_generation_utils, "TASK_INFO", {})
+    monkeypatch.setattr(object_utils, "EXCEPTION_DICT", {})
+    monkeypatch.setattr(catalog, "_registered", dict(catalog._registered))
+    before = dict(base_object.OBJECTS_DICT)
+    GlobalHydra.instance().clear()
+    algorithms = dict(REGISTERED_ALGOS)
+    yield tmp_path
+    GlobalHydra.instance().clear()
+    base_object.OBJECTS_DICT.clear()
+    base_object.OBJECTS_DICT.update(before)
+    REGISTERED_ALGOS.clear()
+    REGISTERED_ALGOS.update(algorithms)
+
+
+def write_box(path: Path, half: float) -> None:
+    """A cube as OBJ."""
+    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
+    quads = ((1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4))
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    path.write_text("\n".join([*lines, *(f"f {a} {b} {c} {d}" for a, b, c, d in quads)]))
