@@ -35,6 +35,7 @@ _HAND = hand_points()
 _CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
 _RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.25, 0.35, 0.6) for k in range(8)]
 _GRASPS, _PLACES, _TRIED = 20, 72, 24
+_PAIRS = 1000  # of holds and places, that are looked at
 _EACH, _DEPTH = 2, 0.03  # places at most for one turn of the body and so many m of depth
 _LEANING = 4  # holds for one approach that leans
 _MISSED = 1e-4  # m, by which a pose may be missed that counts as reached
@@ -284,32 +285,34 @@ def _hand_at(pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
 
 
 def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -> list[Approach]:
-    """Holds and places together, the best first; a body is let fall from where the hand has room."""
-    found = []
+    """The best holds and places together, in order; a body is let fall from where the hand has room."""
     turns = np.stack([spot.mat @ pose.mat.T for spot in spots])
-    entries = np.stack([spot.entry for spot in spots])
-    down = entries[:, 2] < -0.5
-    for grasp in holds:
-        mats = turns @ grasp.mat
-        origins = np.stack([spot.pos for spot in spots]) + turns @ (grasp.pos_world - pose.pos)
+    at, entries = np.stack([spot.pos for spot in spots]), np.stack([spot.entry for spot in spots])
+    aside = np.flatnonzero(entries[:, 2] > -0.5)
+    cost = np.array([[grasp.cost + spot.cost for spot in spots] for grasp in holds])
+    lifts = np.zeros(cost.shape, int)
+    for h, grasp in enumerate(holds):
+        mats, origins = turns @ grasp.mat, at + turns @ (grasp.pos_world - pose.pos)
         hits = np.full((len(spots), len(_LIFTS)), 1e6)
         wanting = np.ones(len(spots), bool)
         for k, lift in enumerate(_LIFTS):
             raised = origins[wanting] + [0, 0, lift + 0.008]
             hits[wanting, k] = voxels.touched(_HAND, raised, mats[wanting])
-            wanting &= (hits[:, k] > 0) & down
+            wanting &= hits[:, k] > 0
+            wanting[aside] = False
             if not wanting.any():
                 break
         price = 0.01 * hits + 0.3 * (hits > 0) + 4.0 * _LIFTS
-        best = price.argmin(axis=1)
-        befores = origins[:, None] - np.array([0.08, 0.16])[:, None] * entries[:, None]
-        for i, spot in enumerate(spots):
-            outside = 0.0
-            if not down[i]:
-                outside = 0.01 * float(voxels.touched(_HAND, befores[i], mats[[i, i]]).sum())
-            cost = grasp.cost + spot.cost + float(price[i, best[i]]) + outside
-            found.append(Approach(grasp, spot, pose, float(_LIFTS[best[i]]), cost))
-    return sorted(found, key=lambda approach: approach.cost)
+        lifts[h] = price.argmin(axis=1)
+        cost[h] += price.min(axis=1)
+        for back in (0.08, 0.16):
+            before = origins[aside] - back * entries[aside]
+            cost[h, aside] += 0.01 * voxels.touched(_HAND, before, mats[aside])
+    best = np.argsort(cost, axis=None, kind="stable")[:_PAIRS]
+    return [
+        Approach(holds[h], spots[s], pose, float(_LIFTS[lifts[h, s]]), float(cost[h, s]))
+        for h, s in zip(*np.unravel_index(best, cost.shape), strict=True)
+    ]
 
 
 def _reachable(
