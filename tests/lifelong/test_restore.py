@@ -12,17 +12,30 @@ from PIL import Image
 
 from libero_env.tasks import get_task
 from lifelong import checkpoints
-from lifelong.data import fake_batch
+from lifelong.data import SequenceVLDataset, fake_batch
+from lifelong.data.fake import fake_observation
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.experiment import build
 from lifelong.restore import restore
 from lifelong.saliency import SaliencySettings
 from lifelong.saliency_rollout import draw_saliency
 from lifelong.training import generator, seeded
+from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit
 CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = ("preset=smoke", "device=cpu", "data.image_size=32", "policy.image_width=8", "policy.head_hidden=16")
+
+
+def make_windows(task: int, spec: PolicySpec) -> SequenceVLDataset:
+    """Eight random frames of one demonstration."""
+    observation, draws = fake_observation(spec, 1, generator(task), steps=8), generator(task)
+    proprio = {name: value[0] for name, value in observation.proprio.items()}
+    actions = 2 * torch.rand(8, spec.action_dim, generator=draws) - 1
+    last = torch.full((8,), 7)
+    return SequenceVLDataset(
+        observation.images[0], proprio, actions, last, observation.language[0], task, spec.seq_len
+    )
 
 
 def make_run(folder: Path, *overrides: str):
@@ -38,14 +51,15 @@ def make_run(folder: Path, *overrides: str):
         policy, algorithm, states = build(config.policy, spec=spec), build(config.algo), []
     batch = fake_batch(spec, 4, generator(0))
     for task in range(2):
-        algorithm.begin_task(task, None, policy)
+        windows = make_windows(task, spec)
+        algorithm.begin_task(task, windows, policy)
         algorithm.begin_phase(algorithm.phases()[0], policy)
         with torch.no_grad(), seeded(task):
             for p in algorithm.trained(policy):
                 p.add_(0.1 * torch.randn_like(p))
         algorithm.after_step(policy)
         algorithm.end_phase(algorithm.phases()[0], policy)
-        algorithm.end_task(task, None, policy, generator(task))
+        algorithm.end_task(task, windows, policy, generator(task))
         state = {"task": task, "policy": policy.state_dict(), "algorithm": algorithm.state_dict()}
         checkpoints.save(folder / "checkpoints" / f"task_{task}.safetensors", state)
         states.append(checkpoints.load(folder / "checkpoints" / f"task_{task}.safetensors")["policy"])
