@@ -179,7 +179,9 @@ def scene_digest(scene: Scene) -> str:
     """What initial states depend on: joints in order, collision shapes of objects and fixtures; 16 hex digits."""
     model = scene.model
     parts = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
-    for name in scene.things:
+    for name, thing in scene.things.items():
+        if thing.digest:
+            parts.append((name, thing.digest))
         for body in scene.bodies[name]:
             for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
                 if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:

@@ -15,7 +15,7 @@ import mujoco
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.builtin.facts import load_facts
-from libero_env.objects.catalog import _registered, get_object
+from libero_env.objects.catalog import get_object, own_names
 from libero_env.objects.model import ObjectModel
 from libero_env.original_mjcf import object_xml
 
@@ -72,7 +72,7 @@ class OriginalPack:
 
     def categories(self) -> tuple[str, ...]:
         """All categories, sorted, with those that users registered."""
-        return tuple(sorted({*_registered, *(c for group in FAMILIES.values() for c in group)}))
+        return tuple(sorted({*own_names(), *(c for group in FAMILIES.values() for c in group)}))
 
     def build(self, category: str) -> ObjectModel:
         """Model of a category, anew at each call; what users registered comes first.
@@ -81,7 +81,7 @@ class OriginalPack:
             UnknownNameError: no object has this name.
             LiberoError: the pack has no model of it, or its files are missing.
         """
-        if category in _registered:
+        if category in own_names():
             return get_object(category)
         if category in _NAMED_ONLY:
             raise LiberoError(

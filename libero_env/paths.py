@@ -23,6 +23,16 @@ def demos_dir() -> Path:
     return cache_dir() / "demos"
 
 
+def objects_dir() -> Path:
+    """Where the user's own objects are kept: `$LIBERO_OBJECTS`, else `objects` of the configuration file, else beside it.
+
+    Raises:
+        LiberoError: as `read_config`.
+    """
+    path = os.environ.get("LIBERO_OBJECTS") or read_config().get("objects")
+    return Path(str(path)).expanduser() if path else config_file().parent / "objects"
+
+
 def config_file() -> Path:
     """`config.yaml` in `$LIBERO_CONFIG_PATH`, else in `~/.libero`; the original's tools write it, it need not exist."""
     folder = os.environ.get("LIBERO_CONFIG_PATH")

@@ -1,8 +1,9 @@
-"""Category name -> object model, from the builtin pack and from what users registered."""
+"""Category name -> object model, from the builtin pack, from what users registered, and from their folder of objects."""
 
 from collections.abc import Callable
 
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.objects import folder
 from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 
@@ -16,10 +17,13 @@ def get_object(category: str) -> ObjectModel:
 
     Raises:
         UnknownNameError: no object has this name; the message lists the valid ones.
-        LiberoError: a registered builder returned something that a scene cannot attach.
+        LiberoError: a registered builder returned something that a scene cannot attach, or a file in the user's
+            folder is missing or broken.
     """
     builder = _registered.get(category) or BUILDERS.get(category)
     if builder is None:
+        if (place := folder.find(category)) is not None:
+            return folder.load(place, category)
         raise UnknownNameError("object category", category, object_names())
     model = builder()
     if category in _registered:
@@ -29,7 +33,12 @@ def get_object(category: str) -> ObjectModel:
 
 def object_names() -> tuple[str, ...]:
     """All categories that `get_object` knows, sorted."""
-    return tuple(sorted({*BUILDERS, *_registered}))
+    return tuple(sorted({*BUILDERS, *own_names()}))
+
+
+def own_names() -> frozenset[str]:
+    """The categories that users added: registered in this process, or kept in their folder of objects."""
+    return frozenset({*_registered, *folder.names()})
 
 
 def register_object(category: str, builder: Builder) -> None:

@@ -26,6 +26,7 @@ class ObjectModel:
         horizontal_radius: radius that placement keeps free around the object, metres.
         articulation: `open`, `close`, `turnon`, `turnoff` -> (low, high) of the joints, rad or m: where an object is
             put for an initial condition of that name, and from where on it counts.
+        digest: of the files it was read from, for what is kept of scenes with it; "" where code says what it is.
     """
 
     category: str
@@ -37,6 +38,7 @@ class ObjectModel:
     top_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     horizontal_radius: float = 0.0
     articulation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    digest: str = ""
 
     def rest_quat(self, rng: np.random.Generator | None = None) -> np.ndarray:
         """Orientation at rest, wxyz (4,), as `rest_quat` below gives it for this object's ranges."""

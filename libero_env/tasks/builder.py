@@ -65,6 +65,21 @@ def load_scene(name: str) -> Mapping[str, Any]:
     return load_data(f"scenes/{name}.yaml")
 
 
+def scene_names() -> tuple[str, ...]:
+    """The names that `load_scene` knows, sorted."""
+    files = (resources.files("libero_env.tasks") / "data" / "scenes").iterdir()
+    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
+
+
+def filled(facts: Mapping[str, Any], given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Facts with the values of their parameters.
+
+    Raises:
+        UnknownNameError: a parameter that has no value.
+    """
+    return _fill(facts, _parameters(given), where)
+
+
 def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
     """The problem that a task in a scene amounts to.
 

@@ -9,6 +9,8 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.problem import Problem
 from libero_env.tasks.builder import build_problem, language_from_name, load_data, load_scene
 
+ENDINGS = (".bddl", ".yaml", ".yml")  # of task files
+
 
 @dataclass(frozen=True)
 class Task:
@@ -98,11 +100,14 @@ def _task(suite: str, index: int, facts: dict) -> Task:
 
 
 def get_task(key: str) -> Task:
-    """The task called `suite/index`, `suite-index` or by its name alone.
+    """The task called `suite/index`, `suite-index` or by its name alone; or of a file, see `read_task`.
 
     Raises:
         UnknownNameError: no such suite, index or task.
+        LiberoError: the file is not a task.
     """
+    if key.endswith(ENDINGS):
+        return read_task(key)
     for mark in "/-":
         suite_name, found, index = key.rpartition(mark)
         if found:
@@ -117,10 +122,21 @@ def get_task(key: str) -> Task:
 
 
 def read_task(path: str | Path) -> Task:
-    """A task of your own from a BDDL file; its suite is `file`, its name the file's.
+    """A task of your own from a BDDL or YAML file; its suite is `file`, its name the file's.
+
+    A BDDL file's instruction is that of its name, as in the original; a YAML file's what it says, see
+    `libero_env.tasks.authoring`.
 
     Raises:
         BDDLError: the file is not a task; the message starts with file:line.
+        LiberoError: a YAML file that is not one task.
     """
+    if str(path).endswith(ENDINGS[1:]):
+        from libero_env.tasks.authoring import read_yaml_tasks
+
+        tasks = read_yaml_tasks(path)
+        if len(tasks) != 1:
+            raise LiberoError(f"{path} holds {len(tasks)} tasks, and one is wanted; put it in a file of its own")
+        return tasks[0]
     problem, name = bddl.read(path), Path(path).stem
     return Task("file", 0, name, language_from_name(name), problem.language, problem)

@@ -1,0 +1,167 @@
+"""Mesh files (OBJ, GLB, glTF, STL, PLY) -> what an object looks like, upright, in metres, with the origin in its middle."""
+
+import shlex
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from math import log
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from libero_env.errors import LiberoError
+
+FORMATS = (".obj", ".glb", ".gltf", ".stl", ".ply")
+_Y_UP = (".glb", ".gltf")  # by their specification
+_UNITS = {"centimetres": 0.01, "millimetres": 0.001}
+_METRES = (0.01, 0.6)  # m, longest side of what is taken to be in metres
+_TYPICAL = 0.1  # m, the side that a guess of the unit comes nearest to
+_GREY = (0.7, 0.7, 0.7, 1.0)
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A part of an object that has one material.
+
+    Attributes:
+        vertices: (n, 3), metres.
+        faces: (f, 3), vertex indices.
+        texcoords: (n, 2) with v = 0 at the lower edge of the picture; None for a plain colour.
+        image: the picture; None for a plain colour.
+        rgba: the colour, 0..1; white where there is a picture.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    texcoords: np.ndarray | None = None
+    image: Image.Image | None = None
+    rgba: tuple[float, ...] = _GREY
+
+
+def read_mesh(path: Path, *, size: float | None, up: str | None, tell: Tell) -> list[Surface]:
+    """The surfaces of a mesh file, z up, the origin in the middle of their bounds.
+
+    Args:
+        path: the file.
+        size: longest side wanted, m; None keeps the file's, after a guess of its unit.
+        up: axis of the file that points up, `z` or `y`; None for what the format says.
+        tell: takes a line about each guess.
+
+    Raises:
+        LiberoError: not a format that is read, no triangles, or a picture is missing; the message names the file.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise LiberoError(f"{path}: unknown format {path.suffix!r}; valid: .xml (MJCF), {', '.join(FORMATS)}")
+    if not path.is_file():
+        raise LiberoError(f"{path}: no such file")
+    _check_pictures(path)
+    surfaces = [_surface(part) for part in _parts(path)]
+    if not surfaces:
+        raise LiberoError(f"{path}: there are no triangles in it; export the object as a mesh")
+    if up is None:
+        up = "y" if path.suffix.lower() in _Y_UP else "z"
+    if up == "y":
+        surfaces = [replace(s, vertices=s.vertices[:, [0, 2, 1]] * (1, -1, 1)) for s in surfaces]
+    low, high = bounds(surfaces)
+    if min(high - low) <= 1e-4 * max(high - low):
+        raise LiberoError(f"{path}: it is flat, and nothing can be taken hold of; give it a thickness")
+    scale = size / max(high - low) if size else _unit(float(max(high - low)), path, tell)
+    middle = (low + high) / 2
+    return [replace(s, vertices=(s.vertices - middle) * scale) for s in surfaces]
+
+
+def bounds(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner, (3,) and (3,)."""
+    points = np.concatenate([s.vertices for s in surfaces])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def welded(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
+    """The whole as one mesh, vertices at one place joined: (n, 3), (f, 3). Seams of textures are none of it."""
+    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
+    points = np.concatenate([s.vertices for s in surfaces])
+    faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)])
+    grain = 1e-5 * np.ptp(points, axis=0).max()
+    _, first, where = np.unique(np.round(points / grain), axis=0, return_index=True, return_inverse=True)
+    faces = where.reshape(-1)[faces]
+    return points[first], faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+
+
+def is_closed(faces: np.ndarray) -> bool:
+    """Whether every edge of triangles (f, 3) lies between two that are turned the same way: an inside and an outside."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there, back = np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)
+    return len(there) == len(edges) and np.array_equal(there, back)
+
+
+def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Of a closed mesh, m^3; negative where it is inside out."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def _parts(path: Path) -> list[Any]:
+    """The meshes of a file as trimesh reads it, where they are in its scene."""
+    import trimesh
+
+    try:
+        found = trimesh.load(str(path), force="scene").dump()
+    except Exception as error:  # noqa: BLE001 - each format's reader fails in its own way
+        raise LiberoError(f"{path}: it cannot be read ({error}); export it anew") from error
+    return [part for part in found if len(getattr(part, "faces", ()))]
+
+
+def _surface(part: Any) -> Surface:
+    vertices, faces = np.array(part.vertices, float), np.array(part.faces, np.int64)
+    material = getattr(part.visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    texcoords = getattr(part.visual, "uv", None)
+    if image is not None and texcoords is not None:
+        return Surface(vertices, faces, np.array(texcoords, float)[:, :2], image.convert("RGB"), (1.0,) * 4)
+    known = getattr(part.visual, "defined", False) or material is not None
+    colour = getattr(material if material is not None else part.visual, "main_color", None) if known else None
+    rgba = _GREY if colour is None else tuple(round(float(value) / 255, 4) for value in colour)
+    return Surface(vertices, faces, rgba=rgba)
+
+
+def _unit(longest: float, path: Path, tell: Tell) -> float:
+    """Metres for one unit of the file, guessed from its longest side."""
+    if _METRES[0] <= longest <= _METRES[1]:
+        return 1.0
+    if longest < _METRES[0]:
+        tell(f"{path.name} is {1000 * longest:.3g} mm long in metres; if that is wrong, say --size (m)")
+        return 1.0
+    name, unit = min(_UNITS.items(), key=lambda item: abs(log(longest * item[1] / _TYPICAL)))
+    tell(
+        f"{path.name} is {longest:.4g} units long: taken for {name}, so that it is {100 * longest * unit:.3g} cm; "
+        "if that is wrong, say --size (m)"
+    )
+    return unit
+
+
+def _check_pictures(path: Path) -> None:
+    """Every picture that an OBJ file's materials name is there; trimesh would leave it out without a word."""
+    if path.suffix.lower() != ".obj":
+        return
+    for library in _named(path, ("mtllib",)):
+        if not library.is_file():
+            raise LiberoError(
+                f"{path}: its material file {library.name} is missing; put it beside it, or remove the line mtllib"
+            )
+        for picture in _named(library, ("map_Kd",)):
+            if not picture.is_file():
+                raise LiberoError(
+                    f"{library}: its texture {picture.name} is missing; put it at {picture}, or remove the line map_Kd"
+                )
+
+
+def _named(path: Path, keys: tuple[str, ...]) -> Iterator[Path]:
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word in keys and rest.strip():
+            whole = path.parent / rest.strip()
+            # options may come before the name, and names may hold blanks
+            yield whole if whole.is_file() else path.parent / shlex.split(rest)[-1].replace("\\", "/")

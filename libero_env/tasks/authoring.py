@@ -1,0 +1,322 @@
+"""Tasks of one's own: a scene and a goal in one YAML file, or in one call.
+
+    scene: kitchen
+    furniture: [wooden_cabinet]
+    objects: [akita_black_bowl, plate]
+    place:
+      wooden_cabinet_1: {at: [0, -0.3], yaw: pi}
+      akita_black_bowl_1: [0, 0]
+      plate_1: {at: [0.05, 0.2], half: 0.02}
+    goal: On akita_black_bowl_1 plate_1
+    language: put the bowl on the plate
+
+The keys are those of `libero_env.tasks.builder`, and these, which are short for what it takes many to say:
+
+    scene      a scene of the benchmark (`kitchen_scene1`, with what stands in it), an empty one (`kitchen`, `living_room`,
+               `study`, `coffee`, `table`, `floor`), or the YAML file of one
+    furniture  categories of fixtures, besides those of the scene; numbered as objects are
+    objects    categories, besides those of the scene
+    place      thing: where it is at the start: [x, y] on the workspace in metres (x points away from the robot, y to its
+               left), `{at: [x, y], half: h, yaw: angle}` for any point within h of it, or what it stands on:
+               `plate_1`, `wooden_cabinet_1_top_side`, `In wooden_cabinet_1_top_region`
+    goal       one atom, several, or an expression; an atom is `On a b`, `(On a b)` or, in Python, `("On", "a", "b")`
+
+Places of objects and fixtures, such as `basket_1_contain_region`, need no declaration.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from libero_env.arena import WORKSPACES, load_workspace
+from libero_env.assets import select_pack
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.objects.model import ObjectModel
+from libero_env.problem import Problem
+from libero_env.tasks.builder import KEYS, build_problem, filled, language_from_name, load_scene, scene_names
+from libero_env.tasks.suites import Suite, Task, read_task
+
+EMPTY: Mapping[str, str] = {
+    "kitchen": "kitchen_table",
+    "living_room": "living_room_table",
+    "study": "study_table",
+    "coffee": "coffee_table",
+    "table": "table",
+    "floor": "floor",
+}
+SHORT = ("scene", "furniture", "objects", "place", "goal", "name", "with")
+_OWN_KEYS = tuple(dict.fromkeys((*SHORT, *KEYS)))
+_HALF = {"object": 0.025, "fixture": 0.01}  # m, of places that say none, as in the original's scenes
+_TABLE = "main_table"  # the original's name of the fixture `table`
+OWN = "own"  # suite of one's own files
+FILE = "file"  # suite of a task that was read alone
+
+Facts = Mapping[str, Any]
+
+
+def make_task(name: str | None = None, **facts: Any) -> Task:
+    """A task of your own; `libero_env.tasks.authoring` lists the facts.
+
+        make_task(scene="kitchen", objects=["red_cup", "plate"], place={"red_cup_1": (0, 0), "plate_1": (0.05, 0.2)},
+                  goal=("On", "red_cup_1", "plate_1"), language="put the red cup on the plate")
+
+    Args:
+        name: of its files; by default the words of the language, joined.
+        facts: what the YAML file would say.
+
+    Raises:
+        LiberoError: a key, scene, thing or place that does not exist, or a thing without a place; the message lists
+            the valid ones.
+    """
+    facts = {key: value for key, value in facts.items() if value is not None}
+    return _task({**facts, **({"name": name} if name else {})}, "task", Path())
+
+
+def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
+    """The task of a YAML file; or several, which stand below `tasks` and share what the file says beside that.
+
+    Raises:
+        LiberoError: as `make_task`, and where the file is no YAML; the message names the file.
+    """
+    path = Path(path)
+    try:
+        facts = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LiberoError(f"{path}: {error.strerror or error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise LiberoError(f"{path} is not valid YAML: {error}") from error
+    if not isinstance(facts, dict):
+        raise LiberoError(f"{path}: expected keys such as scene, objects, place and goal")
+    if "tasks" not in facts:
+        return (_task({"name": path.stem, **facts}, str(path), path.parent),)
+    shared = {key: value for key, value in facts.items() if key != "tasks"}
+    return tuple(_task({**shared, **own}, f"{path}, task {i}", path.parent) for i, own in enumerate(facts["tasks"]))
+
+
+def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
+    """A suite of one's own: the tasks of BDDL and YAML files, in their order.
+
+    Raises:
+        LiberoError: a file that cannot be read, two tasks of one name, or no file.
+    """
+    tasks: list[Task] = []
+    for file in files:
+        tasks += read_yaml_tasks(file) if Path(file).suffix in (".yaml", ".yml") else [read_task(file)]
+    names = [task.name for task in tasks]
+    if twice := sorted({n for n in names if names.count(n) > 1}):
+        raise LiberoError(f"two tasks of the suite {name} are called {', '.join(twice)}; rename one of their files")
+    if not tasks:
+        raise LiberoError(f"the suite {name} has no files; name some that end in .yaml or .bddl")
+    return Suite(name, tuple(replace(task, suite=name, index=i) for i, task in enumerate(tasks)))
+
+
+def write_task(task: Task, path: str | Path) -> Path:
+    """Write a task's BDDL; what reads it takes its instruction from the file's name.
+
+    Raises:
+        LiberoError: the file's name does not end in .bddl.
+    """
+    path = Path(path)
+    if path.suffix != ".bddl":
+        raise LiberoError(f"{path}: task files are .bddl")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(task.bddl_text, encoding="utf-8")
+    return path
+
+
+def places_of(category: str) -> tuple[str, ...]:
+    """The places of an object or fixture that atoms can name after it, such as `contain_region`, sorted.
+
+    Raises:
+        UnknownNameError: no object has this name.
+    """
+    return _places(select_pack().build(category))
+
+
+def _places(item: ObjectModel) -> tuple[str, ...]:
+    names = {site.name for site in item.spec.sites}
+    return tuple(sorted(name for name in names if name and name != "default_site" and not name.endswith("_site")))
+
+
+def _task(facts: Facts, where: str, folder: Path) -> Task:
+    for key in facts:
+        if key not in _OWN_KEYS:
+            raise UnknownNameError(f"key of {where}", key, _OWN_KEYS)
+    said = str(facts.get("language") or language_from_name(str(facts.get("name", ""))))
+    name = str(facts.get("name") or re.sub(r"\W+", "_", said.strip().lower()).strip("_"))
+    if not said:
+        raise LiberoError(f"{where}: it has neither a name nor a language; say what is to be done")
+    problem = _problem({**facts, "name": name, "language": said}, where, folder)
+    return Task(FILE, 0, name, said, said, problem)
+
+
+def _problem(facts: Facts, where: str, folder: Path) -> Problem:
+    """The problem of facts in which the short forms are used."""
+    scene = filled(_scene(facts.get("scene"), where, folder), facts.get("with", {}), where)
+    facts = filled(facts, facts.get("with", {}), where)
+    fixtures = {**scene.get("fixtures", {}), **facts.get("fixtures", {})}
+    fixtures |= _numbered(facts.get("furniture", ()), fixtures.values(), where)
+    objects = _numbered(scene.get("objects", ()), (), where)
+    objects |= _numbered(facts.get("objects", ()), objects.values(), where)
+    things = {**fixtures, **objects}
+    regions, starts = _placed(facts.get("place", {}), fixtures, things, where)
+    init = [*map(_atom, facts.get("init_also", ())), *starts]
+    init += map(_atom, facts["init"] if "init" in facts else scene.get("init", ()))
+    goal = _goal(facts.get("goal", scene.get("goal")), where)
+    declared = _joined(scene.get("regions"), facts.get("regions"), regions)
+    declared = _joined(declared, _undeclared([*init, *goal], declared, things, where))
+    own = {key: facts[key] for key in ("name", "language", "problem", "obj_of_interest") if key in facts}
+    properties = {**scene.get("scene_properties", {}), **facts.get("scene_properties", {})}
+    whole = {
+        **{key: scene[key] for key in ("problem", "obj_of_interest") if key in scene and "goal" not in facts},
+        "problem": scene.get("problem") or load_workspace(_workspace(fixtures, where)[1]).problem, **own, "fixtures": fixtures, "objects": _counts(objects), "regions": declared,
+        "init": init, "goal": goal[0] if goal[0].startswith("(") else goal, "scene_properties": properties,
+    }  # fmt: skip
+    _check_placed(things, init, where)
+    return build_problem({}, whole)
+
+
+def _scene(scene: Any, where: str, folder: Path) -> Facts:
+    """The facts of a scene: of the benchmark, an empty one, or in a file beside the task's."""
+    valid = (*EMPTY, *scene_names())
+    if scene is None:
+        raise LiberoError(f"{where}: it says no scene; add one of {', '.join(valid)}")
+    if isinstance(scene, Mapping):
+        return scene
+    scene = str(scene)
+    if scene in EMPTY or scene in EMPTY.values():
+        category = EMPTY.get(scene, scene)
+        name = _TABLE if category == "table" else category
+        return {"problem": load_workspace(category).problem, "fixtures": {name: category}}
+    if scene.endswith((".yaml", ".yml")):
+        path = folder / scene
+        if not path.is_file():
+            raise LiberoError(f"{where}: its scene {path} is missing")
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    if scene not in valid:
+        raise UnknownNameError(f"scene of {where}", scene, valid)
+    return load_scene(scene)
+
+
+def _numbered(entries: Any, there: Iterable[str], where: str) -> dict[str, str]:
+    """Name -> category of entries such as `plate` or `{plate: 2}`, counted on from those that are there."""
+    if isinstance(entries, str | Mapping):
+        entries = [entries]
+    count, named = Counter(there), {}
+    known = {*select_pack().categories(), *WORKSPACES}
+    for entry in entries:
+        for category, number in entry.items() if isinstance(entry, Mapping) else [(entry, 1)]:
+            if category not in known:
+                raise UnknownNameError(f"object category of {where}", category, known)
+            for _ in range(int(number)):
+                count[category] += 1
+                named[f"{category}_{count[category]}"] = category
+    return named
+
+
+def _counts(objects: Mapping[str, str]) -> list[dict[str, int]]:
+    """Objects as the builder takes them; those of one category come together."""
+    return [{category: number} for category, number in Counter(objects.values()).items()]
+
+
+def _placed(
+    places: Facts, fixtures: Mapping[str, str], things: Mapping[str, str], where: str
+) -> tuple[dict[str, Any], list[str]]:
+    """Regions and init atoms of what `place` says."""
+    workspace = _workspace(fixtures, where)[0]
+    regions: dict[str, Any] = {}
+    atoms = []
+    for thing, place in places.items():
+        if thing not in things:
+            thing = f"{thing}_1" if f"{thing}_1" in things else thing
+        if thing not in things or thing == workspace:
+            raise UnknownNameError(f"thing to place of {where}", thing, set(things) - {workspace})
+        if isinstance(place, str):
+            predicate, _, rest = place.strip("() ").rpartition(" ")
+            atoms.append(f"{predicate or 'On'} {thing} {rest}")
+            continue
+        regions[f"{thing}_start"] = _rectangle(place, "fixture" if thing in fixtures else "object", thing, where)
+        atoms.append(f"On {thing} {workspace}_{thing}_start")
+    return {workspace: regions} if regions else {}, atoms
+
+
+def _workspace(fixtures: Mapping[str, str], where: str) -> tuple[str, str]:
+    """Name and category of the fixture that is the workspace."""
+    for name, category in fixtures.items():
+        if category in WORKSPACES:
+            return name, category
+    raise LiberoError(f"{where}: none of its fixtures is a workspace; name a scene: {', '.join(EMPTY)}")
+
+
+def _rectangle(place: Any, kind: str, thing: str, where: str) -> dict[str, Any]:
+    """The facts of a region: [x, y], or `at`, `half` and `yaw`."""
+    facts = dict(place) if isinstance(place, Mapping) else {"at": list(place)}
+    if "ranges" not in facts:
+        if not isinstance(facts.get("at"), list | tuple) or len(facts["at"]) != 2:
+            raise LiberoError(f"{where}: the place of {thing} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}")
+        half = facts.get("half", _HALF[kind])
+        facts |= {"at": list(facts["at"]), "half": list(half) if isinstance(half, tuple) else half}
+    return facts
+
+
+def _atom(atom: Any) -> str:
+    """`On a b` of `On a b`, `(On a b)` or `("On", "a", "b")`."""
+    return atom.strip().removeprefix("(").removesuffix(")") if isinstance(atom, str) else " ".join(atom)
+
+
+def _goal(goal: Any, where: str) -> list[str]:
+    """Atoms, or one expression in brackets."""
+    if not goal:
+        raise LiberoError(f"{where}: it has no goal; add one, such as `goal: On red_cup_1 plate_1`")
+    if isinstance(goal, str):
+        nested = goal.count("(") > 1 or re.match(r"\(\s*(and|or|not|forall)\b", goal.strip(), re.IGNORECASE)
+        return [goal.strip()] if nested else [_atom(goal)]
+    if isinstance(goal, tuple) and all(isinstance(word, str) and " " not in word for word in goal):
+        return [_atom(goal)]
+    return [_atom(atom) for atom in goal]
+
+
+def _joined(*several: Mapping[str, Any] | None) -> dict[str, dict[str, Any]]:
+    """The regions of several sources by target; later ones replace earlier ones of the same name."""
+    joined: dict[str, dict[str, Any]] = {}
+    for regions in several:
+        for target, facts in (regions or {}).items():
+            joined.setdefault(target, {}).update(facts if isinstance(facts, Mapping) else {name: {} for name in facts})
+    return joined
+
+
+def _undeclared(
+    atoms: Iterable[str], declared: Mapping[str, Facts], things: Mapping[str, str], where: str
+) -> dict[str, dict[str, Any]]:
+    """The places of models that atoms speak of and nothing declares.
+
+    Raises:
+        LiberoError: a name that is none, with the places that there are.
+    """
+    known = {*things, *(f"{target}_{name}" for target, facts in declared.items() for name in facts)}
+    found: dict[str, dict[str, Any]] = {}
+    for atom in atoms:
+        words = re.findall(r"[\w?]+", atom)
+        for name in words if atom.startswith("(") else words[1:]:
+            target = max((t for t in things if name.startswith(f"{t}_")), key=len, default=None)
+            if name in known or target is None or things[target] in WORKSPACES:
+                continue
+            site = name.removeprefix(f"{target}_")
+            if site not in (places := places_of(things[target])):
+                raise UnknownNameError(f"place of {target} ({where}: {atom})", site, places or ("none",))
+            found.setdefault(target, {})[site] = {}
+    return found
+
+
+def _check_placed(things: Mapping[str, str], init: Iterable[str], where: str) -> None:
+    placed = {words[1] for words in map(str.split, init) if len(words) == 3 and words[0] in ("On", "In")}
+    missing = [name for name, category in things.items() if name not in placed and category not in WORKSPACES]
+    if missing:
+        raise LiberoError(
+            f"{where}: nothing says where {', '.join(missing)} stands; add it below place, such as `{missing[0]}: [0, 0]`"
+        )
