@@ -31,7 +31,7 @@ def _lean(azimuth: float, tilt: float) -> np.ndarray:
     return about @ np.array([[c1, 0.0, -s1], [0.0, 1.0, 0.0], [s1, 0.0, c1]]) @ about.T
 
 
-_HAND = hand_points()
+_HAND = hand_points(MAX_OPENING + 0.012)  # with room beside the fingers
 _CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
 _RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.25, 0.35, 0.6) for k in range(8)]
 _GRASPS, _PLACES, _TRIED = 20, 72, 24
@@ -39,6 +39,7 @@ _PAIRS = 1000  # of holds and places, that are looked at
 _EACH, _DEPTH = 2, 0.03  # places at most for one turn of the body and so many m of depth
 _LEANING = 4  # holds for one approach that leans
 _MISSED = 1e-4  # m, by which a pose may be missed that counts as reached
+_HOPELESS = 0.03  # m, that a pose is missed by where others turned the same way are missed too
 _RAISED = 0.10  # m, over where a body was taken, where the hand has turned as it will put it down
 _AGAIN = 0.5  # cost of a hold that failed before, or of a place
 _ALIKE, _ALIKE_TURN = 0.02, 0.4  # m and rad, between holds or places that share their fate
@@ -322,6 +323,7 @@ def _reachable(
     angles = view.simulations.fields["qpos"][view.index][:7]
     best: tuple[float, Approach] | None = None
     seen: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
+    hopeless: set[tuple] = set()
     tried = 0
     for pair in pairs:
         for side, flip in enumerate(_WAYS_ROUND[: 1 + both_ways]):
@@ -332,6 +334,9 @@ def _reachable(
             after, missed = seen[key]
             if best is not None and missed >= best[0]:
                 continue
+            turned = (*key, *np.round(pair.place.mat.ravel(), 1), *np.round(pair.place.entry))
+            if turned in hopeless:
+                continue
             own, tried = replace(pair, grasp=grasp), tried + 1
             clear = 0.08 if pair.place.entry[2] < -0.5 else ASIDE
             way = [
@@ -340,6 +345,8 @@ def _reachable(
                 (own.hand_pos, own.hand_mat),
             ]
             miss = max(missed, shapes.arm.follow(after, way)[1])
+            if miss > _HOPELESS:
+                hopeless.add(turned)
             if best is None or miss < best[0]:
                 best = miss, own
             if miss < _MISSED:

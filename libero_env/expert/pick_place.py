@@ -10,9 +10,9 @@ from libero_env.expert.approach import Approach, Failure, between_fingers, choos
 from libero_env.expert.carry import Carry, Move
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.geometry import Pose
-from libero_env.expert.grasp import MAX_OPENING, TIP_BELOW
+from libero_env.expert.grasp import MAX_OPENING, TIP_BELOW, crowding
 from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
-from libero_env.expert.shapes import Shapes, pose_of
+from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.style import Style
 from libero_env.predicates import StateView, evaluate
 from libero_env.problem import Atom
@@ -32,6 +32,7 @@ LEVEL = 0.45  # vertical part of an approach below which it counts as level
 AROUND = 0.08  # m, within which bodies count as in the way
 DIVERTED = 3  # times that another place is chosen for what is in the hand
 PATIENCE = 25  # steps, to wait for an object to come to rest
+EASE = 0.016  # m, that the fingers open where there is no room for more
 STUCK = 130  # steps of one phase
 
 
@@ -65,8 +66,10 @@ class PickPlace:
         self._diverted = 0  # times that another place was chosen on the way
         self._aside = np.zeros(3)  # m, from the middle between the fingers to that of what they close on
         self._steps, self._opening = 0, 0.0
+        self._tight = False  # others are where the fingers would open to
         self._pressed, self._backing = 0, False  # steps that something resisted the way in; going back out
         self._stuck, self._backings = 0, 0  # steps without motion, and times it backed off
+        self._turn = 0.0  # rad, that the hand was from its hold one step ago
         self._failures: list[Failure] = []
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
@@ -153,7 +156,8 @@ class PickPlace:
             self._aside = between_fingers(self.shapes.cloud(view, self._thing), goal, mat) * mat[:, 0]
             self._enter("close")
             return self._close(view)
-        self._stuck = self._stuck + 1 if np.linalg.norm(self._velocity) < 0.008 and self._steps > 12 else 0
+        still = np.linalg.norm(self._velocity) < 0.008 and abs(turn - self._turn) < 0.01
+        self._stuck, self._turn = (self._stuck + 1 if still and self._steps > 12 else 0), turn
         if self._stuck > 14 or self._backings > 2:
             self._again()
             return self._toward(view, pos + 0.08 * back, view.eef_mat, OPEN)
@@ -246,18 +250,28 @@ class PickPlace:
     def _release(self, view: StateView) -> np.ndarray:
         if self._steps <= self.style.pause:
             return self._toward(view, self._hold.pos, self._hold.mat, CLOSE)
+        if self._steps == self.style.pause + 1:
+            others = self.shapes.others(view, self._thing, spacing=DENSE)
+            self._tight = crowding(others, view.eef_pos, view.eef_mat) > 0.0
         if self._steps > 10:
             self._enter("withdraw")
-        return self._toward(view, self._hold.pos, self._hold.mat, OPEN)
+        return self._toward(view, self._hold.pos, self._hold.mat, self._let_go(view))
+
+    def _let_go(self, view: StateView) -> float:
+        """Open the fingers; where that would push others aside, no further than the object needs."""
+        wide = float(np.abs(view.finger_pos).sum()) > self._opening + EASE
+        return 0.0 if self._tight and wide else OPEN
 
     def _withdraw(self, view: StateView) -> np.ndarray:
         back = -self._hold.mat[:, 2]
-        if (view.eef_pos - self._hold.pos) @ back > 0.07 or self._steps > 20:
+        away = float((view.eef_pos - self._hold.pos) @ back)
+        if away > 0.07 or self._steps > 20:
             if evaluate(self.atom, view):
                 self._enter("rest")
             else:
                 self._again(placed=True)
-        return self._toward(view, self._hold.pos + 0.10 * back, self._hold.mat, OPEN)
+        gripper = OPEN if away > 0.05 else self._let_go(view)
+        return self._toward(view, self._hold.pos + 0.10 * back, self._hold.mat, gripper)
 
     def _rest(self, view: StateView) -> np.ndarray:
         return np.array([0.0] * 6 + [OPEN])
