@@ -16,7 +16,8 @@ ROOT = Path(__file__).parents[2]
 # What a line of code looks like, in any of the languages of the texts. Prose may not.
 CODE = re.compile(
     r"""from\ [\w.]+\ import\ | import\ \w | class\ \w+.*: | def\ \w+\( | @\w+(\(.*\))?$
-    | (for|while|if|elif|with)\ .*:$ | else:$ | return\b | print\( | export\ \w+= | \(?:?define\b | \(:\w+ | </?\w+[ >] | assert\ | [├└│]
+    | (for|while|if|elif|with)\ .*:$ | else:$ | return\b | print\( | export\ \w+= | \(?:?define\b | \(:\w+
+    | </?\w+[ >] | assert\ | [├└│]
     | [\w.]+(\[.+\])?\ [-+*]?=\ \S | [\w.]+\([^一-鿿]*\)$ | [\w.]+\($ | "\w+":\ | '\w+':\ | [])}]+,?$ | -+\w+(/\w+)?$
     | \("[A-Z]\w+",""",
     re.VERBOSE,
@@ -71,10 +72,13 @@ class Block:
 
     def source(self, text: Sequence[str]) -> str:
         """Its code, with indentation and with the lines that are replaced."""
-        lines = [self.replace.get(n, text[n - 1]) for n in self.numbers]
-        if self.kind != "python":
-            return "\n".join(lines) + "\n"
-        return reindent(lines, {n - self.lines[0]: depth for n, depth in self.falls.items()})
+        lines: list[str] = []
+        falls = {}
+        for n in self.numbers:
+            if n in self.falls:
+                falls[len(lines)] = self.falls[n]
+            lines += self.replace.get(n, text[n - 1]).splitlines() or [""]
+        return reindent(lines, falls) if self.kind == "python" else "\n".join(lines) + "\n"
 
 
 def load_blocks() -> list[Block]:

@@ -1,0 +1,55 @@
+"""The notebooks run from top to bottom and draw what they say."""
+
+import base64
+import io
+import os
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+# pictures that each draws
+PICTURES = {"1_quick_walkthrough": 4, "2_scenes_and_tasks": 2, "3_custom_objects": 3, "4_algorithms": 2}
+LARGEST = 300_000  # bytes
+
+
+@pytest.mark.unit
+def test_every_notebook_is_listed():
+    assert sorted(PICTURES) == sorted(path.stem for path in (ROOT / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("name", PICTURES)
+def test_notebooks_are_small_and_sound(name):
+    path = ROOT / "notebooks" / f"{name}.ipynb"
+    assert path.stat().st_size < LARGEST
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert notebook.cells[0].cell_type == "markdown"
+    assert all(not cell.outputs for cell in notebook.cells if cell.cell_type == "code"), "clear all outputs"
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PICTURES)
+def test_notebook(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "demos"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+    notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
+    folder = {"metadata": {"path": str(ROOT / "notebooks")}}
+    NotebookClient(notebook, timeout=600, kernel_name="python3", resources=folder).execute()
+    if kept := os.environ.get("LIBERO_NOTEBOOKS_OUT"):
+        nbformat.write(notebook, Path(kept) / f"{name}.ipynb")
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    pictures = [o.data["image/png"] for o in outputs if "image/png" in o.get("data", {})]
+    assert len(pictures) == PICTURES[name]
+    for picture in pictures:
+        image = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture))).convert("L"))
+        assert min(image.shape) > 100
+        assert image.std() > 10, "a picture shows nothing"
+    assert not [o for o in outputs if o.output_type == "error"]
