@@ -94,7 +94,8 @@ def fill_in(cfg: Any) -> None:
 def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
     """Windows of each task, or group of tasks, of a benchmark; its embeddings are set.
 
-    Demonstrations that are not in `cfg.folder` are recorded by the scripted expert, or found where they were before.
+    Demonstrations that are not in `cfg.folder` are recorded by the scripted expert, or found where they were before;
+    `cfg.demonstrations` says where they are.
 
     Raises:
         ConfigError: groups that do not divide the tasks.
@@ -105,11 +106,9 @@ def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
         raise ConfigError(
             f"data.task_group_size={size} does not divide the {count} tasks of {cfg.benchmark_name}"
         )
-    parts: list[SequenceDataset] = []
-    shape_meta: dict[str, Any] = {}
-    for i in range(count):
-        part, shape_meta = task_dataset(cfg, benchmark, i)
-        parts.append(part)
+    cfg.demonstrations = [str(demonstrations(cfg, benchmark, i)) for i in range(count)]
+    read = [task_dataset(cfg, path) for path in cfg.demonstrations]
+    parts, shape_meta = [windows for windows, _ in read], read[0][1]
     embs = get_task_embs(cfg, [task.language for task in benchmark.tasks])
     benchmark.set_task_embs(embs)
     if size == 1:
@@ -118,13 +117,20 @@ def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
     return [GroupedTaskDataset(parts[i : i + size], list(embs[i : i + size])) for i in starts], shape_meta
 
 
-def task_dataset(cfg: Any, benchmark: Any, i: int) -> tuple[SequenceDataset, dict[str, Any]]:
-    """The windows of one task, without its instruction; see `load_datasets`."""
+def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
+    """The file of a task's demonstrations; recorded where there is none."""
     path = Path(cfg.folder, benchmark.get_task_demonstration(i))
-    if not path.exists():
-        task = native_task(benchmark.get_task(i), cfg.bddl_folder)
-        (path,) = ensure_demos([task], DEMOS, camera_size=(int(cfg.data.img_h), int(cfg.data.img_w)))
-    return get_dataset(path, cfg.data.obs.modality, initialize_obs_utils=i == 0, seq_len=cfg.data.seq_len)
+    if path.exists():
+        return path
+    size = int(cfg.data.img_h), int(cfg.data.img_w)
+    task = native_task(benchmark.get_task(i), cfg.bddl_folder)
+    print(f"[info] no {path}: demonstrations of the scripted expert are taken", flush=True)
+    return ensure_demos([task], DEMOS, camera_size=size)[0]
+
+
+def task_dataset(cfg: Any, path: str | Path) -> tuple[SequenceDataset, dict[str, Any]]:
+    """The windows of a file without an instruction, and their shapes."""
+    return get_dataset(path, cfg.data.obs.modality, seq_len=cfg.data.seq_len)
 
 
 def load_pretrained(algo: Sequential, path: str, device: str) -> None:
@@ -182,6 +188,7 @@ def _learn_in_turn(run: _Run) -> None:
         if i and i == run.done:
             _take_up(run, i - 1, summary)
         began = time.perf_counter()
+        control_seed(run.cfg.seed + i)  # dropout is the same whether the run was interrupted or not
         run.algo.train()
         summary["S_fwd"][i], summary["L_fwd"][i] = run.algo.learn_one_task(
             run.datasets[i], i, run.benchmark, summary

@@ -23,7 +23,8 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
     """Loss and success of a checkpoint on a task; they are printed, and written beside the run's checkpoints.
 
     Returns:
-        `loss`, `success_rate`, its 95 % interval (Wilson), and which episodes succeeded.
+        `loss` (nan where there are no demonstrations of the task), `success_rate`, its 95 % interval (Wilson), and
+        which episodes succeeded.
 
     Raises:
         CheckpointError: no such run or checkpoint.
@@ -43,8 +44,7 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
     algo = _algorithm(args, cfg, benchmark, weights, masks)
     emb = benchmark.get_task_emb(args.task_id)
 
-    windows, _ = task_dataset(cfg, benchmark, args.task_id)
-    loss = float(evaluate_loss(cfg, algo, benchmark, [SequenceVLDataset(windows, emb)])[0])
+    loss = _loss(cfg, algo, benchmark, args.task_id)
     film = VideoWriter(
         path.parent / f"{path.stem}_on{args.task_id}_videos", args.save_videos, single_video=False
     )
@@ -91,6 +91,17 @@ def _algorithm(args: argparse.Namespace, cfg: Any, benchmark: Any, weights: Any,
         algo.take_masks(masks, args.task_id if args.load_task is None else args.load_task)
         algo = algo.get_eval_algo(args.task_id // size)
     return safe_device(algo, cfg.device)
+
+
+def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
+    """The loss on the task's demonstrations, where there are any; none are recorded for it."""
+    name = benchmark.get_task_demonstration(task_id)
+    known = [Path(cfg.folder, name), *map(Path, cfg.get("demonstrations") or ())]
+    path = next((p for p in known if p.name == Path(name).name and p.exists()), None)
+    if path is None:
+        return float("nan")
+    dataset = SequenceVLDataset(task_dataset(cfg, path)[0], benchmark.get_task_emb(task_id))
+    return float(evaluate_loss(cfg, algo, benchmark, [dataset])[0])
 
 
 def _camera(film: VideoWriter, view: str) -> Any:

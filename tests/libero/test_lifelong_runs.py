@@ -13,8 +13,10 @@ import torch
 from libero.libero.benchmark import BENCHMARK_MAPPING, get_benchmark
 from libero.libero.envs import OffScreenRenderEnv
 from libero.lifelong import algos, evaluate, main, metric, utils
+from libero.lifelong import run as run_module
 from libero.lifelong.run import run
 from libero_env.original_states import write_states
+from libero_env.tasks import get_task
 from lifelong import checkpoints
 from tests.libero.lifelong_data import (
     LANGUAGE,
@@ -71,8 +73,7 @@ def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
 
     arguments = ["--benchmark", "two_tasks", "--task_id", "0", "--algo", "packnet", "--policy", "bc_transformer_policy",
                  "--seed", "10000", "--load_task", "1"]  # fmt: skip
-    with pytest.warns(UserWarning, match="imageio"):
-        assert evaluate.main([*arguments, "--save-videos", "--n_eval", "2"]) == 0
+    assert evaluate.main([*arguments, "--save-videos", "--n_eval", "2"]) == 0
     assert "success 0/2 = 0%" in capsys.readouterr().out
     stats = torch.load(path / "task1_model_on0.stats")
     assert stats["successes"] == [False, False] and stats["interval"][1] > 0.3
@@ -100,6 +101,23 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(folder):
     assert begun.parts[0] == "experiments_finetune"
     kept = utils.torch_load_model(begun / "task1_model.pth")[0]
     assert all(torch.equal(kept[n], p) for n, p in states[0]["policy"].items())
+
+
+def test_demonstrations_that_are_not_there_are_recorded(folder, monkeypatch, capsys):
+    """The expert is asked for what the configuration needs; here it has noise at hand."""
+    asked = []
+
+    def record(tasks, count, *, camera_size):
+        asked.append((*tasks, count, camera_size))
+        return [folder / get_benchmark("libero_object")().get_task_demonstration(0)]
+
+    monkeypatch.setattr(run_module, "ensure_demos", record)
+    cfg = config(folder / "elsewhere", "eval.eval=false", "train.n_epochs=0")
+    path = run(cfg)
+    assert asked == [(get_task(f"libero_object/{i}"), 50, (SIZE, SIZE)) for i in range(2)]
+    assert "scripted expert" in capsys.readouterr().out
+    _, stored, _ = utils.torch_load_model(path / "task0_model.pth")
+    assert len(stored.demonstrations) == 2
 
 
 @pytest.mark.slow
@@ -197,9 +215,8 @@ def test_what_the_original_environment_observes_is_what_rollouts_show(acting):
     assert list(data["obs"]) == list(seen[0]["obs"]) and torch.equal(data["task_emb"], seen[0]["task_emb"])
     for key, value in data["obs"].items():
         assert value.shape == seen[0]["obs"][key].shape and value.dtype == torch.float32
-        assert (value - seen[0]["obs"][key]).abs().mean() < 0.02, (
-            key
-        )  # the original observes one substep earlier
+        if "hand" not in key:  # the headlight is at the hand's camera there, at the first camera here
+            assert (value - seen[0]["obs"][key]).abs().mean() < 0.01, key  # there one substep earlier
     assert algo.policy.get_action(data).shape == (1, 7)
 
 

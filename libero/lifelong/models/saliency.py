@@ -1,28 +1,28 @@
-"""Where a policy looks.
+"""Where a policy looks: `lifelong.saliency` for policies that take dictionaries.
 
-Shape legend: B batch, T time, C H W image, P patches.
+Shape legend: B batch, T time, C H W image, A action.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from libero.lifelong.batches import map_tensors
+from libero.lifelong.observations import picture, pixels
+from lifelong.saliency import SaliencySettings, saliency
+from lifelong.types import Batch, Observation
 
 
 class PerturbationAttention:
-    """How far the policy's action moves when a patch of a picture is blanked.
-
-    The saliency of a patch is half the squared distance between the mean actions with and without it (Greydanus et
-    al. 2018, "Visualizing and understanding Atari agents", eq. 3, with the picture's mean colour for the blur).
+    """How far a policy's action moves when a place of a picture is blurred; see `lifelong.saliency`.
 
     Args:
         model: a policy: `forward(data)` gives a distribution of actions, or actions.
-        image_size: H, W of the pictures.
-        patch_size: height and width of a patch.
+        image_size: H, W of pictures in which lengths are measured.
+        patch_size: height and width of what is blurred at once, and the distance of such places.
         device: where the model is.
     """
 
@@ -33,46 +33,48 @@ class PerturbationAttention:
         patch_size: Sequence[int] = (16, 16),
         device: torch.device | str = "cpu",
     ):
-        self.model, self.image_size, self.patch_size = model, tuple(image_size), tuple(patch_size)
-        self.device = torch.device(device)
+        stride = 128 * patch_size[0] / image_size[0]
+        self.settings = SaliencySettings(stride=stride, sigma=0.75 * stride, blur=0.625 * stride)
+        self.model, self.device = model, torch.device(device)
 
-    @torch.no_grad()
     def __call__(self, data: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Saliency of each camera's patches.
+        """Saliency of each camera's pixels.
 
         Args:
             data: as `get_action` takes it, pictures (B, C, H, W), or a window with T steps, the last of which counts.
 
         Returns:
-            View -> (B, rows, columns), not negative, as the pictures lie (lowest row first).
+            View -> (B, H, W), at least 0, as the pictures lie (lowest row first).
         """
         data = map_tensors(dict(data), lambda x: x.to(self.device))
-        views = [key for key, value in data["obs"].items() if value.dim() >= 4]
-        if data["obs"][views[0]].dim() == 4:
-            steps = map_tensors(data["obs"], lambda x: x.unsqueeze(1))
-            data = {**data, "obs": steps}
-        was_training = self.model.training
-        self.model.eval()
-        seen = self._action(data)
-        found = {view: self._saliency(data, view, seen) for view in views}
-        self.model.train(was_training)
-        return found
+        obs = data["obs"]
+        views = [name for name, value in obs.items() if value.dim() >= 4]
+        if obs[views[0]].dim() == 4:
+            obs = map_tensors(obs, lambda x: x.unsqueeze(1))
+        rows = [self._maps({**data, "obs": obs}, views, b) for b in range(len(obs[views[0]]))]
+        heat = torch.stack(rows).flip(-2).cpu().numpy()  # (B, V, H, W)
+        return {view: heat[:, k] for k, view in enumerate(views)}
 
-    def _saliency(self, data: Mapping[str, Any], view: str, seen: Tensor) -> np.ndarray:
-        image = data["obs"][view]
-        height, width = self.patch_size
-        rows, columns = (n // p for n, p in zip(image.shape[-2:], self.patch_size, strict=True))
-        mean = image.mean(dim=(-2, -1), keepdim=True)
-        scores = torch.zeros(len(image), rows, columns)
-        for row in range(rows):
-            for column in range(columns):
-                blank = image.clone()
-                blank[..., row * height : (row + 1) * height, column * width : (column + 1) * width] = mean
-                action = self._action({**data, "obs": {**data["obs"], view: blank}})
-                scores[:, row, column] = 0.5 * (action - seen).square().sum(-1).cpu()
-        return scores.numpy()
+    def _maps(self, data: Mapping[str, Any], views: Sequence[str], row: int) -> Tensor:
+        """(V, H, W) of one row, upright."""
+        one = map_tensors(dict(data), lambda x: x[row : row + 1])
+        images = torch.stack([pixels(one["obs"][view]).flip(-3) for view in views], dim=2)
+        nothing = torch.zeros(1, 1, device=self.device)
+        batch = Batch(Observation(images, {}, nothing), nothing, nothing[0].long(), nothing[0].long())
+        return saliency(cast(Any, _Answering(self.model, one, views)), batch, self.settings)
 
-    def _action(self, data: Mapping[str, Any]) -> Tensor:
-        """The mean action of the last step, (B, A)."""
-        dist = self.model(data)
-        return (dist if isinstance(dist, Tensor) else dist.mean)[:, -1].float()
+
+class _Answering(nn.Module):
+    """A policy's mean actions for other pictures, with all else as it was."""
+
+    def __init__(self, model: nn.Module, data: Mapping[str, Any], views: Sequence[str]):
+        super().__init__()
+        self.model, self.data, self.views = model, data, views
+
+    def predict(self, batch: Batch) -> Tensor:
+        """(B, T, A)."""
+        images = batch.observation.images.flip(-3)
+        data = map_tensors(dict(self.data), lambda x: x.expand(len(images), *x.shape[1:]))
+        seen = {view: picture(images[:, :, k]) for k, view in enumerate(self.views)}
+        answer = self.model({**data, "obs": {**data["obs"], **seen}})
+        return (answer if isinstance(answer, Tensor) else answer.mean).float()
