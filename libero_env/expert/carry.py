@@ -18,6 +18,8 @@ from libero_env.problem import Atom
 BESIDE = 0.05  # m, to either side of the hand that carries
 SLIPPED = 0.03  # m, that a body may move between the fingers
 GENTLE = 0.005  # m, over what carries it, where a body is let go
+LEVEL = 0.008  # m, over it, where one comes in from a side
+SAG = 0.01  # m, at most, that a hand is told to be higher as its load draws it down
 DROP = 0.06  # m, over its place, from which on a body is let fall and need not be there exactly
 DEEP = 0.05  # m, that walls around a place are high over what a body stands on there
 ALIGNED, ALIGNED_TURN = 0.008, 0.1  # m and rad, to where a body goes down between walls
@@ -83,7 +85,8 @@ class Carry:
             self._out, self._steps = None, 0
         if not self._sinking:
             self._mat = self._corrected(view)
-        goal = self.way.place.pos + [0, 0, self.way.lift + GENTLE] - self._mat @ offset
+        gentle = GENTLE if entry[2] < -0.5 else LEVEL
+        goal = self.way.place.pos + [0, 0, self.way.lift + gentle] - self._mat @ offset
         goal[:2] += (1.0 if self.way.lift > DROP else 0.2) * np.array(self.style.place_xy)
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, self._mat)))
         slow = self._steps > 20 and np.linalg.norm(velocity) < 0.01
@@ -149,7 +152,8 @@ class Carry:
             return "there"
         if self._pressed > 8:
             return "there" if holds or left < 0.012 else "blocked"
-        return Move(goal - max(left - 0.06, 0.0) * entry, self._mat)
+        sag = np.clip(goal[2] - pos[2], 0.0, SAG)
+        return Move(goal - max(left - 0.06, 0.0) * entry + [0, 0, sag], self._mat)
 
     def _corrected(self, view: StateView) -> np.ndarray:
         """The hand's orientation at the place, (3, 3), for the body as it is turned in the hand now."""

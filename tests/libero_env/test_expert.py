@@ -6,10 +6,18 @@ import pytest
 
 from libero_env.env import LiberoEnv
 from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoalError, plan_goal
-from libero_env.expert.approach import choose_approach
+from libero_env.expert.approach import (
+    Failure,
+    _alike,
+    _weak_price,
+    between_fingers,
+    choose_approach,
+    choose_place,
+)
+from libero_env.expert.carry import Carry, Move
 from libero_env.expert.driver import run_experts
 from libero_env.expert.geometry import surface_points
-from libero_env.expert.grasp import MAX_OPENING, WIDEST, GraspError, choose_grasp, grasps
+from libero_env.expert.grasp import MAX_OPENING, WIDEST, Grasp, GraspError, choose_grasp, grasps
 from libero_env.expert.motion import action_toward, downward, rotation_between
 from libero_env.predicates import _boxes, _inside, _over, atoms_of, evaluate
 from libero_env.problem import And, Atom, Not, Or
@@ -94,6 +102,31 @@ def test_what_is_too_wide_is_refused_with_its_width():
     with pytest.raises(GraspError, match=r"crate cannot be grasped.*1[0-9]\.[0-9] cm wide") as caught:
         choose_grasp(box((0.06, 0.07, 0.03), 0.005), NOTHING, 0.0, X_AXIS, "crate")
     assert f"{100 * MAX_OPENING:.0f} cm" in str(caught.value)
+
+
+def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
+    cloud = box((0.03, 0.008, 0.03))
+    middle = np.array([0.0, 0.0, 0.04])
+    firm, corner, edge = (
+        _weak_price(cloud, Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0))
+        for pos, yaw in (
+            (middle, np.pi / 2),
+            (middle + [0.03, 0, 0], 0.9),
+            (middle + [0, 0, 0.022], np.pi / 2),
+        )
+    )
+    assert firm < 0.02 < min(corner, edge)
+    assert (
+        _weak_price(cloud, Grasp(middle + [0.2, 0, 0], downward(0.0, X_AXIS), 0.0, 0.0)) > 0.5
+    )  # of nothing
+
+
+@pytest.mark.parametrize("aside", [-0.02, 0.0, 0.015])
+def test_fingers_know_how_far_off_the_middle_they_close(aside):
+    cloud, mat = box((0.03, 0.01, 0.02)), downward(np.pi / 2, X_AXIS)
+    pos = np.array([0.0, 0.0, 0.02]) + aside * mat[:, 0]
+    assert between_fingers(cloud, pos, mat) == pytest.approx(-aside, abs=1e-6)
+    assert between_fingers(cloud, pos + [0.2, 0, 0], mat) == 0.0  # nothing there
 
 
 def test_actions_point_at_the_goal_and_stay_in_range():
@@ -219,6 +252,76 @@ def test_at_a_place_the_atom_would_hold(task_id, view_of):
     np.testing.assert_allclose(way.hand_mat @ way.hand_mat.T, np.eye(3), atol=1e-9)
     test = _inside if step.atom.predicate == "In" else _over
     assert any(test(box, way.place.pos + [0, 0, 0.003]) for box in _boxes(view, step.atom.args[1]))
+
+
+@pytest.mark.sim
+def test_what_failed_is_not_tried_again_the_same_way(view_of):
+    view = view_of("libero_goal/1")
+    shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
+    first = choose_approach(view, shapes, atom)
+    failures = [Failure.of(first, placed=True)]
+    for _ in range(2):
+        way = choose_approach(view, shapes, atom, failures=failures)
+        tried = Failure.of(way, placed=True)
+        assert not any(_alike(tried.hold, failure.hold) for failure in failures)
+        failures.append(tried)
+    assert np.linalg.norm(choose_approach(view, shapes, atom).grasp.pos_world - first.grasp.pos_world) == 0.0
+
+
+@pytest.mark.sim
+def test_another_place_is_found_for_what_is_in_the_hand(view_of):
+    view = view_of("libero_goal/1")
+    shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
+    first = choose_place(view, shapes, atom)
+    other = choose_place(view, shapes, atom, failures=[Failure(None, first.place)])
+    np.testing.assert_allclose(first.grasp.pos_world, view.eef_pos)
+    turn = np.linalg.norm(rotation_between(first.place.mat, other.place.mat))
+    assert np.linalg.norm(first.place.pos - other.place.pos) > 0.01 or turn > 0.3
+
+
+@pytest.mark.sim
+def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
+    """Held beside its place, the next move is level or up; over it, down."""
+    view = view_of("libero_90/73")
+    (step,) = plan_goal(get_task("libero_90/73").problem.goal, view)
+    shapes = Shapes(view.scene)
+    way = choose_approach(view, shapes, step.atom)
+    assert way.place.entry[2] < -0.5
+    carry = Carry(view, step.atom, way, style=Style(), shapes=shapes)
+    low = shapes.span(view, step.atom.args[0])[0]
+    rim = shapes.span(view, "desk_caddy_1")[1]
+    move = carry.next(view, np.ones(3))
+    assert isinstance(move, Move)
+    assert move.pos[2] - view.eef_pos[2] + low > way.place.pos[2] + 0.04  # not yet where it will stand
+    assert rim > way.place.pos[2] + 0.04
+
+
+@pytest.mark.sim
+def test_the_arm_keeps_its_elbow_bent(view_of):
+    view = view_of("libero_goal/1")
+    arm, start = Shapes(view.scene).arm, view.simulations.fields["qpos"][view.index][:7]
+    down = downward(0.0, X_AXIS)
+    near, miss = arm.reach(start, np.array([0.0, 0.0, 1.0]), down)
+    assert miss == 0.0 and near[3] < -0.9
+    far, miss = arm.reach(start, np.array([0.35, 0.0, 1.0]), down)  # could be touched with a straight arm
+    assert miss > 0.0 and far[3] <= -0.9
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "task_id, start",
+    [("libero_goal/3", 0), ("libero_spatial/4", 16), ("libero_90/5", 4), ("libero_90/13", 12), ("libero_90/19", 4),
+     ("libero_90/42", 7), ("libero_90/62", 6), ("libero_90/83", 3), ("libero_90/86", 2), ("libero_90/89", 3)],
+)  # fmt: skip
+def test_narrow_places_leaning_hands_and_small_knobs(task_id, start):
+    task = get_task(task_id)
+    manner, _ = np.random.SeedSequence([task.index, start]).spawn(2)
+    env = BatchEnv(task, 1, cameras=())
+    env.reset(options={"init_state": start})
+    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(manner))])
+    env.close()
+    assert attempt.success and attempt.retries < 4, attempt.reason
 
 
 @pytest.mark.sim
