@@ -1,4 +1,4 @@
-"""Moving pictures: GIF with Pillow, MP4 with PyAV (`pip install libero-lifelong[export]`)."""
+"""Moving pictures: GIF and WebP with Pillow, MP4 with PyAV (`pip install libero-lifelong[export]`)."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -85,18 +85,18 @@ class Mp4:
 
 
 def write_video(path: Path, frames: np.ndarray, fps: int) -> Path:
-    """Write frames (T, H, W, 3) uint8 as .gif or .mp4.
+    """Write frames (T, H, W, 3) uint8 as .webp, .gif or .mp4.
 
     Raises:
         LiberoError: another ending, or PyAV is not installed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
+    if path.suffix in (".gif", ".webp"):
         pictures = [Image.fromarray(frame) for frame in frames]
         pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0)
     elif path.suffix == ".mp4":
         with Mp4(path, fps) as video:
             video.add(frames)
     else:
-        raise LiberoError(f"{path}: videos are .mp4 or .gif")
+        raise LiberoError(f"{path}: videos are .mp4, .webp or .gif")
     return path

@@ -137,8 +137,7 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
                 f"make them anew: libero tasks init-states {task.suite}"
             )
         return shipped[1]
-    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[:16]  # regions and atoms, which the digest knows not
-    path = cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{said}.npz"
+    path = _cached_path(task, digest)
     if path.exists():
         with np.load(path, allow_pickle=False) as stored:
             return stored["states"]
@@ -146,6 +145,18 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
     path.parent.mkdir(parents=True, exist_ok=True)
     _write(path, {"states": states})
     return states
+
+
+def cache_init_states(task: Task) -> Path:
+    """Make the initial states of a task that none are shipped for, unless they are there, and say where."""
+    scene = build_scene(task.problem)
+    load_init_states(task, scene)
+    return _cached_path(task, scene_digest(scene))
+
+
+def _cached_path(task: Task, digest: str) -> Path:
+    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[:16]  # regions and atoms, which the digest knows not
+    return cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{said}.npz"
 
 
 def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:

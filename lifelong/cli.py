@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from libero_env.errors import LiberoError
-from lifelong import cli_assets, cli_demos, cli_eval, cli_tasks, cli_teleop
+from lifelong import cli_assets, cli_demos, cli_eval, cli_objects, cli_tasks, cli_teleop
 from lifelong.errors import LifelongError
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
@@ -63,7 +63,7 @@ def run_doctor(args: argparse.Namespace) -> int:
 
 
 def register_tasks(subparsers: Subparsers) -> None:
-    """`libero tasks list|show|init-states|certify|lint`"""
+    """`libero tasks list|show|init-states|certify|lint|new|preview`"""
     parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     listing = commands.add_parser("list", help="the tasks of one suite, or of all")
@@ -71,11 +71,11 @@ def register_tasks(subparsers: Subparsers) -> None:
     listing.add_argument("--order", type=int, default=0, help="one of the published sequences (0 to 20)")
     listing.set_defaults(run=run_tasks_list)
     show = commands.add_parser("show", help="the BDDL of a task")
-    show.add_argument("task", help="such as libero_object/3, or the task's name")
+    show.add_argument("task", help="such as libero_object/3, the task's name, or a file of your own")
     show.set_defaults(run=run_tasks_show)
-    states = commands.add_parser("init-states", help="make the 50 stored initial states of a suite anew")
-    states.add_argument("suite", help="such as libero_object")
-    states.add_argument("--out", type=Path, help="folder for the .npz files (default: those the package ships)")
+    states = commands.add_parser("init-states", help="make the 50 stored initial states of a suite or task file anew")
+    states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
+    states.add_argument("--out", type=Path, help="folder for the .npz files (default: those the package ships; the cache for a file)")
     states.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
     states.set_defaults(run=run_tasks_init_states)
     cli_tasks.register(commands)
@@ -100,10 +100,15 @@ def run_tasks_show(args: argparse.Namespace) -> None:
 
 def run_tasks_init_states(args: argparse.Namespace) -> None:
     """Write the files, one for each suite that the tasks come from, and say where they are."""
-    from libero_env.init_states import shipped_path, write_suite
+    from libero_env.init_states import cache_init_states, shipped_path, write_suite
     from libero_env.tasks import get_suite
+    from libero_env.tasks.suites import ENDINGS
 
-    tasks = get_suite(args.suite).tasks
+    if args.suite.endswith(ENDINGS) and not args.out:
+        for task in cli_tasks.find_tasks([args.suite]):
+            print(cache_init_states(task))
+        return
+    tasks = cli_tasks.find_tasks([args.suite]) if args.suite.endswith(ENDINGS) else get_suite(args.suite).tasks
     for suite in dict.fromkeys(task.suite for task in tasks):
         path = args.out / f"{suite}.npz" if args.out else shipped_path(suite)
         write_suite(path, [task for task in tasks if task.suite == suite], args.jobs)
@@ -136,6 +141,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     register_tasks,
     cli_demos.register,
     cli_assets.register,
+    cli_objects.register,
     cli_teleop.register,
     cli_eval.register,
     register_report,

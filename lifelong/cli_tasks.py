@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lifelong import cli_tasks_new
+
 if TYPE_CHECKING:
     from libero_env.certify import Certificate
     from libero_env.lint_report import Finding
@@ -16,7 +18,8 @@ LEVELS = ("error", "warning", "info")
 
 
 def register(commands: "argparse._SubParsersAction") -> None:
-    """`libero tasks certify|lint`, next to the other commands about tasks"""
+    """`libero tasks certify|lint|new|preview`, next to the other commands about tasks"""
+    cli_tasks_new.register(commands)
     certify = commands.add_parser("certify", help="let the expert try tasks; goes on where it was stopped")
     _add_tasks(certify)
     certify.add_argument(
@@ -50,7 +53,7 @@ def _add_tasks(parser: argparse.ArgumentParser) -> None:
         "tasks",
         nargs="+",
         metavar="TASK",
-        help="such as libero_goal/3, a suite, or a file that ends in .bddl",
+        help="such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml",
     )
     parser.add_argument("--assets", help="`builtin`, or the folder of the original's models")
 
@@ -68,15 +71,16 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
     Raises:
         LiberoError: no such suite, task or file, or a file that is no task.
     """
-    from libero_env.tasks import get_suite, get_task, read_task, suite_names
+    from libero_env.tasks import get_suite, get_task, suite_names
+    from libero_env.tasks.authoring import read_yaml_tasks
 
-    found: dict[tuple[str, int], Task] = {}
+    found: dict[tuple[str, str], Task] = {}
     for name in names:
-        if name.endswith(".bddl"):
-            tasks: Sequence[Task] = (read_task(name),)
+        if name.endswith((".yaml", ".yml")):
+            tasks: Sequence[Task] = read_yaml_tasks(name)
         else:
             tasks = get_suite(name).tasks if name in suite_names() else (get_task(name),)
-        found |= {(name if task.suite == "file" else task.suite, task.index): task for task in tasks}
+        found |= {(name if task.suite == "file" else task.suite, task.name): task for task in tasks}
     return list(found.values())
 
 
@@ -184,11 +188,15 @@ def run_lint(args: argparse.Namespace) -> int:
 def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
     """The findings of each task."""
     from libero_env.assets import select_pack
-    from libero_env.lint import lint_file, lint_task
+    from libero_env.lint import lint_file, lint_task, lint_text
 
     pack = select_pack(args.assets)
     for name in dict.fromkeys(args.tasks):
         if name.endswith(".bddl"):
             yield lint_file(name, pack, starts=args.starts)
-        else:
-            yield from (lint_task(task, pack, starts=args.starts) for task in find_tasks([name]))
+            continue
+        for task in find_tasks([name]):
+            if task.suite == "file":  # lines count in what `libero tasks show` prints
+                yield lint_text(task.bddl_text, name, task, pack, starts=args.starts)
+            else:
+                yield lint_task(task, pack, starts=args.starts)

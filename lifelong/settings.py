@@ -6,7 +6,8 @@ from typing import Literal
 
 from libero_env.demos import LOW_DIM_KEYS
 from libero_env.errors import UnknownNameError
-from libero_env.tasks import Task, get_suite
+from libero_env.tasks import Suite, Task, get_suite, suite_names
+from libero_env.tasks.authoring import OWN, read_suite
 from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.errors import ConfigError
 from lifelong.types import PolicySpec
@@ -41,6 +42,7 @@ class BenchmarkSettings:
         horizon: Control steps in which a quick policy solves any of them, for `eval.horizon` to refer to.
         group_size: So many tasks, next to each other in the sequence, are learned together as one step of it. They
             are evaluated one by one; metrics take a group for one task, whose success is the mean over its tasks.
+        files: Task files of your own, .yaml or .bddl, which are then the suite; `suite` is what it is called.
     """
 
     suite: str
@@ -48,6 +50,7 @@ class BenchmarkSettings:
     tasks: int | Sequence[int | str] | None = None
     horizon: int = 600
     group_size: int = 1
+    files: Sequence[str] | None = None
 
     def sequence(self) -> tuple[Task, ...]:
         """The tasks in learning order.
@@ -65,8 +68,17 @@ class BenchmarkSettings:
             )
         return tasks
 
+    def _suite(self) -> Suite:
+        if self.files is None and self.suite != OWN:
+            return get_suite(self.suite)
+        if not self.files or isinstance(self.files, str):
+            raise ConfigError(f"benchmark.files is {self.files!r}; name task files of yours: '[a.yaml,b.bddl]'")
+        if self.suite in suite_names():
+            raise ConfigError(f"benchmark.files are given, and {self.suite} has its own tasks; say benchmark=own")
+        return read_suite(self.files, self.suite)
+
     def _chosen(self) -> tuple[Task, ...]:
-        suite = get_suite(self.suite)
+        suite = self._suite()
         tasks = suite.order(self.order)
         if self.tasks is None:
             return tasks

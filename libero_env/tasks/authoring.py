@@ -255,12 +255,14 @@ def _workspace(fixtures: Mapping[str, str], where: str) -> tuple[str, str]:
 
 def _rectangle(place: Any, kind: str, thing: str, where: str) -> dict[str, Any]:
     """The facts of a region: [x, y], or `at`, `half` and `yaw`."""
-    facts = dict(place) if isinstance(place, Mapping) else {"at": list(place)}
-    if "ranges" not in facts:
-        if not isinstance(facts.get("at"), list | tuple) or len(facts["at"]) != 2:
-            raise LiberoError(f"{where}: the place of {thing} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}")
-        half = facts.get("half", _HALF[kind])
-        facts |= {"at": list(facts["at"]), "half": list(half) if isinstance(half, tuple) else half}
+    facts = dict(place) if isinstance(place, Mapping) else {"at": place}
+    if "ranges" in facts:
+        return facts
+    at, half = facts.pop("at", None), facts.pop("half", _HALF[kind])
+    half = half if isinstance(half, list | tuple) else (half, half)
+    if not isinstance(at, list | tuple) or len(at) != 2 or len(half) != 2:
+        raise LiberoError(f"{where}: the place of {thing} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}, metres")
+    facts["ranges"] = [[round(float(at[k % 2]) + (-1, 1)[k // 2] * float(half[k % 2]), 6) for k in range(4)]]
     return facts
 
 
