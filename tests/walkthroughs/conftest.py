@@ -34,14 +34,19 @@ def blocks() -> list[Block]:
 
 @pytest.fixture(scope="session")
 def demos(tmp_path_factory) -> Path:
-    """A demonstration of noise for each task of libero_object, and one by the expert of the task that is replayed."""
+    """A demonstration of noise for each task of libero_object."""
     root = tmp_path_factory.mktemp("demos")
     suite = get_benchmark("libero_object")()
     for i in range(suite.n_tasks):
         write_noise(root / suite.get_task_demonstration(i))
-    drawer = get_benchmark("libero_goal")().get_task_demonstration(0)
-    generate("libero_goal/0", 1, path=root / drawer, camera_size=(64, 64), workers=1, progress=False)
     return root
+
+
+@pytest.fixture(scope="session")
+def drawer(demos) -> Path:
+    """A demonstration by the expert of the task that is looked into and replayed."""
+    path = demos / get_benchmark("libero_goal")().get_task_demonstration(0)
+    return generate("libero_goal/0", 1, path=path, camera_size=(64, 64), workers=1, progress=False)
 
 
 def write_noise(path: Path) -> None:

@@ -19,8 +19,10 @@ CHAPTERS = list(dict.fromkeys(block.chapter for block in load_blocks()))
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize("chapter", CHAPTERS)
-def test_chapter(chapter, blocks, texts, folder):
+def test_chapter(chapter, blocks, texts, folder, request):
     """Every block does what the text says, with the names that the blocks before it have left."""
+    if chapter in ("data", "render"):
+        request.getfixturevalue("drawer")
     scope = {"__name__": "__main__"}
     for block in blocks:
         if block.chapter == chapter:
