@@ -24,7 +24,7 @@ def demos_dir() -> Path:
 
 
 def objects_dir() -> Path:
-    """Where the user's own objects are kept: `$LIBERO_OBJECTS`, else `objects` of the configuration file, else beside it.
+    """Where the user's own objects are: `$LIBERO_OBJECTS`, else `objects` of the configuration file, else beside it.
 
     Raises:
         LiberoError: as `read_config`.

@@ -75,7 +75,11 @@ def register_tasks(subparsers: Subparsers) -> None:
     show.set_defaults(run=run_tasks_show)
     states = commands.add_parser("init-states", help="make the 50 stored initial states of a suite or task file anew")
     states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
-    states.add_argument("--out", type=Path, help="folder for the .npz files (default: those the package ships; the cache for a file)")
+    states.add_argument(
+        "--out",
+        type=Path,
+        help="folder for the .npz files (default: those the package ships; of a file, the cache)",
+    )
     states.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
     states.set_defaults(run=run_tasks_init_states)
     cli_tasks.register(commands)

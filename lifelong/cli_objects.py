@@ -9,7 +9,9 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
     parser = subparsers.add_parser("objects", help="objects of your own, from mesh and MJCF files")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _register_add(commands)
-    listing = commands.add_parser("list", help="the objects of your own; with --all those of the benchmark too")
+    listing = commands.add_parser(
+        "list", help="the objects of your own; with --all those of the benchmark too"
+    )
     listing.add_argument("--all", action="store_true", help="those of the benchmark too")
     listing.set_defaults(run=run_list)
     for name, run, text in (
@@ -33,7 +35,11 @@ def _register_add(commands: "argparse._SubParsersAction") -> None:
     option("--size", type=float, help="longest side, m (default: that of the file, whose unit is guessed)")
     option("--mass", type=float, help="kg (default: by density)")
     option("--density", type=float, help="kg/m^3 (default: 400)")
-    option("--up", choices=("z", "y"), help="axis of the file that points up (default: y for GLB and glTF, else z)")
+    option(
+        "--up",
+        choices=("z", "y"),
+        help="axis of the file that points up (default: y for GLB and glTF, else z)",
+    )
     option(
         "--collision", choices=("decompose", "hull", "boxes"), default="decompose",
         help="convex pieces, the convex hull, or boxes (default: decompose; without CoACD boxes)",
@@ -41,7 +47,11 @@ def _register_add(commands: "argparse._SubParsersAction") -> None:
     option("--faces", type=int, default=3000, help="triangles that its look may have (default: 3000)")
     option("--container", action="store_true", help="things can be put In it: adds the place contain_region")
     option("--replace", action="store_true", help="replace an object of yours that has this name")
-    option("--out", type=Path, help="folder (default: LIBERO_OBJECTS, else objects beside the configuration file)")
+    option(
+        "--out",
+        type=Path,
+        help="folder (default: LIBERO_OBJECTS, else objects beside the configuration file)",
+    )
     add.set_defaults(run=run_add)
 
 
@@ -69,7 +79,9 @@ def describe(facts: dict) -> list[str]:
     if collision:
         lines.append(f"  collision {collision['pieces']} shapes, by {collision['method']}")
     if grasp.get("width") is not None:
-        lines.append(f"  hold      {100 * grasp['width']:.1f} cm wide, {100 * grasp['height']:.1f} cm over the ground")
+        lines.append(
+            f"  hold      {100 * grasp['width']:.1f} cm wide, {100 * grasp['height']:.1f} cm over the ground"
+        )
     elif grasp:
         lines.append(f"  hold      none: {grasp['reason']}")
     if "stands" in facts:

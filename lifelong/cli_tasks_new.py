@@ -9,10 +9,26 @@ def register(commands: "argparse._SubParsersAction") -> None:
     new = commands.add_parser("new", help="write a task file of your own, to start from")
     add = new.add_argument
     add("name", help="of the task; the file is NAME.yaml")
-    add("--scene", default="kitchen", help="kitchen, living_room, study, coffee, table, floor, or kitchen_scene1, ...")
-    add("--objects", nargs="+", default=(), metavar="CATEGORY", help="such as red_cup plate (default: a bowl and a plate)")
+    add(
+        "--scene",
+        default="kitchen",
+        help="kitchen, living_room, study, coffee, table, floor, or kitchen_scene1, ...",
+    )
+    add(
+        "--objects",
+        nargs="+",
+        default=(),
+        metavar="CATEGORY",
+        help="such as red_cup plate (default: bowl, plate)",
+    )
     add("--furniture", nargs="+", default=(), metavar="CATEGORY", help="such as wooden_cabinet")
-    add("--goal", nargs="+", default=(), metavar="ATOM", help="such as 'On red_cup_1 plate_1' (default: first on last)")
+    add(
+        "--goal",
+        nargs="+",
+        default=(),
+        metavar="ATOM",
+        help="such as 'On red_cup_1 plate_1' (default: first on last)",
+    )
     add("--language", help="the instruction (default: of the goal)")
     add("--out", type=Path, default=Path(), help="folder (default: here)")
     add("--bddl", action="store_true", help="write the BDDL file too")
@@ -23,7 +39,13 @@ def register(commands: "argparse._SubParsersAction") -> None:
     add("--starts", type=int, default=3, help="rows of the sheet (default: 3)")
     add("--cameras", nargs="+", help="columns (default: agentview robot0_eye_in_hand birdview)")
     add("--size", type=int, default=256, help="pixels of a picture (default: 256)")
-    add("--video", nargs="?", const="webp", choices=("webp", "gif", "mp4"), help="the expert too (default kind: webp)")
+    add(
+        "--video",
+        nargs="?",
+        const="webp",
+        choices=("webp", "gif", "mp4"),
+        help="the expert too (default kind: webp)",
+    )
     add("--out", type=Path, help="the sheet (default: TASK.png here); the video is put beside it")
     preview.set_defaults(run=run_preview)
 

@@ -1,4 +1,4 @@
-"""Category name -> object model, from the builtin pack, from what users registered, and from their folder of objects."""
+"""Category name -> object model: of the builtin pack, of what users registered, of their folder of objects."""
 
 from collections.abc import Callable
 

@@ -93,7 +93,9 @@ def solid_mass(vertices: np.ndarray, faces: np.ndarray, density: float) -> Mass:
     return _mass(vertices, faces, density, mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT)
 
 
-def _mass(vertices: np.ndarray, faces: np.ndarray | None, density: float, kind: mujoco.mjtMeshInertia) -> Mass:
+def _mass(
+    vertices: np.ndarray, faces: np.ndarray | None, density: float, kind: mujoco.mjtMeshInertia
+) -> Mass:
     scale = 1.0 / np.ptp(vertices, axis=0).max()  # MuJoCo calls very small volumes none
     spec = mujoco.MjSpec()
     mesh = spec.add_mesh(name="mesh", uservert=(vertices * scale).ravel(), inertia=kind)

@@ -108,7 +108,9 @@ def read_spec(path: Path) -> mujoco.MjSpec:
             if element.file:
                 file = path.parent.absolute() / folders[kind] / element.file
                 if not file.is_file():
-                    raise LiberoError(f"{path}: {kind} {file} is missing; put it there, or mend the file's path")
+                    raise LiberoError(
+                        f"{path}: {kind} {file} is missing; put it there, or mend the file's path"
+                    )
                 element.file = str(file)
     spec.meshdir = spec.texturedir = ""
     return spec

@@ -43,7 +43,8 @@ class Options:
         up: axis of the file that points up, `z` or `y`; None for what the format says.
         collision: `decompose`, `hull` or `boxes`; see `libero_env.objects.collision`.
         faces: triangles that the look is simplified to where it has more.
-        container: add the place `contain_region`, the inside of its bounds, for goals such as `In x box_1_contain_region`.
+        container: add the place `contain_region`, the inside of its bounds, for goals such as
+            `In x box_1_contain_region`.
     """
 
     size: float | None = None
@@ -83,7 +84,12 @@ class Added:
 
 
 def add_object(
-    path: str | Path, *, name: str | None = None, out: str | Path | None = None, replace: bool = False, **options: Any
+    path: str | Path,
+    *,
+    name: str | None = None,
+    out: str | Path | None = None,
+    replace: bool = False,
+    **options: Any,
 ) -> Added:
     """Make an object of a file and keep it; from then on task files know it by its name.
 
@@ -104,7 +110,9 @@ def add_object(
     name = check_name(name or _name_of(path), taken_by_own=not replace)
     place = (Path(out) if out else objects_dir()) / name
     if place.exists() and not replace:
-        raise LiberoError(f"{place} is there already; choose another name (--name), or replace it (--replace)")
+        raise LiberoError(
+            f"{place} is there already; choose another name (--name), or replace it (--replace)"
+        )
     place.parent.mkdir(parents=True, exist_ok=True)
     return _make(path, name, place, Options(**options))
 
@@ -142,7 +150,9 @@ def check_name(name: str, *, taken_by_own: bool = True) -> str:
         LiberoError: task files cannot say it, or another object has it.
     """
     if not name.isidentifier() or not name.isascii() or name != name.lower():
-        raise LiberoError(f"{name!r} is no valid name; use small letters, digits and underscores, such as red_cup")
+        raise LiberoError(
+            f"{name!r} is no valid name; use small letters, digits and underscores, such as red_cup"
+        )
     if name in BUILDERS:
         raise LiberoError(f"{name} is the name of a builtin object; choose another (--name my_{name})")
     if taken_by_own and name in folder.names():
@@ -169,7 +179,9 @@ def _make(path: Path, name: str, place: Path, options: Options) -> Added:
     try:
         if path.suffix.lower() in (".xml", ".mjcf"):
             if options.of_meshes:
-                raise LiberoError(f"{path}: an MJCF file says {', '.join(options.of_meshes)} itself; leave it out")
+                raise LiberoError(
+                    f"{path}: an MJCF file says {', '.join(options.of_meshes)} itself; leave it out"
+                )
             facts = store_mjcf(path, name, scratch, container=options.container, tell=notes.append)
         else:
             facts = _from_mesh(path, name, scratch, options, notes)
@@ -198,8 +210,8 @@ def _from_mesh(path: Path, name: str, place: Path, options: Options, notes: list
     closed = is_closed(faces)
     if not closed:
         notes.append(
-            f"{path.name} is not watertight: it weighs as much as its convex hull, filled. Mend the mesh (fill its holes), "
-            "or say --mass"
+            f"{path.name} is not watertight: it weighs as much as its convex hull, filled. Mend the mesh (fill its "
+            "holes), or say --mass"
         )
     if closed and signed_volume(vertices, faces) < 0:
         notes.append(f"{path.name} was inside out and has been turned")
@@ -224,6 +236,8 @@ def _weigh(
     mass = solid_mass(vertices, faces, 1.0) if closed else hull_mass(vertices, 1.0)
     kilograms = options.mass or mass.volume * (options.density or DENSITY)
     if kilograms < _LIGHTEST and options.mass is None and options.density is None:
-        notes.append(f"{1000 * kilograms:.2g} g is lighter than what the fingers hold still: it weighs 20 g; or say --mass")
+        notes.append(
+            f"{1000 * kilograms:.2g} g is less than the fingers hold still: it weighs 20 g; or say --mass"
+        )
         kilograms = _LIGHTEST
     return Mass(mass.volume, mass.centre, mass.inertia * kilograms / mass.volume), kilograms

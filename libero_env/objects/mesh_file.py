@@ -1,4 +1,4 @@
-"""Mesh files (OBJ, GLB, glTF, STL, PLY) -> what an object looks like, upright, in metres, with the origin in its middle."""
+"""Mesh files (OBJ, GLB, glTF, STL, PLY) -> what an object looks like, upright, in metres, around its middle."""
 
 import shlex
 from collections.abc import Callable, Iterator
@@ -91,7 +91,7 @@ def welded(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Whether every edge of triangles (f, 3) lies between two that are turned the same way: an inside and an outside."""
+    """Whether every edge of triangles (f, 3) lies between two that are turned the same way."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there, back = np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)
     return len(there) == len(edges) and np.array_equal(there, back)

@@ -103,8 +103,8 @@ def _root(spec: mujoco.MjSpec, path: Path, tell: Tell) -> mujoco.MjsBody:
     moving = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
     if left_out or moving:
         tell(
-            f"{path.name}: left out are {len(left_out)} elements around the object (lights, cameras, actuators, ...) and "
-            f"{len(moving)} joints of its outermost body, which scenes give a free one"
+            f"{path.name}: left out are {len(left_out)} elements around the object (lights, cameras, actuators, ...) "
+            f"and {len(moving)} joints of its outermost body, which scenes give a free one"
         )
     for element in [*left_out, *body.joints]:
         delete(spec, element)
@@ -112,7 +112,7 @@ def _root(spec: mujoco.MjSpec, path: Path, tell: Tell) -> mujoco.MjsBody:
 
 
 def _sort_geoms(spec: mujoco.MjSpec) -> None:
-    """Groups as scenes expect them: 0 collides, 1 is seen; a copy to be seen of all that collides where nothing else is."""
+    """Groups as scenes expect them: 0 collides, 1 is seen. What collides gets a look where nothing else has one."""
     geoms = list(spec.geoms)
     solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
     looks = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]

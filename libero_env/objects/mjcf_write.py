@@ -90,7 +90,12 @@ def _add_look(
 ) -> None:
     vertices, triangles, texcoords, corners = _simplified(surface, faces)
     _write_obj(place / f"{name}.obj", vertices, triangles, texcoords, corners)
-    material = {"name": f"{name}_material", "rgba": _text(surface.rgba), "specular": "0.25", "shininess": "0.4"}
+    material = {
+        "name": f"{name}_material",
+        "rgba": _text(surface.rgba),
+        "specular": "0.25",
+        "shininess": "0.4",
+    }
     if surface.image is not None:
         picture = surface.image.copy()
         picture.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
@@ -126,7 +131,9 @@ def _write_obj(
     lines += [f"vt {u:.6g} {v:.6g}" for u, v in texcoords]
     if len(texcoords):
         pairs = zip(faces + 1, corners + 1, strict=True)
-        lines += ["f " + " ".join(f"{v}/{t}" for v, t in zip(face, corner, strict=True)) for face, corner in pairs]
+        lines += [
+            "f " + " ".join(f"{v}/{t}" for v, t in zip(face, corner, strict=True)) for face, corner in pairs
+        ]
     else:
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -107,7 +107,9 @@ def _stage(item: ObjectModel) -> mujoco.MjModel:
     spec.visual.map.znear, spec.visual.headlight.ambient = 0.005, [0.35] * 3
     grey = (0.55, 0.57, 0.6, 1.0)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(10, 10, 1), rgba=grey, group=1)
-    spec.worldbody.add_light(pos=(0.5, -0.5, 2.0), dir=(-0.2, 0.2, -1.0), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.worldbody.add_light(
+        pos=(0.5, -0.5, 2.0), dir=(-0.2, 0.2, -1.0), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    )
     spec.worldbody.add_camera(name="turntable", fovy=35.0)
     joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
     set_damping(joint, item.joint_damping)
@@ -137,8 +139,8 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, tell: Tell) -> bool:
     stands = tilt < _TILTED and slid < _SHIFTED
     if not stands:
         tell(
-            f"it does not stay as it is put down: it tilts by {tilt:.0f} degrees and moves by {100 * slid:.0f} cm. Say which "
-            "axis is up (--up), or give it a level bottom (--collision hull)"
+            f"it does not stay as it is put down: it tilts by {tilt:.0f} degrees and moves by {100 * slid:.0f} cm. "
+            "Say which axis is up (--up), or give it a level bottom (--collision hull)"
         )
     return stands
 

@@ -12,13 +12,14 @@
 
 The keys are those of `libero_env.tasks.builder`, and these, which are short for what it takes many to say:
 
-    scene      a scene of the benchmark (`kitchen_scene1`, with what stands in it), an empty one (`kitchen`, `living_room`,
-               `study`, `coffee`, `table`, `floor`), or the YAML file of one
+    scene      a scene of the benchmark (`kitchen_scene1`, with what stands in it), an empty one (`kitchen`,
+               `living_room`, `study`, `coffee`, `table`, `floor`), or the YAML file of one
     furniture  categories of fixtures, besides those of the scene; numbered as objects are
     objects    categories, besides those of the scene
-    place      thing: where it is at the start: [x, y] on the workspace in metres (x points away from the robot, y to its
-               left), `{at: [x, y], half: h, yaw: angle}` for any point within h of it, or what it stands on:
-               `plate_1`, `wooden_cabinet_1_top_side`, `In wooden_cabinet_1_top_region`
+    place      thing: where it is at the start: [x, y] on the workspace in metres (x points away from the robot,
+               y to its left), `{at: [x, y], half: h, yaw: angle}` for any point within h of it, or what it stands on:
+               `plate_1`, `wooden_cabinet_1_top_side`, `In wooden_cabinet_1_top_region`; for a thing of the scene
+               instead of what the scene says
     goal       one atom, several, or an expression; an atom is `On a b`, `(On a b)` or, in Python, `("On", "a", "b")`
 
 Places of objects and fixtures, such as `basket_1_contain_region`, need no declaration.
@@ -95,7 +96,9 @@ def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
     if "tasks" not in facts:
         return (_task({"name": path.stem, **facts}, str(path), path.parent),)
     shared = {key: value for key, value in facts.items() if key != "tasks"}
-    return tuple(_task({**shared, **own}, f"{path}, task {i}", path.parent) for i, own in enumerate(facts["tasks"]))
+    return tuple(
+        _task({**shared, **own}, f"{path}, task {i}", path.parent) for i, own in enumerate(facts["tasks"])
+    )
 
 
 def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
@@ -109,7 +112,9 @@ def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
         tasks += read_yaml_tasks(file) if Path(file).suffix in (".yaml", ".yml") else [read_task(file)]
     names = [task.name for task in tasks]
     if twice := sorted({n for n in names if names.count(n) > 1}):
-        raise LiberoError(f"two tasks of the suite {name} are called {', '.join(twice)}; rename one of their files")
+        raise LiberoError(
+            f"two tasks of the suite {name} are called {', '.join(twice)}; rename one of their files"
+        )
     if not tasks:
         raise LiberoError(f"the suite {name} has no files; name some that end in .yaml or .bddl")
     return Suite(name, tuple(replace(task, suite=name, index=i) for i, task in enumerate(tasks)))
@@ -140,7 +145,9 @@ def places_of(category: str) -> tuple[str, ...]:
 
 def _places(item: ObjectModel) -> tuple[str, ...]:
     names = {site.name for site in item.spec.sites}
-    return tuple(sorted(name for name in names if name and name != "default_site" and not name.endswith("_site")))
+    return tuple(
+        sorted(name for name in names if name and name != "default_site" and not name.endswith("_site"))
+    )
 
 
 def _task(facts: Facts, where: str, folder: Path) -> Task:
@@ -165,20 +172,36 @@ def _problem(facts: Facts, where: str, folder: Path) -> Problem:
     objects |= _numbered(facts.get("objects", ()), objects.values(), where)
     things = {**fixtures, **objects}
     regions, starts = _placed(facts.get("place", {}), fixtures, things, where)
-    init = [*map(_atom, facts.get("init_also", ())), *starts]
-    init += map(_atom, facts["init"] if "init" in facts else scene.get("init", ()))
+    if "init" in facts:
+        rest = [_atom(atom) for atom in facts["init"]]
+    else:
+        moved = {atom.split()[1] for atom in starts}
+        rest = [atom for atom in map(_atom, scene.get("init", ())) if not _places_one(atom, moved)]
+    init = [*map(_atom, facts.get("init_also", ())), *starts, *rest]
     goal = _goal(facts.get("goal", scene.get("goal")), where)
     declared = _joined(scene.get("regions"), facts.get("regions"), regions)
     declared = _joined(declared, _undeclared([*init, *goal], declared, things, where))
-    own = {key: facts[key] for key in ("name", "language", "problem", "obj_of_interest") if key in facts}
-    properties = {**scene.get("scene_properties", {}), **facts.get("scene_properties", {})}
-    whole = {
-        **{key: scene[key] for key in ("problem", "obj_of_interest") if key in scene and "goal" not in facts},
-        "problem": scene.get("problem") or load_workspace(_workspace(fixtures, where)[1]).problem, **own, "fixtures": fixtures, "objects": _counts(objects), "regions": declared,
-        "init": init, "goal": goal[0] if goal[0].startswith("(") else goal, "scene_properties": properties,
-    }  # fmt: skip
     _check_placed(things, init, where)
+    said = {key: facts[key] for key in ("name", "language", "problem", "obj_of_interest") if key in facts}
+    if "goal" not in facts and "obj_of_interest" in scene:
+        said.setdefault("obj_of_interest", scene["obj_of_interest"])
+    said.setdefault("problem", scene.get("problem") or load_workspace(_workspace(fixtures, where)[1]).problem)
+    whole = {
+        **said,
+        "fixtures": fixtures,
+        "objects": _counts(objects),
+        "regions": declared,
+        "init": init,
+        "goal": goal[0] if goal[0].startswith("(") else goal,
+        "scene_properties": {**scene.get("scene_properties", {}), **facts.get("scene_properties", {})},
+    }
     return build_problem({}, whole)
+
+
+def _places_one(atom: str, names: set[str]) -> bool:
+    """Whether an atom says where one of these things stands."""
+    words = atom.split()
+    return len(words) == 3 and words[0] in ("On", "In") and words[1] in names
 
 
 def _scene(scene: Any, where: str, folder: Path) -> Facts:
@@ -240,7 +263,9 @@ def _placed(
             predicate, _, rest = place.strip("() ").rpartition(" ")
             atoms.append(f"{predicate or 'On'} {thing} {rest}")
             continue
-        regions[f"{thing}_start"] = _rectangle(place, "fixture" if thing in fixtures else "object", thing, where)
+        regions[f"{thing}_start"] = _rectangle(
+            place, "fixture" if thing in fixtures else "object", thing, where
+        )
         atoms.append(f"On {thing} {workspace}_{thing}_start")
     return {workspace: regions} if regions else {}, atoms
 
@@ -261,7 +286,9 @@ def _rectangle(place: Any, kind: str, thing: str, where: str) -> dict[str, Any]:
     at, half = facts.pop("at", None), facts.pop("half", _HALF[kind])
     half = half if isinstance(half, list | tuple) else (half, half)
     if not isinstance(at, list | tuple) or len(at) != 2 or len(half) != 2:
-        raise LiberoError(f"{where}: the place of {thing} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}, metres")
+        raise LiberoError(
+            f"{where}: the place of {thing} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}"
+        )
     facts["ranges"] = [[round(float(at[k % 2]) + (-1, 1)[k // 2] * float(half[k % 2]), 6) for k in range(4)]]
     return facts
 
@@ -288,7 +315,9 @@ def _joined(*several: Mapping[str, Any] | None) -> dict[str, dict[str, Any]]:
     joined: dict[str, dict[str, Any]] = {}
     for regions in several:
         for target, facts in (regions or {}).items():
-            joined.setdefault(target, {}).update(facts if isinstance(facts, Mapping) else {name: {} for name in facts})
+            joined.setdefault(target, {}).update(
+                facts if isinstance(facts, Mapping) else {name: {} for name in facts}
+            )
     return joined
 
 
@@ -320,5 +349,5 @@ def _check_placed(things: Mapping[str, str], init: Iterable[str], where: str) ->
     missing = [name for name, category in things.items() if name not in placed and category not in WORKSPACES]
     if missing:
         raise LiberoError(
-            f"{where}: nothing says where {', '.join(missing)} stands; add it below place, such as `{missing[0]}: [0, 0]`"
+            f"{where}: nothing says where {', '.join(missing)} stands; add it below place: `{missing[0]}: [0, 0]`"
         )

@@ -31,7 +31,9 @@ def contact_sheet(
     """
     env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
     try:
-        rows = [np.concatenate([_shown(env, i)[entry(c, "rgb")] for c in cameras], axis=1) for i in range(starts)]
+        rows = [
+            np.concatenate([_shown(env, i)[entry(c, "rgb")] for c in cameras], axis=1) for i in range(starts)
+        ]
     finally:
         env.close()
     sheet = Image.fromarray(np.concatenate(rows))
@@ -65,7 +67,9 @@ def expert_video(
             env.draw = step % _EVERY == _EVERY - 1
             obs, _, terminated, truncated, _ = env.step(expert.act(env.view))
             if env.draw or terminated:
-                frames.append(env.render_frames()[entry(camera, "rgb")] if terminated else obs[entry(camera, "rgb")])
+                frames.append(
+                    env.render_frames()[entry(camera, "rgb")] if terminated else obs[entry(camera, "rgb")]
+                )
             step += 1
     finally:
         env.close()

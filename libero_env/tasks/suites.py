@@ -136,7 +136,9 @@ def read_task(path: str | Path) -> Task:
 
         tasks = read_yaml_tasks(path)
         if len(tasks) != 1:
-            raise LiberoError(f"{path} holds {len(tasks)} tasks, and one is wanted; put it in a file of its own")
+            raise LiberoError(
+                f"{path} holds {len(tasks)} tasks, and one is wanted; put it in a file of its own"
+            )
         return tasks[0]
     problem, name = bddl.read(path), Path(path).stem
     return Task("file", 0, name, language_from_name(name), problem.language, problem)

@@ -68,7 +68,9 @@ def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
         predicate, *args = atom.strip("()").split()
         plain = [names.get(arg, arg).replace("_", " ").replace(" 1", "") for arg in args]
         if predicate in ("On", "In") and len(plain) == 2:
-            said.append(f"put the {plain[0]} {predicate.lower()} the {plain[1].removesuffix(' contain region')}")
+            said.append(
+                f"put the {plain[0]} {predicate.lower()} the {plain[1].removesuffix(' contain region')}"
+            )
         else:
             said.append(f"{predicate.lower()} the {' and the '.join(plain)}")
     return " and ".join(said)
@@ -114,7 +116,9 @@ def _text(
     lines = [f"language: {language}", f"scene: {scene}"]
     lines += [f"furniture: [{', '.join(furniture)}]"] if furniture else []
     lines += [f"objects: [{', '.join(objects)}]"] if objects else []
-    lines += ["# the middle (x away from the robot, y to its left, metres), how far around it, and the angle of furniture"]
+    lines += [
+        "# the middle (x away from the robot, y to its left, m), how far around it, and the angle of furniture"
+    ]
     lines += ["place:", *(f"  {name}: {place}" for name, place in places.items())] if places else []
     lines += ["# all of these must hold: On, In, Open, Close, Turnon, Turnoff, Up, Stack, ...", "goal:"]
     return "\n".join([*lines, *(f"  - {atom}" for atom in goal)]) + "\n"

@@ -1,0 +1,366 @@
+"""Objects made of mesh and MJCF files: what becomes of them, where they are kept, and what is refused."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from libero_env.errors import LiberoError
+from libero_env.init_states import scene_digest
+from libero_env.objects import add_object, catalog, folder, get_object, object_names, register_object_file
+from libero_env.objects.collision import boxes_of, collision_pieces, hull_mass, solid_mass, volume_filled
+from libero_env.objects.from_file import DENSITY, Options
+from libero_env.objects.mesh_file import bounds, is_closed, read_mesh, signed_volume, welded
+from libero_env.scene import build_scene
+from libero_env.tasks import make_task
+from libero_env.tasks.authoring import places_of
+from lifelong.cli import main
+
+pytestmark = pytest.mark.sim
+
+DOOR = """<mujoco><compiler angle="radian"/>
+  <default><default class="look"><geom contype="0" conaffinity="0" group="2" mass="0"/></default></default>
+  <asset><mesh name="m" file="meshes/box.stl"/><material name="red" rgba="1 0 0 1"/></asset>
+  <worldbody><light pos="0 0 2"/><body name="chest" pos="1 2 3"><freejoint/>
+    <geom type="box" size="0.03 0.03 0.02" mass="0.2"/>
+    <geom type="mesh" mesh="m" material="red" class="look"/>
+    <body name="lid" pos="0 0 0.025"><joint name="hinge" axis="0 1 0" range="0 1.5"/>
+      <geom type="box" size="0.03 0.03 0.004" mass="0.05"/><site name="lid_region" size="0.01"/></body>
+  </body></worldbody></mujoco>"""
+ORIGINAL = """<mujoco><worldbody><body>
+  <body name="object"><geom type="box" size="0.02 0.02 0.03" mass="0.05" group="0"/>
+    <geom type="box" size="0.02 0.02 0.03" rgba="0.9 0.1 0.1 1" group="1" contype="0" conaffinity="0"/></body>
+  <site name="bottom_site" pos="0 0 -0.03"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch) -> Path:
+    """An empty folder of objects, and registrations that end with the test."""
+    monkeypatch.setenv("LIBERO_OBJECTS", str(tmp_path / "objects"))
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(catalog, "_registered", {})
+    return tmp_path
+
+
+def box(path: Path, extents=(0.04, 0.05, 0.06)) -> Path:
+    trimesh.creation.box(extents).export(path)
+    return path
+
+
+def textured_box(path: Path) -> Path:
+    """An OBJ file of two materials, one of them a picture: left half red, right half blue."""
+    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+    picture = Image.new("RGB", (16, 16), (255, 0, 0))
+    picture.paste((0, 0, 255), (8, 0, 16, 16))
+    picture.save(path.with_name("skin.png"))
+    path.with_suffix(".mtl").write_text("newmtl skin\nmap_Kd skin.png\nnewmtl green\nKd 0 1 0\n")
+    lines = [f"mtllib {path.stem}.mtl", *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "usemtl skin"]
+    for number, (a, b, c) in enumerate(mesh.faces + 1):
+        lines += ["usemtl green"] * (number == 8) + [f"f {a}/1 {b}/2 {c}/3"]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def cup() -> trimesh.Trimesh:
+    """Hollow: 7 cm wide, 9 cm high, walls of 3 mm."""
+    profile = [[0, 0], [0.03, 0], [0.035, 0.09], [0.032, 0.09], [0.027, 0.004], [0, 0.004]]
+    return trimesh.creation.revolve(np.array(profile), sections=24)
+
+
+def test_a_textured_mesh_becomes_an_object_of_a_scene(tmp_path):
+    added = add_object(textured_box(tmp_path / "my box.obj"), size=0.12, density=500.0)
+    assert (added.name, added.folder) == ("my_box", tmp_path / "objects" / "my_box")
+    assert added.facts["size"] == pytest.approx([0.08, 0.10, 0.12])
+    mass = 0.08 * 0.10 * 0.12 * 500
+    assert added.facts["mass"] == pytest.approx(mass, rel=1e-4)
+    assert added.facts["stands"]
+    assert added.facts["collision"] == {"method": "hull", "pieces": 1}
+    assert added.facts["grasp"]["width"] is None and "8.0 cm wide" in added.facts["grasp"]["reason"]
+    picture = np.asarray(Image.open(added.folder / "preview.png"))
+    assert picture.shape == (2 * 224, 4 * 224, 3) and np.ptp(picture) > 100
+
+    task = make_task(scene="kitchen", objects=["my_box", "plate"], place={"my_box": (0, 0), "plate": (0, 0.2)},
+                     goal="On my_box_1 plate_1", language="lift the box")  # fmt: skip
+    model = build_scene(task.problem).model
+    body = model.body("my_box_1_main")
+    assert model.body_mass[body.id] == pytest.approx(mass, rel=1e-4)
+    sides = np.array([0.08, 0.10, 0.12]) ** 2
+    assert sorted(model.body_inertia[body.id]) == pytest.approx(sorted(mass / 12 * (sides.sum() - sides)), rel=1e-3)
+    texture = model.texture("my_box_1_my_box_visual0_texture")
+    assert (texture.width[0], texture.height[0]) == (16, 16)
+    looks = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body.id and model.geom_group[g] == 1]
+    assert len(looks) == 2
+    assert model.mat_rgba[model.geom_matid[looks]].tolist() == [[1, 1, 1, 1], [0, 1, 0, 1]]
+
+
+@pytest.mark.parametrize("ending", [".obj", ".stl", ".ply", ".glb"])
+def test_every_format_gives_the_same_shape(tmp_path, ending):
+    notes: list[str] = []
+    surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up="z", tell=notes.append)
+    low, high = bounds(surfaces)
+    assert high - low == pytest.approx([0.04, 0.05, 0.06]) and low + high == pytest.approx([0, 0, 0], abs=1e-9)
+    vertices, faces = welded(surfaces)
+    assert (len(vertices), len(faces), notes) == (8, 12, [])
+    assert signed_volume(vertices, faces) == pytest.approx(1.2e-4)
+
+
+def test_y_is_up_where_the_format_says_so(tmp_path):
+    sizes = {}
+    for ending in (".glb", ".stl"):
+        surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up=None, tell=print)
+        sizes[ending] = np.subtract(*bounds(surfaces)[::-1])
+    assert sizes[".stl"] == pytest.approx([0.04, 0.05, 0.06])
+    assert sizes[".glb"] == pytest.approx([0.04, 0.06, 0.05])
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1000, "millimetres"), (100, "centimetres"), (1, None)])
+def test_units_are_guessed_and_said(tmp_path, scale, unit):
+    notes: list[str] = []
+    path = box(tmp_path / "box.stl", np.array([0.04, 0.05, 0.08]) * scale)
+    low, high = bounds(read_mesh(path, size=None, up=None, tell=notes.append))
+    assert max(high - low) == pytest.approx(0.08)
+    assert unit in notes[0] if unit else not notes
+
+
+def test_closed_means_that_every_edge_has_two_sides():
+    faces = trimesh.creation.box().faces
+    turned = faces.copy()
+    turned[0] = turned[0][::-1]
+    assert is_closed(faces) and not is_closed(faces[1:]) and not is_closed(turned)
+
+
+def test_mass_and_inertia_are_those_of_the_solid():
+    mesh = cup()
+    found = solid_mass(np.array(mesh.vertices), np.array(mesh.faces), 1000.0)
+    assert found.volume == pytest.approx(mesh.volume, rel=1e-6)
+    assert found.centre == pytest.approx(mesh.center_mass, abs=1e-6)
+    tensor = 1000.0 * mesh.moment_inertia
+    assert found.inertia[:3] == pytest.approx(np.diag(tensor), rel=1e-3)
+    assert hull_mass(np.array(mesh.vertices), 1.0).volume > 2 * found.volume
+
+
+def inside_any(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return (np.abs(points[:, None] - boxes[:, :3]) <= boxes[:, 3:] + 1e-9).all(axis=2).any(axis=1)
+
+
+def test_boxes_cover_the_walls_and_leave_a_cup_hollow():
+    mesh = cup()
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    boxes = boxes_of(vertices, faces)
+    assert 4 < len(boxes) <= 60
+    assert inside_any(boxes, vertices).all() and inside_any(boxes, vertices[faces].mean(axis=1)).all()
+    assert not inside_any(boxes, np.array([[0, 0, 0.05], [0.01, 0, 0.08], [0, 0, 0.1]])).any()
+
+
+def test_boxes_of_a_solid_have_no_hole():
+    mesh = trimesh.creation.icosphere(2, 0.05)
+    boxes = boxes_of(np.array(mesh.vertices), np.array(mesh.faces))
+    points = np.random.default_rng(0).uniform(-0.028, 0.028, (200, 3))
+    assert inside_any(boxes, points).all()
+    assert 8 * boxes[:, 3:].prod(axis=1).sum() < 1.5 * mesh.volume
+
+
+def test_what_is_convex_is_its_hull_and_what_is_not_is_taken_apart(monkeypatch):
+    solid, hollow = trimesh.creation.icosphere(2, 0.05), cup()
+    assert collision_pieces(np.array(solid.vertices), np.array(solid.faces), "decompose", print).method == "hull"
+    vertices, faces = np.array(hollow.vertices), np.array(hollow.faces)
+    assert volume_filled(vertices, faces) < 0.5
+    seen: dict = {}
+
+    def run_coacd(mesh, **options):
+        seen.update(options, longest=np.ptp(mesh.vertices, axis=0).max())
+        low = mesh.vertices[:, 2] < 0.5
+        return [(mesh.vertices[low], None), (mesh.vertices[~low], None)]
+
+    fake = SimpleNamespace(run_coacd=run_coacd, set_log_level=print, Mesh=lambda v, f: SimpleNamespace(vertices=v))
+    monkeypatch.setitem(sys.modules, "coacd", fake)
+    found = collision_pieces(vertices, faces, "decompose", print)
+    assert (found.method, len(found), seen["seed"]) == ("decompose", 2, 0)
+    assert seen["longest"] == pytest.approx(1.0)  # its threshold is for meshes of that size
+    assert np.ptp(np.concatenate(found.meshes), axis=0) == pytest.approx(np.ptp(vertices, axis=0))
+
+
+def test_without_coacd_boxes_stand_in_and_say_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    notes: list[str] = []
+    mesh = cup()
+    found = collision_pieces(np.array(mesh.vertices), np.array(mesh.faces), "decompose", notes.append)
+    assert found.method == "boxes" and "libero-lifelong[objects]" in notes[0]
+
+
+def test_coacd_itself():
+    pytest.importorskip("coacd")
+    mesh = cup()
+    found = collision_pieces(np.array(mesh.vertices), np.array(mesh.faces), "decompose", print)
+    assert found.method == "decompose" and 3 < len(found) <= 24
+    centre = np.array([0, 0, 0.05])
+    assert not any((p.min(axis=0) < centre).all() and (p.max(axis=0) > centre).all() for p in found.meshes)
+
+
+def test_an_open_mesh_weighs_as_much_as_its_hull(tmp_path):
+    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+    mesh.update_faces(np.arange(12) > 1)
+    mesh.export(tmp_path / "open.stl")
+    added = add_object(tmp_path / "open.stl", collision="hull", container=True)
+    assert any("not watertight" in note for note in added.notes)
+    assert added.facts["mass"] == pytest.approx(1.2e-4 * DENSITY, rel=1e-3)
+    assert added.facts["grasp"]["width"] == pytest.approx(0.04, abs=0.003)
+    assert places_of("open") == ("contain_region",)
+
+
+def test_an_mjcf_file_keeps_its_parts_and_gets_what_scenes_need(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    box(tmp_path / "meshes" / "box.stl")
+    (tmp_path / "chest.xml").write_text(DOOR)
+    added = add_object(tmp_path / "chest.xml")
+    assert added.facts["mass"] == pytest.approx(0.25) and added.facts["size"][:2] == pytest.approx([0.06, 0.06])
+    assert "1 elements around" in added.notes[0]
+    item = get_object("chest")
+    model = item.spec.compile()
+    assert [model.joint(j).name for j in range(model.njnt)] == ["hinge"]
+    assert model.body("main").pos.tolist() == [0, 0, 0]
+    solid = (model.geom_contype | model.geom_conaffinity) > 0
+    assert solid.sum() == 2 and (model.geom_group[solid] == 0).all() and (model.geom_group[~solid] == 1).all()
+    assert places_of("chest") == ("lid_region",)
+    (tmp_path / "meshes" / "box.stl").unlink()  # the object has its own copy
+    get_object("chest").spec.compile()
+
+
+def test_a_file_of_the_originals_kind_is_read(tmp_path):
+    (tmp_path / "brick.xml").write_text(ORIGINAL)
+    added = add_object(tmp_path / "brick.xml", name="brick")
+    assert added.facts["mass"] == pytest.approx(0.05)
+    assert added.facts["bottom_offset"] == pytest.approx([0, 0, -0.03])
+    assert get_object("brick").spec.compile().ngeom == 2
+
+
+def test_registering_lasts_for_the_process_and_is_made_once(tmp_path):
+    path = box(tmp_path / "block.stl")
+    assert register_object_file(path, mass=0.2) == "block"
+    assert get_object("block").spec.compile().body("main").mass[0] == pytest.approx(0.2)
+    made = list((tmp_path / "cache" / "objects").glob("*/block"))
+    before = (made[0] / "object.xml").stat().st_mtime_ns
+    register_object_file(path, mass=0.2)
+    assert list((tmp_path / "cache" / "objects").glob("*/block")) == made
+    assert (made[0] / "object.xml").stat().st_mtime_ns == before
+    assert "block" in object_names() and folder.names() == ()
+
+
+def test_nothing_is_made_by_asking(tmp_path):
+    assert "milk" in object_names() and folder.find("milk") is None
+    assert not (tmp_path / "objects").exists()
+
+
+def test_what_is_kept_of_a_scene_depends_on_the_files(tmp_path):
+    def digest() -> str:
+        task = make_task(scene="floor", objects=["brick"], place={"brick": (0, 0)}, goal="Up brick_1", language="x")
+        build_scene.__globals__["_build_scene"].cache_clear()
+        return scene_digest(build_scene(task.problem))
+
+    (tmp_path / "brick.xml").write_text(ORIGINAL)
+    place = add_object(tmp_path / "brick.xml").folder
+    first = digest()
+    assert digest() == first
+    text = (place / "object.xml").read_text()
+    (place / "object.xml").write_text(text.replace("0.9 0.1 0.1", "0.1 0.9 0.1"))
+    assert digest() != first
+
+
+def broken(tmp_path: Path, kind: str) -> Path:
+    """A file that cannot become an object."""
+    path = tmp_path / f"{kind}.obj"
+    if kind in ("texture", "mtl"):
+        textured_box(path)
+        path.with_name("skin.png" if kind == "texture" else "mtl.mtl").unlink()
+    elif kind == "flat":
+        path.write_text("v 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nf 1 2 3\n")
+    elif kind == "empty":
+        path.write_text("# nothing\n")
+    elif kind in ("two", "weightless", "xml"):
+        path = path.with_suffix(".xml")
+        geom = "<geom type='box' size='0.02 0.02 0.02'{}/>".format(" mass='0'" if kind == "weightless" else "")
+        body = f"<body>{geom}</body>" * (2 if kind == "two" else 1)
+        path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>" if kind != "xml" else "<mujoco>")
+    elif kind == "fbx":
+        path = path.with_suffix(".fbx")
+        path.write_text("")
+    elif kind == "large":
+        box(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("texture", {}, "skin.png is missing; put it at"),
+        ("mtl", {}, "material file mtl.mtl is missing"),
+        ("flat", {}, "it is flat"),
+        ("empty", {}, "empty.obj: "),
+        ("two", {}, "2 bodies"),
+        ("weightless", {}, "weighs nothing"),
+        ("xml", {}, "xml.xml: "),
+        ("two", {"size": 0.1}, "says size itself"),
+        ("fbx", {}, "unknown format '.fbx'; valid: .xml"),
+        ("large", {"size": 3.0}, "too large"),
+        ("large", {"name": "milk"}, "--name my_milk"),
+        ("large", {"name": "Red Cup"}, "small letters"),
+        ("large", {"collision": "cubes"}, "valid are decompose, hull, boxes"),
+        ("absent", {}, "no such file"),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_its_remedy(tmp_path, kind, options, message):
+    with pytest.raises(LiberoError, match=message):
+        add_object(broken(tmp_path, kind), **options)
+    root = tmp_path / "objects"
+    assert not root.exists() or not list(root.iterdir())  # nothing half made stays
+
+
+def test_options_that_contradict_each_other():
+    with pytest.raises(LiberoError, match="say one of them"):
+        Options(mass=1.0, density=2.0)
+    with pytest.raises(LiberoError, match="above 0"):
+        Options(size=0.0)
+    with pytest.raises(LiberoError, match="valid: y, z"):
+        Options(up="x")
+
+
+def test_a_stored_object_that_was_spoilt_is_named(tmp_path):
+    (tmp_path / "brick.xml").write_text(ORIGINAL)
+    place = add_object(tmp_path / "brick.xml").folder
+    (place / "object.yaml").write_text("name: brick\n")
+    with pytest.raises(LiberoError, match="does not say bottom_offset"):
+        get_object("brick")
+
+
+def test_the_command_adds_lists_shows_draws_and_removes(tmp_path, capsys):
+    path = str(box(tmp_path / "block.stl"))
+    assert main(["objects", "add", path, "--name", "red_block", "--mass", "0.1"]) == 0
+    said = capsys.readouterr().out
+    assert "4.0 x 5.0 x 6.0 cm" in said and "100 g" in said and "stands    yes" in said
+    assert main(["objects", "add", path, "--name", "red_block"]) == 2
+    assert "--replace" in capsys.readouterr().err
+    assert main(["objects", "add", path, "--name", "red_block", "--mass", "0.2", "--replace"]) == 0
+    assert "200 g" in capsys.readouterr().out
+    assert main(["objects", "list"]) == 0 and capsys.readouterr().out.startswith("red_block ")
+    assert main(["objects", "show", "red_block", "basket"]) == 0
+    assert "contain_region" in capsys.readouterr().out
+    assert main(["objects", "preview", "basket", "--out", str(tmp_path / "basket.png")]) == 0
+    assert Image.open(tmp_path / "basket.png").size == (4 * 224, 2 * 224)
+    assert main(["objects", "remove", "red_block"]) == 0 and "red_block" not in object_names()
+    capsys.readouterr()
+    assert main(["objects", "remove", "red_block"]) == 2
+    assert "object of your own" in capsys.readouterr().err
+
+
+def test_a_mesh_of_many_triangles_is_simplified(tmp_path):
+    trimesh.creation.icosphere(4, 0.03).export(tmp_path / "ball.stl")
+    added = add_object(tmp_path / "ball.stl", faces=300)
+    model = mujoco.MjSpec.from_file(str(added.folder / "object.xml")).compile()
+    assert model.mesh_facenum[model.mesh("ball_visual0_mesh").id] <= 330
+    assert any("simplified" in note for note in added.notes)
