@@ -1,4 +1,4 @@
-"""What README.md and CONTRIBUTING.md show is run here."""
+"""What README.md and CONTRIBUTING.md show is run here; tests/test_docs_site.py does it for docs/."""
 
 import re
 from pathlib import Path

@@ -1,0 +1,290 @@
+"""The pages in docs/: what they show runs, what they name exists, and nothing is left out of them."""
+
+import argparse
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+
+from libero.lifelong.config import load_config
+from libero_env.objects import catalog
+from lifelong.algorithms import Algorithm
+from lifelong.cli import build_parser, main
+from lifelong.launch import check_choices
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+CONFIGS = ROOT / "configs"
+PAGES = sorted(DOCS.glob("*.md"))
+GENERATED = ("commands.md", "configuration.md")
+NOT_RUN = r"<!-- not run: \S[^>]*-->\n+"  # before a block that is not, with the reason
+
+
+@cache
+def generate() -> ModuleType:
+    """docs/generate.py, which no package holds."""
+    spec = importlib.util.spec_from_file_location("docs_generate", DOCS / "generate.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The blocks that are meant to be run."""
+    found = re.findall(rf"({NOT_RUN})?^```({'|'.join(languages)})\n(.*?)^```", text(page), re.M | re.S)
+    return [code for excuse, _, code in found if not excuse]
+
+
+def lines(page: Path) -> Iterator[str]:
+    """Command lines without comments, of blocks and of indented text."""
+    indented = re.findall(r"^    (?! )(?:libero|python|torchrun|lifelong\.) .*$", text(page), re.M)
+    for line in [*"".join(blocks(page, "sh")).splitlines(), *indented]:
+        for part in line.split(" && "):
+            words = shlex.split(part, comments=True)
+            if words:
+                yield shlex.join(words)
+
+
+PYTHON = [
+    pytest.param(page, code, id=f"{page.stem}-{i}")
+    for page in PAGES
+    for i, code in enumerate(blocks(page, "python"))
+]
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(("page", "code"), PYTHON)
+def test_python_blocks_run(page, code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    monkeypatch.setenv("LIBERO_OBJECTS", str(tmp_path))
+    monkeypatch.setattr(catalog, "_registered", {})
+    exec(compile(code, str(page), "exec"), {"__name__": "shown"})  # noqa: S102
+
+
+@pytest.mark.sim
+def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
+    (code,) = blocks(DOCS / "evaluating.md", "python")
+    (tmp_path / "my_policy.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    tiny = ["--suite", "libero_object/0", "--episodes", "2", "--horizon", "3"]
+    assert main(["eval", "my_policy:make", *tiny]) == 0
+    assert "eval/my_policy.make/eval.json" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "my_policy")
+
+
+@cache
+def composes(*overrides: str) -> None:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        compose("config", list(overrides))
+
+
+def check_line(line: str) -> None:
+    """A command line that its program would take.
+
+    Raises:
+        SystemExit, Exception: It would not.
+    """
+    words = shlex.split(line)
+    if words[0] == "torchrun":
+        words = ["python", *words[words.index("train.py") :]]
+    if words[0].endswith("libero"):
+        build_parser().parse_args(words[1:])
+    elif words[:2] == ["python", "train.py"]:
+        overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
+        check_choices(overrides, CONFIGS)
+        if "-m" in words:  # Hydra takes lists apart before it composes
+            overrides = [re.sub(r"=([^\[,]*),.*", r"=\1", w) for w in overrides]
+        composes(*overrides)
+    elif words[0] == "python":
+        assert (ROOT / words[1]).is_file() or words[1] == "-m", line
+    else:
+        assert words[0] in ("export", "git", "pip", "python3.11", ".venv/bin/pip", "source", "make"), line
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+def test_command_lines_are_valid(page):
+    for line in lines(page):
+        try:
+            check_line(line)
+        except (Exception, SystemExit) as error:
+            raise AssertionError(f"{page.name}: {line}") from error
+
+
+@pytest.mark.unit
+def test_a_wrong_command_line_is_found():
+    for line in (
+        "libero tasks lost",
+        "python train.py algo=ewx",
+        "python train.py train.epoch=3",
+        "libreo doctor",
+    ):
+        with pytest.raises((Exception, SystemExit)):
+            check_line(line)
+
+
+def written() -> str:
+    """All pages but those that are generated."""
+    return "\n".join(text(page) for page in PAGES if page.name not in GENERATED)
+
+
+@pytest.mark.unit
+def test_every_command_is_shown():
+    names = [parser.prog for parser in generate().commands()]
+    assert "libero demos export" in names
+    assert not [name for name in names if not re.search(rf"\b{re.escape(name)}\b", written())]
+
+
+@pytest.mark.unit
+def test_every_command_and_argument_is_in_the_reference():
+    page = generate().command_reference()
+    for parser in generate().commands():
+        assert f"## {parser.prog}\n" in page
+        section = page.split(f"## {parser.prog}\n")[1].split("\n## ")[0]
+        for action in parser._actions:
+            if not isinstance(action, argparse._HelpAction):
+                names = action.option_strings or [action.metavar or action.dest]
+                assert all(re.search(rf"`{re.escape(n)}[ .`]", section) for n in names), (parser.prog, names)
+
+
+OPTIONS = [(file.parent.name, file.stem) for file in sorted(CONFIGS.glob("*/*.yaml"))]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("group", sorted({group for group, _ in OPTIONS}))
+def test_every_option_of_a_group_is_shown(group):
+    said = {name for found in re.findall(rf"\b{group}=([\w,]+)", written()) for name in found.split(",")}
+    assert not {option for g, option in OPTIONS if g == group} - said
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("algo", [option for group, option in OPTIONS if group == "algo"])
+def test_every_algorithm_has_a_section_that_names_its_keys(algo):
+    page = text(DOCS / "algorithms.md")
+    assert re.search(rf"^\| `{algo}` \|", page, re.M)
+    section = page.split(f"\n## algo={algo}\n")[1].split("\n## ")[0]
+    keys = set(yaml.safe_load((CONFIGS / "algo" / f"{algo}.yaml").read_text())) - {"_target_", "compat"}
+    missing = [key for key in keys if not re.search(rf"\b{key}\b", section)]
+    assert not missing
+
+
+@pytest.mark.unit
+def test_hooks_of_the_guide_are_those_of_algorithms():
+    shown = text(DOCS / "algorithms.md").split("## Your own")[1]
+    for hook in ("begin_task", "phases", "begin_phase", "mix", "penalty", "after_backward", "after_step", "end_phase",
+                 "end_task", "policy_for", "state_dict", "load_state_dict"):  # fmt: skip
+        assert hasattr(Algorithm, hook)
+        assert hook in shown
+
+
+@pytest.mark.unit
+def test_every_key_is_in_the_reference_with_its_meaning():
+    page = generate().configuration_reference()
+    for group, option in OPTIONS:
+        values = yaml.safe_load((CONFIGS / group / f"{option}.yaml").read_text(encoding="utf-8"))
+        assert f"- `{group}={option}`" in page
+        if f"`configs/{group}/{option}.yaml`\n\n```yaml" in page:  # shown whole
+            continue
+        for key in set(values) - {"_target_"}:
+            assert f"| `{group}.{key}` |" in page
+    rows = re.findall(r"^\| `[\w.]+` \|.*$", page, re.M)
+    assert len(rows) > 100
+    assert not [row for row in rows if not row.split("|")[-2].strip()]
+
+
+def shown_keys(column: int) -> Iterator[list[str]]:
+    """Overrides of a column of the table of keys: those of an algorithm by themselves, all others together."""
+    table = text(DOCS / "migrating.md").split("## Keys")[1].split("\n## ")[0]
+    rest: list[str] = []
+    for row in re.findall(r"^\| `.*$", table, re.M):
+        for found in re.findall(r"`([^`]+)`", row.split("|")[column]):
+            words = [w if "=" in w else f"{w}=1" for w in found.replace("...", "x").split()]
+            if re.match("(lifelong|algo)=", words[0]):
+                yield words
+            else:
+                rest += words
+    assert len(rest) > 10
+    yield rest
+
+
+@pytest.mark.unit
+def test_keys_of_the_migration_guide_exist():
+    for words in shown_keys(1):
+        load_config(*words)
+    for words in shown_keys(2):
+        composes(*words)
+
+
+@pytest.mark.unit
+def test_extras_and_variables_are_told():
+    page = text(DOCS / "install.md")
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
+    code = "".join(
+        file.read_text(encoding="utf-8")
+        for p in ("libero_env", "lifelong")
+        for file in (ROOT / p).rglob("*.py")
+    )
+    variables = set(re.findall(r"\b(?:LIBERO|MUJOCO)_[A-Z_]+\b", code))
+    assert "LIBERO_CACHE" in variables
+    assert not [name for name in {*extras, *variables} if f"\n| `{name}` |" not in page]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_names_exists(page):
+    content = text(page)
+    folders = "libero_env|lifelong|configs|tests|experiments|scripts|benchmark_scripts"
+    named = re.findall(rf"`((?:{folders})/[\w./]+)`", content)
+    named += [str((DOCS / link).relative_to(ROOT)) for link in re.findall(r"\]\((?!http|#)([^)#]+)", content)]
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
+@pytest.mark.unit
+def test_every_page_is_in_the_navigation():
+    def pages(node) -> Iterator[str]:
+        for part in node if isinstance(node, list) else node.values():
+            yield from [part] if isinstance(part, str) else pages(part)
+
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
+    assert sorted(pages(nav)) == [page.name for page in PAGES]
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_fetches_nothing(tmp_path):
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "http_proxy": "http://127.0.0.1:9",
+                   "https_proxy": "http://127.0.0.1:9"}  # fmt: skip
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(build, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    site = tmp_path / "site"
+    for page in PAGES:
+        html = (site / f"{page.stem}.html").read_text(encoding="utf-8")
+        assert "<!-- generated" not in html
+        fetched = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?://[^"]+)"', html)
+        assert not fetched, f"{page.name} fetches {fetched}"
+        for link in re.findall(r'(?:href|src)="(?!https?:|mailto:|data:|#)([^"#?]+)(#[^"]*)?"', html):
+            target = (site / page.parent.relative_to(DOCS) / link[0]).resolve()
+            assert target.exists(), f"{page.name} leads to {link[0]}"
+            if link[1] and target.suffix == ".html":
+                assert f'id="{link[1][1:]}"' in target.read_text(encoding="utf-8"), (
+                    f"{page.name}: {''.join(link)}"
+                )
