@@ -72,7 +72,7 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
         LiberoError: no such suite, task or file, or a file that is no task.
     """
     from libero_env.tasks import get_suite, get_task, suite_names
-    from libero_env.tasks.authoring import read_yaml_tasks
+    from libero_env.tasks.files import read_yaml_tasks
 
     found: dict[tuple[str, str], Task] = {}
     for name in names:

@@ -7,7 +7,7 @@ from typing import Literal
 from libero_env.demos import LOW_DIM_KEYS
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
-from libero_env.tasks.authoring import OWN, read_suite
+from libero_env.tasks.files import OWN, read_suite
 from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.errors import ConfigError
 from lifelong.types import PolicySpec

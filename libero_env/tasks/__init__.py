@@ -17,8 +17,12 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     """What makes tasks needs the objects, and they are not imported before it is asked for."""
-    if name in ("make_task", "read_suite", "write_task"):
-        from libero_env.tasks import authoring
+    if name == "make_task":
+        from libero_env.tasks.authoring import make_task
 
-        return getattr(authoring, name)
+        return make_task
+    if name in ("read_suite", "write_task"):
+        from libero_env.tasks import files
+
+        return getattr(files, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

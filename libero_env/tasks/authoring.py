@@ -28,7 +28,6 @@ Places of objects and fixtures, such as `basket_1_contain_region`, need no decla
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import ObjectModel
 from libero_env.problem import Problem
 from libero_env.tasks.builder import KEYS, build_problem, filled, language_from_name, load_scene, scene_names
-from libero_env.tasks.suites import Suite, Task, read_task
+from libero_env.tasks.suites import Task
 
 EMPTY: Mapping[str, str] = {
     "kitchen": "kitchen_table",
@@ -53,8 +52,8 @@ EMPTY: Mapping[str, str] = {
 SHORT = ("scene", "furniture", "objects", "place", "goal", "name", "with")
 _OWN_KEYS = tuple(dict.fromkeys((*SHORT, *KEYS)))
 _HALF = {"object": 0.025, "fixture": 0.01}  # m, of places that say none, as in the original's scenes
+_PLACING = ("On", "In")  # predicates that say where something stands
 _TABLE = "main_table"  # the original's name of the fixture `table`
-OWN = "own"  # suite of one's own files
 FILE = "file"  # suite of a task that was read alone
 
 Facts = Mapping[str, Any]
@@ -75,16 +74,15 @@ def make_task(name: str | None = None, **facts: Any) -> Task:
             the valid ones.
     """
     facts = {key: value for key, value in facts.items() if value is not None}
-    return _task({**facts, **({"name": name} if name else {})}, "task", Path())
+    return task_of({**facts, **({"name": name} if name else {})}, "task", Path())
 
 
-def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
-    """The task of a YAML file; or several, which stand below `tasks` and share what the file says beside that.
+def read_facts(path: Path) -> dict[str, Any]:
+    """What a YAML file says.
 
     Raises:
-        LiberoError: as `make_task`, and where the file is no YAML; the message names the file.
+        LiberoError: it is missing, no YAML, or has a key that does not exist.
     """
-    path = Path(path)
     try:
         facts = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -93,45 +91,10 @@ def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
         raise LiberoError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(facts, dict):
         raise LiberoError(f"{path}: expected keys such as scene, objects, place and goal")
-    if "tasks" not in facts:
-        return (_task({"name": path.stem, **facts}, str(path), path.parent),)
-    shared = {key: value for key, value in facts.items() if key != "tasks"}
-    return tuple(
-        _task({**shared, **own}, f"{path}, task {i}", path.parent) for i, own in enumerate(facts["tasks"])
-    )
-
-
-def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
-    """A suite of one's own: the tasks of BDDL and YAML files, in their order.
-
-    Raises:
-        LiberoError: a file that cannot be read, two tasks of one name, or no file.
-    """
-    tasks: list[Task] = []
-    for file in files:
-        tasks += read_yaml_tasks(file) if Path(file).suffix in (".yaml", ".yml") else [read_task(file)]
-    names = [task.name for task in tasks]
-    if twice := sorted({n for n in names if names.count(n) > 1}):
-        raise LiberoError(
-            f"two tasks of the suite {name} are called {', '.join(twice)}; rename one of their files"
-        )
-    if not tasks:
-        raise LiberoError(f"the suite {name} has no files; name some that end in .yaml or .bddl")
-    return Suite(name, tuple(replace(task, suite=name, index=i) for i, task in enumerate(tasks)))
-
-
-def write_task(task: Task, path: str | Path) -> Path:
-    """Write a task's BDDL; what reads it takes its instruction from the file's name.
-
-    Raises:
-        LiberoError: the file's name does not end in .bddl.
-    """
-    path = Path(path)
-    if path.suffix != ".bddl":
-        raise LiberoError(f"{path}: task files are .bddl")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(task.bddl_text, encoding="utf-8")
-    return path
+    for key in facts:
+        if key not in (*_OWN_KEYS, "tasks"):
+            raise UnknownNameError(f"key of {path}", key, _OWN_KEYS)
+    return facts
 
 
 def places_of(category: str) -> tuple[str, ...]:
@@ -150,7 +113,14 @@ def _places(item: ObjectModel) -> tuple[str, ...]:
     )
 
 
-def _task(facts: Facts, where: str, folder: Path) -> Task:
+def task_of(facts: Facts, where: str, folder: Path) -> Task:
+    """The task that facts amount to; see `make_task`.
+
+    Args:
+        facts: what a YAML file says.
+        where: for messages.
+        folder: that of the file, beside which a scene's file may be.
+    """
     for key in facts:
         if key not in _OWN_KEYS:
             raise UnknownNameError(f"key of {where}", key, _OWN_KEYS)
@@ -164,66 +134,78 @@ def _task(facts: Facts, where: str, folder: Path) -> Task:
 
 def _problem(facts: Facts, where: str, folder: Path) -> Problem:
     """The problem of facts in which the short forms are used."""
-    scene = filled(_scene(facts.get("scene"), where, folder), facts.get("with", {}), where)
-    facts = filled(facts, facts.get("with", {}), where)
+    whole = _written_out(facts, {}, where, folder)
+    if "goal" not in whole:
+        raise LiberoError(f"{where}: it has no goal; add one, such as `goal: On red_cup_1 plate_1`")
+    things = {**whole["fixtures"], **_numbered(whole["objects"], (), where)}
+    placed = {words[1] for words in map(str.split, whole["init"]) if len(words) == 3 and words[0] in _PLACING}
+    missing = [name for name, category in things.items() if name not in placed and category not in WORKSPACES]
+    if missing:
+        raise LiberoError(
+            f"{where}: nothing says where {', '.join(missing)} stands; add it below place: `{missing[0]}: [0, 0]`"
+        )
+    if "problem" not in whole:
+        whole["problem"] = load_workspace(_workspace(things, where)[1]).problem
+    return build_problem({}, whole)
+
+
+def _written_out(facts: Facts, given: Facts, where: str, folder: Path) -> dict[str, Any]:
+    """Facts of a task or scene, with those of the scene that it names, in the builder's words alone."""
+    given = {**facts.get("with", {}), **given}
+    scene = _scene(facts, given, where, folder)
+    facts = filled(facts, given, where)
     fixtures = {**scene.get("fixtures", {}), **facts.get("fixtures", {})}
     fixtures |= _numbered(facts.get("furniture", ()), fixtures.values(), where)
     objects = _numbered(scene.get("objects", ()), (), where)
     objects |= _numbered(facts.get("objects", ()), objects.values(), where)
     things = {**fixtures, **objects}
     regions, starts = _placed(facts.get("place", {}), fixtures, things, where)
-    if "init" in facts:
-        rest = [_atom(atom) for atom in facts["init"]]
-    else:
-        moved = {atom.split()[1] for atom in starts}
-        rest = [atom for atom in map(_atom, scene.get("init", ())) if not _places_one(atom, moved)]
-    init = [*map(_atom, facts.get("init_also", ())), *starts, *rest]
-    goal = _goal(facts.get("goal", scene.get("goal")), where)
-    declared = _joined(scene.get("regions"), facts.get("regions"), regions)
+    moved = {atom.split()[1] for atom in starts}
+    rest = map(_atom, facts["init"] if "init" in facts else scene.get("init", ()))
+    init = [*map(_atom, facts.get("init_also", ())), *starts]
+    init += [atom for atom in rest if not _places_one(atom, moved)]
+    goal = _goal(facts.get("goal") or scene.get("goal") or [])
+    declared = _joined(scene.get("regions"), facts.get("regions"))
+    for target, own in regions.items():
+        declared.setdefault(target, {}).update(own)
     declared = _joined(declared, _undeclared([*init, *goal], declared, things, where))
-    _check_placed(things, init, where)
-    said = {key: facts[key] for key in ("name", "language", "problem", "obj_of_interest") if key in facts}
-    if "goal" not in facts and "obj_of_interest" in scene:
-        said.setdefault("obj_of_interest", scene["obj_of_interest"])
-    said.setdefault("problem", scene.get("problem") or load_workspace(_workspace(fixtures, where)[1]).problem)
-    whole = {
-        **said,
-        "fixtures": fixtures,
-        "objects": _counts(objects),
-        "regions": declared,
-        "init": init,
-        "goal": goal[0] if goal[0].startswith("(") else goal,
-        "scene_properties": {**scene.get("scene_properties", {}), **facts.get("scene_properties", {})},
-    }
-    return build_problem({}, whole)
+    said = {key: scene[key] for key in ("problem",) if key in scene}
+    if not facts.get("goal") and "obj_of_interest" in scene:
+        said["obj_of_interest"] = scene["obj_of_interest"]
+    said |= {key: facts[key] for key in ("name", "language", "problem", "obj_of_interest") if key in facts}
+    said |= {"goal": goal[0] if goal[0].startswith("(") else goal} if goal else {}
+    styles = {**scene.get("scene_properties", {}), **facts.get("scene_properties", {})}
+    whole = {"fixtures": fixtures, "objects": _counts(objects), "regions": declared, "init": init}
+    return {**said, **whole, "scene_properties": styles}
 
 
 def _places_one(atom: str, names: set[str]) -> bool:
     """Whether an atom says where one of these things stands."""
     words = atom.split()
-    return len(words) == 3 and words[0] in ("On", "In") and words[1] in names
+    return len(words) == 3 and words[0] in _PLACING and words[1] in names
 
 
-def _scene(scene: Any, where: str, folder: Path) -> Facts:
-    """The facts of a scene: of the benchmark, an empty one, or in a file beside the task's."""
-    valid = (*EMPTY, *scene_names())
+def _scene(facts: Facts, given: Facts, where: str, folder: Path) -> dict[str, Any]:
+    """The facts of the scene that is named: of the benchmark, an empty one, or in a file beside this one."""
+    scene, valid = facts.get("scene"), (*EMPTY, *scene_names())
     if scene is None:
+        if any(category in WORKSPACES for category in facts.get("fixtures", {}).values()):
+            return {}
         raise LiberoError(f"{where}: it says no scene; add one of {', '.join(valid)}")
     if isinstance(scene, Mapping):
-        return scene
+        return _written_out(scene, given, where, folder)
     scene = str(scene)
     if scene in EMPTY or scene in EMPTY.values():
         category = EMPTY.get(scene, scene)
-        name = _TABLE if category == "table" else category
-        return {"problem": load_workspace(category).problem, "fixtures": {name: category}}
+        return {"fixtures": {_TABLE if category == "table" else category: category}}
     if scene.endswith((".yaml", ".yml")):
         path = folder / scene
         if not path.is_file():
             raise LiberoError(f"{where}: its scene {path} is missing")
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return _written_out(read_facts(path), given, str(path), path.parent)
     if scene not in valid:
         raise UnknownNameError(f"scene of {where}", scene, valid)
-    return load_scene(scene)
+    return filled(load_scene(scene), given, where)
 
 
 def _numbered(entries: Any, there: Iterable[str], where: str) -> dict[str, str]:
@@ -298,10 +280,8 @@ def _atom(atom: Any) -> str:
     return atom.strip().removeprefix("(").removesuffix(")") if isinstance(atom, str) else " ".join(atom)
 
 
-def _goal(goal: Any, where: str) -> list[str]:
+def _goal(goal: Any) -> list[str]:
     """Atoms, or one expression in brackets."""
-    if not goal:
-        raise LiberoError(f"{where}: it has no goal; add one, such as `goal: On red_cup_1 plate_1`")
     if isinstance(goal, str):
         nested = goal.count("(") > 1 or re.match(r"\(\s*(and|or|not|forall)\b", goal.strip(), re.IGNORECASE)
         return [goal.strip()] if nested else [_atom(goal)]
@@ -311,13 +291,13 @@ def _goal(goal: Any, where: str) -> list[str]:
 
 
 def _joined(*several: Mapping[str, Any] | None) -> dict[str, dict[str, Any]]:
-    """The regions of several sources by target; later ones replace earlier ones of the same name."""
+    """The regions of several sources by target; a later one changes facts of an earlier one of its name."""
     joined: dict[str, dict[str, Any]] = {}
     for regions in several:
-        for target, facts in (regions or {}).items():
-            joined.setdefault(target, {}).update(
-                facts if isinstance(facts, Mapping) else {name: {} for name in facts}
-            )
+        for target, named in (regions or {}).items():
+            there = joined.setdefault(target, {})
+            for name, facts in (named if isinstance(named, Mapping) else dict.fromkeys(named, {})).items():
+                there[name] = {**(there.get(name) or {}), **facts} if isinstance(facts, Mapping) else facts
     return joined
 
 
@@ -342,12 +322,3 @@ def _undeclared(
                 raise UnknownNameError(f"place of {target} ({where}: {atom})", site, places or ("none",))
             found.setdefault(target, {})[site] = {}
     return found
-
-
-def _check_placed(things: Mapping[str, str], init: Iterable[str], where: str) -> None:
-    placed = {words[1] for words in map(str.split, init) if len(words) == 3 and words[0] in ("On", "In")}
-    missing = [name for name, category in things.items() if name not in placed and category not in WORKSPACES]
-    if missing:
-        raise LiberoError(
-            f"{where}: nothing says where {', '.join(missing)} stands; add it below place: `{missing[0]}: [0, 0]`"
-        )

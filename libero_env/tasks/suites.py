@@ -132,7 +132,7 @@ def read_task(path: str | Path) -> Task:
         LiberoError: a YAML file that is not one task.
     """
     if str(path).endswith(ENDINGS[1:]):
-        from libero_env.tasks.authoring import read_yaml_tasks
+        from libero_env.tasks.files import read_yaml_tasks
 
         tasks = read_yaml_tasks(path)
         if len(tasks) != 1:

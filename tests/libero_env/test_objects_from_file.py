@@ -91,7 +91,9 @@ def test_a_textured_mesh_becomes_an_object_of_a_scene(tmp_path):
     body = model.body("my_box_1_main")
     assert model.body_mass[body.id] == pytest.approx(mass, rel=1e-4)
     sides = np.array([0.08, 0.10, 0.12]) ** 2
-    assert sorted(model.body_inertia[body.id]) == pytest.approx(sorted(mass / 12 * (sides.sum() - sides)), rel=1e-3)
+    assert sorted(model.body_inertia[body.id]) == pytest.approx(
+        sorted(mass / 12 * (sides.sum() - sides)), rel=1e-3
+    )
     texture = model.texture("my_box_1_my_box_visual0_texture")
     assert (texture.width[0], texture.height[0]) == (16, 16)
     looks = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body.id and model.geom_group[g] == 1]
@@ -104,7 +106,9 @@ def test_every_format_gives_the_same_shape(tmp_path, ending):
     notes: list[str] = []
     surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up="z", tell=notes.append)
     low, high = bounds(surfaces)
-    assert high - low == pytest.approx([0.04, 0.05, 0.06]) and low + high == pytest.approx([0, 0, 0], abs=1e-9)
+    assert high - low == pytest.approx([0.04, 0.05, 0.06]) and low + high == pytest.approx(
+        [0, 0, 0], abs=1e-9
+    )
     vertices, faces = welded(surfaces)
     assert (len(vertices), len(faces), notes) == (8, 12, [])
     assert signed_volume(vertices, faces) == pytest.approx(1.2e-4)
@@ -168,7 +172,9 @@ def test_boxes_of_a_solid_have_no_hole():
 
 def test_what_is_convex_is_its_hull_and_what_is_not_is_taken_apart(monkeypatch):
     solid, hollow = trimesh.creation.icosphere(2, 0.05), cup()
-    assert collision_pieces(np.array(solid.vertices), np.array(solid.faces), "decompose", print).method == "hull"
+    assert (
+        collision_pieces(np.array(solid.vertices), np.array(solid.faces), "decompose", print).method == "hull"
+    )
     vertices, faces = np.array(hollow.vertices), np.array(hollow.faces)
     assert volume_filled(vertices, faces) < 0.5
     seen: dict = {}
@@ -178,7 +184,9 @@ def test_what_is_convex_is_its_hull_and_what_is_not_is_taken_apart(monkeypatch):
         low = mesh.vertices[:, 2] < 0.5
         return [(mesh.vertices[low], None), (mesh.vertices[~low], None)]
 
-    fake = SimpleNamespace(run_coacd=run_coacd, set_log_level=print, Mesh=lambda v, f: SimpleNamespace(vertices=v))
+    fake = SimpleNamespace(
+        run_coacd=run_coacd, set_log_level=print, Mesh=lambda v, f: SimpleNamespace(vertices=v)
+    )
     monkeypatch.setitem(sys.modules, "coacd", fake)
     found = collision_pieces(vertices, faces, "decompose", print)
     assert (found.method, len(found), seen["seed"]) == ("decompose", 2, 0)
@@ -219,7 +227,9 @@ def test_an_mjcf_file_keeps_its_parts_and_gets_what_scenes_need(tmp_path):
     box(tmp_path / "meshes" / "box.stl")
     (tmp_path / "chest.xml").write_text(DOOR)
     added = add_object(tmp_path / "chest.xml")
-    assert added.facts["mass"] == pytest.approx(0.25) and added.facts["size"][:2] == pytest.approx([0.06, 0.06])
+    assert added.facts["mass"] == pytest.approx(0.25) and added.facts["size"][:2] == pytest.approx(
+        [0.06, 0.06]
+    )
     assert "1 elements around" in added.notes[0]
     item = get_object("chest")
     model = item.spec.compile()
@@ -259,7 +269,9 @@ def test_nothing_is_made_by_asking(tmp_path):
 
 def test_what_is_kept_of_a_scene_depends_on_the_files(tmp_path):
     def digest() -> str:
-        task = make_task(scene="floor", objects=["brick"], place={"brick": (0, 0)}, goal="Up brick_1", language="x")
+        task = make_task(
+            scene="floor", objects=["brick"], place={"brick": (0, 0)}, goal="Up brick_1", language="x"
+        )
         build_scene.__globals__["_build_scene"].cache_clear()
         return scene_digest(build_scene(task.problem))
 
@@ -284,7 +296,9 @@ def broken(tmp_path: Path, kind: str) -> Path:
         path.write_text("# nothing\n")
     elif kind in ("two", "weightless", "xml"):
         path = path.with_suffix(".xml")
-        geom = "<geom type='box' size='0.02 0.02 0.02'{}/>".format(" mass='0'" if kind == "weightless" else "")
+        geom = "<geom type='box' size='0.02 0.02 0.02'{}/>".format(
+            " mass='0'" if kind == "weightless" else ""
+        )
         body = f"<body>{geom}</body>" * (2 if kind == "two" else 1)
         path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>" if kind != "xml" else "<mujoco>")
     elif kind == "fbx":

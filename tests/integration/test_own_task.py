@@ -1,0 +1,105 @@
+"""From a mesh and a YAML scene to a trained and evaluated policy, with the commands that people type."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from PIL import Image
+
+from libero_env.env import LiberoEnv
+from libero_env.tasks import read_task, write_task
+from lifelong.cli import main
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+TINY = (
+    "preset=smoke", "algo=er", "threads=1", "data.demos=2", "data.image_size=32", "train.epochs=1",
+    "train.steps_per_epoch=3", "train.batch_size=4", "eval.every=1", "eval.horizon=8", "eval.episodes=1",
+    "eval.curve_episodes=1",
+)  # fmt: skip
+SCENE = {
+    "fixtures": {"kitchen_table": "kitchen_table"},
+    "objects": ["checked_bar", "basket"],
+    "place": {"checked_bar_1": {"at": [0.0, 0.0], "half": 0.01}, "basket_1": [0.0, 0.25]},
+}
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch) -> Path:
+    for variable, folder in (("OBJECTS", "objects"), ("CACHE", "cache"), ("DEMOS", "demos")):
+        monkeypatch.setenv(f"LIBERO_{variable}", str(tmp_path / folder))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_bar(path: Path) -> None:
+    """A bar of 40 x 60 x 40 with a checked picture, as an exporter that thinks in millimetres writes it."""
+    mesh = trimesh.creation.box((40, 60, 40))
+    squares = np.kron([[0, 1] * 4, [1, 0] * 4] * 4, np.ones((8, 8)))[..., None] * [200, 120, 40]
+    Image.fromarray(squares.astype(np.uint8)).save(path.with_name("checks.png"))
+    path.with_suffix(".mtl").write_text("newmtl skin\nmap_Kd checks.png\n")
+    lines = [f"mtllib {path.stem}.mtl", "usemtl skin", *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", *(f"f {a}/1 {b}/2 {c}/3" for a, b, c in mesh.faces + 1)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_from_a_mesh_to_a_report(home, capsys):
+    write_bar(home / "bar.obj")
+    assert main(["objects", "add", "bar.obj", "--name", "checked_bar", "--size", "0.06"]) == 0
+    assert "hold      4.0 cm wide" in capsys.readouterr().out
+
+    (home / "scene.yaml").write_text(yaml.safe_dump(SCENE))
+    goals = {
+        "put_the_bar_in_the_basket": "In checked_bar_1 basket_1_contain_region",
+        "lift": "Up checked_bar_1",
+    }
+    for name, goal in goals.items():
+        (home / f"{name}.yaml").write_text(yaml.safe_dump({"scene": "scene.yaml", "goal": goal}))
+    written = write_task(read_task("put_the_bar_in_the_basket.yaml"), "put_the_bar_in_the_basket.bddl")
+
+    env = LiberoEnv(str(written), camera_size=(32, 32))
+    obs, _ = env.reset(seed=0)
+    start = env.view.body_pos("checked_bar_1").copy()
+    moved = env.step(np.array([0, 0, 1, 0, 0, 0, -1.0]))[0]
+    assert obs["agentview_rgb"].shape == (32, 32, 3) and moved["ee_pos"][2] > obs["ee_pos"][2]
+    assert env.view.body_pos("checked_bar_1") == pytest.approx(start, abs=1e-3)  # it rests where it was put
+    env.close()
+
+    make = ["demos", "generate", "--bddl", str(written), "--n", "2", "--size", "32", "--workers", "1"]
+    assert main(make) == 0
+    (file,) = (home / "demos").rglob("*.hdf5")
+    with h5py.File(file) as demos:
+        assert "checked_bar" in demos["data"].attrs["bddl_file_content"]
+        assert len(demos["data"]) == 2 and demos["data/demo_0/obs/agentview_rgb"].shape[1:] == (32, 32, 3)
+
+    command = [sys.executable, str(ROOT / "train.py"), "benchmark=own",
+               f"benchmark.files=[{written},put_the_bar_in_the_basket.yaml]", *TINY]  # fmt: skip
+    done = subprocess.run(
+        command, cwd=home, env=dict(os.environ), capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode != 0 and "rename" in done.stdout + done.stderr  # two tasks of one name
+
+    command[3] = f"benchmark.files=[{written},second.yaml]"
+    facts = {
+        "scene": "scene.yaml",
+        "goal": "In checked_bar_1 basket_1_contain_region",
+        "place": {"basket_1": [0.05, 0.25]},
+    }
+    (home / "second.yaml").write_text(yaml.safe_dump(facts))
+    done = subprocess.run(
+        command, cwd=home, env=dict(os.environ), capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (log,) = (home / "runs" / "own").rglob("results.jsonl")
+    summary = json.loads((log.parent / "results.json").read_text())
+    assert summary["finished"] and summary["tasks_learned"] == 2
+    assert len(list((home / "cache" / "init_states").glob("*.npz"))) == 2  # of each task, drawn once
+    assert "put the bar in the basket" in (log.parent / "report.html").read_text()

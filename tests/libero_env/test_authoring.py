@@ -1,0 +1,318 @@
+"""Tasks of one's own: one YAML file or one call, what it amounts to, and what is refused."""
+
+from dataclasses import replace
+from itertools import combinations
+from math import hypot
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from libero_env import bddl, init_states
+from libero_env.arena import WORKSPACES
+from libero_env.env import LiberoEnv
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.problem import Atom, Not, Or, differences
+from libero_env.scene import build_scene
+from libero_env.tasks import get_suite, get_task, make_task, read_suite, read_task, suite_names, write_task
+from libero_env.tasks.authoring import EMPTY, places_of
+from libero_env.tasks.builder import load_data
+from libero_env.tasks.preview import contact_sheet
+from libero_env.tasks.template import task_template
+from lifelong.cli import main
+from lifelong.errors import ConfigError
+from lifelong.settings import BenchmarkSettings
+
+FACTS = {
+    "scene": "kitchen",
+    "furniture": ["wooden_cabinet"],
+    "objects": ["akita_black_bowl", "plate"],
+    "place": {
+        "wooden_cabinet_1": {"at": [0, -0.3], "yaw": "pi"},
+        "akita_black_bowl_1": [0, 0],
+        "plate": {"at": [0.05, 0.2], "half": [0.01, 0.02]},
+    },
+    "goal": ["On akita_black_bowl_1 plate_1", "Open wooden_cabinet_1_top_region"],
+    "language": "Put the bowl on the plate",
+}
+BDDL = """(define (problem LIBERO_Kitchen_Tabletop_Manipulation) (:domain robosuite)
+(:language Put the bowl on the plate)
+(:regions
+ (wooden_cabinet_1_start (:target kitchen_table) (:ranges ((-0.01 -0.31 0.01 -0.29))) (:yaw_rotation ((pi pi))))
+ (akita_black_bowl_1_start (:target kitchen_table) (:ranges ((-0.025 -0.025 0.025 0.025))))
+ (plate_1_start (:target kitchen_table) (:ranges ((0.04 0.18 0.06 0.22))))
+ (top_region (:target wooden_cabinet_1)))
+(:fixtures kitchen_table - kitchen_table wooden_cabinet_1 - wooden_cabinet)
+(:objects akita_black_bowl_1 - akita_black_bowl plate_1 - plate)
+(:obj_of_interest akita_black_bowl_1 plate_1 wooden_cabinet_1)
+(:init (On wooden_cabinet_1 kitchen_table_wooden_cabinet_1_start)
+ (On akita_black_bowl_1 kitchen_table_akita_black_bowl_1_start) (On plate_1 kitchen_table_plate_1_start))
+(:goal (And (On akita_black_bowl_1 plate_1) (Open wooden_cabinet_1_top_region))))"""
+
+
+def said(**changes) -> dict:
+    return {**FACTS, **changes}
+
+
+def yaml_file(path: Path, facts: dict) -> Path:
+    path.write_text(yaml.safe_dump(facts, sort_keys=False))
+    return path
+
+
+def test_short_facts_are_the_task_that_its_bddl_says():
+    task = make_task(**FACTS)
+    assert differences(task.problem, bddl.parse(BDDL)) == []
+    assert (task.name, task.language) == ("put_the_bowl_on_the_plate", "Put the bowl on the plate")
+
+
+def test_a_file_a_call_and_the_bddl_written_are_the_same(tmp_path):
+    task = make_task("bowl", **FACTS)
+    read = read_task(yaml_file(tmp_path / "bowl.yaml", FACTS))
+    assert read == task and get_task(str(tmp_path / "bowl.yaml")) == task
+    again = read_task(write_task(task, tmp_path / "bowl.bddl"))
+    assert differences(again.problem, task.problem) == []
+    with pytest.raises(LiberoError, match="task files are .bddl"):
+        write_task(task, tmp_path / "bowl.txt")
+
+
+@pytest.mark.parametrize("suite", [name for name in suite_names() if name != "libero_100"])
+def test_the_benchmarks_own_facts_mean_the_same_here(suite):
+    """One vocabulary: what the suites' files say, in a file of one's own."""
+    facts = load_data(f"{suite}.yaml")
+    for task, own in zip(get_suite(suite).tasks, facts["tasks"], strict=True):
+        shared = {key: value for key, value in facts.items() if key != "tasks"}
+        made = make_task(**{**shared, **own})
+        assert differences(made.problem, replace(task.problem, language=made.problem.language)) == [], task.id
+
+
+@pytest.mark.parametrize("scene", [*EMPTY, *sorted(set(EMPTY.values()) - set(EMPTY))])
+def test_empty_scenes_have_their_workspace_alone(scene):
+    task = make_task(scene=scene, objects=["plate"], place={"plate": [0, 0]}, goal="Up plate_1", language="x")
+    assert [c for c in task.problem.fixtures.values() if c in WORKSPACES] == list(
+        task.problem.fixtures.values()
+    )
+    assert len(task.problem.fixtures) == 1 and list(task.problem.objects) == ["plate_1"]
+
+
+@pytest.mark.parametrize(
+    ("goal", "expected"),
+    [
+        ("On plate_1 akita_black_bowl_1", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+        ("(on plate_1 akita_black_bowl_1)", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+        (("On", "plate_1", "akita_black_bowl_1"), [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+        (
+            [("Up", "plate_1"), "Up akita_black_bowl_1"],
+            [Atom("Up", ("plate_1",)), Atom("Up", ("akita_black_bowl_1",))],
+        ),
+    ],
+)
+def test_goals_are_atoms_in_any_notation(goal, expected):
+    assert list(make_task(**said(goal=goal)).problem.goal.parts) == expected
+
+
+def test_goals_may_be_expressions_over_places_that_nothing_declares():
+    goal = make_task(**said(goal="(Or (Open wooden_cabinet_1_top_region) (Not (Up plate_1)))")).problem.goal
+    assert goal == Or((Atom("Open", ("wooden_cabinet_1_top_region",)), Not(Atom("Up", ("plate_1",)))))
+
+
+def test_things_are_added_to_a_scene_and_its_own_can_be_moved():
+    task = make_task(scene="kitchen_scene1", objects=["plate", {"butter": 2}], goal="On butter_2 plate_2", language="x",
+                     place={"plate_2": [0.1, 0.1], "butter_1": "plate_2", "butter_2": "In wooden_cabinet_1_top_region",
+                            "plate_1": [-0.1, 0.25]})  # fmt: skip
+    problem = task.problem
+    assert dict(problem.objects) == {"akita_black_bowl_1": "akita_black_bowl", "plate_1": "plate", "plate_2": "plate",
+                                     "butter_1": "butter", "butter_2": "butter"}  # fmt: skip
+    assert Atom("On", ("butter_1", "plate_2")) in problem.init
+    assert Atom("In", ("butter_2", "wooden_cabinet_1_top_region")) in problem.init
+    assert [a.args[1] for a in problem.init if a.args[0] == "plate_1"] == ["kitchen_table_plate_1_start"]
+    assert {"butter_2", "plate_2"} == set(problem.obj_of_interest)
+
+
+def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
+    regions = {"floor": {"middle": {"at": [0, 0], "half": 0.02}}}
+    base = {
+        "fixtures": {"floor": "floor"},
+        "objects": ["milk"],
+        "regions": regions,
+        "init": ["On milk_1 floor_middle"],
+    }
+    yaml_file(tmp_path / "base.yaml", base)
+    yaml_file(
+        tmp_path / "my_scene.yaml",
+        {"scene": "base.yaml", "objects": ["$other"], "place": {"$other": [0, 0.2]}},
+    )
+    facts = {"scene": "my_scene.yaml", "goal": "Up milk_1", "with": {"other": "butter"}}
+    task = read_task(yaml_file(tmp_path / "lift.yaml", facts))
+    assert task.language == "lift" and task.problem.name == "LIBERO_Floor_Manipulation"
+    assert list(task.problem.objects) == ["milk_1", "butter_1"]
+    assert Atom("On", ("milk_1", "floor_middle")) in task.problem.init
+    assert Atom("On", ("butter_1", "floor_butter_1_start")) in task.problem.init
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scene": "kitchn"}, "Did you mean 'kitchen'"),
+        ({"scene": None}, "says no scene; add one of kitchen"),
+        ({"scene": "mine.yaml"}, "mine.yaml is missing"),
+        ({"plce": {}}, "Did you mean 'place'"),
+        ({"objects": ["akita_black_bowl", "plat"]}, "Did you mean 'plate'"),
+        ({"objects": ["akita_black_bowl", "plate", "milk"]}, "where milk_1 stands.*`milk_1: \\[0, 0\\]`"),
+        ({"place": {"cup_1": [0, 0]}}, "thing to place of task 'cup_1'"),
+        ({"place": {**FACTS["place"], "plate": 0.1}}, "place of plate_1 is 0.1; expected \\[x, y\\]"),
+        ({"goal": "Open wooden_cabinet_1_top_regio"}, "Did you mean 'top_region'"),
+        ({"goal": "In plate_1 akita_black_bowl_1_inside"}, "Valid: none"),
+        ({"goal": "On plate_1 cup_1"}, "cup_1"),
+        ({"goal": None}, "it has no goal"),
+        ({"language": None}, "neither a name nor a language"),
+    ],
+)
+def test_what_is_wrong_is_said_with_what_is_right(changes, message):
+    with pytest.raises(LiberoError, match=message):
+        make_task(**said(**changes))
+
+
+def test_files_that_are_no_tasks_are_named(tmp_path):
+    for text, message in (
+        ("a: [", "not valid YAML"),
+        ("- a", "expected keys"),
+        ("tasks: []\n", "holds 0 tasks"),
+    ):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(LiberoError, match=f"bad.yaml.*{message}"):
+            read_task(tmp_path / "bad.yaml")
+    with pytest.raises(LiberoError, match="absent.yaml"):
+        read_task(tmp_path / "absent.yaml")
+
+
+def test_places_are_the_sites_that_goals_can_name():
+    assert places_of("basket") == ("contain_region",)
+    assert {"top_region", "middle_region", "bottom_region", "top_side"} <= set(places_of("wooden_cabinet"))
+
+
+def test_a_suite_of_files_is_numbered_and_named(tmp_path):
+    several = {key: value for key, value in FACTS.items() if key not in ("goal", "language")}
+    lifts = {"lift_plate": "Up plate_1", "lift_bowl": "Up akita_black_bowl_1"}
+    several["tasks"] = [{"name": name, "goal": goal} for name, goal in lifts.items()]
+    files = [yaml_file(tmp_path / "b.yaml", FACTS), yaml_file(tmp_path / "a.yaml", several)]
+    files.append(write_task(make_task(**FACTS), tmp_path / "c.bddl"))
+    suite = read_suite(files)
+    assert [task.id for task in suite.tasks] == ["own/0", "own/1", "own/2", "own/3"]
+    assert [task.name for task in suite.tasks] == ["b", "lift_plate", "lift_bowl", "c"]
+    assert suite.tasks[1].language == "lift plate"
+    with pytest.raises(LiberoError, match="called b; rename"):
+        read_suite([files[0], files[0]])
+    with pytest.raises(LiberoError, match="holds 2 tasks"):
+        read_task(files[1])
+
+
+def test_the_settings_of_a_run_take_files(tmp_path):
+    files = [str(yaml_file(tmp_path / f"{name}.yaml", FACTS)) for name in "xyz"]
+    settings = BenchmarkSettings("own", files=files, tasks=["z", 0])
+    assert [task.name for task in settings.sequence()] == ["z", "x"]
+    assert [task.id for task in BenchmarkSettings("own", files=files).sequence()] == [
+        "own/0",
+        "own/1",
+        "own/2",
+    ]
+    for bad in (
+        BenchmarkSettings("own"),
+        BenchmarkSettings("own", files=[]),
+        BenchmarkSettings("own", files=files[0]),
+    ):
+        with pytest.raises(ConfigError, match="name task files"):
+            bad.sequence()
+    with pytest.raises(ConfigError, match="say benchmark=own"):
+        BenchmarkSettings("libero_goal", files=files).sequence()
+    with pytest.raises(UnknownNameError):
+        BenchmarkSettings("own", files=files, tasks=["w"]).sequence()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"objects": ["butter", "basket"]},
+        {"scene": "floor", "objects": ["milk", "butter", "ketchup", "basket"]},
+        {"furniture": ["wooden_cabinet"], "objects": ["butter"], "goal": ["Open wooden_cabinet_1_top_region"]},
+        {"scene": "kitchen_scene1", "objects": ["butter"], "goal": ["On butter_1 plate_1"]},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_templates_are_tasks_with_room_between_things(options):
+    text, task = task_template(**options)
+    assert make_task(**yaml.safe_load(text)) == task
+    if options.get("objects", ())[-1:] == ["basket"]:
+        assert task.problem.goal.parts[-1].args[1] == "basket_1_contain_region"
+    middles = [(x0 + x1, y0 + y1) for r in task.problem.regions for x0, y0, x1, y1 in r.ranges]
+    assert len(middles) == len(task.problem.objects) + len(task.problem.fixtures) - 1
+    assert min(hypot(a[0] - b[0], a[1] - b[1]) / 2 for a, b in combinations(middles, 2)) >= 0.13
+
+
+def test_templates_that_cannot_be_are_refused():
+    with pytest.raises(LiberoError, match="a goal is needed"):
+        task_template("kitchen_scene1", ["butter"])
+    with pytest.raises(LiberoError, match="no room for so many objects"):
+        task_template("kitchen", ["butter"] * 9)
+
+
+@pytest.mark.sim
+def test_starts_of_a_file_are_kept_by_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    made = []
+
+    def generate(task, scene):
+        made.append(task.name)
+        return np.zeros((50, 1 + scene.model.nq + scene.model.nv + 7 * len(scene.fixtures)))
+
+    monkeypatch.setattr(init_states, "generate_init_states", generate)
+    facts = said(furniture=[], place={"plate": [0, 0.2], "akita_black_bowl": [0, 0]}, goal="Up plate_1")
+    task = make_task("one", **facts)
+    moved = make_task("one", **{**facts, "place": {"plate": [0, 0.25], "akita_black_bowl": [0, 0]}})
+    paths = [init_states.cache_init_states(t) for t in (task, replace(task, suite="own", index=3), moved)]
+    assert paths[0] == paths[1] != paths[2] and made == ["one", "one"]
+    assert init_states.load_init_states(task, build_scene(task.problem)).shape[0] == 50
+
+
+@pytest.mark.sim
+def test_a_task_runs_by_the_name_of_its_file_and_is_drawn(tmp_path, capsys):
+    assert (
+        main(
+            [
+                "tasks",
+                "new",
+                "first",
+                "--scene",
+                "floor",
+                "--objects",
+                "butter",
+                "basket",
+                "--bddl",
+                "--out",
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
+    path = tmp_path / "first.yaml"
+    assert "put the butter in the basket" in capsys.readouterr().out
+    assert read_task(tmp_path / "first.bddl").problem == read_task(path).problem
+    assert (
+        main(["tasks", "new", "first", "--out", str(tmp_path)]) == 2
+        and "is there already" in capsys.readouterr().err
+    )
+    assert main(["tasks", "show", str(path)]) == 0
+    assert bddl.parse(capsys.readouterr().out) == read_task(path).problem
+    assert main(["tasks", "lint", str(path), "--starts", "0"]) == 0
+    assert "0 errors, 0 warnings" in capsys.readouterr().out
+    env = LiberoEnv(str(path), cameras=())
+    env.reset(seed=0)
+    assert env.step(np.zeros(7))[4]["progress"] == {"(In butter_1 basket_1_contain_region)": False}
+    env.close()
+    sheet = contact_sheet(
+        read_task(path), tmp_path / "sheet.png", starts=2, cameras=("agentview", "birdview"), size=32
+    )
+    picture = np.asarray(Image.open(sheet))
+    assert picture.shape == (64, 64, 3) and (picture[:32] != picture[32:]).any()
