@@ -6,9 +6,8 @@ from typing import Literal
 import numpy as np
 
 from libero_env.expert.approach import ASIDE, Approach
-from libero_env.expert.clearance import obstacle_height
+from libero_env.expert.clearance import lowest, obstacle_height
 from libero_env.expert.geometry import Pose
-from libero_env.expert.grasp import TIP_BELOW
 from libero_env.expert.motion import rotation_between
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.style import Style
@@ -27,6 +26,7 @@ ASTRAY = 0.03  # m, from there, where it goes up again
 HELD = 0.012  # m, from the grip site to the nearest point of what is still held
 BLOCKED = 0.03  # m, before its place, where something that stops a body is in its way
 CORRECTED = 0.35  # rad, by which the hand turns to set right what turned in it
+IDLE = 20  # steps without motion, from which on a place counts as out of reach
 OUT = 30  # steps, to get out of where something is in the way
 
 End = Literal["there", "blocked", "slipped", "lost"]
@@ -69,6 +69,7 @@ class Carry:
         self._taken = self._offset(view)
         self._mat = way.hand_mat
         self._out, self._steps, self._pressed = out, 0, 0
+        self._idle, self._turn = 0, 0.0  # steps in which nothing moved, and rad that the hand was to turn
         self._sinking = False  # between the walls around its place, or in from the side
 
     def next(self, view: StateView, velocity: np.ndarray) -> Move | End:
@@ -90,7 +91,11 @@ class Carry:
         goal[:2] += (1.0 if self.way.lift > DROP else 0.2) * np.array(self.style.place_xy)
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, self._mat)))
         slow = self._steps > 20 and np.linalg.norm(velocity) < 0.01
-        hang = max(pos[2] - self.shapes.span(view, self._thing)[0], TIP_BELOW)
+        self._idle = self._idle + 1 if slow and abs(turn - self._turn) < 0.01 else 0
+        self._turn = turn
+        if self._idle > IDLE:
+            return "blocked"
+        hang = max(pos[2] - self.shapes.span(view, self._thing)[0], lowest(view.eef_mat), lowest(self._mat))
         if entry[2] < -0.5:
             return self._down(view, goal, turn, hang, bool(slow))
         return self._aside(view, goal, turn, hang, bool(slow))
@@ -99,7 +104,8 @@ class Carry:
         """Back out of where the body is now: along its entry, or up over what is around."""
         entry, pos = self.way.place.entry, view.eef_pos
         if entry[2] < -0.5:
-            high = self._highest(view, pos) + max(pos[2] - self.shapes.span(view, self._thing)[0], TIP_BELOW)
+            hang = max(pos[2] - self.shapes.span(view, self._thing)[0], lowest(view.eef_mat))
+            high = self._highest(view, pos) + hang
             return Pose(np.array([*pos[:2], max(pos[2], high + self.style.margin)]), view.eef_mat)
         goal = self.way.place.pos + [0, 0, GENTLE] - self._mat @ self._offset(view)
         return Pose(goal - ASIDE * entry if self._sinking else pos, view.eef_mat)

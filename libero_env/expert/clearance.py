@@ -146,6 +146,11 @@ def hand_points(opening: float = MAX_OPENING) -> np.ndarray:
     return np.concatenate(blocks)
 
 
+def lowest(mat: np.ndarray) -> float:
+    """How far fingers and palm of a hand turned by (3, 3) reach below its grip site, m."""
+    return float(-(_CORNERS @ mat[2]).min())
+
+
 def _block(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE) -> np.ndarray:
     axes = [np.linspace(a, b, max(2, int(np.ceil((b - a) / spacing)) + 1)) for a, b in (x, y, z)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -162,3 +167,16 @@ def obstacle_height(
     along = np.clip((points[:, :2] - start[:2]) @ way / max(way @ way, 1e-12), 0.0, 1.0)
     near = np.linalg.norm(points[:, :2] - start[:2] - along[:, None] * way, axis=1) < radius
     return float(points[near, 2].max(initial=floor))
+
+
+_CORNERS = np.array(
+    [
+        (x, y, z)
+        for half, width, z in (
+            (0.5 * MAX_OPENING + FINGER_THICKNESS, FINGER_HALF_WIDTH, TIP_BELOW),
+            (HAND_HALF_LENGTH, HAND_HALF_WIDTH, -PALM_ABOVE),
+        )
+        for x in (-half, half)
+        for y in (-width, width)
+    ]
+)  # of fingers and palm, in the frame of the grip site, m

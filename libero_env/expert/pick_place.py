@@ -8,7 +8,7 @@ from libero_env.control import SUBSTEPS
 from libero_env.errors import LiberoError
 from libero_env.expert.approach import Approach, Failure, between_fingers, choose_approach, choose_place
 from libero_env.expert.carry import Carry, Move
-from libero_env.expert.clearance import obstacle_height
+from libero_env.expert.clearance import lowest, obstacle_height
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import MAX_OPENING, TIP_BELOW, crowding
 from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
@@ -31,6 +31,7 @@ FINGER_CLEARANCE = 0.03  # m, of the fingertips over what they pass
 LEVEL = 0.45  # vertical part of an approach below which it counts as level
 AROUND = 0.08  # m, within which bodies count as in the way
 DIVERTED = 3  # times that another place is chosen for what is in the hand
+RISING = 0.05  # share of the way sideways up to which a hand stays where it is
 PATIENCE = 25  # steps, to wait for an object to come to rest
 EASE = 0.016  # m, that the fingers open where there is no room for more
 STUCK = 130  # steps of one phase
@@ -73,6 +74,7 @@ class PickPlace:
         self._failures: list[Failure] = []
         self._before: np.ndarray | None = None  # where the grip site was one step ago
         self._velocity = np.zeros(3)
+        self._anchor: np.ndarray | None = None  # (2,) where the hand rises, before it moves sideways
         self._lay: Pose | None = None  # the object's pose one step ago
         self._waited = 0  # steps, for the object to come to rest
 
@@ -182,7 +184,7 @@ class PickPlace:
         far = float(np.linalg.norm((over - view.eef_pos)[:2])) > 0.03 if level else aside > 0.05
         if not (far and aside > 0.05):
             return over, False
-        height = self._in_the_way(view, over, AROUND) + FINGER_CLEARANCE + TIP_BELOW
+        height = self._in_the_way(view, over, AROUND) + FINGER_CLEARANCE + lowest(view.eef_mat)
         if level:
             return np.array([*over[:2], max(over[2], height)]), True
         return over + max(height - over[2], 0.0) / back[2] * back, True
@@ -286,6 +288,10 @@ class PickPlace:
         slow: bool = False,
     ) -> np.ndarray:
         style = self.style
+        if lateral > RISING or self._anchor is None:
+            self._anchor = view.eef_pos[:2].copy()
+        else:  # a hand that turns drifts
+            goal, lateral = np.array([*self._anchor, goal[2]]), 1.0
         return action_toward(
             view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
             speed=0.35 * style.speed if slow else style.speed, lateral=lateral,

@@ -18,6 +18,7 @@ _LIFT = 0.008  # m, off what carries it when a body is tested for room
 _SIDEWAYS = tuple(np.arange(0.02, 0.29, 0.025))  # m, of the way in from a side that must be free
 _NEAR = 0.024  # m, between the origins of things that stand on one another
 _LEANS = (0.45, 0.8, 1.3)  # rad, of a body that fits nowhere upright
+_EDGE, _WITHIN = 40.0, 0.02  # cost of each m that a spot is nearer to the edge of its region than so many m
 _CROWDED = 0.04  # share of a body's points that may seem to lie in others, as voxels are coarse
 _UNDER = 0.15  # share of a body's columns that may reach into what hangs over them
 _UNCARRIED = 2.0  # cost of a lean with nothing under the middle of the body
@@ -162,6 +163,7 @@ def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, in
         u, v = (np.linspace(-0.9, 0.9, _GRID) * h for h in half[:2])
         offsets = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         costs = 4.0 * np.linalg.norm(offsets - _wanted(half, share), axis=1)
+        costs += _EDGE * np.maximum(_WITHIN - (half[:2] - np.abs(offsets)).min(axis=1), 0.0)
         below = centre[2] + (0.5 * half[2] if atom.predicate == "In" else 0.06)
         if _flat_region(view, target):
             below = view.scene.workspace.surface_height + 0.02
