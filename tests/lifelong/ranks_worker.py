@@ -37,7 +37,8 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
 
     Without dropout: its masks are each rank's own.
     """
-    walk.ALGORITHMS[algo] = lambda: instantiate(OmegaConf.load(CONFIGS / f"{algo}.yaml"))
+    config = OmegaConf.create({"compat": None, "algo": OmegaConf.load(CONFIGS / f"{algo}.yaml")})
+    walk.ALGORITHMS[algo] = lambda: instantiate(config.algo)
     with seeded(7):
         policy = BCTransformer(
             spec=walk.SPEC, embed_dim=8, image_width=8, stage_blocks=[1], stem_pool=False, layers=1, heads=2,
