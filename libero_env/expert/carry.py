@@ -153,11 +153,10 @@ class Carry:
             return Move(over, self._mat, np.clip(1.0 - (over[2] - pos[2]) / 0.05, 0.0, 1.0))
         left = float((goal - pos) @ entry)
         self._pressed = self._pressed + 1 if slow else 0
-        holds = evaluate(self.atom, view)
-        if left < (0.012 if holds else 0.004) and np.linalg.norm(goal - pos) < 0.03:
+        if left < 0.003 and np.linalg.norm(goal - pos) < 0.03:
             return "there"
         if self._pressed > 8:
-            return "there" if holds or left < 0.012 else "blocked"
+            return "there" if left < 0.012 or evaluate(self.atom, view) else "blocked"
         sag = np.clip(goal[2] - pos[2], 0.0, SAG)
         return Move(goal - max(left - 0.06, 0.0) * entry + [0, 0, sag], self._mat)
 
