@@ -7,10 +7,12 @@ from weakref import WeakValueDictionary
 
 import torch
 
+from libero_env.demos import demo_lengths
 from libero_env.demos_generate import ensure_demos
 from libero_env.tasks import Task
 from lifelong.data import DemoSource, open_windows
 from lifelong.data.memory import TaskWindows
+from lifelong.errors import DataError
 from lifelong.settings import DataSettings
 from lifelong.types import PolicySpec
 
@@ -20,19 +22,40 @@ def find_demos(
 ) -> list[Path]:
     """The demonstration file of each task; recorded now where there is none.
 
+    A file `<folder>/<suite>/<task>_demo.hdf5`, as the original's are laid out, goes before ours where the folder is
+    named.
+
     Args:
         tasks: In learning order.
         counts: Demonstrations needed of each.
         data: Size of the pictures, and the folder of the files.
         progress: Show a bar.
+
+    Raises:
+        DataError: A file laid out like that has fewer.
     """
-    found: dict[str, Path] = {}
+    found = dict(_laid_out(tasks, counts, data))
     for count in sorted(set(counts), reverse=True):
-        wanted = [task for task, n in zip(tasks, counts, strict=True) if n == count]
+        wanted = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in found]
+        if not wanted:
+            continue
         size = (data.image_size, data.image_size)
         paths = ensure_demos(wanted, count, camera_size=size, root=data.folder, progress=progress)
         found |= zip([task.id for task in wanted], paths, strict=True)
     return [found[task.id] for task in tasks]
+
+
+def _laid_out(tasks: Sequence[Task], counts: Sequence[int], data: DataSettings) -> Iterator[tuple[str, Path]]:
+    """Files in the original's layout, by task."""
+    for task, count in zip(tasks, counts, strict=True) if data.folder else ():
+        file = Path(data.folder or "").expanduser() / task.suite / f"{task.name}_demo.hdf5"
+        if file.is_file():
+            there = len(demo_lengths(file, count))
+            if there < count:
+                raise DataError(
+                    f"{file} has {there} demonstrations and {count} are wanted; use data.demos={there}"
+                )
+            yield task.id, file
 
 
 @dataclass(frozen=True)
