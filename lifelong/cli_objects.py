@@ -1,7 +1,9 @@
 """`libero objects`: objects made of files of one's own, kept where tasks find them."""
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
@@ -70,7 +72,7 @@ def run_add(args: argparse.Namespace) -> None:
         print(f"tasks find it with LIBERO_OBJECTS={args.out}")
 
 
-def describe(facts: dict) -> list[str]:
+def describe(facts: Mapping[str, Any]) -> list[str]:
     """Lines about an object, from its `object.yaml`."""
     size, grasp, collision = facts.get("size", ()), facts.get("grasp") or {}, facts.get("collision") or {}
     lines = [f"  size      {' x '.join(f'{100 * side:.1f}' for side in size)} cm"] if size else []

@@ -57,7 +57,8 @@ def run_new(args: argparse.Namespace) -> None:
         LiberoError: a name that does not exist, or the file is there.
     """
     from libero_env.errors import LiberoError
-    from libero_env.tasks import read_task, write_task
+    from libero_env.tasks import read_task
+    from libero_env.tasks.files import write_task
     from libero_env.tasks.template import task_template
 
     path = args.out / f"{args.name}.yaml"

@@ -9,7 +9,15 @@ from PIL import Image
 
 from libero_env.errors import LiberoError
 from libero_env.expert.geometry import surface_points
-from libero_env.expert.grasp import WIDEST, GraspError, grasps
+from libero_env.expert.grasp import (
+    FINGER_HALF_WIDTH,
+    PAD_ABOVE,
+    PAD_BELOW,
+    WIDEST,
+    Grasp,
+    GraspError,
+    grasps,
+)
 from libero_env.mjspec import set_damping
 from libero_env.objects.mesh_file import Tell
 from libero_env.objects.model import ROOT_BODY, ObjectModel
@@ -20,6 +28,7 @@ _BODY = _PREFIX + ROOT_BODY
 _FINE = 0.004  # m between points that widths are measured by
 _SECONDS = 1.5  # of standing
 _TILTED, _SHIFTED = 10.0, 0.02  # degrees and m that say it fell over or slid away
+_ASLANT = 0.006  # m, from one half of a pad to the other
 VIEWS = 8
 _PIXELS = 224
 
@@ -33,7 +42,7 @@ def try_object(item: ObjectModel, tell: Tell, picture: Path | None = None) -> di
         picture: PNG to write; None for none.
 
     Returns:
-        `size` (m), placement's figures, `stands`, and `grasp`: the width of the best hold in m, or why there is none.
+        `size` (m), placement's figures, `stands`, and `grasp`: the width of the narrowest hold, m, or why none.
 
     Raises:
         LiberoError: it cannot be compiled, or nothing of it collides.
@@ -146,15 +155,34 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, tell: Tell) -> bool:
 
 
 def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, tell: Tell) -> dict[str, Any]:
-    """The best hold from above that the expert knows where the object lies now, or why there is none."""
+    """The narrowest square hold from above that the expert knows where the object lies now, or why there is none."""
     body = data.body(_BODY)
     cloud = surface_points(model, body.id, _FINE) @ body.xmat.reshape(3, 3).T + body.xpos
     try:
-        best = grasps(cloud, 0.0, np.array([0.0, 1.0, 0.0]), name=name, number=1)[0]
-    except GraspError as error:
-        tell(
-            f"{error}. It can carry or hold other things; to be picked up, a part of it must be at most "
-            f"{100 * WIDEST:.1f} cm wide (--size)"
+        found = grasps(cloud, 0.0, np.array([0.0, 1.0, 0.0]), name=name, number=400, apart=0.01)
+        reason = (
+            f"{name}: only its edges fit between the fingers, which slip off; its faces are too far apart"
         )
-        return {"width": None, "reason": str(error)}
-    return {"width": round(float(best.width), 4), "height": round(float(best.pos_world[2]), 4)}
+    except GraspError as error:
+        found, reason = [], str(error)
+    square = [hold for hold in found if _is_square(cloud, hold)]
+    if square:
+        best = min(square, key=lambda hold: (round(float(hold.width), 3), hold.cost))
+        return {"width": round(float(best.width), 4), "height": round(float(best.pos_world[2]), 4)}
+    tell(
+        f"{reason}. It can carry or hold other things; to be picked up, a part of it must be at most "
+        f"{100 * WIDEST:.1f} cm wide (--size)"
+    )
+    return {"width": None, "reason": reason}
+
+
+def _is_square(cloud: np.ndarray, hold: Grasp) -> bool:
+    """Whether the pads meet faces that stand across the way they close, and not the two sides of an edge."""
+    along, across, down = ((cloud - hold.pos_world) @ hold.mat).T
+    near = (np.abs(along) < 0.5 * hold.width + _FINE) & (np.abs(across) < FINGER_HALF_WIDTH)
+    near &= (down < PAD_BELOW) & (down > -PAD_ABOVE)
+    for side in (along, -along):
+        halves = [side[near & half] for half in (across < 0, across >= 0)]
+        if not all(map(len, halves)) or abs(halves[0].max() - halves[1].max()) > _ASLANT:
+            return False
+    return True

@@ -314,5 +314,6 @@ def test_a_task_runs_by_the_name_of_its_file_and_is_drawn(tmp_path, capsys):
     sheet = contact_sheet(
         read_task(path), tmp_path / "sheet.png", starts=2, cameras=("agentview", "birdview"), size=32
     )
-    picture = np.asarray(Image.open(sheet))
+    with Image.open(sheet) as opened:
+        picture = np.asarray(opened)
     assert picture.shape == (64, 64, 3) and (picture[:32] != picture[32:]).any()
