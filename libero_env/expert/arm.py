@@ -3,14 +3,18 @@
 import mujoco
 import numpy as np
 
+from libero_env.control import POSITION_SCALE
 from libero_env.expert.motion import rotation_between
+from libero_env.predicates import StateView
 from libero_env.robot import REST_QPOS
 
 _STEPS, _GAIN, _REST = 60, 0.5, 0.03
 _DAMPED = 1e-3 * np.eye(6)
 _STALLED = 1e-3  # rad, of a step that gets nowhere
 _POS, _TURN = 0.006, 0.06  # m and rad, what counts as reached
-_MARGIN = 0.08  # rad, kept from the limits of a joint
+_MARGIN = 0.2  # rad, kept from the limits of a joint, which the controller runs into on the way
+_FOLD, _WATCHED = -0.467, 0.6  # rad, of the straight elbow, and short of it where it is watched
+_LINKS, _KEPT = 0.0892, 0.012  # m, a b / (2 (a + b)) of the links, and of the way out that is not used
 _STRAIGHT = -0.9  # rad, of the elbow: straight at -0.47, beyond which it folds over and does not come back
 _FOLDED = -2.85  # rad, of the elbow folded up, short of its limit
 _ROLLS, _SWING = (
@@ -18,6 +22,22 @@ _ROLLS, _SWING = (
     1.0,
 )  # joints that turn the arm about itself, and rad from which on they count as a miss
 _SITE = "gripper0_grip_site"
+
+
+def held_back(view: StateView, action: np.ndarray) -> np.ndarray:
+    """An action (7,) without what would straighten the elbow, and with a little of the opposite where it is nearly so.
+
+    The way out that is left of bent links a and b, an angle d short of straight, is a b d^2 / (2 (a + b)).
+    """
+    fields, i, model = view.simulations.fields, view.index, view.scene.model
+    short = _FOLD - float(fields["qpos"][i][model.joint("robot0_joint4").qposadr[0]])
+    if not 0.0 < short < _WATCHED:
+        return action
+    shoulder, wrist = (fields["xpos"][i][model.body(f"robot0_link{k}").id] for k in (2, 6))
+    out = (wrist - shoulder) / np.linalg.norm(wrist - shoulder)
+    left = max(_LINKS * short**2 - _KEPT, -_KEPT)
+    beyond = max(float(action[:3] @ out) * POSITION_SCALE - left, 0.0)
+    return np.concatenate([np.clip(action[:3] - beyond / POSITION_SCALE * out, -1.0, 1.0), action[3:]])
 
 
 class Arm:

@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from libero_env.expert.approach import takeable
+from libero_env.expert.arm import held_back
 from libero_env.expert.articulated import MoveJoint
 from libero_env.expert.drag import Drag
 from libero_env.expert.into_container import IntoContainer
@@ -99,7 +100,7 @@ class Expert:
         if isinstance(self.skill, IntoContainer) and self.skill.trouble:
             self._retries = self.retries + 1
             self.skill = PickPlace(self.skill.atom, style=self.style, shapes=self.shapes)
-        return self.skill.act(view)
+        return held_back(view, self.skill.act(view))
 
     def _skill_for(self, step: Step, view: StateView) -> Skill:
         state = JOINT_STATES.get(step.atom.predicate)
