@@ -75,7 +75,7 @@ def run_new(args: argparse.Namespace) -> None:
         f"libero tasks preview {path} --video",
         f"libero tasks lint {path}",
         f"libero demos generate --task {path} --n 10",
-        f"python train.py benchmark=own benchmark.files='[{path}]'",
+        f"python train.py benchmark=own benchmark.files='[{path}]' language=onehot",
     ):
         print(f"  {command}")
 

@@ -124,7 +124,7 @@ def test_a_sweep_ends_with_a_report_that_compares(home, tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, derpp, er, ewc, lwf, mas, multitask,"),
+        ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, derpp, dmpel, er, ewc, lora, lwf, mas,"),
         ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
         ("eval.select=first", "valid: best, last"),
         ("device=tpu", "valid: auto, cpu, cuda"),
