@@ -14,6 +14,7 @@ from libero_env.expert.approach import (
     choose_approach,
     choose_place,
 )
+from libero_env.expert.arm import held_back
 from libero_env.expert.carry import Carry, Move
 from libero_env.expert.driver import run_experts
 from libero_env.expert.geometry import surface_points
@@ -305,6 +306,18 @@ def test_the_arm_keeps_its_elbow_bent(view_of):
     assert miss == 0.0 and near[3] < -0.9
     far, miss = arm.reach(start, np.array([0.35, 0.0, 1.0]), down)  # could be touched with a straight arm
     assert miss > 0.0 and far[3] <= -0.9
+
+
+@pytest.mark.sim
+def test_a_nearly_straight_arm_is_held_back(view_of):
+    view = view_of("libero_goal/1")
+    qpos, outward = view.simulations.fields["qpos"][view.index], np.array([1.0, 0, 0, 0.2, 0, 0, -1.0])
+    np.testing.assert_array_equal(held_back(view, outward), outward)  # bent, as it starts
+    elbow = view.scene.model.joint("robot0_joint4").qposadr[0]
+    qpos[elbow] = -0.75
+    held = held_back(view, outward)
+    assert held[0] < 0.3 and np.array_equal(held[3:], outward[3:])
+    np.testing.assert_array_equal(held_back(view, -outward), -outward)  # back is free
 
 
 @pytest.mark.sim
