@@ -26,7 +26,7 @@ from libero_env.scene import build_scene
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.vector import BatchEnv
 
-GENERATOR = "scripted-expert-7"  # change it when the same seed gives other demonstrations
+GENERATOR = "scripted-expert-8"  # change it when the same seed gives other demonstrations
 MAX_ATTEMPTS = 10  # of one demonstration
 BATCH = 5  # demonstrations simulated together, and recorded before the next
 

@@ -5,18 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from libero_env.expert.clearance import Voxels, hand_points
+from libero_env.expert.clearance import Voxels
 from libero_env.expert.geometry import Pose
-from libero_env.expert.grasp import (
-    FINGER_HALF_WIDTH,
-    MAX_OPENING,
-    PAD_ABOVE,
-    PAD_BELOW,
-    Grasp,
-    GraspError,
-    crowding,
-    grasps,
-)
+from libero_env.expert.grasp import Grasp, GraspError, grasps
+from libero_env.expert.hold_price import HAND, crowd_price, weak_price
 from libero_env.expert.motion import finger_axis, rotation_between
 from libero_env.expert.place import DOWN, Place, places
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
@@ -31,7 +23,6 @@ def _lean(azimuth: float, tilt: float) -> np.ndarray:
     return about @ np.array([[c1, 0.0, -s1], [0.0, 1.0, 0.0], [s1, 0.0, c1]]) @ about.T
 
 
-_HAND = hand_points(MAX_OPENING + 0.012)  # with room beside the fingers
 _CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
 _RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.25, 0.35, 0.6) for k in range(8)]
 _GRASPS, _PLACES, _TRIED = 20, 72, 24
@@ -46,8 +37,6 @@ _ALIKE, _ALIKE_TURN = 0.02, 0.4  # m and rad, between holds or places that share
 _LIFTS = np.array(
     [0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18]
 )  # m, over the place, from which a body is let fall
-_BITE = 0.010  # m of a body, along and across the pads, that make a firm hold
-_BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room too
 _TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
 _NEAR = 0.3  # m, around a body: what is further away is in no hand's way
 ASIDE = 0.16  # m, before a place that is entered from a side
@@ -214,37 +203,11 @@ def _free_holds(
             error = error or problem
             continue
         for g in own:
-            price = _crowd_price(voxels, near, g) + _weak_price(cloud, g) + _failed_price(pose, g, failures)
+            price = crowd_price(voxels, near, g) + weak_price(cloud, g) + _failed_price(pose, g, failures)
             found.append(replace(g, cost=g.cost + lean + price))
     if not found:
         raise error or GraspError(f"{thing} cannot be grasped")
     return sorted(found, key=lambda g: g.cost)
-
-
-def between_fingers(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
-    """How far the middle of what open fingers close on is from the middle between them, m along their opening."""
-    u = _between_pads(cloud, pos, mat)[:, 0]
-    return 0.5 * float(u.min() + u.max()) if len(u) else 0.0
-
-
-def _between_pads(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-    """The points that open fingers have between their pads, in the hand's frame, (M, 3)."""
-    local = (cloud - pos) @ mat
-    u, v, depth = local.T
-    pads = (np.abs(v) < FINGER_HALF_WIDTH) & (depth > -PAD_ABOVE) & (depth < PAD_BELOW)
-    return local[pads & (np.abs(u) < 0.5 * MAX_OPENING)]
-
-
-def _weak_price(cloud: np.ndarray, grasp: Grasp) -> float:
-    """What it costs that the pads have little of the body between them, or meet its faces askew."""
-    u, v, depth = _between_pads(cloud, grasp.pos_world, grasp.mat).T
-    if not len(u):
-        return 1.0
-    price = 30.0 * max(_BITE - np.ptp(depth), 0.0) + 30.0 * max(_BITE - np.ptp(v), 0.0)
-    parts = [u[np.abs(v - middle) < 0.004] for middle in (-0.007, 0.0, 0.007)]
-    faces = np.array([(part.min(), part.max()) for part in parts if len(part)])
-    askew = np.ptp(faces, axis=0).max() if len(faces) else 0.0
-    return float(price + 30.0 * max(askew - 0.003, 0.0))
 
 
 def _failed_price(pose: Pose, grasp: Grasp, failures: Sequence[Failure]) -> float:
@@ -254,15 +217,6 @@ def _failed_price(pose: Pose, grasp: Grasp, failures: Sequence[Failure]) -> floa
     return _AGAIN * sum(
         f.hold is not None and (_alike(hold, f.hold) or _alike(turned, f.hold)) for f in failures
     )
-
-
-def _crowd_price(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
-    """What it costs that others are in the hand's way, at the hold and before it."""
-    crowd = crowding(near, grasp.pos_world, grasp.mat)
-    below = max(voxels.floor - float(_hand_at(grasp.pos_world, grasp.mat)[:, 2].min()), 0.0)
-    price = 20.0 * crowd + 0.3 * (crowd > 0) + 40.0 * below + 0.1 * (below > 0)
-    ways = [crowding(near, grasp.pos_world - back * grasp.mat[:, 2], grasp.mat) for back in _BEFORE]
-    return price + 5.0 * max(ways) + 0.1 * (max(ways) > 0)
 
 
 def _tilts(spots: list[Place], pose: Pose) -> list[np.ndarray]:
@@ -281,10 +235,6 @@ def _tilts(spots: list[Place], pose: Pose) -> list[np.ndarray]:
     return turns
 
 
-def _hand_at(pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-    return pos + _HAND @ mat.T
-
-
 def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -> list[Approach]:
     """The best holds and places together, in order; a body is let fall from where the hand has room."""
     turns = np.stack([spot.mat @ pose.mat.T for spot in spots])
@@ -298,7 +248,7 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
         wanting = np.ones(len(spots), bool)
         for k, lift in enumerate(_LIFTS):
             raised = origins[wanting] + [0, 0, lift + 0.008]
-            hits[wanting, k] = voxels.touched(_HAND, raised, mats[wanting])
+            hits[wanting, k] = voxels.touched(HAND, raised, mats[wanting])
             wanting &= hits[:, k] > 0
             wanting[aside] = False
             if not wanting.any():
@@ -308,7 +258,7 @@ def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -
         cost[h] += price.min(axis=1)
         for back in (0.08, 0.16):
             before = origins[aside] - back * entries[aside]
-            cost[h, aside] += 0.01 * voxels.touched(_HAND, before, mats[aside])
+            cost[h, aside] += 0.01 * voxels.touched(HAND, before, mats[aside])
     best = np.argsort(cost, axis=None, kind="stable")[:_PAIRS]
     return [
         Approach(holds[h], spots[s], pose, float(_LIFTS[lifts[h, s]]), float(cost[h, s]))

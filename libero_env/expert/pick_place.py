@@ -6,11 +6,12 @@ import numpy as np
 
 from libero_env.control import SUBSTEPS
 from libero_env.errors import LiberoError
-from libero_env.expert.approach import Approach, Failure, between_fingers, choose_approach, choose_place
+from libero_env.expert.approach import Approach, Failure, choose_approach, choose_place
 from libero_env.expert.carry import Carry, Move
 from libero_env.expert.clearance import lowest, obstacle_height
 from libero_env.expert.geometry import Pose
 from libero_env.expert.grasp import MAX_OPENING, TIP_BELOW, crowding
+from libero_env.expert.hold_price import between_fingers
 from libero_env.expert.motion import CLOSE, OPEN, action_toward, rotation_between
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.style import Style

@@ -20,6 +20,7 @@ from lifelong.policies.base import Policy
 from lifelong.types import Batch, Observation
 
 _QUERY = "routing_query"  # stands among the readings of a batch; policies read those of their spec only
+_FREE = 0.002  # divergence that replay lets pass: coefficients that are off by 0.03
 _CHUNK = 8  # windows of which queries are made at a time
 
 
@@ -41,7 +42,9 @@ class DMPEL(Algorithm):
     * The paper's router sees features of a frozen CLIP; this one the image in `pool` by `pool` pixels.
     * Choice 0 is the base alone, without an expert: the task that the base was learned with needs none.
     * Replay is a penalty while a task is learned, not a stage after it: the divergence of the coefficients, over all
-      choices, from those kept. Squared errors would hardly move a router that is sure of itself.
+      choices, from those kept, as far as it is more than hardly any. Squared errors would not move a router that is
+      sure of itself; and without the allowance the optimiser, which looks at gradients' signs rather than sizes,
+      would push new choices away from old contexts, and with these from all, before they have learned anything.
     * Linear layers and convolutions have experts. An LSTM stays as the base left it; what goes into it and what
       comes out passes through layers that have.
     """
@@ -114,7 +117,8 @@ class DMPEL(Algorithm):
         queries = self._episodes["queries"]
         if self._router is None:
             self._router = self._make_router(len(_groups(layers)), queries, draws)
-        self._router.grow(self.experts, queries)
+        earlier = [m["queries"] for m in self._memory.values()]
+        self._router.grow(self.experts, queries, torch.cat([queries[:0], *earlier]))
         self._library[task_index] = {n: self._make_experts(layer, draws) for n, layer in layers.items()}
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
@@ -146,12 +150,13 @@ class DMPEL(Algorithm):
         return replace(batch, observation=replace(batch.observation, proprio=proprio))
 
     def penalty(self, policy: Policy) -> Tensor | None:
-        """`replay * KL(c_then | c)`, mean over the contexts of earlier tasks, a scalar; None without any."""
+        """`replay * max(0, KL(c_then | c) - _FREE)`, mean over earlier tasks' contexts, a scalar; None without any."""
         if self._router is None or not self._memory:
             return None
         logits = self._router.logits(torch.cat([m["queries"] for m in self._memory.values()]))
         then = torch.cat([_padded(m["coefficients"], logits) for m in self._memory.values()])
-        return self.replay * functional.kl_div(logits.log_softmax(-1), then, reduction="none").sum(-1).mean()
+        divergence = functional.kl_div(logits.log_softmax(-1), then, reduction="none").sum(-1)
+        return self.replay * functional.relu(divergence - _FREE).mean()
 
     def end_phase(self, phase: Any, policy: Policy) -> None:
         """Take the experts off the policy's layers."""

@@ -13,6 +13,9 @@ from torch.nn import functional
 from lifelong.errors import PolicyError
 from lifelong.nn.adapters import check_found, matches
 
+_GAP = 7.0  # e^-7: a choice has less than a thousandth of the weight of the best one
+_RIDGE = 1e-4
+
 
 class Router(nn.Module):
     """From a query to how much of each expert every group of layers takes.
@@ -32,11 +35,15 @@ class Router(nn.Module):
         self.enter, self.top_k = nn.Parameter(enter), top_k
         self.keys, self.bias = nn.Parameter(keys), nn.Parameter(bias)
 
+    def hidden(self, query: Tensor) -> Tensor:
+        """(B, Q) -> (B, hidden), float32."""
+        with torch.autocast(query.device.type, enabled=False):
+            return functional.gelu(query.float() @ self.enter.T)
+
     def logits(self, query: Tensor) -> Tensor:
         """(B, Q) -> (B, G, N), float32."""
         with torch.autocast(query.device.type, enabled=False):
-            hidden = functional.gelu(query.float() @ self.enter.T)
-            return torch.einsum("bh,ngh->bgn", hidden, self.keys) + self.bias.T
+            return torch.einsum("bh,ngh->bgn", self.hidden(query), self.keys) + self.bias.T
 
     def forward(self, query: Tensor) -> Tensor:
         """(B, Q) -> coefficients (B, G, N), which sum to one over N and are zero beyond the best."""
@@ -47,12 +54,25 @@ class Router(nn.Module):
         return logits.softmax(-1)
 
     @torch.no_grad()
-    def grow(self, count: int, queries: Tensor) -> None:
-        """Append `count` choices, which on these queries (B, Q) start level with the best there are."""
-        level = self.logits(queries).amax(-1).mean(0)  # (G,)
-        keys = torch.cat([self.keys, self.keys.new_zeros(count, *self.keys.shape[1:])])
-        bias = torch.cat([self.bias, level.expand(count, -1)])
-        self.keys, self.bias = nn.Parameter(keys), nn.Parameter(bias)
+    def grow(self, count: int, queries: Tensor, earlier: Tensor) -> None:
+        """Append `count` choices, with keys that fit two wishes by weighted least squares.
+
+        On the new task's queries (B, Q) they start level with the best choice there is, on earlier ones (M, Q)
+        `_GAP` below it. Keys of zero would disturb earlier tasks, and replay would then drive the new choices
+        out on all queries before the router learned to tell these apart.
+        """
+        both = torch.cat([queries, earlier])
+        wished = self.logits(both).amax(-1)  # (B + M, G)
+        wished[len(queries) :] -= _GAP
+        hidden = functional.pad(self.hidden(both), (0, 1), value=1.0).double()
+        weight = torch.cat([q.new_full((len(q), 1), 1 / max(1, len(q))) for q in (queries, earlier)]).double()
+        gram = hidden.T @ (weight * hidden) + _RIDGE * torch.eye(hidden.shape[1]).to(hidden)
+        solved = torch.linalg.solve(gram, hidden.T @ (weight * wished.double())).to(
+            self.keys
+        )  # (hidden + 1, G)
+        keys, bias = solved[:-1].T.expand(count, -1, -1), solved[-1].expand(count, -1)
+        self.keys = nn.Parameter(torch.cat([self.keys, keys]))
+        self.bias = nn.Parameter(torch.cat([self.bias, bias]))
 
 
 def routed_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:

@@ -9,8 +9,6 @@ from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoa
 from libero_env.expert.approach import (
     Failure,
     _alike,
-    _weak_price,
-    between_fingers,
     choose_approach,
     choose_place,
 )
@@ -19,6 +17,7 @@ from libero_env.expert.carry import Carry, Move
 from libero_env.expert.driver import run_experts
 from libero_env.expert.geometry import surface_points
 from libero_env.expert.grasp import MAX_OPENING, WIDEST, Grasp, GraspError, choose_grasp, grasps
+from libero_env.expert.hold_price import between_fingers, weak_price
 from libero_env.expert.motion import action_toward, downward, rotation_between
 from libero_env.predicates import _boxes, _inside, _over, atoms_of, evaluate
 from libero_env.problem import And, Atom, Not, Or
@@ -109,7 +108,7 @@ def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
     cloud = box((0.03, 0.008, 0.03))
     middle = np.array([0.0, 0.0, 0.04])
     firm, corner, edge = (
-        _weak_price(cloud, Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0))
+        weak_price(cloud, Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0))
         for pos, yaw in (
             (middle, np.pi / 2),
             (middle + [0.03, 0, 0], 0.9),
@@ -117,9 +116,7 @@ def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
         )
     )
     assert firm < 0.02 < min(corner, edge)
-    assert (
-        _weak_price(cloud, Grasp(middle + [0.2, 0, 0], downward(0.0, X_AXIS), 0.0, 0.0)) > 0.5
-    )  # of nothing
+    assert weak_price(cloud, Grasp(middle + [0.2, 0, 0], downward(0.0, X_AXIS), 0.0, 0.0)) > 0.5  # of nothing
 
 
 @pytest.mark.parametrize("aside", [-0.02, 0.0, 0.015])

@@ -330,9 +330,23 @@ def test_dmpel_coefficients_are_shares_of_the_best_choices():
     torch.testing.assert_close(c.sum(-1), torch.ones(10, 2))
     assert ((c > 0).sum(-1) == 3).all()
     assert torch.equal(c.argmax(-1), router.logits(query).argmax(-1))
-    router.grow(1, query)
-    logits = router.logits(query)
-    torch.testing.assert_close(logits[..., 6].mean(0), logits[..., :6].amax(-1).mean(0))
+
+
+def test_dmpel_new_choices_begin_level_on_new_contexts_and_leave_earlier_ones_alone():
+    """Contexts of a task differ little, those of two tasks in a few entries."""
+    draws = generator(1)
+    sizes = {"enter": (32, 50), "keys": (3, 2, 32), "bias": (3, 2)}
+    router = Router(**{k: 0.2 * torch.randn(v, generator=draws) for k, v in sizes.items()}, top_k=0)
+    tasks = torch.randn(50, generator=draws) + 0.5 * torch.randn(3, 1, 50, generator=draws)
+    new, *old = tasks + 0.05 * torch.randn(3, 20, 50, generator=draws)
+    earlier = torch.cat(old)
+    before = router(earlier)
+    router.grow(2, new, earlier)
+    assert router.keys.shape[0] == 5
+    gap = router.logits(new)[..., 3:] - router.logits(new)[..., :3].amax(-1, keepdim=True)
+    assert gap.abs().max() < 0.5
+    assert (router(earlier)[..., :3] - before).abs().max() < 0.03
+    torch.testing.assert_close(router.keys[3], router.keys[4])
 
 
 def test_dmpel_a_new_expert_begins_as_nothing_and_old_ones_never_move():
@@ -365,7 +379,7 @@ def test_dmpel_replay_keeps_the_coefficients_of_earlier_tasks():
         gaps = {t: (_padded(memory[t]["coefficients"], now[t]) - now[t]).abs().max().item() for t in now}
         assert gaps[2] == 0
         drift[replay] = max(gaps.values())
-    assert drift[10.0] < 0.1 < 0.3 < drift[0.0], drift
+    assert drift[10.0] < 0.05 < 0.1 < drift[0.0], drift
 
 
 def test_dmpel_sees_the_first_frame_of_a_demonstration():
@@ -420,6 +434,7 @@ def test_dmpel_acts_as_it_was_trained(kind, head):
             whole = acting.predict(batch)
         else:
             whole = policy.head.mode(policy.distribution(batch.observation))
+        whole = whole.clamp(-1, 1)  # as every action that is acted out
         acting.reset(2)
         for step in range(steps):
             action = acting.act(frame(batch.observation, step))
