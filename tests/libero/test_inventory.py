@@ -78,6 +78,48 @@ DOMAIN = """_load_fixtures_in_arena _load_objects_in_arena _load_sites_in_arena 
     object_states_dict object_sites_dict parsed_problem robots"""
 STATES = """get_geom_state check_contact check_contain check_ontop get_joint_state set_joint is_open is_close turn_on
     turn_off update_state"""
+BENCHMARK = """get_num_tasks get_task_names get_task_problems get_task_bddl_files get_task_bddl_file_path
+    get_task_demonstration get_task get_task_emb set_task_embs get_task_init_states tasks n_tasks name task_embs
+    task_order_index"""
+GROUPS = {
+    "HopeBaseObject": """AlphabetSoup BbqSauce Butter Cherries ChocolatePudding Cookies Corn CreamCheese Ketchup
+        MacaroniAndCheese Mayo Milk OrangeJuice Popcorn SaladDressing NewSaladDressing TomatoSauce""",
+    "GoogleScannedObject": "Rack WhiteBowl AkitaBlackBowl Plate Basket Chefmate8Frypan GlazedRimPorcelainRamekin",
+    "TurbosquidObjects": """WoodenTray WhiteStorageBox WoodenShelf WoodenTwoLayerShelf WineRack WineBottle
+        DiningSetGroup BowlDrainer MokaPot BlackBook YellowBook RedCoffeeMug DeskCaddy PorcelainMug WhiteYellowMug""",
+    "ArticulatedObject": """Microwave WoodenCabinet WhiteCabinet ShortCabinet ShortFridge FlatStove SlideCabinet
+        Window Faucet BasinFaucet""",
+    "TargetZone": "TargetZone",
+}
+SITES = {
+    "Basket WoodenTray": "contain_region",
+    "WhiteStorageBox": "top_side bottom_side right_side left_side",
+    "WoodenShelf WoodenCabinet WhiteCabinet": "top_side top_region middle_region bottom_region",
+    "WoodenTwoLayerShelf": "top_side top_region bottom_region",
+    "WineRack": "top_region",
+    "DiningSetGroup": "center_region",
+    "BowlDrainer": "left_region right_region",
+    "DeskCaddy": "left_contain_region right_contain_region front_contain_region back_contain_region",
+    "Microwave": "top_side heating_region",
+    "ShortCabinet": "top_region middle_region bottom_region",
+    "ShortFridge": "upper_region middle_region lower_region",
+    "FlatStove": "cook_region burner",
+    "SlideCabinet": "slide_site",
+    "Window": "handleOpenStart handleCloseStart",
+    "Faucet": "handleStartClose handleStartOpen",
+    "BasinFaucet": "hot_water cold_water",
+}
+JOINTS = {
+    "Microwave": "microjoint",
+    "WoodenCabinet WhiteCabinet": "top_level middle_level bottom_level",
+    "ShortCabinet": "middle_level top_region bottom_region",
+    "ShortFridge": "fridge_door_joint_0",
+    "FlatStove": "button",
+    "SlideCabinet": "slidedoor_joint",
+    "Window": "window_slide",
+    "Faucet": "knob_Joint_1",
+    "BasinFaucet": "hinge",
+}
 PREDICATES = "true false in on up printjointstate open close turnon turnoff"
 
 
@@ -104,6 +146,23 @@ def test_members(env):
     states = env.env.object_states_dict.values()
     assert [name for name in STATES.split() for state in states if not hasattr(state, name)] == []
     assert env.env.language_instruction.lower() == env.language_instruction
+
+
+@pytest.mark.parametrize("name", ["LIBERO_SPATIAL", "LIBERO_OBJECT", "LIBERO_GOAL", "LIBERO_90", "LIBERO_10"])
+def test_benchmarks(name):
+    from libero.libero import benchmark
+
+    suite = benchmark.get_benchmark(name)()
+    assert [member for member in BENCHMARK.split() if not hasattr(suite, member)] == []
+    number = 90 if name == "LIBERO_90" else 10
+    assert suite.get_num_tasks() == suite.n_tasks == len(suite.tasks) == number
+    assert suite.get_task_bddl_files() == [f"{task}.bddl" for task in suite.get_task_names()]
+    assert suite.get_task_problems() == ["Libero"] * number
+    assert suite.get_task(0)._fields == (
+        *("name", "language", "problem", "problem_folder", "bddl_file", "init_states_file"),
+    )
+    suite.set_task_embs(range(number))
+    assert suite.get_task_emb(number - 1) == number - 1
 
 
 def test_states_answer(env):
@@ -177,6 +236,27 @@ def test_objects(category):
     if opens:
         assert item.is_open(np.mean(opens))
         assert not item.is_close(np.mean(opens))
+
+
+def test_classes_of_objects():
+    from libero.libero.envs import objects
+
+    kinds = {name: group for group, names in GROUPS.items() for name in names.split()}
+    assert sorted(kinds) == sorted(cls.__name__ for cls in OBJECTS_DICT.values())
+    for name, group in kinds.items():
+        cls = getattr(objects, name)
+        assert issubclass(cls, getattr(objects, group)), name
+        assert objects.get_object_fn(cls(name="it").category_name) is cls
+
+
+@pytest.mark.parametrize("part, table", [("sites", SITES), ("joints", JOINTS)])
+def test_parts_of_objects(part, table):
+    from libero.libero.envs import objects
+
+    for names, parts in table.items():
+        for name in names.split():
+            found = getattr(getattr(objects, name)(name="it"), part)
+            assert {f"it_{p}" for p in parts.split()} <= set(found), name
 
 
 def test_site_objects_and_zones():
