@@ -1,0 +1,71 @@
+"""Put the numbers of a comparison into the README beside it.
+
+libero report RUNS...              # writes comparison.json; copy it here
+python experiments/algorithms/table.py
+"""
+
+import json
+from collections.abc import Iterator
+from itertools import combinations
+from pathlib import Path
+
+from lifelong.report_tables import duration, quantity
+
+HERE = Path(__file__).parent
+COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
+
+
+def table(name: str, heads: list[str], rows: list[list[str]]) -> Iterator[tuple[str, list[str]]]:
+    """A name and the lines of a Markdown table."""
+    lines = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
+    yield name, lines + ["| " + " | ".join(row) + " |" for row in rows]
+
+
+def metric(cell: dict) -> str:
+    """Mean over seeds, and the interval of the hierarchical bootstrap."""
+    return f"{cell['mean']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
+
+
+def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
+    """Metrics, costs, and pairs that the intervals tell apart; best AUC first."""
+    groups = sorted(found["groups"].items(), key=lambda item: -item[1]["metrics"]["auc"]["mean"])
+    rows = [[label, *(metric(group["metrics"][m]) for m in COLUMNS)] for label, group in groups]
+    yield from table("metrics", ["algorithm", *COLUMNS.values()], rows)
+    rows = [[label, *costs(group["costs"])] for label, group in groups]
+    heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
+    yield from table("costs", heads, rows)
+    apart = {frozenset((d["of"], d["less"])): d["metrics"]["auc"] for d in found["differences"]}
+    told = [pair for pair, gap in apart.items() if gap["low"] > 0 or gap["high"] < 0]
+    unclear = [f"{a} and {b}" for (a, _), (b, _) in combinations(groups, 2) if frozenset((a, b)) not in told]
+    yield (
+        "pairs",
+        [
+            f"{len(told)} of {len(apart)} pairs differ in AUC with 95 % confidence. Not told apart: {', '.join(unclear)}."
+        ],
+    )
+
+
+def costs(values: dict) -> list[str]:
+    """Cells of a row of costs."""
+    return [
+        duration(values["training_seconds"]),
+        duration(values.get("end_task_seconds", 0.0)),
+        quantity(values["flops_per_step"], "FLOP"),
+        quantity(values["parameters_trained"]),
+        quantity(values["stored_bytes"], "B"),
+        quantity(values["peak_memory_bytes"], "B"),
+    ]
+
+
+def main() -> None:
+    readme = HERE / "README.md"
+    text = readme.read_text(encoding="utf-8")
+    for name, lines in tables(json.loads((HERE / "comparison.json").read_text(encoding="utf-8"))):
+        start, end = f"<!-- {name} -->\n", f"\n<!-- end of {name} -->"
+        before, rest = text.split(start)
+        text = before + start + "\n".join(lines) + end + rest.split(end)[1]
+    readme.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
