@@ -21,7 +21,7 @@ from lifelong.checkpoints import load_weights
 from lifelong.demonstrations import DemoDatasets, find_demos
 from lifelong.distributed import Ranks
 from lifelong.evaluation import EnvPool, EvalSettings
-from lifelong.nn.precision import check_compiler, deterministic
+from lifelong.nn.precision import check_compiler, deterministic, keep_freed_memory
 from lifelong.policies import Policy
 from lifelong.pretraining import pretrain, weights_of
 from lifelong.records import PhaseRecord, RunEndRecord, start_record, utc_now
@@ -60,6 +60,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     settings = RunSettings(**{str(k): v for k, v in config.items() if k not in GROUPS})
     if settings.threads:
         torch.set_num_threads(settings.threads)
+    keep_freed_memory()
     with deterministic(settings.deterministic):
         return _run(config, names, settings, ranks)
 

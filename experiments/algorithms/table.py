@@ -1,7 +1,6 @@
 """Put the numbers of a comparison into the README beside it.
 
-libero report RUNS...              # writes comparison.json; copy it here
-python experiments/algorithms/table.py
+python experiments/algorithms/table.py          # reads comparison.json, which `libero report` writes
 """
 
 import json
@@ -15,10 +14,10 @@ HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
 
 
-def table(name: str, heads: list[str], rows: list[list[str]]) -> Iterator[tuple[str, list[str]]]:
-    """A name and the lines of a Markdown table."""
+def table(heads: list[str], rows: list[list[str]]) -> list[str]:
+    """The lines of a Markdown table."""
     lines = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
-    yield name, lines + ["| " + " | ".join(row) + " |" for row in rows]
+    return lines + ["| " + " | ".join(row) + " |" for row in rows]
 
 
 def metric(cell: dict) -> str:
@@ -30,19 +29,15 @@ def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
     """Metrics, costs, and pairs that the intervals tell apart; best AUC first."""
     groups = sorted(found["groups"].items(), key=lambda item: -item[1]["metrics"]["auc"]["mean"])
     rows = [[label, *(metric(group["metrics"][m]) for m in COLUMNS)] for label, group in groups]
-    yield from table("metrics", ["algorithm", *COLUMNS.values()], rows)
+    yield "metrics", table(["algorithm", *COLUMNS.values()], rows)
     rows = [[label, *costs(group["costs"])] for label, group in groups]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
-    yield from table("costs", heads, rows)
+    yield "costs", table(heads, rows)
     apart = {frozenset((d["of"], d["less"])): d["metrics"]["auc"] for d in found["differences"]}
     told = [pair for pair, gap in apart.items() if gap["low"] > 0 or gap["high"] < 0]
     unclear = [f"{a} and {b}" for (a, _), (b, _) in combinations(groups, 2) if frozenset((a, b)) not in told]
-    yield (
-        "pairs",
-        [
-            f"{len(told)} of {len(apart)} pairs differ in AUC with 95 % confidence. Not told apart: {', '.join(unclear)}."
-        ],
-    )
+    text = f"{len(told)} of {len(apart)} pairs differ in AUC with 95 % confidence."
+    yield "pairs", [f"{text} Not told apart: {', '.join(unclear)}."]
 
 
 def costs(values: dict) -> list[str]:

@@ -31,6 +31,7 @@ from omegaconf import OmegaConf
 from lifelong.algorithms import Sequential
 from lifelong.data import DemoSource, open_windows
 from lifelong.distributed import Ranks
+from lifelong.nn.precision import keep_freed_memory
 from lifelong.step import Step
 from lifelong.training import FitSettings, generator
 from lifelong.types import Batch, PolicySpec
@@ -54,6 +55,7 @@ def best(call: Callable[[], object], times: int) -> float:
 def measure_here(path: Path, precision: str, args: argparse.Namespace) -> dict[str, float]:
     """What the worker of the original measures, of ours."""
     torch.set_num_threads(args.threads)
+    keep_freed_memory()
     torch.manual_seed(0)
     dataset = open_windows(DemoSource(path, SPEC), language=torch.zeros(SPEC.language_dim), memory="host")
     draws = torch.Generator().manual_seed(0)
@@ -78,12 +80,13 @@ def measure_here(path: Path, precision: str, args: argparse.Namespace) -> dict[s
 
 def measure_original(path: Path, args: argparse.Namespace) -> dict[str, float]:
     """The original, by its interpreter."""
+    source = {"PYTHONPATH": str(args.source.resolve())} if args.source else {}
     numbers = [args.batch, SPEC.seq_len, args.batches, args.steps, args.threads]
     done = subprocess.run(
         [args.original, "-W", "ignore", WORKER, path, *map(str, numbers)],
         capture_output=True,
         text=True,
-        env=os.environ | {"OMP_NUM_THREADS": str(args.threads)},
+        env=os.environ | {"OMP_NUM_THREADS": str(args.threads)} | source,
     )
     if done.returncode:
         raise SystemExit(f"the original stopped:\n{done.stderr[-2000:]}")
@@ -108,6 +111,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--original", required=True, help="the original's interpreter")
+    parser.add_argument(
+        "--source", type=Path, help="the original's repository, if that has no libero.lifelong"
+    )
     parser.add_argument("--file", type=Path, help="a demonstration file with 128x128 pictures")
     parser.add_argument("--demos", type=int, default=10, help="demonstrations of the file of noise")
     parser.add_argument("--batch", type=int, default=32)

@@ -13,8 +13,11 @@ import time
 import types
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from easydict import EasyDict
+
+np.bool = bool  # robomimic 0.2 writes it so, and numpy took it away
 
 # torchvision's kernels are of no use here, and a build for another torch cannot register them.
 sys.modules["torchvision._meta_registrations"] = types.ModuleType("torchvision._meta_registrations")

@@ -28,6 +28,7 @@ from lifelong.algorithms import Sequential
 from lifelong.costs import step_costs
 from lifelong.data import fake_batch
 from lifelong.distributed import Ranks
+from lifelong.nn.precision import keep_freed_memory
 from lifelong.policies import Policy
 from lifelong.step import Step
 from lifelong.training import FitSettings, generator
@@ -101,6 +102,7 @@ def make_step(job: Job, policy: Policy) -> Step:
 def measure(job: Job) -> dict[str, float | str]:
     """Median seconds of a step, peak memory in bytes, operations of a step; with `profile` torch's table."""
     torch.set_num_threads(job.threads)
+    keep_freed_memory()
     policy, batch = build(job)
     step, draws, cuda = make_step(job, policy), generator(0), job.device.startswith("cuda")
     wait = torch.cuda.synchronize if cuda else lambda: None

@@ -1,5 +1,6 @@
-"""How networks are computed: in which precision, with which kernels, compiled or not."""
+"""How networks are computed: in which precision, with which kernels, compiled or not, in which memory."""
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -120,6 +121,24 @@ def check_compiler(device: torch.device) -> None:
             f"torch.compile does not work here; it needs {needed} ({type(error).__name__}: {reason.strip()}). "
             "Install that, or use train.compile=off"
         ) from error
+
+
+def keep_freed_memory() -> bool:
+    """Have glibc's allocator keep what is freed, for the whole process; elsewhere nothing happens.
+
+    By default it gives large blocks back to the system, which zeroes every page of them again when the next step needs
+    its activations. With the paper's policy on two cores that took a quarter of a step
+    (experiments/benchmarks). The settings are mallopt(3)'s.
+
+    Returns:
+        Whether the allocator took the settings.
+    """
+    trim_threshold, top_pad, mmap_max = -1, -2, -4
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # not glibc
+        return False
+    return all(mallopt(*pair) for pair in ((mmap_max, 0), (trim_threshold, 2**31 - 1), (top_pad, 2**28)))
 
 
 def _small(x: torch.Tensor) -> torch.Tensor:

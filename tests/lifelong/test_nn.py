@@ -1,6 +1,10 @@
 """Network parts have the properties their names promise."""
 
 import math
+import platform
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -233,3 +237,26 @@ def test_brightness_scales() -> None:
     changed = ColorJitter(0.3, 0, 0, 0, keep=0.0).images(images, generator()).float()
     assert ((changed >= 70) & (changed <= 130)).all()
     assert len(changed.unique()) > 3  # each window its own
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
+def test_freed_memory_is_kept():
+    """A process that asked for it holds a freed tensor's pages; another gives them back."""
+    code = """
+import os, sys, torch
+from lifelong.nn.precision import keep_freed_memory
+resident = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+kept = sys.argv[1] == "keep" and keep_freed_memory()
+before = resident()
+del (block := [torch.ones(2**25)])[:]
+print(int(kept), resident() - before)
+"""
+    runs = [
+        subprocess.run([sys.executable, "-c", code, how], capture_output=True, text=True, check=True)
+        for how in ("keep", "leave")
+    ]
+    (kept, held), (_, left) = (map(int, run.stdout.split()) for run in runs)
+    if kept:  # glibc
+        assert left < 2**26 < held
+    else:
+        assert platform.libc_ver()[0] != "glibc"
