@@ -3,7 +3,7 @@
     python original_training.py FILE BATCH SEQ_LEN BATCHES STEPS THREADS
 
 The last line of its output is JSON: windows per second of one loader process, seconds of a training step (the best), of
-loading and a step together, peak memory in bytes, and the policy's parameters.
+loading, augmentation and a step together, peak memory in bytes, and the policy's parameters.
 """
 
 import json
@@ -57,8 +57,15 @@ POLICY = {  # the published settings
         "network_kwargs": {"hidden_size": 1024, "num_layers": 2, "min_std": 0.0001, "num_modes": 5},
         "loss_kwargs": {"loss_coef": 1.0},
     },
-    "color_aug": {"network": "IdentityAug", "network_kwargs": {}},
-    "translation_aug": {"network": "IdentityAug", "network_kwargs": {}},
+    "color_aug": {
+        "network": "BatchWiseImgColorJitterAug",
+        "network_kwargs": {
+            "input_shape": None,
+            **dict.fromkeys(("brightness", "contrast", "saturation", "hue"), 0.3),
+            "epsilon": 0.1,
+        },
+    },
+    "translation_aug": {"network": "TranslationAug", "network_kwargs": {"translation": 8}},
 }
 
 
@@ -80,7 +87,7 @@ def best(call, times: int) -> float:
 
 
 def main(path: str, *numbers: str) -> None:
-    """Measure the loader, a step, and both together."""
+    """Measure the loader, a step, and all of training."""
     batch, seq_len, batches, steps, threads = map(int, numbers)
     torch.set_num_threads(threads)
     torch.manual_seed(0)
@@ -92,7 +99,8 @@ def main(path: str, *numbers: str) -> None:
     policy = get_policy_class("BCTransformerPolicy")(cfg, shapes).train()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-4, weight_decay=1e-4)
 
-    def step(found: dict) -> None:
+    def step(found: dict, augment: bool) -> None:
+        cfg.train.use_augmentation = augment
         loss = policy.compute_loss(found)
         optimizer.zero_grad()
         loss.backward()
@@ -103,8 +111,8 @@ def main(path: str, *numbers: str) -> None:
     held = next(loader)
     found = {
         "windows": rate,
-        "step": best(lambda: step(held), steps),
-        "both": best(lambda: step(next(loader)), steps),
+        "step": best(lambda: step(held, False), steps),
+        "all": best(lambda: step(next(loader), True), steps),
         "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         "parameters": sum(p.numel() for p in policy.parameters()),
     }
