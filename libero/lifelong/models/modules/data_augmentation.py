@@ -71,6 +71,8 @@ class TranslationAug(_Aug):
 class _JitterAug(_Aug):
     """Brightness, contrast, saturation and hue; `epsilon` is the chance that nothing changes."""
 
+    epsilon = 0.05
+
     def __init__(
         self,
         input_shape: Sequence[int] | None = None,
@@ -78,9 +80,10 @@ class _JitterAug(_Aug):
         contrast: float = 0.3,
         saturation: float = 0.3,
         hue: float = 0.3,
-        epsilon: float = 0.05,
+        epsilon: float | None = None,
     ):
-        super().__init__(ColorJitter(brightness, contrast, saturation, hue, keep=epsilon))
+        keep = self.epsilon if epsilon is None else epsilon
+        super().__init__(ColorJitter(brightness, contrast, saturation, hue, keep=keep))
 
 
 class ImgColorJitterAug(_JitterAug):
@@ -91,6 +94,8 @@ class ImgColorJitterAug(_JitterAug):
 
 class BatchWiseImgColorJitterAug(_JitterAug):
     """A change of colours for each window of the batch."""
+
+    epsilon = 0.1
 
 
 class _OfAllViews(nn.Module):
@@ -106,20 +111,10 @@ class _OfAllViews(nn.Module):
 
 
 class ImgColorJitterGroupAug(_OfAllViews):
-    """A change of colours for each window, the same for all cameras."""
+    """A change of colours for each window, the same for all cameras; arguments as of `BatchWiseImgColorJitterAug`."""
 
-    def __init__(
-        self,
-        input_shape: Sequence[int] | None = None,
-        brightness: float = 0.3,
-        contrast: float = 0.3,
-        saturation: float = 0.3,
-        hue: float = 0.3,
-        epsilon: float = 0.1,
-    ):
-        super().__init__(
-            BatchWiseImgColorJitterAug(input_shape, brightness, contrast, saturation, hue, epsilon)
-        )
+    def __init__(self, input_shape: Sequence[int] | None = None, **limits: float):
+        super().__init__(BatchWiseImgColorJitterAug(input_shape, **{"epsilon": 0.05, **limits}))
 
 
 class TranslationAugGroup(_OfAllViews):
