@@ -105,7 +105,7 @@ def _redraw(row: Cells, draws: int, rng: np.random.Generator) -> Floats:
     and shifted back: the mean is p, and the variance is above 0 everywhere. Single rates may leave [0, 1].
     """
     n, z2 = row.episodes.astype(float), NormalDist().inv_cdf(0.975) ** 2
-    centre = (row.rates * n + z2 / 2) / (n + z2)
+    centre = (np.nan_to_num(row.rates) * n + z2 / 2) / (n + z2)  # NaN where there were no episodes
     drawn = rng.binomial(row.episodes, centre, size=(draws, len(n))) / np.maximum(n, 1)
     return row.rates + np.where(n > 0, drawn - centre, 0.0)
 

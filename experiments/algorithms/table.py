@@ -21,23 +21,27 @@ def table(heads: list[str], rows: list[list[str]]) -> list[str]:
 
 
 def metric(cell: dict) -> str:
-    """Mean over seeds, and the interval of the hierarchical bootstrap."""
+    """Mean over seeds, and the interval of the hierarchical bootstrap; a dash where nothing is defined."""
+    if cell["mean"] is None:
+        return "–"
     return f"{cell['mean']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
 
 
 def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
     """Metrics, costs, and pairs that the intervals tell apart; best AUC first."""
-    groups = sorted(found["groups"].items(), key=lambda item: -item[1]["metrics"]["auc"]["mean"])
+    groups = sorted(found["groups"].items(), key=lambda item: -(item[1]["metrics"]["auc"]["mean"] or 0))
     rows = [[label, *(metric(group["metrics"][m]) for m in COLUMNS)] for label, group in groups]
     yield "metrics", table(["algorithm", *COLUMNS.values()], rows)
     rows = [[label, *costs(group["costs"])] for label, group in groups]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
     apart = {frozenset((d["of"], d["less"])): d["metrics"]["auc"] for d in found["differences"]}
-    told = [pair for pair, gap in apart.items() if gap["low"] > 0 or gap["high"] < 0]
-    unclear = [f"{a} and {b}" for (a, _), (b, _) in combinations(groups, 2) if frozenset((a, b)) not in told]
-    text = f"{len(told)} of {len(apart)} pairs differ in AUC with 95 % confidence."
-    yield "pairs", [f"{text} Not told apart: {', '.join(unclear)}."]
+    apart = {pair: gap for pair, gap in apart.items() if gap["low"] is not None}
+    unclear = [pair for pair, gap in apart.items() if gap["low"] <= 0 <= gap["high"]]
+    order = [label for label, _ in groups]
+    pairs = [pair for pair in combinations(order, 2) if frozenset(pair) in unclear]
+    text = f"{len(apart) - len(unclear)} of {len(apart)} pairs differ in AUC with 95 % confidence."
+    yield "pairs", [f"{text} Not told apart: {', '.join(f'{a} and {b}' for a, b in pairs)}."]
 
 
 def costs(values: dict) -> list[str]:

@@ -16,6 +16,7 @@ from lifelong import checkpoints
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
+ALGORITHMS = sorted(file.stem for file in (ROOT / "configs" / "algo").glob("*.yaml"))
 TINY = (
     "preset=smoke", "algo=packnet", "threads=1", "data.demos=2", "train.epochs=2", "train.steps_per_epoch=2",
     "train.batch_size=4", "eval.every=1", "eval.horizon=12", "eval.episodes=2", "eval.curve_episodes=1",
@@ -119,6 +120,17 @@ def test_a_sweep_ends_with_a_report_that_compares(home, tmp_path):
     assert "2 runs compared" in output
     assert (tmp_path / "sweep" / "report.html").is_file()
     assert len(list(tmp_path.rglob("results.json"))) == 2
+
+
+@pytest.mark.parametrize("policy", ["bc_transformer_small", "bc_rnn_small", "bc_vilt_small"])
+def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
+    """The whole line of preset=smoke, with fewer and shorter steps and episodes."""
+    tiny = (*(t for t in TINY if not t.startswith("algo")), "eval.episodes=1", f"policy={policy}")
+    output = finish(start(home, tmp_path, "-m", f"algo={','.join(ALGORITHMS)}", *tiny))
+    assert f"{len(ALGORITHMS)} runs compared" in output
+    for algo in ALGORITHMS:
+        found = json.loads((tmp_path / "libero_object" / algo / f"{policy}_seed1" / "results.json").read_text())
+        assert found["finished"] and found["tasks_learned"] == 2, algo
 
 
 @pytest.mark.parametrize(
