@@ -120,7 +120,8 @@ def test_of_tasks_learned_together_only_the_success_at_the_end_is_known():
     episodes = np.zeros((4, 4), int)
     episodes[-1] = 20
     matrix = np.where(episodes > 0, 0.5, np.nan)
-    found = resample([Member(Scores((None,) * 4, matrix, episodes))])
+    nothing = Curve(np.zeros(0, int), np.zeros(0), np.zeros(0, int))
+    found = resample([Member(Scores((nothing,) * 4, matrix, episodes))])
     assert found.interval("final_success").low < 0.5 < found.interval("final_success").high
     for name in set(METRIC_NAMES) - {"final_success"}:
         assert np.isnan(found.values[name]) and np.isnan(found.interval(name).low)
