@@ -60,9 +60,9 @@ def main() -> None:
     readme = HERE / "README.md"
     text = readme.read_text(encoding="utf-8")
     for name, lines in tables(json.loads((HERE / "comparison.json").read_text(encoding="utf-8"))):
-        start, end = f"<!-- {name} -->\n", f"\n<!-- end of {name} -->"
+        start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         before, rest = text.split(start)
-        text = before + start + "\n".join(lines) + end + rest.split(end)[1]
+        text = before + start + "\n".join([*lines, end]) + rest.split(end)[1]
     readme.write_text(text, encoding="utf-8")
 
 
