@@ -146,7 +146,10 @@ def learning_figure(
 
 
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
-    """Average success over the tasks learned so far against their number; ± one standard error."""
+    """Average success over the tasks learned so far against their number; ± one standard error.
+
+    Beyond as many lines as there are colours, the next ones are dashed with open markers.
+    """
     named = any(line.label for line in lines)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(5.6, 3.1) if named else (3.5, 2.7), layout="constrained")
@@ -154,10 +157,14 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         for number, line in enumerate(lines):
             mean, error = zip(*(mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T), strict=True)
             x, mean, error = np.arange(1, len(mean) + 1), 100 * np.array(mean), 100 * np.array(error)
-            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
-            marker = LINE_MARKERS[number % len(LINE_MARKERS)]
-            axes.plot(x, mean, color=colour, marker=marker, ms=3.8, lw=1.4, label=line.label, clip_on=False)
-            axes.fill_between(x, mean - error, mean + error, color=colour, alpha=0.18, lw=0)
+            turn, place = divmod(number, len(LINE_COLOURS))
+            colour, look = LINE_COLOURS[place], {"ls": "--", "mfc": "white"} if turn else {}
+            marker = LINE_MARKERS[place % len(LINE_MARKERS)]
+            axes.plot(
+                x, mean, color=colour, marker=marker, ms=3.8, lw=1.4, label=line.label, clip_on=False, **look
+            )
+            band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
+            axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)
         longest = max(line.values.shape[1] for line in lines)
         axes.set_xlim(0.8, longest + 0.2)
         axes.set_ylim(0, 100)

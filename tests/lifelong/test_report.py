@@ -13,6 +13,7 @@ import yaml
 from PIL import Image
 
 from lifelong.errors import LifelongError
+from lifelong.figures import Line, forgetting_figure
 from lifelong.metrics import METRIC_NAMES
 from lifelong.records import (
     CostRecord,
@@ -400,3 +401,10 @@ def test_labels_leave_out_what_all_instructions_share():
     assert short_labels(["open the door"]) == ["open the door"]
     assert short_labels(["push it", "push it"]) == ["push it", "push it"]
     assert short_labels(["open the door", "close the window"]) == ["open the door", "close the window"]
+
+
+def test_lines_of_many_methods_can_be_told_apart():
+    figure = forgetting_figure([Line(f"method {i}", np.full((1, 3), 0.05 * i)) for i in range(14)])
+    lines = [line for line in figure.axes[0].get_lines() if not line.get_label().startswith("_")]
+    looks = {(x.get_color(), x.get_marker(), x.get_linestyle(), x.get_markerfacecolor()) for x in lines}
+    assert len(looks) == len(lines) == 14
