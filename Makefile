@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "No virtual environment could be made; on Debian: apt-get install python3-venv"; exit 1; }
 	@echo "Installing into $(VENV); the first time takes some minutes"
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$(EXTRAS)]'
-	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite
+	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic
 	@touch $@
 
 gl: $(GL_STAMP)
