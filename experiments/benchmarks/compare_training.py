@@ -74,14 +74,13 @@ def measure_here(path: Path, precision: str, args: argparse.Namespace) -> dict[s
         return dataset.batch(torch.randperm(len(dataset), generator=draws)[: args.batch])
 
     held = load()
-    found = {
+    return {
         "windows": args.batch / best(load, 10 * args.batches),
         "step": best(lambda: plain(held, generator(0), 1e-4), args.steps),
         "all": best(lambda: whole(load(), generator(0), 1e-4), args.steps),
         "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         "parameters": sum(p.numel() for p in policy.parameters()),
     }
-    return found
 
 
 def measure_original(path: Path, args: argparse.Namespace) -> dict[str, float]:

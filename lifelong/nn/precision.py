@@ -127,7 +127,7 @@ def keep_freed_memory() -> bool:
     """Have glibc's allocator keep what is freed, for the whole process; elsewhere nothing happens.
 
     By default it gives large blocks back to the system, which zeroes every page of them again when the next step needs
-    its activations. With the paper's policy on two cores that took a quarter of a step
+    its activations. With the paper's policy on two cores that took more than a quarter of a step
     (experiments/benchmarks). The settings are mallopt(3)'s.
 
     Returns:
