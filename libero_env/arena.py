@@ -157,15 +157,26 @@ def _add_room(
     ground = world.add_body(name=figures["floor_body"]) if figures["floor_body"] else world
     add_material(spec, "floor", styles["floor"])
     ground.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=figures["floor"]["size"], material="floor", group=1,
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=figures["floor"]["size"],
+        material="floor",
+        group=1,
         condim=3,
-    )  # fmt: skip
+    )
     add_material(spec, "wall", styles["wall"], *figures["wall_gloss"])
     for name, wall in figures["walls"].items():
         world.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=wall["pos"], quat=wall["quat"], size=wall["size"],
-            material="wall", group=1, contype=0, conaffinity=0,
-        )  # fmt: skip
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=wall["pos"],
+            quat=wall["quat"],
+            size=wall["size"],
+            material="wall",
+            group=1,
+            contype=0,
+            conaffinity=0,
+        )
 
 
 def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
@@ -176,18 +187,29 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
     contact = table.get("contact", {})
     for box in table["collision"]:
         geom = body.add_geom(
-            name=box.get("name", ""), type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.get("pos", [0.0] * 3),
-            quat=box.get("quat", [1.0, 0.0, 0.0, 0.0]), size=box["size"],
-            friction=box.get("friction") or contact["friction"], group=0, rgba=[0.5, 0.5, 0.5, 0.3],
-        )  # fmt: skip
+            name=box.get("name", ""),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.get("pos", [0.0] * 3),
+            quat=box.get("quat", [1.0, 0.0, 0.0, 0.0]),
+            size=box["size"],
+            friction=box.get("friction") or contact["friction"],
+            group=0,
+            rgba=[0.5, 0.5, 0.5, 0.3],
+        )
         if "solref" in contact:
             geom.solref, geom.solimp = contact["solref"], [*contact["solimp"], 0.5, 2.0]
     add_material(spec, "table", table["style"], *table["gloss"])
     for part in table.get("visual", ()):
         body.add_geom(
-            name=part["name"], type=getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}"),
-            pos=part.get("pos", [0.0] * 3), size=part["size"], material="table", group=1, contype=0, conaffinity=0,
-        )  # fmt: skip
+            name=part["name"],
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}"),
+            pos=part.get("pos", [0.0] * 3),
+            size=part["size"],
+            material="table",
+            group=1,
+            contype=0,
+            conaffinity=0,
+        )
     if "shapes" in table:
         first = spec.body(next(iter(table["bodies"])))
         add_visual_mesh(spec, first, "table_visual", _from_above(table), "table")

@@ -35,13 +35,22 @@ def add_visual_mesh(
         added = spec.add_material(name=material, specular=0.1, shininess=0.1)
         add_texture(spec, added, palette_picture())
     added = spec.add_mesh(
-        name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel(), usertexcoord=mesh.texcoords.ravel()
-    )  # fmt: skip
+        name=name,
+        uservert=mesh.vertices.ravel(),
+        userface=mesh.faces.ravel(),
+        usertexcoord=mesh.texcoords.ravel(),
+    )
     added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     body.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, group=1, contype=0,
-        conaffinity=0, mass=0.0,
-    )  # fmt: skip
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=material,
+        group=1,
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+    )
 
 
 @cache

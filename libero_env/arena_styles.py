@@ -58,8 +58,12 @@ def add_material(
 def add_texture(spec: mujoco.MjSpec, material: mujoco.MjsMaterial, image: np.ndarray) -> None:
     """Give a material a picture, (height, width, 3) uint8."""
     texture = spec.add_texture(
-        name=material.name, type=mujoco.mjtTexture.mjTEXTURE_2D, height=image.shape[0], width=image.shape[1], nchannel=3
-    )  # fmt: skip
+        name=material.name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        height=image.shape[0],
+        width=image.shape[1],
+        nchannel=3,
+    )
     texture.data = image.tobytes()
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
 

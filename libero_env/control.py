@@ -53,7 +53,9 @@ class ArmIndex:
     """Where the arm is in a model's arrays."""
 
     joints: np.ndarray  # (7,) joint ids
-    mass_address: np.ndarray  # (7, 7) index of each entry of the arm's mass-matrix block in the sparse array M
+    mass_address: (
+        np.ndarray
+    )  # (7, 7) index of each entry of the arm's mass-matrix block in the sparse array M
     site: int  # grip site
     torque_limit: np.ndarray  # (7,) N m
     fingers: np.ndarray  # (2,) joint ids
@@ -63,7 +65,9 @@ class ArmIndex:
     def of(cls, model: mujoco.MjModel) -> "ArmIndex":
         """Look the arm up by its names; it must be the first chain of the model."""
         joints = np.array([model.joint(n).id for n in ARM_JOINTS], np.int64)
-        assert (joints == np.arange(7)).all() and (model.jnt_dofadr[:7] == joints).all(), "the arm comes first"
+        assert (joints == np.arange(7)).all() and (model.jnt_dofadr[:7] == joints).all(), (
+            "the arm comes first"
+        )
         address = _mass_address(model)
         fingers = np.array([model.joint(n).id for n in FINGER_JOINTS], np.int64)
         limit, finger_range = model.actuator_ctrlrange[:7, 1].copy(), model.actuator_ctrlrange[7:9].copy()
@@ -209,7 +213,10 @@ def control(
             a, b = (r + 1) % 3, (r + 2) % 3
             error = 0.0
             for c in range(3):
-                error += site_mat[i, 3 * a + c] * goal_mat[i, 3 * b + c] - site_mat[i, 3 * b + c] * goal_mat[i, 3 * a + c]
+                error += (
+                    site_mat[i, 3 * a + c] * goal_mat[i, 3 * b + c]
+                    - site_mat[i, 3 * b + c] * goal_mat[i, 3 * a + c]
+                )
             torque[r] = _KP * 0.5 * error - _KD * w
         _solve(linear, force, 3)
         _solve(angular, torque, 3)

@@ -92,7 +92,12 @@ class ControllerState:
         self.gripper[ids] = 0.0
 
     def set_goals(
-        self, ids: np.ndarray, actions: np.ndarray, qpos: np.ndarray, site_pos: np.ndarray, site_mat: np.ndarray
+        self,
+        ids: np.ndarray,
+        actions: np.ndarray,
+        qpos: np.ndarray,
+        site_pos: np.ndarray,
+        site_mat: np.ndarray,
     ) -> None:
         """New goals at the first substep; arrays (num, ...)."""
         self.kind.set_goals(ids, actions, qpos, site_pos, site_mat, self.goal, self.memory)
@@ -124,7 +129,9 @@ def get_controller(name: str = "osc_pose", control_delta: bool = True) -> Contro
 def _osc_pose(delta: bool) -> Controller:
     pose = np.array([*[_REACH] * 3, *[2 * np.pi] * 3, 1.0])
     high = np.ones(7) if delta else pose
-    return Controller("osc_pose", delta, -high, high, (3, 9), control, _pose_step if delta else _pose_goal(pose))
+    return Controller(
+        "osc_pose", delta, -high, high, (3, 9), control, _pose_step if delta else _pose_goal(pose)
+    )
 
 
 def _osc_position(delta: bool) -> Controller:

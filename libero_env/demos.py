@@ -194,9 +194,13 @@ def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]
     if steps == 0:
         raise BrokenDemoError(f"{file}: {name}/actions is empty; expected (T, 7) with T > 0")
     _check_shape(actions, "actions", file, name, (steps, 7), "f")
-    for key, shape, kind in (("states", (steps, None), "f"), ("robot_states", (steps, 9), "f"),
-                             ("expert_actions", (steps, 7), "f"), ("rewards", (steps,), "uif"),
-                             ("dones", (steps,), "uif")):  # fmt: skip
+    for key, shape, kind in (
+        ("states", (steps, None), "f"),
+        ("robot_states", (steps, 9), "f"),
+        ("expert_actions", (steps, 7), "f"),
+        ("rewards", (steps,), "uif"),
+        ("dones", (steps,), "uif"),
+    ):
         if key in group:
             _check_shape(_dataset(group, key, file, name), key, file, name, shape, kind)
     for key in obs_keys:

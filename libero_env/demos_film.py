@@ -53,9 +53,12 @@ class Filmer:
 
     def __init__(self, task: Task, shots: Shots, assets: Pack | str | Path | None = None):
         self.env = LiberoEnv(
-            task, cameras=shots.cameras, camera_size=shots.size, assets=assets,
+            task,
+            cameras=shots.cameras,
+            camera_size=shots.size,
+            assets=assets,
             observations=(*shots.pictures, "proprioception", "ee_quat"),
-        )  # fmt: skip
+        )
 
     @property
     def scene(self) -> Scene:

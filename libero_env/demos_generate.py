@@ -164,9 +164,13 @@ def record(
         for i in range(0, len(numbers), BATCH)
     ]
     bar = tqdm(
-        total=n * len(jobs), initial=sum(tally.recorded for tally in tallies), desc="demonstrations", unit="demo",
-        smoothing=0.1, disable=None if progress is None else not progress,
-    )  # fmt: skip
+        total=n * len(jobs),
+        initial=sum(tally.recorded for tally in tallies),
+        desc="demonstrations",
+        unit="demo",
+        smoothing=0.1,
+        disable=None if progress is None else not progress,
+    )
     with bar:
         done = _run(
             [(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cores()

@@ -154,9 +154,19 @@ class _Dataset:
             "timestamp": (np.arange(steps) / CONTROL_HZ).astype(np.float32),
             "next.reward": np.append(np.zeros(steps - 1), float(row.success)).astype(np.float32),
             "next.done": np.append(np.zeros(steps - 1, bool), True),
-            **dict(zip(_INDICES, (np.arange(steps), np.full(steps, number), first + np.arange(steps),
-                                  np.full(steps, task)), strict=True)),
-        }  # fmt: skip
+            **dict(
+                zip(
+                    _INDICES,
+                    (
+                        np.arange(steps),
+                        np.full(steps, number),
+                        first + np.arange(steps),
+                        np.full(steps, task),
+                    ),
+                    strict=True,
+                )
+            ),
+        }
         found = {"episode_index": number, "tasks": [language], "length": steps}
         found |= self._data.add(columns)
         found |= {"dataset_from_index": first, "dataset_to_index": first + steps}
@@ -243,9 +253,15 @@ class _Dataset:
 
 def _video_feature(height: int, width: int, channels: int) -> dict[str, Any]:
     info = {
-        "video.height": height, "video.width": width, "video.channels": channels, "video.codec": "h264",
-        "video.pix_fmt": PIXELS, "video.fps": CONTROL_HZ, "video.is_depth_map": False, "has_audio": False,
-    }  # fmt: skip
+        "video.height": height,
+        "video.width": width,
+        "video.channels": channels,
+        "video.codec": "h264",
+        "video.pix_fmt": PIXELS,
+        "video.fps": CONTROL_HZ,
+        "video.is_depth_map": False,
+        "has_audio": False,
+    }
     return {
         "dtype": "video",
         "shape": [height, width, channels],

@@ -105,9 +105,14 @@ def _replayed(
             if terminated:
                 break
     return Replay(
-        name, episode.success, bool(terminated), t + 1, np.array(drift), np.array(arm_drift),
+        name,
+        episode.success,
+        bool(terminated),
+        t + 1,
+        np.array(drift),
+        np.array(arm_drift),
         np.stack(frames) if frames else None,
-    )  # fmt: skip
+    )
 
 
 def rerender(

@@ -205,9 +205,13 @@ def select(episode: Episode, keep: np.ndarray) -> Episode:
         return None if values is None else values[keep]
 
     return replace(
-        episode, actions=episode.actions[keep], states=episode.states[keep], robot_states=cut(episode.robot_states),
-        expert_actions=cut(episode.expert_actions), obs={key: values[keep] for key, values in episode.obs.items()},
-    )  # fmt: skip
+        episode,
+        actions=episode.actions[keep],
+        states=episode.states[keep],
+        robot_states=cut(episode.robot_states),
+        expert_actions=cut(episode.expert_actions),
+        obs={key: values[keep] for key, values in episode.obs.items()},
+    )
 
 
 def _labels(episode: Episode) -> np.ndarray:

@@ -32,9 +32,19 @@ TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
 # What demonstrations of one file have in common.
 _MADE_WITH = (
-    "bddl_file_name", "bddl_file_content", "seed", "camera_size", "cameras", "pictures", "pairing", "generator",
-    "disturbed", "variation", "model_digest", "filter",
-)  # fmt: skip
+    "bddl_file_name",
+    "bddl_file_content",
+    "seed",
+    "camera_size",
+    "cameras",
+    "pictures",
+    "pairing",
+    "generator",
+    "disturbed",
+    "variation",
+    "model_digest",
+    "filter",
+)
 
 
 @dataclass(frozen=True)
@@ -174,10 +184,13 @@ class DemoWriter:
         for key, values in _with_ee_states(episode.obs).items():
             if is_picture(key):
                 obs.create_dataset(
-                    key, data=values[:, ::-1], chunks=(min(FRAMES_PER_CHUNK, steps), *values.shape[1:]),
-                    compression=self.compression, compression_opts=1 if self.compression == "gzip" else None,
+                    key,
+                    data=values[:, ::-1],
+                    chunks=(min(FRAMES_PER_CHUNK, steps), *values.shape[1:]),
+                    compression=self.compression,
+                    compression_opts=1 if self.compression == "gzip" else None,
                     shuffle=self.compression is not None and values.dtype != np.uint8,
-                )  # fmt: skip
+                )
             elif key in LOW_DIM_KEYS:
                 obs.create_dataset(key, data=np.asarray(values, np.float64))
         group.attrs["num_samples"] = steps

@@ -66,12 +66,21 @@ class LiberoEnv(gymnasium.Env):
         render_mode: str | None = None,
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise LiberoError(f"render_mode {render_mode!r}; valid: None, {', '.join(self.metadata['render_modes'])}")
+            raise LiberoError(
+                f"render_mode {render_mode!r}; valid: None, {', '.join(self.metadata['render_modes'])}"
+            )
         self.reward = Reward(reward, reward_scale)
         self.world = World(
-            task, 1, cameras=cameras, camera_size=camera_size, observations=observations, controller=controller,
-            control_delta=control_delta, assets=assets, semantics=semantics,
-        )  # fmt: skip
+            task,
+            1,
+            cameras=cameras,
+            camera_size=camera_size,
+            observations=observations,
+            controller=controller,
+            control_delta=control_delta,
+            assets=assets,
+            semantics=semantics,
+        )
         self.task, self.horizon, self.render_mode = self.world.task, horizon, render_mode
         self.observation_space, self.action_space = self.world.observation_space(), self.world.action_space()
         self.draw = True

@@ -41,7 +41,9 @@ def settle(
         PlacementError: something still moves after five seconds.
     """
     nv, still = simulations.model.nv, np.zeros((simulations.num, 7))
-    simulations.reset([i], qpos[None], np.zeros((1, nv)), fixtures=None if fixtures is None else fixtures[None])
+    simulations.reset(
+        [i], qpos[None], np.zeros((1, nv)), fixtures=None if fixtures is None else fixtures[None]
+    )
     for _ in range(_MAX_SETTLE):
         before = simulations.fields["qpos"][i].copy()
         for _ in range(10):
@@ -50,7 +52,9 @@ def settle(
         if np.abs(after - before)[nq_robot:].max(initial=0.0) < _STILL:
             after[:nq_robot] = qpos[:nq_robot]
             return after
-    raise PlacementError(f"objects still move after {_MAX_SETTLE * 0.5:.0f} s; do their regions lie on a surface?")
+    raise PlacementError(
+        f"objects still move after {_MAX_SETTLE * 0.5:.0f} s; do their regions lie on a surface?"
+    )
 
 
 def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.random.Generator) -> Start:
@@ -70,7 +74,9 @@ def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.rando
         simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)))
         if not (why := "; ".join(start_faults(view))):
             return Start(qpos, start.fixtures)
-    raise PlacementError(f"{scene.problem.language!r}: no start in {_MAX_DRAWS} draws is as the task says: {why}")
+    raise PlacementError(
+        f"{scene.problem.language!r}: no start in {_MAX_DRAWS} draws is as the task says: {why}"
+    )
 
 
 def start_faults(view: StateView) -> list[str]:
@@ -155,7 +161,9 @@ def cache_init_states(task: Task) -> Path:
 
 
 def _cached_path(task: Task, digest: str) -> Path:
-    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[:16]  # regions and atoms, which the digest knows not
+    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[
+        :16
+    ]  # regions and atoms, which the digest knows not
     return cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{said}.npz"
 
 

@@ -12,9 +12,25 @@ from libero_env.tasks import Task
 
 # words of names that do not say what a thing is
 _QUALITIES = {
-    "and", "of", "the", "two", "new", "black", "white", "red", "yellow", "wooden", "flat", "short", "glazed", "rim",
-    "region", "side", "contain", "init",
-}  # fmt: skip
+    "and",
+    "of",
+    "the",
+    "two",
+    "new",
+    "black",
+    "white",
+    "red",
+    "yellow",
+    "wooden",
+    "flat",
+    "short",
+    "glazed",
+    "rim",
+    "region",
+    "side",
+    "contain",
+    "init",
+}
 _ALSO = {"shelf": "cabinet", "cabinet": "drawer"}  # what people call it too
 _PARTS = {"drawer", "compartment", "layer", "side", "shelf", "region", "of"}  # what a side is said of
 _SIDES = ({"top", "middle", "bottom"}, {"left", "right"}, {"front", "back"})

@@ -147,10 +147,13 @@ class Observer:
         if not frames:
             return
         for i in ids:
-            self._draw(i, [
-                Picture(index, **{kind: frames[entry(camera, kind)][i] for kind in self._kinds})
-                for camera, index in self._cameras.items()
-            ])  # fmt: skip
+            self._draw(
+                i,
+                [
+                    Picture(index, **{kind: frames[entry(camera, kind)][i] for kind in self._kinds})
+                    for camera, index in self._cameras.items()
+                ],
+            )
             if self.segmentation:
                 for camera in self._cameras:
                     rows = frames[entry(camera, "segmentation")]
@@ -227,7 +230,9 @@ class _Things:
 
     def __init__(self, scene: Scene):
         model = scene.model
-        self._bodies = {name: model.body(f"{name}_{ROOT_BODY}").id for name in (*scene.objects, *scene.fixtures)}
+        self._bodies = {
+            name: model.body(f"{name}_{ROOT_BODY}").id for name in (*scene.objects, *scene.fixtures)
+        }
         joints = {name: [int(model.jnt_qposadr[j]) for j in scene.joints[name]] for name in self._bodies}
         self._joints = {name: addresses for name, addresses in joints.items() if addresses}
 
@@ -277,12 +282,15 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Quaternion products, wxyz (n, 4); the same bits for every n."""
     aw, ax, ay, az = a.T
     bw, bx, by, bz = b.T
-    return np.stack([
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ], axis=1)  # fmt: skip
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=1,
+    )
 
 
 def rotated(quat: np.ndarray, vectors: np.ndarray) -> np.ndarray:

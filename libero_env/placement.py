@@ -43,7 +43,10 @@ def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
     data.qpos[:7] += ARM_NOISE * rng.standard_normal(7)
     fixtures = _sample_fixtures(scene, rng)
     if scene.fixtures:
-        model.body_pos[scene.fixture_bodies], model.body_quat[scene.fixture_bodies] = fixtures[:, :3], fixtures[:, 3:]
+        model.body_pos[scene.fixture_bodies], model.body_quat[scene.fixture_bodies] = (
+            fixtures[:, :3],
+            fixtures[:, 3:],
+        )
     _sample_joints(scene, data, rng)
     touching: set[str] = set()
     for _ in range(_MAX_TRIES):
@@ -122,11 +125,15 @@ def _places(scene: Scene) -> Mapping[str, Place]:
     atoms = [a for a in scene.problem.init if a.args[0] in scene.objects and len(a.args) == 2]
     places = {atom.args[0]: _place_of(scene, atom) for atom in atoms}
     if missing := set(scene.objects) - set(places):
-        raise PlacementError(f"no init atom says where {', '.join(sorted(missing))} stands; add (On object region)")
+        raise PlacementError(
+            f"no init atom says where {', '.join(sorted(missing))} stands; add (On object region)"
+        )
     ordered: dict[str, Place] = {}
     while len(ordered) < len(places):
         waiting = set(places) - set(ordered)
-        ready = {name: place for name, place in places.items() if name in waiting and place.carrier not in waiting}
+        ready = {
+            name: place for name, place in places.items() if name in waiting and place.carrier not in waiting
+        }
         if not ready:
             raise PlacementError(f"{', '.join(sorted(waiting))} stand on each other in a circle")
         ordered.update(ready)
@@ -164,7 +171,9 @@ def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) 
         ranges = scene.things[owner].articulation if owner is not None else {}
         joints = scene.joints.get(atom.args[0], ())
         if state not in ranges or not joints:
-            raise PlacementError(f"init atom ({atom.predicate} {atom.args[0]}): it has no joint that can be {state!r}")
+            raise PlacementError(
+                f"init atom ({atom.predicate} {atom.args[0]}): it has no joint that can be {state!r}"
+            )
         for joint in joints:
             low, high = np.clip(sorted(ranges[state]), *scene.model.jnt_range[joint])
             data.qpos[scene.model.jnt_qposadr[joint]] = rng.uniform(low, high)
@@ -232,7 +241,9 @@ def _touching(scene: Scene, data: mujoco.MjData) -> set[str]:
     """Objects in contact with another object, a fixture or the robot."""
     model = scene.model
     roots = model.body_rootid[model.geom_bodyid[data.contact.geom[: data.ncon]]]
-    owners = {int(scene.bodies[name][0]): name for name in scene.things} | {int(scene.bodies[ROBOT][0]): ROBOT}
+    owners = {int(scene.bodies[name][0]): name for name in scene.things} | {
+        int(scene.bodies[ROBOT][0]): ROBOT
+    }
     found = set()
     for a, b in roots:
         names = {owners.get(int(body), "") for body in (a, b)}

@@ -106,7 +106,11 @@ class StateView:
             for geom in range(start, start + model.body_geomnum[body]):
                 if model.geom_contype[geom] or model.geom_conaffinity[geom]:
                     turn = mat @ _mat(model.geom_quat[geom])
-                    centre = self._field("xpos")[body] + mat @ model.geom_pos[geom] + turn @ model.geom_aabb[geom, :3]
+                    centre = (
+                        self._field("xpos")[body]
+                        + mat @ model.geom_pos[geom]
+                        + turn @ model.geom_aabb[geom, :3]
+                    )
                     half = np.abs(turn) @ model.geom_aabb[geom, 3:]
                     corners.append((centre - half, centre + half))
         low, high = zip(*corners, strict=True)
@@ -215,7 +219,9 @@ def strict_on(view: StateView, thing: str, place: str) -> bool:
     if view.is_thing(place):
         low, high = view.bounds(place)
         over = ((view.body_pos(thing) > low) & (view.body_pos(thing) < high))[:2].all()
-        return bool(over and view.body_pos(thing)[2] > view.body_pos(place)[2] and view.in_contact(thing, place))
+        return bool(
+            over and view.body_pos(thing)[2] > view.body_pos(place)[2] and view.in_contact(thing, place)
+        )
     region = _region(view, place)
     point = view.body_pos(thing)
     if not view.in_contact(thing, region.target):
@@ -290,7 +296,9 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
         case Not(part):
             return not evaluate(part, view, semantics)
         case ForAll(variables, body):
-            return all(evaluate(_bind(body, binding), view, semantics) for binding in _bindings(variables, view))
+            return all(
+                evaluate(_bind(body, binding), view, semantics) for binding in _bindings(variables, view)
+            )
     raise TypeError(f"not a goal: {expression!r}")
 
 
@@ -333,7 +341,9 @@ def _boxes(view: StateView, address: str) -> list[Box]:
     if not region.ranges:
         site = mujoco.mj_name2id(view.scene.model, mujoco.mjtObj.mjOBJ_SITE, address)
         if site < 0:
-            raise LiberoError(f"region {address}: {region.target} has no site {region.name!r}, and no ranges are given")
+            raise LiberoError(
+                f"region {address}: {region.target} has no site {region.name!r}, and no ranges are given"
+            )
         return [(view.site_pos(address), view.site_mat(address), view.scene.model.site_size[site])]
     boxes = zone_boxes(region, view.scene.workspace)
     return [(centre, np.eye(3), half) for centre, half in boxes]

@@ -37,7 +37,9 @@ def open_context(width: int, height: int) -> tuple[str, object]:
         try:
             return name, importlib.import_module(f"mujoco.{name}").GLContext(width, height)
         except Exception as error:  # noqa: BLE001 - each backend fails in its own way (ImportError, AttributeError, GL)
-            failures.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
+            failures.append(
+                f"{name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            )
     raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
 
 
@@ -80,7 +82,9 @@ class Renderer:
     def __init__(self, model: mujoco.MjModel, height: int, width: int):
         largest = min(model.vis.global_.offheight, model.vis.global_.offwidth)
         if not (0 < height <= largest and 0 < width <= largest):
-            raise RenderError(f"a frame of {height}x{width} pixels is not between 1 and {largest} on each side")
+            raise RenderError(
+                f"a frame of {height}x{width} pixels is not between 1 and {largest} on each side"
+            )
         self._model, self._height, self._width = model, height, width
         self._gl: object | None = None
         self._pixels = np.empty((height, width, 3), np.uint8)
@@ -94,7 +98,9 @@ class Renderer:
         """
         index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
         if index < 0:
-            raise UnknownNameError("camera", name, [self._model.camera(i).name for i in range(self._model.ncam)])
+            raise UnknownNameError(
+                "camera", name, [self._model.camera(i).name for i in range(self._model.ncam)]
+            )
         return index
 
     def render(self, data: mujoco.MjData, cameras: list[int], out: list[np.ndarray]) -> None:
@@ -118,7 +124,7 @@ class Renderer:
             if k == 0:
                 mujoco.mjv_updateScene(
                     self._model, data, self._options, None, self._camera, everything, self._scene
-                )  # fmt: skip
+                )
                 for site in glowing:
                     self._add_site(data, site)
             else:
@@ -131,7 +137,9 @@ class Renderer:
     def _draw_colours(self, picture: Picture) -> None:
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         depth = None if picture.depth is None else self._depth
-        mujoco.mjr_readPixels(None if picture.rgb is None else self._pixels, depth, self._viewport, self._context)
+        mujoco.mjr_readPixels(
+            None if picture.rgb is None else self._pixels, depth, self._viewport, self._context
+        )
         if picture.rgb is not None:
             picture.rgb[:] = self._pixels[::-1]  # OpenGL's first row is the lowest
         if picture.depth is not None:
@@ -162,9 +170,13 @@ class Renderer:
         material = model.site_matid[site]
         rgba = model.site_rgba[site] if material < 0 else model.mat_rgba[material]
         mujoco.mjv_initGeom(
-            geom, model.site_type[site], model.site_size[site], data.site_xpos[site], data.site_xmat[site],
+            geom,
+            model.site_type[site],
+            model.site_size[site],
+            data.site_xpos[site],
+            data.site_xmat[site],
             rgba.astype(np.float32),
-        )  # fmt: skip
+        )
         geom.emission = 1.0 if material < 0 else model.mat_emission[material]
         geom.objtype, geom.objid, geom.segid = mujoco.mjtObj.mjOBJ_SITE, site, scene.ngeom
         geom.category = mujoco.mjtCatBit.mjCAT_DYNAMIC

@@ -97,7 +97,9 @@ def joint_share(view: StateView, address: str, state: str) -> float:
     if state not in ranges or _OPPOSITE[state] not in ranges or not values.size:
         return 0.0
     wanted, opposite = np.array(ranges[state]), np.array(ranges[_OPPOSITE[state]])
-    start = opposite[np.abs(opposite - wanted.mean()).argmax()]  # the far end of one, the near end of the other
+    start = opposite[
+        np.abs(opposite - wanted.mean()).argmax()
+    ]  # the far end of one, the near end of the other
     end = wanted[np.abs(wanted - opposite.mean()).argmin()]
     shares = np.clip((values - start) / (end - start), 0.0, 1.0)
     return float(shares.max() if state in ("open", "turnon") else shares.min())

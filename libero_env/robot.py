@@ -39,7 +39,9 @@ def robosuite_assets() -> Path:
     """
     spec = importlib.util.find_spec("robosuite")
     if spec is None or spec.origin is None:
-        raise LiberoError("robosuite is not installed; it supplies the robot's model: pip install robosuite==1.4.1")
+        raise LiberoError(
+            "robosuite is not installed; it supplies the robot's model: pip install robosuite==1.4.1"
+        )
     return Path(spec.origin).parent / "models" / "assets"
 
 
@@ -83,9 +85,15 @@ def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
             mesh = spec.add_mesh(name=f"visual{i}", uservert=vertices.ravel(), userface=faces.ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             spec.body(body).add_geom(
-                name=f"visual{i}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=rgba, group=1,
-                contype=0, conaffinity=0, mass=0.0,
-            )  # fmt: skip
+                name=f"visual{i}",
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=mesh.name,
+                rgba=rgba,
+                group=1,
+                contype=0,
+                conaffinity=0,
+                mass=0.0,
+            )
     for geom in visuals:
         delete(spec, geom)
     used = {g.meshname for g in spec.geoms}
@@ -97,7 +105,9 @@ def _simplified(spec: mujoco.MjSpec, name: str, groups: dict) -> list[tuple[np.n
     """Vertices and faces of each group in its body's frame, from the cache where it has them."""
     parts = [(g.meshname, *g.pos, *g.quat) for geoms in groups.values() for g in geoms]
     digest = hashlib.sha256(repr((_CACHE_VERSION, _FACES_PER_GEOM, name, parts)).encode()).hexdigest()[:16]
-    return _simplified_cached(digest, tuple(tuple(_source(spec, g) for g in geoms) for geoms in groups.values()))
+    return _simplified_cached(
+        digest, tuple(tuple(_source(spec, g) for g in geoms) for geoms in groups.values())
+    )
 
 
 def _source(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> tuple[str, tuple[float, ...], tuple[float, ...]]:

@@ -233,9 +233,13 @@ def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Work
         if region.target == name and region.ranges:
             centre, half = zone_boxes(region, workspace)[0]
             spec.worldbody.add_site(
-                name=region.address, type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=np.maximum(half, 1e-4),
-                rgba=(0.0, 0.0, 0.0, 0.0), group=3,
-            )  # fmt: skip
+                name=region.address,
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=centre,
+                size=np.maximum(half, 1e-4),
+                rgba=(0.0, 0.0, 0.0, 0.0),
+                group=3,
+            )
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectModel) -> None:

@@ -38,12 +38,16 @@ def labels(scene: Scene, kind: str) -> Labels:
     if kind == "element":
         geoms = {1 + i: model.geom(i).name or f"geom{i}" for i in range(model.ngeom)}
         sites = {1 + model.ngeom + i: model.site(i).name or f"site{i}" for i in range(model.nsite)}
-        return Labels(np.arange(1 + model.ngeom + model.nsite, dtype=np.int32), {0: "nothing", **geoms, **sites})
+        return Labels(
+            np.arange(1 + model.ngeom + model.nsite, dtype=np.int32), {0: "nothing", **geoms, **sites}
+        )
     if kind not in SEGMENTATIONS:
         raise UnknownNameError("segmentation", kind, SEGMENTATIONS)
     things = {**scene.objects, **scene.fixtures}
     called = {name: name if kind == "instance" else item.category for name, item in things.items()}
-    numbers = {label: number for number, label in enumerate(dict.fromkeys((ARENA, ARM, GRIPPER, *called.values())))}
+    numbers = {
+        label: number for number, label in enumerate(dict.fromkeys((ARENA, ARM, GRIPPER, *called.values())))
+    }
     of_body = np.zeros(model.nbody, np.int32)
     for body in range(model.nbody):
         name = model.body(body).name

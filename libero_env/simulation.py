@@ -23,9 +23,18 @@ except ImportError:  # before MuJoCo 4
 
 # What the controller and the views of the state read, as arrays (n, ...).
 _FIELDS = (
-    "qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat",
-    MASS_FIELD, "qfrc_bias",
-)  # fmt: skip
+    "qpos",
+    "qvel",
+    "ctrl",
+    "xpos",
+    "xquat",
+    "xanchor",
+    "xaxis",
+    "site_xpos",
+    "site_xmat",
+    MASS_FIELD,
+    "qfrc_bias",
+)
 
 
 Tap = Callable[[mujoco.MjData], None]
@@ -143,8 +152,13 @@ class Simulations(ABC):
         """The kernel's view of MjData."""
         site = self.arm.site
         names = ("qpos", "qvel", "xanchor", "xaxis")
-        return (*(fields[n] for n in names), fields["site_xpos"][:, site], fields["site_xmat"][:, site],
-                fields[MASS_FIELD], fields["qfrc_bias"])  # fmt: skip
+        return (
+            *(fields[n] for n in names),
+            fields["site_xpos"][:, site],
+            fields["site_xmat"][:, site],
+            fields[MASS_FIELD],
+            fields["qfrc_bias"],
+        )
 
     def _constants(self) -> tuple[np.ndarray, ...]:
         return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, REST
@@ -158,7 +172,9 @@ class LoopSimulations(Simulations):
         self._datas = [mujoco.MjData(self.model) for _ in range(num)]
         self._views = [self._view(data) for data in self._datas]
         # One simulation is read in place; several are copied together after each step.
-        self.fields = self._views[0] if num == 1 else {k: np.concatenate([v[k] for v in self._views]) for k in _FIELDS}
+        self.fields = (
+            self._views[0] if num == 1 else {k: np.concatenate([v[k] for v in self._views]) for k in _FIELDS}
+        )
         self._calls = [(self._inputs(v), v["ctrl"]) for v in self._views]
 
     def _view(self, data: mujoco.MjData) -> dict[str, np.ndarray]:

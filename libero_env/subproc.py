@@ -77,7 +77,12 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
     ):
         if not specs:
             raise LiberoError("SubprocEnv needs at least one environment")
-        self.num_envs, self.render_mode, self.timeout, self.start_timeout = len(specs), None, timeout, start_timeout
+        self.num_envs, self.render_mode, self.timeout, self.start_timeout = (
+            len(specs),
+            None,
+            timeout,
+            start_timeout,
+        )
         self.tasks = tuple(_task_name(spec) for spec in specs)
         self._workers: list[Worker] = []
         self._finalizer = weakref.finalize(self, shut_down, self._workers)
@@ -243,9 +248,13 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         return [worker.shared.views if worker.shared else {} for worker in self._workers]
 
     def _info(self) -> dict[str, Any]:
-        info: dict[str, Any] = {"success": self._success.copy(), "progress": [dict(p) for p in self._progress]}
+        info: dict[str, Any] = {
+            "success": self._success.copy(),
+            "progress": [dict(p) for p in self._progress],
+        }
         own = [
-            {key: view.copy() for key, view in views.items() if key not in self._common} for views in self._views()
+            {key: view.copy() for key, view in views.items() if key not in self._common}
+            for views in self._views()
         ]
         return {**info, "own": own} if any(own) else info
 

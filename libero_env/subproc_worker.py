@@ -27,7 +27,9 @@ class Shared:
     def __init__(self, space: spaces.Dict, name: str | None = None):
         """Make a block, or attach to the one of this name."""
         boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in space.items()]
-        starts = np.cumsum([0, *(-(-int(np.prod(s)) * d.itemsize // 64) * 64 for _, s, d in boxes)])  # aligned
+        starts = np.cumsum(
+            [0, *(-(-int(np.prod(s)) * d.itemsize // 64) * 64 for _, s, d in boxes)]
+        )  # aligned
         self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
         self.name = self._memory.name
         self._owner = name is None

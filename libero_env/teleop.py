@@ -23,9 +23,19 @@ GENERATOR = "teleoperation"
 VIEW = (480, 480)  # pixels of the pictures that screens ask the world for
 # Key -> (entry of the action, direction): position in the robot's frame, then rotation vector.
 MOTIONS: Mapping[str, tuple[int, float]] = {
-    "w": (0, -1.0), "s": (0, 1.0), "a": (1, -1.0), "d": (1, 1.0), "f": (2, -1.0), "r": (2, 1.0),
-    "z": (3, -1.0), "x": (3, 1.0), "t": (4, 1.0), "g": (4, -1.0), "c": (5, -1.0), "v": (5, 1.0),
-}  # fmt: skip
+    "w": (0, -1.0),
+    "s": (0, 1.0),
+    "a": (1, -1.0),
+    "d": (1, 1.0),
+    "f": (2, -1.0),
+    "r": (2, 1.0),
+    "z": (3, -1.0),
+    "x": (3, 1.0),
+    "t": (4, 1.0),
+    "g": (4, -1.0),
+    "c": (5, -1.0),
+    "v": (5, 1.0),
+}
 GRIPPER, RESET, QUIT = " ", "q", "escape"
 HELP = (
     "w s: back, forth   a d: left, right   r f: up, down   z x, t g, c v: turn about x, y, z\n"

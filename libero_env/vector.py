@@ -57,10 +57,17 @@ class BatchEnv(gymnasium.vector.VectorEnv):
     ):
         self.reward = Reward(reward, reward_scale)
         self.world = World(
-            task, num_envs, threads=num_threads, cameras=cameras, camera_size=camera_size,
-            observations=observations, controller=controller, control_delta=control_delta, assets=assets,
+            task,
+            num_envs,
+            threads=num_threads,
+            cameras=cameras,
+            camera_size=camera_size,
+            observations=observations,
+            controller=controller,
+            control_delta=control_delta,
+            assets=assets,
             semantics=semantics,
-        )  # fmt: skip
+        )
         self.task, self.num_envs, self.horizon, self.render_mode = self.world.task, num_envs, horizon, None
         self.single_observation_space = self.world.observation_space()
         self.single_action_space = self.world.action_space()
@@ -175,7 +182,9 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         for k, i in enumerate(ids):
             reached[k], progress = self.world.judge(i)
             self._progress[i] = list(progress.values())
-            rewards[k] = self.reward(self.world.views[i], bool(reached[k]), self.world.atoms, self._progress[i])
+            rewards[k] = self.reward(
+                self.world.views[i], bool(reached[k]), self.world.atoms, self._progress[i]
+            )
         return reached, rewards
 
     def _observe(self, drawn: np.ndarray) -> dict[str, np.ndarray]:

@@ -59,16 +59,24 @@ class World:
         self.task = get_task(task) if isinstance(task, str) else task
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
         self.scene: Scene = build_scene(self.task.problem, pack)
-        self.num, self.cameras, self.camera_size = num, tuple(cameras), (int(camera_size[0]), int(camera_size[1]))
+        self.num, self.cameras, self.camera_size = (
+            num,
+            tuple(cameras),
+            (int(camera_size[0]), int(camera_size[1])),
+        )
         self.simulations: Simulations = make_simulations(
             self.scene.model, num, threads, self.scene.fixture_bodies.tolist()
         )
         self.simulations.controller = ControllerState(num, self.controller)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
         self.observer = Observer(
-            self.scene, self.simulations, self.views,
-            observations=observations, cameras=self.cameras, camera_size=self.camera_size,
-        )  # fmt: skip
+            self.scene,
+            self.simulations,
+            self.views,
+            observations=observations,
+            cameras=self.cameras,
+            camera_size=self.camera_size,
+        )
         # without those of quantifiers, whose variables stand for several things
         self.atoms = tuple(a for a in atoms_of(self.task.problem.goal) if all(map(self._exists, a.args)))
 
@@ -99,12 +107,20 @@ class World:
             PlacementError: nothing fits, or nothing comes to rest.
         """
         simulations, own = self.simulations, self.simulations.controller
-        simulations.controller = ControllerState(self.num)  # settling holds the pose, whatever an action means
+        simulations.controller = ControllerState(
+            self.num
+        )  # settling holds the pose, whatever an action means
         try:
-            starts = [sample_settled(self.scene, simulations, i, rng) for i, rng in zip(ids, generators, strict=True)]
+            starts = [
+                sample_settled(self.scene, simulations, i, rng)
+                for i, rng in zip(ids, generators, strict=True)
+            ]
         finally:
             simulations.controller = own
-        qpos, fixtures = np.stack([start.qpos for start in starts]), np.stack([start.fixtures for start in starts])
+        qpos, fixtures = (
+            np.stack([start.qpos for start in starts]),
+            np.stack([start.fixtures for start in starts]),
+        )
         self.simulations.reset(ids, qpos, np.zeros((len(ids), self.scene.model.nv)), fixtures=fixtures)
 
     def step(self, ids: Sequence[int], actions: np.ndarray) -> None:
@@ -117,7 +133,10 @@ class World:
 
     def progress(self, i: int) -> dict[str, bool]:
         """Truth of each atom of the goal in simulation i."""
-        return {f"({a.predicate} {' '.join(a.args)})": evaluate(a, self.views[i], self.semantics) for a in self.atoms}
+        return {
+            f"({a.predicate} {' '.join(a.args)})": evaluate(a, self.views[i], self.semantics)
+            for a in self.atoms
+        }
 
     def judge(self, i: int) -> tuple[bool, dict[str, bool]]:
         """Truth of the goal in simulation i and of each of its atoms; none is evaluated twice in a conjunction."""

@@ -73,14 +73,18 @@ def register_tasks(subparsers: Subparsers) -> None:
     show = commands.add_parser("show", help="the BDDL of a task")
     show.add_argument("task", help="such as libero_object/3, the task's name, or a file of your own")
     show.set_defaults(run=run_tasks_show)
-    states = commands.add_parser("init-states", help="make the 50 stored initial states of a suite or task file anew")
+    states = commands.add_parser(
+        "init-states", help="make the 50 stored initial states of a suite or task file anew"
+    )
     states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
     states.add_argument(
         "--out",
         type=Path,
         help="folder for the .npz files (default: those the package ships; of a file, the cache)",
     )
-    states.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
+    states.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)"
+    )
     states.set_defaults(run=run_tasks_init_states)
     cli_tasks.register(commands)
 
@@ -112,7 +116,9 @@ def run_tasks_init_states(args: argparse.Namespace) -> None:
         for task in cli_tasks.find_tasks([args.suite]):
             print(cache_init_states(task))
         return
-    tasks = cli_tasks.find_tasks([args.suite]) if args.suite.endswith(ENDINGS) else get_suite(args.suite).tasks
+    tasks = (
+        cli_tasks.find_tasks([args.suite]) if args.suite.endswith(ENDINGS) else get_suite(args.suite).tasks
+    )
     for suite in dict.fromkeys(task.suite for task in tasks):
         path = args.out / f"{suite}.npz" if args.out else shipped_path(suite)
         write_suite(path, [task for task in tasks if task.suite == suite], args.jobs)

@@ -55,12 +55,19 @@ def _register_generate(commands: "argparse._SubParsersAction") -> None:
     add("--seed", type=int, default=0, help="of starts and manners (default: 0)")
     add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
     add(
-        "--variation", nargs="+", choices=(*VARIATIONS, "none"), default=VARIATIONS,
+        "--variation",
+        nargs="+",
+        choices=(*VARIATIONS, "none"),
+        default=VARIATIONS,
         help="of the manner and of the executed actions (default: all)",
-    )  # fmt: skip
+    )
     add("--noise", type=float, help="standard deviation of the noise on actions (default: 0.12)")
-    add("--pairing", choices=("aligned", "libero"), default="aligned",
-        help="observations before their action, or after it as in the original (default: aligned)")  # fmt: skip
+    add(
+        "--pairing",
+        choices=("aligned", "libero"),
+        default="aligned",
+        help="observations before their action, or after it as in the original (default: aligned)",
+    )
     add("--workers", type=int, default=0, help="processes (default: one for each core)")
     add("--folder", type=Path, help="where to keep them (default: LIBERO_DEMOS, or in the cache)")
     generate.set_defaults(run=run_generate)

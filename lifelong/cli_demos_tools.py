@@ -96,8 +96,13 @@ def run_rerender(args: argparse.Namespace) -> None:
     from libero_env.demos_replay import rerender
     from lifelong.cli_demos import describe, pictures
 
-    print(describe(rerender(args.file, args.out, Shots(tuple(args.cameras), args.size, pictures(args)),
-                            assets=args.assets)))  # fmt: skip
+    print(
+        describe(
+            rerender(
+                args.file, args.out, Shots(tuple(args.cameras), args.size, pictures(args)), assets=args.assets
+            )
+        )
+    )
 
 
 def run_filter(args: argparse.Namespace) -> None:

@@ -208,9 +208,15 @@ def _own_policy(args: argparse.Namespace) -> Candidate:
 
     def env(task: "Task", count: int, p: "Protocol", a: argparse.Namespace) -> "VectorEnv":
         return BatchEnv(
-            task, count, num_threads=a.threads, cameras=cameras, camera_size=p.camera_size,
-            horizon=p.steps(task) + p.settle_steps, observations=observations, assets=a.assets,
-        )  # fmt: skip
+            task,
+            count,
+            num_threads=a.threads,
+            cameras=cameras,
+            camera_size=p.camera_size,
+            horizon=p.steps(task) + p.settle_steps,
+            observations=observations,
+            assets=a.assets,
+        )
 
     @contextmanager
     def actor(task: "Task", states: Sequence[int], p: "Protocol") -> "Iterator[Actor]":

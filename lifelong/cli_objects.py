@@ -43,9 +43,11 @@ def _register_add(commands: "argparse._SubParsersAction") -> None:
         help="axis of the file that points up (default: y for GLB and glTF, else z)",
     )
     option(
-        "--collision", choices=("decompose", "hull", "boxes"), default="decompose",
+        "--collision",
+        choices=("decompose", "hull", "boxes"),
+        default="decompose",
         help="convex pieces, the convex hull, or boxes (default: decompose; without CoACD boxes)",
-    )  # fmt: skip
+    )
     option("--faces", type=int, default=3000, help="triangles that its look may have (default: 3000)")
     option("--container", action="store_true", help="things can be put In it: adds the place contain_region")
     option("--replace", action="store_true", help="replace an object of yours that has this name")

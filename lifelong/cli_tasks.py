@@ -91,9 +91,14 @@ def run_certify(args: argparse.Namespace) -> int:
 
     jobs = args.jobs or cores()
     found = certify(
-        find_tasks(args.tasks), args.states, jobs=jobs, out=args.out, assets=args.assets, disturb=args.disturb,
+        find_tasks(args.tasks),
+        args.states,
+        jobs=jobs,
+        out=args.out,
+        assets=args.assets,
+        disturb=args.disturb,
         again=args.again,
-    )  # fmt: skip
+    )
     write_results(found, args.out, assets=args.assets, disturb=args.disturb)
     short = [certificate for certificate in found if certificate.rate < args.require]
     for certificate in short:

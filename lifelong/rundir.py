@@ -1,9 +1,9 @@
 """A run's directory: its configuration, its records, its checkpoints, and a lock while it is written.
 
-    config.yaml      the resolved configuration
-    results.jsonl    records, append-only
-    checkpoints/     task_<k>.safetensors after each task, progress and best of the present one
-    videos/          recorded rollouts
+config.yaml      the resolved configuration
+results.jsonl    records, append-only
+checkpoints/     task_<k>.safetensors after each task, progress and best of the present one
+videos/          recorded rollouts
 """
 
 import fcntl
@@ -20,7 +20,17 @@ from lifelong.errors import ConfigError, LifelongError
 from lifelong.results import ResultLog
 
 # What may differ between the start of a run and its resumption: it changes no result.
-VOLATILE = ("device", "progress", "resume", "run_id", "runs_dir", "threads", "wandb", "data.memory", "data.backend")
+VOLATILE = (
+    "device",
+    "progress",
+    "resume",
+    "run_id",
+    "runs_dir",
+    "threads",
+    "wandb",
+    "data.memory",
+    "data.backend",
+)
 
 
 class RunDirectory:

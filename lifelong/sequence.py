@@ -141,7 +141,10 @@ class TaskSequence:
         began = time.perf_counter()
         with seeded(p.seed, END_TASK, task, 1, device=p.device):  # for dropout
             p.algorithm.end_task(task, dataset, p.policy, draws)
-        spent = {"end_task_seconds": time.perf_counter() - began, "stored_bytes": costs.stored_bytes(p.algorithm)}
+        spent = {
+            "end_task_seconds": time.perf_counter() - began,
+            "stored_bytes": costs.stored_bytes(p.algorithm),
+        }
         with p.algorithm.policy_for(task, p.policy) as acting:
             spent |= costs.action_costs(acting) | costs.peak_costs(p.device)
         self.log.append(CostRecord(task=task, costs=spent))

@@ -72,9 +72,13 @@ class BenchmarkSettings:
         if self.files is None and self.suite != OWN:
             return get_suite(self.suite)
         if not self.files or isinstance(self.files, str):
-            raise ConfigError(f"benchmark.files is {self.files!r}; name task files of yours: '[a.yaml,b.bddl]'")
+            raise ConfigError(
+                f"benchmark.files is {self.files!r}; name task files of yours: '[a.yaml,b.bddl]'"
+            )
         if self.suite in suite_names():
-            raise ConfigError(f"benchmark.files are given, and {self.suite} has its own tasks; say benchmark=own")
+            raise ConfigError(
+                f"benchmark.files are given, and {self.suite} has its own tasks; say benchmark=own"
+            )
         return read_suite(self.files, self.suite)
 
     def _chosen(self) -> tuple[Task, ...]:

@@ -51,7 +51,9 @@ class Batch:
         """The same batch on another device."""
         move = lambda x: x.to(device, non_blocking=True)  # noqa: E731
         obs = self.observation
-        moved = Observation(move(obs.images), {k: move(v) for k, v in obs.proprio.items()}, move(obs.language))
+        moved = Observation(
+            move(obs.images), {k: move(v) for k, v in obs.proprio.items()}, move(obs.language)
+        )
         return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids))
 
     def rows(self, rows: slice | Tensor) -> "Batch":

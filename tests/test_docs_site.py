@@ -188,8 +188,20 @@ def test_every_algorithm_has_a_section_that_names_its_keys(algo):
 @pytest.mark.unit
 def test_hooks_of_the_guide_are_those_of_algorithms():
     shown = text(DOCS / "algorithms.md").split("## Your own")[1]
-    for hook in ("begin_task", "phases", "begin_phase", "mix", "penalty", "after_backward", "after_step", "end_phase",
-                 "end_task", "policy_for", "state_dict", "load_state_dict"):  # fmt: skip
+    for hook in (
+        "begin_task",
+        "phases",
+        "begin_phase",
+        "mix",
+        "penalty",
+        "after_backward",
+        "after_step",
+        "end_phase",
+        "end_task",
+        "policy_for",
+        "state_dict",
+        "load_state_dict",
+    ):
         assert hasattr(Algorithm, hook)
         assert hook in shown
 
@@ -270,8 +282,12 @@ def test_every_page_is_in_the_navigation():
 
 @pytest.mark.slow
 def test_the_site_builds_and_fetches_nothing(tmp_path):
-    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "http_proxy": "http://127.0.0.1:9",
-                   "https_proxy": "http://127.0.0.1:9"}  # fmt: skip
+    environment = {
+        **os.environ,
+        "NO_MKDOCS_2_WARNING": "1",
+        "http_proxy": "http://127.0.0.1:9",
+        "https_proxy": "http://127.0.0.1:9",
+    }
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(build, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

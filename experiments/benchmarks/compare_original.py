@@ -75,8 +75,9 @@ class Comparison:
         self.original = Original(python, config)
         self.about = self.original("about")
         self.packs: dict[str, Pack | str] = {
-            "camera step": "builtin", "simplified camera step": select_pack(self.about["assets"], lod)
-        }  # fmt: skip
+            "camera step": "builtin",
+            "simplified camera step": select_pack(self.about["assets"], lod),
+        }
         env = self.env(cameras=())
         scene, name = env.world.scene, f"{env.task.suite}/{env.task.name}"
         self.poses = scene.fixture_poses
@@ -162,11 +163,14 @@ class Comparison:
         ask("build", file=self.file, cameras=True), ask("reset"), env.reset(options={"init_state": 0})
         rows = [
             (
-                ask("reset", state=state), ask("put", state=state), ask("reset"),
-                best(lambda: env.reset(options={"init_state": 1}), 10), best(lambda i=i: env.reset(seed=i), 1),
+                ask("reset", state=state),
+                ask("put", state=state),
+                ask("reset"),
+                best(lambda: env.reset(options={"init_state": 1}), 10),
+                best(lambda i=i: env.reset(seed=i), 1),
             )
             for i in range(self.slow_rounds)
-        ]  # fmt: skip
+        ]
         env.close()
         names = ("original reset", "original put", "original placement", "reset", "placement")
         return dict(zip(names, np.min(rows, axis=0).tolist(), strict=True))
@@ -190,9 +194,11 @@ class Comparison:
         for side, rows in (("original ", other[1:]), ("", own[1:])):
             imports, build, first = np.min(rows, axis=0).tolist()
             figures |= {
-                f"{side}import": imports, f"{side}build": build,
-                f"{side}import and build": imports + build, f"{side}build and reset": build + first,
-            }  # fmt: skip
+                f"{side}import": imports,
+                f"{side}build": build,
+                f"{side}import and build": imports + build,
+                f"{side}build and reset": build + first,
+            }
         return figures
 
     def limits(self) -> Figures:
@@ -219,9 +225,12 @@ class Comparison:
         bare_steps, step = np.min(steps, axis=0).mean(axis=0).tolist()
         mine, drawing, reading = np.min(frames, axis=0).mean(axis=0).tolist()
         return {
-            "bare steps": bare_steps, "step beside bare": step, "drawing": mine, "bare drawing": drawing,
+            "bare steps": bare_steps,
+            "step beside bare": step,
+            "drawing": mine,
+            "bare drawing": drawing,
             "bare drawing and reading": reading,
-        }  # fmt: skip
+        }
 
     def memory(self) -> Figures:
         """Resident memory in a fresh process: after fifty resets with pictures, and after many more."""
@@ -295,9 +304,16 @@ def main() -> None:
     comparison.original.close()
     print(json.dumps(comparison.notes))
     found = {
-        "task": args.task, "rounds": rounds, "lod": args.lod, "mujoco": versions, "machine": host,
-        "load_after": os.getloadavg(), "seconds": figures, "rows": rows, "notes": comparison.notes,
-    }  # fmt: skip
+        "task": args.task,
+        "rounds": rounds,
+        "lod": args.lod,
+        "mujoco": versions,
+        "machine": host,
+        "load_after": os.getloadavg(),
+        "seconds": figures,
+        "rows": rows,
+        "notes": comparison.notes,
+    }
     args.out.write_text(json.dumps(found, indent=1) + "\n")
 
 

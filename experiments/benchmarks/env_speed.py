@@ -105,7 +105,12 @@ def build_seconds(repeats: int) -> dict[str, float]:
         "print(b - a, c - b, time.perf_counter() - c)"
     )
     rows = [
-        [float(x) for x in subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout.split()]
+        [
+            float(x)
+            for x in subprocess.run(
+                [sys.executable, "-c", code], capture_output=True, check=True
+            ).stdout.split()
+        ]
         for _ in range(repeats)
     ]
     imports, build, first_reset = np.min(rows, axis=0)
@@ -113,7 +118,9 @@ def build_seconds(repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=int, default=200)
     parser.add_argument("--batch", type=int, default=16)
     args = parser.parse_args()

@@ -24,9 +24,14 @@ class Original:
         env = {**os.environ, "LIBERO_CONFIG_PATH": str(config), "OMP_NUM_THREADS": "1"}
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 - as long as the process
         self._process = subprocess.Popen(
-            [python, "-W", "ignore", WORKER], env=env, text=True, bufsize=1, stderr=self._log,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
+            [python, "-W", "ignore", WORKER],
+            env=env,
+            text=True,
+            bufsize=1,
+            stderr=self._log,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
         self.pid = self._process.pid
 
     def __call__(self, do: str, **arguments: Any) -> dict[str, Any]:

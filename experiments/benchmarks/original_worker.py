@@ -40,9 +40,14 @@ def build(name: str, file: str, cameras: bool) -> dict:
     """Make an environment as `OffScreenRenderEnv` does, or one without cameras."""
     start = time.perf_counter()
     ENVS[name] = ControlEnv(
-        bddl_file_name=file, camera_heights=128, camera_widths=128, use_camera_obs=cameras, ignore_done=True,
-        has_renderer=False, has_offscreen_renderer=cameras,
-    )  # fmt: skip
+        bddl_file_name=file,
+        camera_heights=128,
+        camera_widths=128,
+        use_camera_obs=cameras,
+        ignore_done=True,
+        has_renderer=False,
+        has_offscreen_renderer=cameras,
+    )
     return {"s": time.perf_counter() - start}
 
 

@@ -55,9 +55,14 @@ def main(path: str, rgb: str, low_dim: str, seq_len: str, batch: str, repeats: s
     rows = []
     for mode, where in (("low_dim", "pictures from the file"), ("all", "everything in memory")):
         windows = SequenceDataset(
-            hdf5_path=path, obs_keys=(*views, *readings), dataset_keys=("actions",), seq_length=int(seq_len),
-            hdf5_cache_mode=mode, hdf5_use_swmr=False, load_next_obs=False,
-        )  # fmt: skip
+            hdf5_path=path,
+            obs_keys=(*views, *readings),
+            dataset_keys=("actions",),
+            seq_length=int(seq_len),
+            hdf5_cache_mode=mode,
+            hdf5_use_swmr=False,
+            load_next_obs=False,
+        )
         draws = torch.Generator().manual_seed(0)
         batches = endless(DataLoader(WithTask(windows), size, shuffle=True, drop_last=True, generator=draws))
         rows.append(measured(f"robomimic, {where}", lambda b=batches: next(b), size, count))

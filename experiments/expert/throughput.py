@@ -32,7 +32,9 @@ def seconds(suite: str, n: int, size: int, workers: int, images: bool) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--suites", nargs="+", default=["libero_object", "libero_10"])
     parser.add_argument("--n", type=int, default=10, help="demonstrations of each task")
     parser.add_argument("--size", type=int, default=128)
@@ -40,7 +42,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     args = parser.parse_args()
     workers = args.workers or cores()
-    print(f"| suite, {workers} processes | without pictures, demos/h | two {args.size}x{args.size} views | ratio |")
+    print(
+        f"| suite, {workers} processes | without pictures, demos/h | two {args.size}x{args.size} views | ratio |"
+    )
     print("| --- | ---: | ---: | ---: |")
     for suite in args.suites:
         best = {False: float("inf"), True: float("inf")}

@@ -52,8 +52,10 @@ def main() -> None:
         worst, states, faulty = max(worst, *moved.values()), states + len(rows), faulty + bool(faults)
         if faults:
             print(f"{task.id} {task.name}: {'; '.join(sorted(set(faults)))}", flush=True)
-    print(f"{describe(args, pack)}: {len(tasks)} tasks, {states} states, {faulty} tasks with faults; "
-          f"the farthest that anything moves in {IDLE_STEPS} idle steps: {1000 * worst:.2f} mm")  # fmt: skip
+    print(
+        f"{describe(args, pack)}: {len(tasks)} tasks, {states} states, {faulty} tasks with faults; "
+        f"the farthest that anything moves in {IDLE_STEPS} idle steps: {1000 * worst:.2f} mm"
+    )
 
 
 def describe(args: argparse.Namespace, pack: Pack) -> str:

@@ -126,8 +126,11 @@ def portrait(model: ObjectModel, *, size: int, collision: bool = False) -> np.nd
     behind = np.deg2rad(azimuth - 35)  # over the photographer's left shoulder
     towards = np.array([0.6 * np.cos(behind), 0.6 * np.sin(behind), -0.8])
     scene.worldbody.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=middle - 3 * extent * towards, dir=towards, diffuse=(0.5,) * 3
-    )  # fmt: skip
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=middle - 3 * extent * towards,
+        dir=towards,
+        diffuse=(0.5,) * 3,
+    )
     scene.stat.extent, scene.stat.center = extent, middle
     compiled, data = posed(scene)
     camera = mujoco.MjvCamera()

@@ -50,9 +50,14 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
     )
     with film:
         episodes = rollouts(
-            cfg, algo, task, emb, args.task_id, range(cfg.eval.n_eval),
+            cfg,
+            algo,
+            task,
+            emb,
+            args.task_id,
+            range(cfg.eval.n_eval),
             watch=_camera(film, cfg.data.obs.modality.rgb[0]) if args.save_videos else None,
-        )  # fmt: skip
+        )
     successes = [e.success for part in episodes for e in part.episodes]
     return _told(path, args, task, loss, successes)
 

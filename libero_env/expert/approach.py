@@ -183,9 +183,14 @@ def _alike(pose: Pose, other: Pose) -> bool:
 
 
 def _free_holds(
-    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, thing: str, tilts: Sequence[np.ndarray | None],
+    view: StateView,
+    voxels: Voxels,
+    cloud: np.ndarray,
+    pose: Pose,
+    thing: str,
+    tilts: Sequence[np.ndarray | None],
     failures: Sequence[Failure],
-) -> list[Grasp]:  # fmt: skip
+) -> list[Grasp]:
     """Holds along some approaches, those in the way of others and those that failed last.
 
     Raises:

@@ -289,9 +289,16 @@ class MoveJoint:
     ) -> np.ndarray:
         style = self.style
         return action_toward(
-            view.eef_pos, view.eef_mat, pos, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
-            speed=style.speed, lateral=lateral,
-        )  # fmt: skip
+            view.eef_pos,
+            view.eef_mat,
+            pos,
+            mat,
+            velocity=self._velocity,
+            gripper=gripper,
+            gain=style.gain,
+            speed=style.speed,
+            lateral=lateral,
+        )
 
     def _in_the_way(self, view: StateView, goal: np.ndarray) -> float:
         """Height of the highest thing near the next decimetre of the way, m."""

@@ -11,7 +11,7 @@ from libero_env.expert.grasp import (
     MAX_OPENING,
     PALM_ABOVE,
     TIP_BELOW,
-)  # fmt: skip
+)
 
 _CELL, _COARSE = 0.006, 0.012  # m, for what stands close to others, and for the hand
 _WALL = 0.01  # m, between points of what stands and does not hang

@@ -96,6 +96,13 @@ class Drag:
         self, view: StateView, goal: np.ndarray, mat: np.ndarray, speed: float = 1.0, lateral: float = 1.0
     ):
         return action_toward(
-            view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=CLOSE, gain=self.style.gain,
-            speed=speed * self.style.speed, lateral=lateral,
-        )  # fmt: skip
+            view.eef_pos,
+            view.eef_mat,
+            goal,
+            mat,
+            velocity=self._velocity,
+            gripper=CLOSE,
+            gain=self.style.gain,
+            speed=speed * self.style.speed,
+            lateral=lateral,
+        )

@@ -66,10 +66,16 @@ def run_experts(
     for i, rows in enumerate(states):
         rows.append(world.physics_state(i))
     return [
-        Attempt(bool(success[i]), np.array(states[i]), np.array(executed[i]), np.array(wanted[i]), expert.retries,
-                "" if success[i] else _reason(expert, len(executed[i])))
+        Attempt(
+            bool(success[i]),
+            np.array(states[i]),
+            np.array(executed[i]),
+            np.array(wanted[i]),
+            expert.retries,
+            "" if success[i] else _reason(expert, len(executed[i])),
+        )
         for i, expert in enumerate(experts)
-    ]  # fmt: skip
+    ]
 
 
 def _reason(expert: Expert, steps: int) -> str:

@@ -97,8 +97,11 @@ def _tube_points(radius: float, half: float, spacing: float) -> np.ndarray:
     angle = np.arange(0, 2 * np.pi, spacing / radius)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rows = [np.column_stack([radius * ring, np.full(len(ring), z)]) for z in _steps(half, spacing)]
-    caps = [np.column_stack([r * ring, np.full(len(ring), z)])
-            for r in np.arange(0.0, radius, spacing) for z in (-half, half)]  # fmt: skip
+    caps = [
+        np.column_stack([r * ring, np.full(len(ring), z)])
+        for r in np.arange(0.0, radius, spacing)
+        for z in (-half, half)
+    ]
     return np.concatenate(rows + caps)
 
 

@@ -103,7 +103,15 @@ def grasps(
 def _faced(points: np.ndarray, pos: np.ndarray, yaw: float) -> bool:
     """Whether the pads meet faces on both sides that stand along the approach, and not slanted ones."""
     return hold_kernels.faces_reach_up(
-        points, pos, np.cos(yaw), np.sin(yaw), FINGER_HALF_WIDTH, PAD_ABOVE, MAX_OPENING, _SLANT, 0.6 * PAD_ABOVE
+        points,
+        pos,
+        np.cos(yaw),
+        np.sin(yaw),
+        FINGER_HALF_WIDTH,
+        PAD_ABOVE,
+        MAX_OPENING,
+        _SLANT,
+        0.6 * PAD_ABOVE,
     )
 
 

@@ -240,8 +240,13 @@ def _pushes(handle: Handle, mat: np.ndarray, follows: Sequence[float]) -> Iterat
     fingers, across, approach = mat.T
     offset = handle.part - handle.pos
     beside = np.cross(handle.along, handle.out)
-    tip = np.array([s * TIP * fingers + t * FINGER_HALF_WIDTH * across + TIP_BELOW * approach
-                    for s in (1, -1) for t in (1, -1)])  # fmt: skip
+    tip = np.array(
+        [
+            s * TIP * fingers + t * FINGER_HALF_WIDTH * across + TIP_BELOW * approach
+            for s in (1, -1)
+            for t in (1, -1)
+        ]
+    )
     forward = float((-tip @ handle.out).max())
     upright = abs(handle.along[2]) > 0.7
     tilt = np.arcsin(np.clip(-approach[2], -1, 1))

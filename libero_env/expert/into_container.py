@@ -207,9 +207,16 @@ class IntoContainer:
     ) -> np.ndarray:
         style = self.style
         return action_toward(
-            view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
-            speed=style.speed, lateral=lateral,
-        )  # fmt: skip
+            view.eef_pos,
+            view.eef_mat,
+            goal,
+            mat,
+            velocity=self._velocity,
+            gripper=gripper,
+            gain=style.gain,
+            speed=style.speed,
+            lateral=lateral,
+        )
 
     def _grasp_pose(self, view: StateView) -> tuple[np.ndarray, np.ndarray]:
         """Where the grip site must be to take the object, following it when it moves; planned anew when it turns."""

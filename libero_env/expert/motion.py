@@ -11,9 +11,17 @@ TURN_GAIN = 2.5
 
 
 def action_toward(
-    pos: np.ndarray, mat: np.ndarray, goal_pos: np.ndarray, goal_mat: np.ndarray, *,
-    velocity: np.ndarray, gripper: float, gain: float = 1.6, speed: float = 1.0, lateral: float = 1.0,
-) -> np.ndarray:  # fmt: skip
+    pos: np.ndarray,
+    mat: np.ndarray,
+    goal_pos: np.ndarray,
+    goal_mat: np.ndarray,
+    *,
+    velocity: np.ndarray,
+    gripper: float,
+    gain: float = 1.6,
+    speed: float = 1.0,
+    lateral: float = 1.0,
+) -> np.ndarray:
     """Damped proportional action towards a pose of the grip site.
 
     Damping and the stiffer rotation are there because the controller treats position and orientation as decoupled,

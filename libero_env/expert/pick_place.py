@@ -294,9 +294,16 @@ class PickPlace:
         else:  # a hand that turns drifts
             goal, lateral = np.array([*self._anchor, goal[2]]), 1.0
         return action_toward(
-            view.eef_pos, view.eef_mat, goal, mat, velocity=self._velocity, gripper=gripper, gain=style.gain,
-            speed=0.35 * style.speed if slow else style.speed, lateral=lateral,
-        )  # fmt: skip
+            view.eef_pos,
+            view.eef_mat,
+            goal,
+            mat,
+            velocity=self._velocity,
+            gripper=gripper,
+            gain=style.gain,
+            speed=0.35 * style.speed if slow else style.speed,
+            lateral=lateral,
+        )
 
     def _grasp_pose(self, view: StateView) -> tuple[np.ndarray, np.ndarray]:
         """Where the grip site must be to take the object, following it when it moves a little."""

@@ -86,9 +86,16 @@ Turn = tuple[np.ndarray, float, np.ndarray | None]  # (3, 3) to apply, its cost,
 
 
 def _found(
-    view: StateView, voxels: Voxels, cloud: np.ndarray, pose: Pose, atom: Atom, share: tuple[int, int],
-    turns: list[Turn], directions: list[np.ndarray], crowded: float,
-) -> list[Place]:  # fmt: skip
+    view: StateView,
+    voxels: Voxels,
+    cloud: np.ndarray,
+    pose: Pose,
+    atom: Atom,
+    share: tuple[int, int],
+    turns: list[Turn],
+    directions: list[np.ndarray],
+    crowded: float,
+) -> list[Place]:
     """Places of a body turned in these ways, of which at most a share may seem to lie in others."""
     found = []
     step = max(1, len(cloud) // _ENOUGH)
@@ -110,7 +117,9 @@ def _found(
                 continue
             if only is not None:  # it falls back: its middle should have something under it
                 middle = body.mean(axis=0)[None] * [1, 1, 0] + [0, 0, body[:, 2].min()]
-                costs = costs + _UNCARRIED * (origins[:, 2] - voxels.drop(middle, origins[:, :2], below) > 0.01)
+                costs = costs + _UNCARRIED * (
+                    origins[:, 2] - voxels.drop(middle, origins[:, :2], below) > 0.01
+                )
             ways = directions if only is None else [only]
             entries, crowd = _ways_in(voxels, body[::step], origins, ways, crowded)
             for pos, cost, entry, full in zip(origins, costs, entries, crowd, strict=True):
@@ -152,9 +161,11 @@ def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, in
         xy = view.body_pos(target)[:2]
         offsets = np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)])
         yield (
-            xy + offsets, 8.0 * np.linalg.norm(offsets, axis=1), np.inf,
+            xy + offsets,
+            8.0 * np.linalg.norm(offsets, axis=1),
+            np.inf,
             lambda origin: bool(np.linalg.norm(origin[:2] - xy) < _NEAR),
-        )  # fmt: skip
+        )
         return
     test = _inside if atom.predicate == "In" else _over
     for box in _boxes(view, target):

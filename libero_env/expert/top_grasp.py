@@ -90,7 +90,11 @@ def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[f
             askew = min((turn_between(yaw, other) for other in aligned), default=0.0)
             for x, y, width, shift in whole_holds(slab, yaw):
                 cost = (
-                    0.25 * turn_between(yaw, now) + 8.0 * width + 4.0 * away_from_middle + 3.0 * shift + 0.4 * askew
+                    0.25 * turn_between(yaw, now)
+                    + 8.0 * width
+                    + 4.0 * away_from_middle
+                    + 3.0 * shift
+                    + 0.4 * askew
                 )
                 yield cost, TopGrasp(np.array([x, y, height]), float(yaw), width)
 

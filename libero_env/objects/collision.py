@@ -120,9 +120,13 @@ def _decomposed(coacd, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
     coacd.set_log_level("error")
     scale = 1.0 / np.ptp(vertices, axis=0).max()
     parts = coacd.run_coacd(
-        coacd.Mesh(vertices * scale, faces.astype(np.int32)), threshold=_CONCAVITY, max_convex_hull=_MAX_PIECES,
-        max_ch_vertex=64, decimate=True, seed=0,
-    )  # fmt: skip
+        coacd.Mesh(vertices * scale, faces.astype(np.int32)),
+        threshold=_CONCAVITY,
+        max_convex_hull=_MAX_PIECES,
+        max_ch_vertex=64,
+        decimate=True,
+        seed=0,
+    )
     return tuple(np.asarray(points) / scale for points, _ in parts)
 
 

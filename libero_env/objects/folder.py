@@ -87,9 +87,14 @@ def load(place: Path, category: str) -> ObjectModel:
     figures: dict[str, Any] = {key: facts[key] for key in _MAY_SAY if key in facts}
     bottom, top = (tuple(map(float, facts[key])) for key in ("bottom_offset", "top_offset"))
     return ObjectModel(
-        category, spec, bottom_offset=(bottom[0], bottom[1], bottom[2]), top_offset=(top[0], top[1], top[2]),
-        horizontal_radius=float(facts["horizontal_radius"]), digest=digest(place), **figures,
-    )  # fmt: skip
+        category,
+        spec,
+        bottom_offset=(bottom[0], bottom[1], bottom[2]),
+        top_offset=(top[0], top[1], top[2]),
+        horizontal_radius=float(facts["horizontal_radius"]),
+        digest=digest(place),
+        **figures,
+    )
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -41,9 +41,13 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, tell: Tel
     low, high = bounds_of(_compiled(spec, path))
     if container and all(site.name != "contain_region" for site in spec.sites):
         root.add_site(
-            name="contain_region", type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2,
-            size=INSIDE * (high - low) / 2, rgba=(0, 0, 0, 0), group=3,
-        )  # fmt: skip
+            name="contain_region",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(low + high) / 2,
+            size=INSIDE * (high - low) / 2,
+            rgba=(0, 0, 0, 0),
+            group=3,
+        )
     model = _compiled(spec, path)
     kilograms = float(model.body_subtreemass[model.body(ROOT_BODY).id])
     if kilograms < 1e-6:
@@ -126,9 +130,19 @@ def _sort_geoms(spec: mujoco.MjSpec) -> None:
 
 def _add_look(geom: mujoco.MjsGeom) -> None:
     look = geom.parent.add_geom(
-        type=geom.type, size=geom.size, pos=geom.pos, quat=geom.quat, fromto=geom.fromto, rgba=geom.rgba,
-        material=geom.material, meshname=geom.meshname, group=1, contype=0, conaffinity=0, mass=0.0,
-    )  # fmt: skip
+        type=geom.type,
+        size=geom.size,
+        pos=geom.pos,
+        quat=geom.quat,
+        fromto=geom.fromto,
+        rgba=geom.rgba,
+        material=geom.material,
+        meshname=geom.meshname,
+        group=1,
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+    )
     look.alt = geom.alt
 
 

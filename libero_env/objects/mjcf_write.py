@@ -53,9 +53,10 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
     assets = ET.SubElement(root, "asset")
     main = ET.SubElement(ET.SubElement(root, "worldbody"), "body", {"name": ROOT_BODY})
     ET.SubElement(
-        main, "inertial",
+        main,
+        "inertial",
         {"pos": _text(body.centre), "mass": _text([body.mass]), "fullinertia": _text(body.inertia)},
-    )  # fmt: skip
+    )
     _add_collision(place, body, assets, main)
     total = sum(len(surface.faces) for surface in surfaces)
     if total > faces:
@@ -72,9 +73,14 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
 
 def _add_collision(place: Path, body: Body, assets: ET.Element, main: ET.Element) -> None:
     touch = {
-        "group": "0", "condim": "3", "rgba": "0.8 0.8 0.8 0.3", "friction": _text(FRICTION), "solref": _text(SOLREF),
-        "solimp": _text((*SOLIMP, 0.5, 2.0)), "mass": "0",
-    }  # fmt: skip
+        "group": "0",
+        "condim": "3",
+        "rgba": "0.8 0.8 0.8 0.3",
+        "friction": _text(FRICTION),
+        "solref": _text(SOLREF),
+        "solimp": _text((*SOLIMP, 0.5, 2.0)),
+        "mass": "0",
+    }
     for number, points in enumerate(body.pieces.meshes):
         name = f"{body.name}_collision{number}"
         # the hull is made of the points by MuJoCo, and no triangles are needed
@@ -105,10 +111,19 @@ def _add_look(
     ET.SubElement(assets, "material", material)
     ET.SubElement(assets, "mesh", {"name": f"{name}_mesh", "file": f"{name}.obj", "inertia": "shell"})
     ET.SubElement(
-        main, "geom",
-        {"name": f"visual{number or ''}", "type": "mesh", "mesh": f"{name}_mesh", "material": f"{name}_material",
-         "group": "1", "contype": "0", "conaffinity": "0", "mass": "0"},
-    )  # fmt: skip
+        main,
+        "geom",
+        {
+            "name": f"visual{number or ''}",
+            "type": "mesh",
+            "mesh": f"{name}_mesh",
+            "material": f"{name}_material",
+            "group": "1",
+            "contype": "0",
+            "conaffinity": "0",
+            "mass": "0",
+        },
+    )
 
 
 def _simplified(surface: Surface, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -16,6 +16,19 @@ from lifelong.algorithms.si import SI
 from lifelong.algorithms.single_task import SingleTask
 
 __all__ = [
-    "AGEM", "DMPEL", "ER", "EWC", "MAS", "SI", "Algorithm", "DERpp", "LoRA", "LwF", "Multitask", "PackNet", "Phase",
-    "Sequential", "SingleTask",
-]  # fmt: skip
+    "AGEM",
+    "DMPEL",
+    "ER",
+    "EWC",
+    "MAS",
+    "SI",
+    "Algorithm",
+    "DERpp",
+    "LoRA",
+    "LwF",
+    "Multitask",
+    "PackNet",
+    "Phase",
+    "Sequential",
+    "SingleTask",
+]

@@ -68,9 +68,14 @@ def open_windows(
         dataset = frame_cache.mapped(source, language=language, task_id=task_id)
     else:
         dataset = SequenceVLDataset.from_file(
-            source.path, spec=source.spec, language=language, task_id=task_id, limit=source.limit,
-            pairing=source.pairing, labels=source.labels,
-        )  # fmt: skip
+            source.path,
+            spec=source.spec,
+            language=language,
+            task_id=task_id,
+            limit=source.limit,
+            pairing=source.pairing,
+            labels=source.labels,
+        )
     if memory == "device":
         return dataset.to(device)
     pin = device.type == "cuda" and memory in ("pinned", "mmap")

@@ -21,10 +21,19 @@ KILLS = 5  # of each run
 START_UP = 0.2  # share of the kills that come before the process has written anything
 DEADLINE = 1800.0  # s; of a machine that has other things to do
 TINY = (
-    "preset=smoke", "threads=1", "data.demos=2", "train.epochs=3", "train.steps_per_epoch=2", "train.batch_size=4",
-    "eval.every=1", "eval.horizon=3", "eval.episodes=1", "eval.curve_episodes=1", "eval.record_every=0",
+    "preset=smoke",
+    "threads=1",
+    "data.demos=2",
+    "train.epochs=3",
+    "train.steps_per_epoch=2",
+    "train.batch_size=4",
+    "eval.every=1",
+    "eval.horizon=3",
+    "eval.episodes=1",
+    "eval.curve_episodes=1",
+    "eval.record_every=0",
     "progress=false",
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")

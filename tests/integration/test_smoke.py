@@ -18,9 +18,18 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 ROOT = Path(__file__).parents[2]
 ALGORITHMS = sorted(file.stem for file in (ROOT / "configs" / "algo").glob("*.yaml"))
 TINY = (
-    "preset=smoke", "algo=packnet", "threads=1", "data.demos=2", "train.epochs=2", "train.steps_per_epoch=2",
-    "train.batch_size=4", "eval.every=1", "eval.horizon=12", "eval.episodes=2", "eval.curve_episodes=1",
-)  # fmt: skip
+    "preset=smoke",
+    "algo=packnet",
+    "threads=1",
+    "data.demos=2",
+    "train.epochs=2",
+    "train.steps_per_epoch=2",
+    "train.batch_size=4",
+    "eval.every=1",
+    "eval.horizon=12",
+    "eval.episodes=2",
+    "eval.curve_episodes=1",
+)
 
 
 @pytest.fixture(scope="module")
@@ -129,14 +138,19 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
     output = finish(start(home, tmp_path, "-m", f"algo={','.join(ALGORITHMS)}", *tiny))
     assert f"{len(ALGORITHMS)} runs compared" in output
     for algo in ALGORITHMS:
-        found = json.loads((tmp_path / "libero_object" / algo / f"{policy}_seed1" / "results.json").read_text())
+        found = json.loads(
+            (tmp_path / "libero_object" / algo / f"{policy}_seed1" / "results.json").read_text()
+        )
         assert found["finished"] and found["tasks_learned"] == 2, algo
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, derpp, dmpel, er, ewc, lora, lwf, mas,"),
+        (
+            "algo=evc",
+            "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, derpp, dmpel, er, ewc, lora, lwf, mas,",
+        ),
         ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
         ("eval.select=first", "valid: best, last"),
         ("device=tpu", "valid: auto, cpu, cuda"),

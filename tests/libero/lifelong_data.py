@@ -12,15 +12,29 @@ from libero_env.demos_write import DemoWriter, Episode
 
 SIZE, LANGUAGE = 32, 16
 TINY = (
-    "device=cpu", "policy.image_encoder.network_kwargs.remove_layer_num=5",
-    "policy.policy_head.network_kwargs.hidden_size=16", "data.seq_len=3", f"data.img_h={SIZE}", f"data.img_w={SIZE}",
-    "train.n_epochs=1", "train.batch_size=4", "train.num_workers=0", "eval.num_workers=0", "eval.n_eval=1",
-    "eval.num_procs=1", "eval.max_steps=4", "eval.eval_every=1",
-)  # fmt: skip
+    "device=cpu",
+    "policy.image_encoder.network_kwargs.remove_layer_num=5",
+    "policy.policy_head.network_kwargs.hidden_size=16",
+    "data.seq_len=3",
+    f"data.img_h={SIZE}",
+    f"data.img_w={SIZE}",
+    "train.n_epochs=1",
+    "train.batch_size=4",
+    "train.num_workers=0",
+    "eval.num_workers=0",
+    "eval.n_eval=1",
+    "eval.num_procs=1",
+    "eval.max_steps=4",
+    "eval.eval_every=1",
+)
 TINY_TRANSFORMER = (
-    "policy.embed_size=8", "policy.transformer_num_layers=1", "policy.transformer_num_heads=2",
-    "policy.transformer_head_output_size=4", "policy.transformer_mlp_hidden_size=8", "policy.transformer_max_seq_len=3",
-)  # fmt: skip
+    "policy.embed_size=8",
+    "policy.transformer_num_layers=1",
+    "policy.transformer_num_heads=2",
+    "policy.transformer_head_output_size=4",
+    "policy.transformer_mlp_hidden_size=8",
+    "policy.transformer_max_seq_len=3",
+)
 
 
 class TwoTasks(Benchmark):

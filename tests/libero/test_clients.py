@@ -133,10 +133,18 @@ def test_dataset_tool_of_the_original():
         "control_freq": 20,
     }
     update_env_kwargs(
-        kwargs, bddl_file_name=file, has_renderer=False, has_offscreen_renderer=True, ignore_done=True,
-        use_camera_obs=True, camera_depths=False, camera_names=["robot0_eye_in_hand", "agentview"],
-        camera_heights=SIZE, camera_widths=SIZE, camera_segmentations=None,
-    )  # fmt: skip
+        kwargs,
+        bddl_file_name=file,
+        has_renderer=False,
+        has_offscreen_renderer=True,
+        ignore_done=True,
+        use_camera_obs=True,
+        camera_depths=False,
+        camera_names=["robot0_eye_in_hand", "agentview"],
+        camera_heights=SIZE,
+        camera_widths=SIZE,
+        camera_segmentations=None,
+    )
     env = TASK_MAPPING[info["problem_name"]](**kwargs)
     env.reset()
     model_xml = postprocess_model_xml(env.sim.model.get_xml(), {})

@@ -98,8 +98,10 @@ def test_scenes_are_found_by_name_and_type(demo_scene):
     assert mu_utils.MU_DICT["kitchen_demo_scene"] is demo_scene
     assert {f"KitchenScene{i}" for i in range(1, 11)} < {cls.__name__ for cls in get_scene_dict("kitchen")}
     assert {kind: len(scenes) for kind, scenes in get_scene_dict().items()} == {
-        "kitchen": 11, "living_room": 6, "study": 4,
-    }  # fmt: skip
+        "kitchen": 11,
+        "living_room": 6,
+        "study": 4,
+    }
     assert get_scene_class("STUDY_SCENE3")().workspace_name == "study_table"
     with pytest.raises(UnknownNameError, match="kitchen_scene0.*kitchen_demo_scene"):
         get_scene_class("kitchen_scene0")
@@ -291,8 +293,12 @@ def test_pieces(tmp_path, capsys):
 
     @pieces.PDDLDefinition("LIBERO_Tabletop_Manipulation")
     def lift(name):
-        return {"language": "lift it", "fixtures": {"main_table": "table"}, "objects": {name: "plate"},
-                "goal": pieces.LogicalState("Up", name)}  # fmt: skip
+        return {
+            "language": "lift it",
+            "fixtures": {"main_table": "table"},
+            "objects": {name: "plate"},
+            "goal": pieces.LogicalState("Up", name),
+        }
 
     text = lift("plate_1")
     assert bddl.parse(text).goal == Atom("Up", ("plate_1",))

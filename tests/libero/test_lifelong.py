@@ -86,9 +86,11 @@ def test_windows_are_the_files_frames(file):
     assert np.allclose(window["obs"]["joint_states"], joints[wanted], atol=1e-6)
     assert np.allclose(window["actions"], actions[wanted], atol=1e-6)
     assert {k: tuple(v.shape) for k, v in window["obs"].items()} == {
-        "agentview_rgb": (3, 3, SIZE, SIZE), "eye_in_hand_rgb": (3, 3, SIZE, SIZE), "gripper_states": (3, 2),
+        "agentview_rgb": (3, 3, SIZE, SIZE),
+        "eye_in_hand_rgb": (3, 3, SIZE, SIZE),
+        "gripper_states": (3, 2),
         "joint_states": (3, 7),
-    }  # fmt: skip
+    }
 
 
 def test_frames_may_be_stacked(file):

@@ -224,9 +224,15 @@ def test_multitask_learns_all_at_once(files, monkeypatch):
 
 
 def test_schedules_and_optimisers_are_torchs(files):
-    algo, _, _ = learner(files, "base", "train.optimizer.name=torch.optim.SGD", "~train.optimizer.kwargs.betas",
-                         "train.scheduler.name=torch.optim.lr_scheduler.StepLR", "~train.scheduler.kwargs.eta_min",
-                         "+train.scheduler.kwargs.step_size=2")  # fmt: skip
+    algo, _, _ = learner(
+        files,
+        "base",
+        "train.optimizer.name=torch.optim.SGD",
+        "~train.optimizer.kwargs.betas",
+        "train.scheduler.name=torch.optim.lr_scheduler.StepLR",
+        "~train.scheduler.kwargs.eta_min",
+        "+train.scheduler.kwargs.step_size=2",
+    )
     assert isinstance(algo.optimizer, torch.optim.SGD)
     assert isinstance(algo.scheduler, torch.optim.lr_scheduler.StepLR)
     with pytest.raises(LiberoError, match="AdamW"):
@@ -257,10 +263,13 @@ class MyTransformerPolicy(BasePolicy):
         policy.language_encoder.network_kwargs.output_size = size
         self.language_encoder = MLPEncoder(**policy.language_encoder.network_kwargs)
         self.extra_encoder = ExtraModalityTokens(
-            use_joint=cfg.data.use_joint, use_gripper=cfg.data.use_gripper, use_ee=cfg.data.use_ee,
-            extra_num_layers=policy.extra_num_layers, extra_hidden_size=policy.extra_hidden_size,
+            use_joint=cfg.data.use_joint,
+            use_gripper=cfg.data.use_gripper,
+            use_ee=cfg.data.use_ee,
+            extra_num_layers=policy.extra_num_layers,
+            extra_hidden_size=policy.extra_hidden_size,
             extra_embedding_size=size,
-        )  # fmt: skip
+        )
         policy.temporal_position_encoding.network_kwargs.input_size = size
         self.positions = SinusoidalPositionEncoding(**policy.temporal_position_encoding.network_kwargs)
         self.temporal_transformer = TransformerDecoder(

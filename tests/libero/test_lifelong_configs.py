@@ -27,10 +27,13 @@ pytestmark = pytest.mark.unit
 GROUPS = ("data", "eval", "lifelong", "policy", "train")
 PARTS = sorted(p.relative_to(CONFIGS / "policy") for p in CONFIGS.glob("policy/*/*.yaml"))
 NETWORKS = {
-    **data_augmentation.AUGMENTATIONS, **language_modules.ENCODERS, **HEADS,
-    "ResnetEncoder": rgb_modules.ResnetEncoder, "PatchEncoder": rgb_modules.PatchEncoder,
+    **data_augmentation.AUGMENTATIONS,
+    **language_modules.ENCODERS,
+    **HEADS,
+    "ResnetEncoder": rgb_modules.ResnetEncoder,
+    "PatchEncoder": rgb_modules.PatchEncoder,
     "SinusoidalPositionEncoding": transformer_modules.SinusoidalPositionEncoding,
-}  # fmt: skip
+}
 
 
 def words() -> set[str]:

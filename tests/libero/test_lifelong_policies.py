@@ -50,16 +50,22 @@ def test_sizes_are_the_originals(group, count):
 
 SMALL = {
     "bc_rnn_policy": (
-        "policy.image_embed_size=8", "policy.text_embed_size=8", "policy.rnn_hidden_size=8", "policy.rnn_num_layers=1",
+        "policy.image_embed_size=8",
+        "policy.text_embed_size=8",
+        "policy.rnn_hidden_size=8",
+        "policy.rnn_num_layers=1",
         "+policy.native.image_width=8",
     ),
     "bc_transformer_policy": ("+policy.native.image_width=8",),
     "bc_vilt_policy": (
-        "policy.spatial_down_sample_embed_size=8", "policy.spatial_transformer_num_layers=1",
-        "policy.spatial_transformer_num_heads=2", "policy.spatial_transformer_head_output_size=4",
-        "policy.spatial_transformer_mlp_hidden_size=8", "+policy.native.patch_width=8",
+        "policy.spatial_down_sample_embed_size=8",
+        "policy.spatial_transformer_num_layers=1",
+        "policy.spatial_transformer_num_heads=2",
+        "policy.spatial_transformer_head_output_size=4",
+        "policy.spatial_transformer_mlp_hidden_size=8",
+        "+policy.native.patch_width=8",
     ),
-}  # fmt: skip
+}
 
 
 def small(group: str, file, *overrides: str):
@@ -146,13 +152,19 @@ def test_weights_are_the_native_networks(file):
 
 def test_configured_variants(file):
     policy, batch = small(
-        "bc_transformer_policy", file, "policy.extra_num_layers=2", "policy/language_encoder=rnn_encoder",
-        "policy/policy_head=deterministic_head", "policy.policy_head.network_kwargs.hidden_size=8",
-        "policy.image_encoder.network_kwargs.freeze=true", "policy.image_encoder.network_kwargs.language_fusion=none",
+        "bc_transformer_policy",
+        file,
+        "policy.extra_num_layers=2",
+        "policy/language_encoder=rnn_encoder",
+        "policy/policy_head=deterministic_head",
+        "policy.policy_head.network_kwargs.hidden_size=8",
+        "policy.image_encoder.network_kwargs.freeze=true",
+        "policy.image_encoder.network_kwargs.language_fusion=none",
         "policy/data_augmentation@policy.color_aug=img_color_jitter_group_aug",
-        "policy/data_augmentation@policy.translation_aug=translation_aug_group", "data.use_ee=true",
+        "policy/data_augmentation@policy.translation_aug=translation_aug_group",
+        "data.use_ee=true",
         "data.obs.modality.low_dim=[gripper_states,joint_states,ee_states]",
-    )  # fmt: skip
+    )
     policy.compute_loss(batch).backward()
     assert policy(batch).shape == (4, 3, 7)
     names = {n.split(".")[1] for n, p in policy.named_parameters() if p.requires_grad and p.grad is not None}

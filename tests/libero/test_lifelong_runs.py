@@ -62,8 +62,11 @@ def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
     assert path == Path("experiments/two_tasks/PackNet/BCTransformerPolicy_seed10000/run_001")
     result = torch.load(path / "result.pt")
     assert {k: tuple(result[k].shape) for k in ("L_conf_mat", "S_conf_mat", "L_fwd", "S_fwd")} == {
-        "L_conf_mat": (2, 2), "S_conf_mat": (2, 2), "L_fwd": (2,), "S_fwd": (2,),
-    }  # fmt: skip
+        "L_conf_mat": (2, 2),
+        "S_conf_mat": (2, 2),
+        "L_fwd": (2,),
+        "S_fwd": (2,),
+    }
     assert (result["L_conf_mat"] != 0).tolist() == [[True, False], [True, True]]
     assert (result["S_conf_mat"] == 0).all(), "nobody succeeds in four steps"
     for key in ("k1_p0", "k0_e1"):
@@ -71,8 +74,20 @@ def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
         assert len(states) == metric.SETTLE_STEPS + 4 and states[0].shape == states[-1].shape
         assert states[1][0] > states[0][0], "the first number is the time"
 
-    arguments = ["--benchmark", "two_tasks", "--task_id", "0", "--algo", "packnet", "--policy", "bc_transformer_policy",
-                 "--seed", "10000", "--load_task", "1"]  # fmt: skip
+    arguments = [
+        "--benchmark",
+        "two_tasks",
+        "--task_id",
+        "0",
+        "--algo",
+        "packnet",
+        "--policy",
+        "bc_transformer_policy",
+        "--seed",
+        "10000",
+        "--load_task",
+        "1",
+    ]
     assert evaluate.main([*arguments, "--save-videos", "--n_eval", "2"]) == 0
     assert "success 0/2 = 0%" in capsys.readouterr().out
     stats = torch.load(path / "task1_model_on0.stats")
@@ -124,17 +139,28 @@ def test_demonstrations_that_are_not_there_are_recorded(folder, monkeypatch, cap
 def test_from_the_command_line(folder, tmp_path):
     """The script itself, with groups of tasks; its folder's modules do not stand for others of their names."""
     command = [
-        sys.executable, str(ROOT / "libero/lifelong/main.py"), *TINY, *TINY_TRANSFORMER, *SMALL, f"folder={folder}",
-        "benchmark_name=LIBERO_OBJECT", "lifelong=multitask", "eval.eval=false", "data.task_group_size=5",
-        "train.debug=true", "seed=7",
-    ]  # fmt: skip
+        sys.executable,
+        str(ROOT / "libero/lifelong/main.py"),
+        *TINY,
+        *TINY_TRANSFORMER,
+        *SMALL,
+        f"folder={folder}",
+        "benchmark_name=LIBERO_OBJECT",
+        "lifelong=multitask",
+        "eval.eval=false",
+        "data.task_group_size=5",
+        "train.debug=true",
+        "seed=7",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=dict(os.environ))
     assert done.returncode == 0, done.stderr
     assert "train.debug=True has no effect" in done.stdout
     path = tmp_path / "experiments/LIBERO_OBJECT/Multitask/BCTransformerPolicy_seed7/run_001"
     assert {p.name for p in path.glob("*.pth")} == {
-        "multitask_model.pth", "multitask_model_ep0.pth", "multitask_model_ep1.pth",
-    }  # fmt: skip
+        "multitask_model.pth",
+        "multitask_model_ep0.pth",
+        "multitask_model_ep1.pth",
+    }
     assert torch.load(path / "result.pt")["S_conf_mat"].shape == (2, 2)
 
 

@@ -118,12 +118,26 @@ def test_goals_may_be_expressions_over_places_that_nothing_declares():
 
 
 def test_things_are_added_to_a_scene_and_its_own_can_be_moved():
-    task = make_task(scene="kitchen_scene1", objects=["plate", {"butter": 2}], goal="On butter_2 plate_2", language="x",
-                     place={"plate_2": [0.1, 0.1], "butter_1": "plate_2", "butter_2": "In wooden_cabinet_1_top_region",
-                            "plate_1": [-0.1, 0.25]})  # fmt: skip
+    task = make_task(
+        scene="kitchen_scene1",
+        objects=["plate", {"butter": 2}],
+        goal="On butter_2 plate_2",
+        language="x",
+        place={
+            "plate_2": [0.1, 0.1],
+            "butter_1": "plate_2",
+            "butter_2": "In wooden_cabinet_1_top_region",
+            "plate_1": [-0.1, 0.25],
+        },
+    )
     problem = task.problem
-    assert dict(problem.objects) == {"akita_black_bowl_1": "akita_black_bowl", "plate_1": "plate", "plate_2": "plate",
-                                     "butter_1": "butter", "butter_2": "butter"}  # fmt: skip
+    assert dict(problem.objects) == {
+        "akita_black_bowl_1": "akita_black_bowl",
+        "plate_1": "plate",
+        "plate_2": "plate",
+        "butter_1": "butter",
+        "butter_2": "butter",
+    }
     assert Atom("On", ("butter_1", "plate_2")) in problem.init
     assert Atom("In", ("butter_2", "wooden_cabinet_1_top_region")) in problem.init
     assert [a.args[1] for a in problem.init if a.args[0] == "plate_1"] == ["kitchen_table_plate_1_start"]
@@ -236,11 +250,15 @@ def test_the_settings_of_a_run_take_files(tmp_path):
         {},
         {"objects": ["butter", "basket"]},
         {"scene": "floor", "objects": ["milk", "butter", "ketchup", "basket"]},
-        {"furniture": ["wooden_cabinet"], "objects": ["butter"], "goal": ["Open wooden_cabinet_1_top_region"]},
+        {
+            "furniture": ["wooden_cabinet"],
+            "objects": ["butter"],
+            "goal": ["Open wooden_cabinet_1_top_region"],
+        },
         {"scene": "kitchen_scene1", "objects": ["butter"], "goal": ["On butter_1 plate_1"]},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_templates_are_tasks_with_room_between_things(options):
     text, task = task_template(**options)
     assert make_task(**yaml.safe_load(text)) == task

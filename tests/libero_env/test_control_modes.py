@@ -72,7 +72,9 @@ def test_the_action_space_is_the_controllers(mode):
 @pytest.mark.parametrize("mode", MODES, ids=str)
 def test_starts_do_not_depend_on_the_controller(mode):
     env, usual = make(mode), LiberoEnv(TASK, cameras=())
-    np.testing.assert_array_equal(env.reset(seed=4)[0]["joint_states"], usual.reset(seed=4)[0]["joint_states"])
+    np.testing.assert_array_equal(
+        env.reset(seed=4)[0]["joint_states"], usual.reset(seed=4)[0]["joint_states"]
+    )
     np.testing.assert_array_equal(env.world.physics_state(0), usual.world.physics_state(0))
     env.close()
     usual.close()
@@ -126,10 +128,23 @@ def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summin
     for velocity in np.cumsum(rng.normal(scale=0.02, size=(40, 7)), axis=0):
         qvel, unused = np.append(velocity, [0.0, 0.0])[None], np.zeros((1, 9, 3))
         state.kind.kernel(
-            np.zeros(1, np.int64), np.zeros((1, 8)), np.zeros((1, 9)), qvel, unused, unused, np.zeros((1, 3)),
-            np.zeros((1, 9)), np.zeros((1, 81)), bias, *state.arrays, ctrl, np.zeros((7, 7), np.int64), limit,
-            np.array([[0.0, 0.04], [-0.04, 0.0]]), np.zeros(7),
-        )  # fmt: skip
+            np.zeros(1, np.int64),
+            np.zeros((1, 8)),
+            np.zeros((1, 9)),
+            qvel,
+            unused,
+            unused,
+            np.zeros((1, 3)),
+            np.zeros((1, 9)),
+            np.zeros((1, 81)),
+            bias,
+            *state.arrays,
+            ctrl,
+            np.zeros((7, 7), np.int64),
+            limit,
+            np.array([[0.0, 0.04], [-0.04, 0.0]]),
+            np.zeros(7),
+        )
         error = state.goal[0] - velocity
         changes, last = [*changes, error - last][-5:], error
         total = total if saturated else total + error

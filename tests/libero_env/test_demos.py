@@ -68,8 +68,17 @@ def test_limit_and_keys_select(path):
 def test_file_has_the_originals_layout(path):
     with h5py.File(path) as handle:
         data = handle["data"]
-        assert {"env_name", "problem_info", "macros_image_convention", "bddl_file_name", "bddl_file_content",
-                "env_args", "num_demos", "total", "tag"} <= set(data.attrs)  # fmt: skip
+        assert {
+            "env_name",
+            "problem_info",
+            "macros_image_convention",
+            "bddl_file_name",
+            "bddl_file_content",
+            "env_args",
+            "num_demos",
+            "total",
+            "tag",
+        } <= set(data.attrs)
         assert data.attrs["num_demos"] == 3 and data.attrs["total"] == 33 and data.attrs["tag"] == "libero-v1"
         assert data.attrs["env_name"] == "Libero_Floor_Manipulation"
         info = json.loads(data.attrs["problem_info"])
@@ -77,8 +86,15 @@ def test_file_has_the_originals_layout(path):
             info["problem_name"] == "libero_floor_manipulation" and "butter" in info["language_instruction"]
         )
         demo = data["demo_0"]
-        types = {"actions": "float64", "states": "float64", "robot_states": "float64", "rewards": "uint8",
-                 "dones": "uint8", "obs/agentview_rgb": "uint8", "obs/ee_states": "float64"}  # fmt: skip
+        types = {
+            "actions": "float64",
+            "states": "float64",
+            "robot_states": "float64",
+            "rewards": "uint8",
+            "dones": "uint8",
+            "obs/agentview_rgb": "uint8",
+            "obs/ee_states": "float64",
+        }
         assert {key: str(demo[key].dtype) for key in types} == types
         np.testing.assert_array_equal(demo["obs/agentview_rgb"][()], episode(0).obs["agentview_rgb"][:, ::-1])
         np.testing.assert_array_equal(demo.attrs["init_state"], demo["states"][0])

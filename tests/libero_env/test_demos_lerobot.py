@@ -113,8 +113,11 @@ def test_a_full_video_goes_on_in_the_next_file(files, tmp_path):
     indices = [row["videos/observation.images.image/file_index"] for row in rows]
     assert videos == [f"file-{i:03d}.mp4" for i in sorted(set(indices))] and len(videos) > 1
     for i in set(indices):
-        firsts = [r["videos/observation.images.image/from_timestamp"] for r in rows
-                  if r["videos/observation.images.image/file_index"] == i]  # fmt: skip
+        firsts = [
+            r["videos/observation.images.image/from_timestamp"]
+            for r in rows
+            if r["videos/observation.images.image/file_index"] == i
+        ]
         assert firsts[0] == 0.0 and firsts == sorted(firsts)
 
 

@@ -135,8 +135,15 @@ def test_statistics_add_up():
     found = (Histogram.of(frames[:7]) + Histogram.of(frames[7:])).values()
     pixels = frames.reshape(-1, 3) / 255.0
     quantiles = np.quantile(pixels, QUANTILES, axis=0, method="inverted_cdf")
-    for name, wanted in {"min": pixels.min(0), "max": pixels.max(0), "mean": pixels.mean(0), "std": pixels.std(0),
-                         "q01": quantiles[0], "q50": quantiles[2], "q99": quantiles[4]}.items():  # fmt: skip
+    for name, wanted in {
+        "min": pixels.min(0),
+        "max": pixels.max(0),
+        "mean": pixels.mean(0),
+        "std": pixels.std(0),
+        "q01": quantiles[0],
+        "q50": quantiles[2],
+        "q99": quantiles[4],
+    }.items():
         np.testing.assert_allclose(np.ravel(found[name]), wanted, atol=1e-9, err_msg=name)
         assert np.shape(found[name]) == (3, 1, 1)
     assert found["count"] == [20]
@@ -149,8 +156,13 @@ def test_robomimic_reads_the_files(path):
         {"obs": {"low_dim": ["joint_states"], "rgb": ["agentview_rgb"]}}
     )
     windows = dataset.SequenceDataset(
-        str(path), obs_keys=("joint_states", "agentview_rgb"), dataset_keys=("actions", "rewards", "dones"),
-        load_next_obs=False, frame_stack=1, seq_length=4, hdf5_cache_mode=None,
-    )  # fmt: skip
+        str(path),
+        obs_keys=("joint_states", "agentview_rgb"),
+        dataset_keys=("actions", "rewards", "dones"),
+        load_next_obs=False,
+        frame_stack=1,
+        seq_length=4,
+        hdf5_cache_mode=None,
+    )
     assert windows.n_demos == 3 and len(windows) == 33
     np.testing.assert_array_equal(windows[0]["actions"], episode(0).actions[:4])

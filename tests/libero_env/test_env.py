@@ -221,7 +221,9 @@ def test_a_task_of_ones_own_gets_initial_states_of_its_own(tmp_path, monkeypatch
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
     task = dataclasses.replace(get_suite("libero_object").tasks[0], suite="mine", name="my_task")
     scene = build_scene(task.problem)
-    monkeypatch.setattr(init_states, "generate_init_states", lambda task, scene: generate_init_states(task, scene, 2))
+    monkeypatch.setattr(
+        init_states, "generate_init_states", lambda task, scene: generate_init_states(task, scene, 2)
+    )
     made = load_init_states(task, scene)
     monkeypatch.setattr(init_states, "generate_init_states", None)  # found again, not made again
     np.testing.assert_array_equal(load_init_states(task, scene), made)

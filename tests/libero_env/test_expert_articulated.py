@@ -63,10 +63,18 @@ def make_task(tmp_path, category, region, state, begin, place, yaw):
     x, y = place
     address = f"thing_1_{region}" if region else "thing_1"
     text = PROBLEM.format(
-        category=category, state=state, goal=state.capitalize(), address=address, yaw=yaw,
-        part=f"({region} (:target thing_1))" if region else "", begin=f"({begin} {address})" if begin else "",
-        x0=x - 0.01, y0=y - 0.01, x1=x + 0.01, y1=y + 0.01,
-    )  # fmt: skip
+        category=category,
+        state=state,
+        goal=state.capitalize(),
+        address=address,
+        yaw=yaw,
+        part=f"({region} (:target thing_1))" if region else "",
+        begin=f"({begin} {address})" if begin else "",
+        x0=x - 0.01,
+        y0=y - 0.01,
+        x1=x + 0.01,
+        y1=y + 0.01,
+    )
     file = tmp_path / f"{category}_{region}_{state}.bddl"
     file.write_text(text)
     return read_task(file), address

@@ -86,8 +86,13 @@ def test_a_textured_mesh_becomes_an_object_of_a_scene(tmp_path):
         picture = np.asarray(opened)
     assert picture.shape == (2 * 224, 4 * 224, 3) and np.ptp(picture) > 100
 
-    task = make_task(scene="kitchen", objects=["my_box", "plate"], place={"my_box": (0, 0), "plate": (0, 0.2)},
-                     goal="On my_box_1 plate_1", language="lift the box")  # fmt: skip
+    task = make_task(
+        scene="kitchen",
+        objects=["my_box", "plate"],
+        place={"my_box": (0, 0), "plate": (0, 0.2)},
+        goal="On my_box_1 plate_1",
+        language="lift the box",
+    )
     model = build_scene(task.problem).model
     body = model.body("my_box_1_main")
     assert model.body_mass[body.id] == pytest.approx(mass, rel=1e-4)

@@ -32,7 +32,10 @@ def world_points(env, camera, depth):
     """Where each pixel's surface is in the world, (H, W, 3), from depth and the camera's figures."""
     observer = env.world.observer
     rows, cols = np.indices(depth.shape)
-    rays = np.stack([cols + 0.5, rows + 0.5, np.ones(depth.shape)], -1) @ np.linalg.inv(observer.intrinsics(camera)).T
+    rays = (
+        np.stack([cols + 0.5, rows + 0.5, np.ones(depth.shape)], -1)
+        @ np.linalg.inv(observer.intrinsics(camera)).T
+    )
     pose = observer.camera_to_world(0, camera)
     return rays * depth[..., None] @ pose[:3, :3].T + pose[:3, 3]
 
@@ -87,7 +90,9 @@ def test_the_hands_camera_moves_with_the_hand(kitchen):
 
 def test_kinds_of_segmentation_agree(kitchen):
     world = kitchen.world
-    of = {kind: world.frame(0, "agentview", f"segmentation_{kind}") for kind in ("instance", "class", "element")}
+    of = {
+        kind: world.frame(0, "agentview", f"segmentation_{kind}") for kind in ("instance", "class", "element")
+    }
     names = {kind: world.observer.labels(kind) for kind in of}
     scene = world.scene
     for instance, category, element in {*zip(*(of[kind].ravel().tolist() for kind in of), strict=True)}:

@@ -52,7 +52,11 @@ def test_the_workspace_has_the_measured_figures(scene, shared):
     data.qpos[:9] = figures["arm_qpos"]
     mujoco.mj_forward(model, data)
     assert model.opt.timestep == figures["timestep"]
-    assert (model.opt.impratio, model.opt.cone, model.opt.integrator) == (20.0, figures["cone"], figures["integrator"])
+    assert (model.opt.impratio, model.opt.cone, model.opt.integrator) == (
+        20.0,
+        figures["cone"],
+        figures["integrator"],
+    )
     assert (model.opt.density, model.opt.viscosity) == (figures["density"], figures["viscosity"])
     np.testing.assert_allclose(data.site("gripper0_grip_site").xpos, figures["grip_site_world"], atol=1e-5)
     for name, camera in figures["cameras"].items():
@@ -147,7 +151,10 @@ def test_predicates_do_not_touch_the_state(view, task):
 
 
 def test_goals_combine(view):
-    yes, no = Atom("In", ("milk_1", "floor_other_object_region_2")), Atom("In", ("milk_1", "basket_1_contain_region"))
+    yes, no = (
+        Atom("In", ("milk_1", "floor_other_object_region_2")),
+        Atom("In", ("milk_1", "basket_1_contain_region")),
+    )
     assert not evaluate(no, view)
     yes = Not(no)
     assert evaluate(And((yes, Not(no))), view) and not evaluate(And((yes, no)), view)
@@ -163,7 +170,9 @@ def test_pictures_are_upright_and_repeat():
     again = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
     np.testing.assert_array_equal(frame, again)
     brown = lambda image: ((image[..., 0] > image[..., 2] * 1.6) & (image[..., 0] > 60)).sum()  # noqa: E731
-    assert brown(frame[24:48, 40:]) > 5 * max(brown(frame[:16, :32]), 1), "the basket stands on the right, below middle"
+    assert brown(frame[24:48, 40:]) > 5 * max(brown(frame[:16, :32]), 1), (
+        "the basket stands on the right, below middle"
+    )
     env.close()
     env.close()
 

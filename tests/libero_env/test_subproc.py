@@ -22,10 +22,12 @@ def counter(fault="", at=3, size=2):
         from gymnasium import spaces
 
         class Counter(gymnasium.Env):
-            observation_space = spaces.Dict({
-                "count": spaces.Box(0, 1e6, (), np.float64),
-                "own": spaces.Box(-1e6, 1e6, (size,), np.float64),
-            })  # fmt: skip
+            observation_space = spaces.Dict(
+                {
+                    "count": spaces.Box(0, 1e6, (), np.float64),
+                    "own": spaces.Box(-1e6, 1e6, (size,), np.float64),
+                }
+            )
             action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
             count = 0
 

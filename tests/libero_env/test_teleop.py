@@ -104,8 +104,13 @@ def test_reports_of_a_mouse():
 @pytest.mark.unit
 def test_keys_of_windows_and_terminals():
     assert [key_name(code) for code in (256, 32, ord("W"), ord("Q"), ord("M"), 300)] == [
-        QUIT, GRIPPER, "w", "q", None, None,
-    ]  # fmt: skip
+        QUIT,
+        GRIPPER,
+        "w",
+        "q",
+        None,
+        None,
+    ]
     keyboard = Keyboard()
     press_typed(keyboard, "\x1b[A")
     assert (keyboard.command, keyboard.steps) == (None, {})

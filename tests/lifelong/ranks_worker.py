@@ -41,9 +41,21 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
     walk.ALGORITHMS[algo] = lambda: instantiate(config.algo)
     with seeded(7):
         policy = BCTransformer(
-            spec=walk.SPEC, embed_dim=8, image_width=8, stage_blocks=[1], stem_pool=False, layers=1, heads=2,
-            head_dim=4, mlp_dim=8, head_hidden=8, head_layers=1, modes=2, min_std=0.05, dropout=0.0,
-        )  # fmt: skip
+            spec=walk.SPEC,
+            embed_dim=8,
+            image_width=8,
+            stage_blocks=[1],
+            stem_pool=False,
+            layers=1,
+            heads=2,
+            head_dim=4,
+            mlp_dim=8,
+            head_hidden=8,
+            head_layers=1,
+            modes=2,
+            min_std=0.05,
+            dropout=0.0,
+        )
     parts = walk.parts(folder / algo, algo)
     parts = replace(
         parts,

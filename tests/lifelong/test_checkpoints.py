@@ -15,7 +15,12 @@ def test_a_tree_comes_back_as_it_was(tmp_path):
     net(torch.ones(1, 3)).sum().backward()
     optimizer.step()
     view = torch.arange(6.0).reshape(2, 3).t()
-    tree = {"opt": optimizer.state_dict(), "view": view, "same": view, "list": [1, 2.5, None, "x", (True, {3: view})]}
+    tree = {
+        "opt": optimizer.state_dict(),
+        "view": view,
+        "same": view,
+        "list": [1, 2.5, None, "x", (True, {3: view})],
+    }
     checkpoints.save(tmp_path / "a" / "state.safetensors", tree)
     back = checkpoints.load(tmp_path / "a" / "state.safetensors")
     assert back["list"][:4] == [1, 2.5, None, "x"]

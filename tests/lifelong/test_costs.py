@@ -37,9 +37,20 @@ def dataset(task: int = 0, frames: int = 20) -> SequenceVLDataset:
 def transformer() -> BCTransformer:
     with seeded(7):
         return BCTransformer(
-            spec=SPEC, embed_dim=8, image_width=8, stage_blocks=[1], stem_pool=False, layers=1, heads=2,
-            head_dim=4, mlp_dim=8, head_hidden=8, head_layers=1, modes=2, min_std=0.05,
-        )  # fmt: skip
+            spec=SPEC,
+            embed_dim=8,
+            image_width=8,
+            stage_blocks=[1],
+            stem_pool=False,
+            layers=1,
+            heads=2,
+            head_dim=4,
+            mlp_dim=8,
+            head_hidden=8,
+            head_layers=1,
+            modes=2,
+            min_std=0.05,
+        )
 
 
 def counted(work) -> int:

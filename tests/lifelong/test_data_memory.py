@@ -115,8 +115,11 @@ def test_frames_are_written_once_and_found_again(path: Path, monkeypatch: pytest
     source = DemoSource(path, SPEC)
     first = open_windows(source, language=LANGUAGE, memory="mmap")
     monkeypatch.setattr(frame_cache, "_write_arrays", lambda *_: pytest.fail("written again"))
-    again = open_windows(DemoSource(path, PolicySpec(image_size=(6, 8), language_dim=4, seq_len=2)),
-                         language=LANGUAGE, memory="mmap")  # fmt: skip
+    again = open_windows(
+        DemoSource(path, PolicySpec(image_size=(6, 8), language_dim=4, seq_len=2)),
+        language=LANGUAGE,
+        memory="mmap",
+    )
     assert torch.equal(again.images, first.images)
     assert again.batch(torch.arange(3)).actions.shape == (3, 2, 7)
     assert not list(cache_root().glob("*.part")) and not list(cache_root().glob(".*.part"))

@@ -73,9 +73,20 @@ def parts(path, algo: str) -> Parts:
     datasets = {task: dataset(task) for task in range(TASKS)}
     with seeded(7):
         policy = BCTransformer(
-            spec=SPEC, embed_dim=8, image_width=8, stage_blocks=[1], stem_pool=False, layers=1, heads=2,
-            head_dim=4, mlp_dim=8, head_hidden=8, head_layers=1, modes=2, min_std=0.05,
-        )  # fmt: skip
+            spec=SPEC,
+            embed_dim=8,
+            image_width=8,
+            stage_blocks=[1],
+            stem_pool=False,
+            layers=1,
+            heads=2,
+            head_dim=4,
+            mlp_dim=8,
+            head_hidden=8,
+            head_layers=1,
+            modes=2,
+            min_std=0.05,
+        )
     return Parts(
         instructions=tuple(f"do {task}" for task in range(TASKS)),
         languages=torch.stack([d.language for d in datasets.values()]),
@@ -100,7 +111,9 @@ def outcome(path, log):
     for record in log.read().records:
         values = {k: v for k, v in asdict(record).items() if k != "seconds"}
         if isinstance(record, CostRecord):  # what is counted, not what is measured
-            values["costs"] = {k: v for k, v in record.costs.items() if not k.endswith("seconds") and "peak" not in k}
+            values["costs"] = {
+                k: v for k, v in record.costs.items() if not k.endswith("seconds") and "peak" not in k
+            }
         key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
         key += tuple(values.get("costs", ()))
         assert kept.setdefault(key, values) == values, "a record was made twice, and differs"

@@ -176,16 +176,27 @@ def four(path: Path, algorithm, **changes) -> Parts:
     datasets = {task: dataset(task) for task in range(4)}
     p = parts(path, "sequential")
     record = start_record(
-        algo="x", benchmark="y", policy="z", seed=1, preset="", tasks="abcd", instructions="abcd", config="",
+        algo="x",
+        benchmark="y",
+        policy="z",
+        seed=1,
+        preset="",
+        tasks="abcd",
+        instructions="abcd",
+        config="",
         group_size=changes.get("group_size", 2),
-    )  # fmt: skip
+    )
     if not p.directory.log.read().records:
         p.directory.log.append(record)
     return replace(
-        p, instructions=tuple("abcd"), languages=torch.stack([d.language for d in datasets.values()]),
-        datasets=datasets, algorithm=algorithm, fit=replace(p.fit, epochs=1, steps_per_epoch=2),
+        p,
+        instructions=tuple("abcd"),
+        languages=torch.stack([d.language for d in datasets.values()]),
+        datasets=datasets,
+        algorithm=algorithm,
+        fit=replace(p.fit, epochs=1, steps_per_epoch=2),
         **({"group_size": 2} | changes),
-    )  # fmt: skip
+    )
 
 
 def kept(path: Path) -> tuple[dict, dict]:
@@ -204,8 +215,13 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
     results = ResultLog(tmp_path / "whole" / "results.jsonl").read()
     evals = results.of(EvalRecord)
     assert {(r.learned, r.task) for r in evals if r.phase == "matrix"} == {
-        (1, 0), (1, 1), (3, 0), (3, 1), (3, 2), (3, 3)
-    }  # fmt: skip
+        (1, 0),
+        (1, 1),
+        (3, 0),
+        (3, 1),
+        (3, 2),
+        (3, 3),
+    }
     assert {(r.learned, r.task, r.epoch) for r in evals if r.phase == "curve"} == {
         (last, task, epoch)
         for last, group in ((1, (0, 1)), (3, (2, 3)))
@@ -230,20 +246,33 @@ def test_metrics_take_a_group_for_one_task(tmp_path) -> None:
     log = ResultLog(tmp_path / "results.jsonl")
     log.append(
         start_record(
-            algo="er", benchmark="b", policy="p", seed=1, preset="", tasks="abcd", instructions="abcd",
-            config="", group_size=2,
+            algo="er",
+            benchmark="b",
+            policy="p",
+            seed=1,
+            preset="",
+            tasks="abcd",
+            instructions="abcd",
+            config="",
+            group_size=2,
         )
-    )  # fmt: skip
+    )
 
     def evaluated(phase: str, learned: int, epoch: int, rates: dict[int, float]) -> None:
         for task, rate in rates.items():
             successes = tuple(k < round(10 * rate) for k in range(10))
             log.append(
                 EvalRecord(
-                    phase=phase, learned=learned, epoch=epoch, task=task, successes=successes, lengths=(1,) * 10,
-                    init_states=tuple(range(10)), seconds=1.0,
+                    phase=phase,
+                    learned=learned,
+                    epoch=epoch,
+                    task=task,
+                    successes=successes,
+                    lengths=(1,) * 10,
+                    init_states=tuple(range(10)),
+                    seconds=1.0,
                 )
-            )  # fmt: skip
+            )
 
     evaluated("curve", 1, 0, {0: 0.0, 1: 0.0})
     evaluated("curve", 1, 5, {0: 0.6, 1: 0.8})  # the best of the group: 0.7

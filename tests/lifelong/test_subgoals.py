@@ -20,10 +20,19 @@ def record(
     first = lambda counts: tuple(tuple(i < n for n in counts) for i in range(10))  # noqa: E731
     start = start or [0] * len(atoms)
     return EvalRecord(
-        phase="matrix", learned=learned, epoch=0, task=task, successes=tuple(all(r) for r in first(ever)),
-        lengths=(5,) * 10, init_states=tuple(range(10)), seconds=1.0, atoms=atoms, atoms_at_start=first(start),
-        atoms_ever=first(ever), atoms_at_end=first([n // 2 for n in ever]),
-    )  # fmt: skip
+        phase="matrix",
+        learned=learned,
+        epoch=0,
+        task=task,
+        successes=tuple(all(r) for r in first(ever)),
+        lengths=(5,) * 10,
+        init_states=tuple(range(10)),
+        seconds=1.0,
+        atoms=atoms,
+        atoms_at_start=first(start),
+        atoms_ever=first(ever),
+        atoms_at_end=first([n // 2 for n in ever]),
+    )
 
 
 RUN = [

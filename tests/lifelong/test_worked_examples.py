@@ -17,9 +17,15 @@ pytestmark = pytest.mark.unit
 
 def evaluation(phase: str, learned: int, epoch: int, task: int, wins: int) -> EvalRecord:
     return EvalRecord(
-        phase=phase, learned=learned, epoch=epoch, task=task, successes=tuple(i < wins for i in range(20)),
-        lengths=(9,) * 20, init_states=tuple(range(20)), seconds=1.0,
-    )  # fmt: skip
+        phase=phase,
+        learned=learned,
+        epoch=epoch,
+        task=task,
+        successes=tuple(i < wins for i in range(20)),
+        lengths=(9,) * 20,
+        init_states=tuple(range(20)),
+        seconds=1.0,
+    )
 
 
 def test_metrics_of_three_tasks_from_their_records():

@@ -45,9 +45,12 @@ def training_data(scope: Scope) -> Scope:
     from libero.lifelong.config import load_config
 
     cfg = load_config(
-        "device=cpu", "train.n_epochs=1", "train.use_augmentation=false", "policy.transformer_num_layers=1",
+        "device=cpu",
+        "train.n_epochs=1",
+        "train.use_augmentation=false",
+        "policy.transformer_num_layers=1",
         "policy.image_encoder.network_kwargs.remove_layer_num=5",
-    )  # fmt: skip
+    )
     cfg.shape_meta = scope["shape_meta"]
     cfg.policy.language_encoder.network_kwargs.input_size = scope["task_embs"].shape[-1]
     few = [torch.utils.data.Subset(dataset, range(4)) for dataset in scope["datasets"]]

@@ -56,10 +56,23 @@ def _templates(scene_type: str, number: int) -> list[type[BenchmarkScene]]:
 
 
 (
-    KitchenScene1, KitchenScene2, KitchenScene3, KitchenScene4, KitchenScene5,
-    KitchenScene6, KitchenScene7, KitchenScene8, KitchenScene9, KitchenScene10,
-) = _templates("kitchen", 10)  # fmt: skip
+    KitchenScene1,
+    KitchenScene2,
+    KitchenScene3,
+    KitchenScene4,
+    KitchenScene5,
+    KitchenScene6,
+    KitchenScene7,
+    KitchenScene8,
+    KitchenScene9,
+    KitchenScene10,
+) = _templates("kitchen", 10)
 (
-    LivingRoomScene1, LivingRoomScene2, LivingRoomScene3, LivingRoomScene4, LivingRoomScene5, LivingRoomScene6,
-) = _templates("living_room", 6)  # fmt: skip
+    LivingRoomScene1,
+    LivingRoomScene2,
+    LivingRoomScene3,
+    LivingRoomScene4,
+    LivingRoomScene5,
+    LivingRoomScene6,
+) = _templates("living_room", 6)
 StudyScene1, StudyScene2, StudyScene3, StudyScene4 = _templates("study", 4)

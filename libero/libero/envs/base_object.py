@@ -279,5 +279,7 @@ class MujocoXMLObject(BaseObject):
 
 def declare(base: type[BaseObject], module: str, names: str) -> list[type]:
     """Subclasses of `base` for these class names, registered, in order."""
-    return [register_object(type(name, (base,), {"__module__": module, "__doc__": f"`{category_of(name)}`"}))
-            for name in names.split()]  # fmt: skip
+    return [
+        register_object(type(name, (base,), {"__module__": module, "__doc__": f"`{category_of(name)}`"}))
+        for name in names.split()
+    ]

@@ -33,11 +33,27 @@ TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz
 # What robosuite or the original take, and what follows from the task file or means nothing without a window here.
 WITHOUT_EFFECT = (
-    "arena_type", "custom_material", "env_name", "hard_reset", "mount_types", "render_collision_mesh",
-    "render_gpu_device_id", "render_visual_mesh", "renderer", "renderer_config", "robot_configs",
-    "scene_properties", "scene_xml", "table_friction", "table_full_size", "table_offset",
-    "visualization_sites_list", "workspace_name", "workspace_offset", "z_offset",
-)  # fmt: skip
+    "arena_type",
+    "custom_material",
+    "env_name",
+    "hard_reset",
+    "mount_types",
+    "render_collision_mesh",
+    "render_gpu_device_id",
+    "render_visual_mesh",
+    "renderer",
+    "renderer_config",
+    "robot_configs",
+    "scene_properties",
+    "scene_xml",
+    "table_friction",
+    "table_full_size",
+    "table_offset",
+    "visualization_sites_list",
+    "workspace_name",
+    "workspace_offset",
+    "z_offset",
+)
 
 
 class EpisodeOverError(LiberoError, ValueError):

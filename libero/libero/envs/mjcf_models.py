@@ -144,8 +144,11 @@ def _measured(xml: str) -> dict[str, tuple[float, ...]]:
         half = np.abs(mat) @ model.geom_aabb[geom, 3:]
         low, high = np.minimum(low, middle - half), np.maximum(high, middle + half)
     radius = float(np.abs([low[:2], high[:2]]).max())
-    return {"bottom": (0.0, 0.0, float(low[2])), "top": (0.0, 0.0, float(high[2])),
-            "horizontal_radius": (radius, 0.0, 0.0)}  # fmt: skip
+    return {
+        "bottom": (0.0, 0.0, float(low[2])),
+        "top": (0.0, 0.0, float(high[2])),
+        "horizontal_radius": (radius, 0.0, 0.0),
+    }
 
 
 def accept_plain_files(target_class: Any) -> None:

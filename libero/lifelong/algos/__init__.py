@@ -9,6 +9,14 @@ from libero.lifelong.algos.packnet import PackNet
 from libero.lifelong.algos.single_task import SingleTask
 
 __all__ = [
-    "AGEM", "ER", "EWC", "REGISTERED_ALGOS", "Multitask", "PackNet", "Sequential", "SingleTask", "get_algo_class",
+    "AGEM",
+    "ER",
+    "EWC",
+    "REGISTERED_ALGOS",
+    "Multitask",
+    "PackNet",
+    "Sequential",
+    "SingleTask",
+    "get_algo_class",
     "get_algo_list",
-]  # fmt: skip
+]

@@ -215,11 +215,16 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         """Success on tasks while they are learned, averaged."""
         rates = [
             evaluate_one_task_success(
-                self.cfg, self, benchmark.get_task(task), benchmark.get_task_emb(task), task, sim_states,
+                self.cfg,
+                self,
+                benchmark.get_task(task),
+                benchmark.get_task_emb(task),
+                task,
+                sim_states,
                 selecting=True,
             )
             for task in tasks
-        ]  # fmt: skip
+        ]
         return float(np.mean(rates))
 
     def practise(

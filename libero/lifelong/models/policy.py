@@ -27,8 +27,27 @@ from libero.lifelong.models.modules.transformer_modules import (
 from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
 
 __all__ = [
-    "Attention", "BCRNNPolicy", "BCTransformerPolicy", "BCViLTPolicy", "BasePolicy", "DeterministicHead", "DropPath",
-    "ExtraModalities", "ExtraModalityTokens", "GMMHead", "IdentityEncoder", "MLPEncoder", "Norm", "PatchEncoder",
-    "PerturbationAttention", "ResnetEncoder", "SinusoidalPositionEncoding", "SpatialProjection", "SpatialSoftmax",
-    "TransformerDecoder", "TransformerFeedForwardNN", "get_policy_class", "get_policy_list",
-]  # fmt: skip
+    "Attention",
+    "BCRNNPolicy",
+    "BCTransformerPolicy",
+    "BCViLTPolicy",
+    "BasePolicy",
+    "DeterministicHead",
+    "DropPath",
+    "ExtraModalities",
+    "ExtraModalityTokens",
+    "GMMHead",
+    "IdentityEncoder",
+    "MLPEncoder",
+    "Norm",
+    "PatchEncoder",
+    "PerturbationAttention",
+    "ResnetEncoder",
+    "SinusoidalPositionEncoding",
+    "SpatialProjection",
+    "SpatialSoftmax",
+    "TransformerDecoder",
+    "TransformerFeedForwardNN",
+    "get_policy_class",
+    "get_policy_list",
+]

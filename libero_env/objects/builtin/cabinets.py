@@ -1,6 +1,5 @@
 """Cabinets: two of drawers with bar handles, a low one, and one with a sliding door. All open towards -y."""
 
-
 from collections.abc import Sequence
 
 from libero_env.objects.builtin.assemble import Look

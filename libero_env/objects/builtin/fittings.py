@@ -76,8 +76,14 @@ def faucet() -> dict[str, Look]:
 
 def basin_faucet() -> dict[str, Look]:
     """Square mixer tap of polished steel; the lever on its top turns."""
-    palette = Palette({"steel": brushed((212, 215, 220), seed=70, depth=0.02), "hole": plain((40, 42, 46)),
-                       "blue": plain((54, 104, 196)), "red": plain((200, 44, 40))})  # fmt: skip
+    palette = Palette(
+        {
+            "steel": brushed((212, 215, 220), seed=70, depth=0.02),
+            "hole": plain((40, 42, 46)),
+            "blue": plain((54, 104, 196)),
+            "red": plain((200, 44, 40)),
+        }
+    )
     steel, hole, picture = palette["steel"], palette["hole"], palette.png()
     stand = merge(
         [
@@ -109,12 +115,14 @@ def _window_frame(palette: Palette) -> Mesh:
     return merge(
         [
             block((-0.1248, -0.0300, -0.1010), (0.1248, 0.0300, -0.0910), frame, bevel=0.0015),
-            *(block((x - 0.0075, -0.0150, -0.0915), (x + 0.0075, 0.0150, 0.0905), post, bevel=0.001)
-              for x in (-0.108, 0.108)),
+            *(
+                block((x - 0.0075, -0.0150, -0.0915), (x + 0.0075, 0.0150, 0.0905), post, bevel=0.001)
+                for x in (-0.108, 0.108)
+            ),
             block((-0.1010, -0.0150, -0.0915), (0.1010, 0.0150, -0.0755), frame),
             block((-0.1010, -0.0150, 0.0755), (0.1010, 0.0150, 0.0905), frame),
         ]
-    )  # fmt: skip
+    )
 
 
 def _sash(palette: Palette, x0: float, x1: float, y: float) -> Mesh:

@@ -197,7 +197,9 @@ def _facet(corners: Sequence[np.ndarray], half: np.ndarray, face: str, cell: Cel
     """Convex polygon of a body around the origin, turned outwards, with the picture of a face of its box."""
     points = np.array(corners, float)
     (ax, ay, az), (bx, by, bz) = points[1] - points[0], points[2] - points[0]
-    normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])  # np.cross takes ten times as long
+    normal = np.array(
+        [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
+    )  # np.cross takes ten times as long
     if normal @ points.mean(axis=0) < 0:
         points = points[::-1]
     share = 0.5 + 0.5 * points @ np.transpose(_FACES[face]) / (np.abs(_FACES[face]) @ half)

@@ -11,12 +11,20 @@ class ArticulatedObject(BuiltinObject):
 
 
 (
-    BasinFaucet, Faucet, FlatStove, Microwave, ShortCabinet, ShortFridge, SlideCabinet, WhiteCabinet,
-    Window, WoodenCabinet,
+    BasinFaucet,
+    Faucet,
+    FlatStove,
+    Microwave,
+    ShortCabinet,
+    ShortFridge,
+    SlideCabinet,
+    WhiteCabinet,
+    Window,
+    WoodenCabinet,
 ) = declare(
     ArticulatedObject,
     __name__,
     "BasinFaucet Faucet FlatStove Microwave ShortCabinet ShortFridge SlideCabinet WhiteCabinet "
     "Window WoodenCabinet",
-)  # fmt: skip
+)
 register_visual_change_object(FlatStove)

@@ -10,9 +10,15 @@ class GoogleScannedObject(BuiltinObject):
 
 
 (
-    AkitaBlackBowl, Basket, Chefmate8Frypan, GlazedRimPorcelainRamekin, Plate, Rack, WhiteBowl,
+    AkitaBlackBowl,
+    Basket,
+    Chefmate8Frypan,
+    GlazedRimPorcelainRamekin,
+    Plate,
+    Rack,
+    WhiteBowl,
 ) = declare(
     GoogleScannedObject,
     __name__,
     "AkitaBlackBowl Basket Chefmate8Frypan GlazedRimPorcelainRamekin Plate Rack WhiteBowl",
-)  # fmt: skip
+)

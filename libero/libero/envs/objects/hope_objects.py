@@ -10,11 +10,26 @@ class HopeBaseObject(BuiltinObject):
 
 
 (
-    AlphabetSoup, BbqSauce, Butter, Cherries, ChocolatePudding, Cookies, Corn, CreamCheese, Ketchup,
-    MacaroniAndCheese, Mayo, Milk, NewSaladDressing, OrangeJuice, Popcorn, SaladDressing, TomatoSauce,
+    AlphabetSoup,
+    BbqSauce,
+    Butter,
+    Cherries,
+    ChocolatePudding,
+    Cookies,
+    Corn,
+    CreamCheese,
+    Ketchup,
+    MacaroniAndCheese,
+    Mayo,
+    Milk,
+    NewSaladDressing,
+    OrangeJuice,
+    Popcorn,
+    SaladDressing,
+    TomatoSauce,
 ) = declare(
     HopeBaseObject,
     __name__,
     "AlphabetSoup BbqSauce Butter Cherries ChocolatePudding Cookies Corn CreamCheese Ketchup "
     "MacaroniAndCheese Mayo Milk NewSaladDressing OrangeJuice Popcorn SaladDressing TomatoSauce",
-)  # fmt: skip
+)

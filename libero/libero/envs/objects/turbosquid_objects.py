@@ -10,8 +10,20 @@ class TurbosquidObjects(BuiltinObject):
 
 
 (
-    BlackBook, BowlDrainer, DeskCaddy, DiningSetGroup, MokaPot, PorcelainMug, RedCoffeeMug,
-    WhiteStorageBox, WhiteYellowMug, WineBottle, WineRack, WoodenShelf, WoodenTray, WoodenTwoLayerShelf,
+    BlackBook,
+    BowlDrainer,
+    DeskCaddy,
+    DiningSetGroup,
+    MokaPot,
+    PorcelainMug,
+    RedCoffeeMug,
+    WhiteStorageBox,
+    WhiteYellowMug,
+    WineBottle,
+    WineRack,
+    WoodenShelf,
+    WoodenTray,
+    WoodenTwoLayerShelf,
     YellowBook,
 ) = declare(
     TurbosquidObjects,
@@ -19,4 +31,4 @@ class TurbosquidObjects(BuiltinObject):
     "BlackBook BowlDrainer DeskCaddy DiningSetGroup MokaPot PorcelainMug RedCoffeeMug "
     "WhiteStorageBox WhiteYellowMug WineBottle WineRack WoodenShelf WoodenTray WoodenTwoLayerShelf "
     "YellowBook",
-)  # fmt: skip
+)

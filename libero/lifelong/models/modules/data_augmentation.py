@@ -141,7 +141,11 @@ class DataAugGroup(nn.Module):
 AUGMENTATIONS = {
     kind.__name__: kind
     for kind in (
-        BatchWiseImgColorJitterAug, IdentityAug, ImgColorJitterAug, ImgColorJitterGroupAug, TranslationAug,
+        BatchWiseImgColorJitterAug,
+        IdentityAug,
+        ImgColorJitterAug,
+        ImgColorJitterGroupAug,
+        TranslationAug,
         TranslationAugGroup,
     )
-}  # fmt: skip
+}
