@@ -32,7 +32,7 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
 def commands(parser: argparse.ArgumentParser | None = None) -> Iterator[argparse.ArgumentParser]:
     """Every subcommand of `libero` that runs something, in the order of its help."""
     if parser is None:
-        from lifelong.cli import build_parser
+        from lifelong.cli.main import build_parser
 
         parser = build_parser()
     groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]

@@ -30,8 +30,8 @@ def register() -> None:
         if name not in gymnasium.registry:
             gymnasium.register(
                 name,
-                entry_point="libero_env.env:LiberoEnv",
-                vector_entry_point="libero_env.vector:BatchEnv",
+                entry_point="libero_env.envs.env:LiberoEnv",
+                vector_entry_point="libero_env.envs.batch:BatchEnv",
                 kwargs={"task": task},
             )
 

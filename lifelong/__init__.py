@@ -1,1 +1,8 @@
-"""Lifelong robot learning: data, policies, algorithms, training, evaluation and reports."""
+"""Lifelong robot learning: policies, algorithms, the training loop, evaluation, metrics and reports.
+
+The names below are loaded when they are first used; importing this package does not load PyTorch.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

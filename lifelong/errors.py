@@ -29,3 +29,7 @@ class DataError(LifelongError, ValueError):
 
 class PolicyError(LifelongError, ValueError):
     """A policy built or used in a way it cannot work; the message says what would be valid."""
+
+
+class ResultsError(LifelongError):
+    """Results that cannot be read or written; the message names the file and what is missing."""

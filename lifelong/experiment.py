@@ -11,28 +11,32 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
-from libero_env.vector import BatchEnv
 from lifelong.algorithms import Algorithm
+from lifelong.build import build
 from lifelong.checkpoints import load_weights
-from lifelong.demonstrations import DemoDatasets, find_demos
-from lifelong.distributed import Ranks
-from lifelong.evaluation import EnvPool, EvalSettings
-from lifelong.nn.precision import check_compiler, deterministic, keep_freed_memory
+from lifelong.data.demonstrations import DemoDatasets, find_demos
+from lifelong.data.settings import CAMERAS, DataSettings
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies import Policy
 from lifelong.pretraining import pretrain, weights_of
-from lifelong.records import PhaseRecord, RunEndRecord, start_record, utc_now
-from lifelong.report import write_report
-from lifelong.results import write_summary
-from lifelong.rundir import RunDirectory, decisive
+from lifelong.report.page import write_report
+from lifelong.results.records import PhaseRecord, RunEndRecord, start_record, utc_now
+from lifelong.results.run_directory import RunDirectory, decisive
+from lifelong.results.summary import write_summary
+from lifelong.seeding import seeded
 from lifelong.sequence import Parts, TaskSequence
-from lifelong.settings import CAMERAS, BenchmarkSettings, DataSettings, PretrainSettings, RunSettings
+from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
-from lifelong.training import BatchAugmentation, FitSettings, seeded
+from lifelong.training.distributed import Ranks
+from lifelong.training.fit import BatchAugmentation
+from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
+from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 
 GROUPS = (
@@ -148,11 +152,6 @@ def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built
         tracker=build(config.wandb),
         device=device,
     )
-
-
-def build(node: DictConfig, **more: Any) -> Any:
-    """The object a node of the configuration describes, with plain lists and dictionaries inside."""
-    return instantiate(node, _convert_="all", _partial_=True)(**more)
 
 
 def _record_start(

@@ -14,8 +14,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.errors import LiberoError, UnknownNameError
 from lifelong import experiment
-from lifelong.distributed import Ranks, joined, rank
-from lifelong.report import write_report
+from lifelong.report.page import write_report
+from lifelong.training.distributed import Ranks, joined, rank
 
 
 class CombinedReport(Callback):

@@ -10,8 +10,8 @@ from lifelong import checkpoints
 from lifelong.algorithms.base import WindowDataset
 from lifelong.algorithms.multitask import Multitask
 from lifelong.errors import CheckpointError
-from lifelong.results import ResultLog
-from lifelong.rundir import RunDirectory
+from lifelong.results.log import ResultLog
+from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import Parts, TaskSequence
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker

@@ -15,20 +15,25 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lifelong import checkpoints, costs
+from libero_env.timing import CONTROL_PERIOD
+from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm, Phase, WindowDataset
-from lifelong.distributed import Ranks
-from lifelong.evaluation import EnvPool, EvalSettings, rollout, save_animation
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.rollout import rollout, save_animation
+from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
-from lifelong.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
-from lifelong.rundir import RunDirectory
+from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
+from lifelong.results.run_directory import RunDirectory
+from lifelong.seeding import generator, seeded
 from lifelong.streams import StageData, StreamSettings, stages_of
 from lifelong.tracking import Tracker
-from lifelong.training import BatchAugmentation, EpochEnd, FitSettings, fit, generator, seeded
+from lifelong.training import costs
+from lifelong.training.distributed import Ranks
+from lifelong.training.fit import BatchAugmentation, EpochEnd, fit
+from lifelong.training.settings import FitSettings
 
 # First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` has another.
 FIT, END_TASK, ROLLOUT = 1, 2, 3
-CONTROL_PERIOD = 0.05  # s
 SAVE_EVERY = 60.0  # s between two saves while learning, but for those at points of the learning curve
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm, JoinedWindows, WindowDataset
 from lifelong.errors import ConfigError
-from lifelong.training import generator
+from lifelong.seeding import generator
 from lifelong.types import Batch
 
 BLUR = 4  # first word of a seed, see `lifelong.sequence`

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env import bddl, doctor, paths
-from libero_env.doctor import Finding
-from libero_env.tasks import get_suite, get_task
-from lifelong import cli
-from lifelong.doctor import check_torch
+from libero_env import paths
+from libero_env.cli import doctor
+from libero_env.cli.doctor import Finding
+from libero_env.tasks import bddl, get_suite, get_task
+from lifelong.cli import main as cli
+from lifelong.cli.doctor import check_torch
 
 pytestmark = pytest.mark.unit
 
@@ -65,7 +66,7 @@ def test_errors_are_one_line_and_a_status(argv, hint, capsys):
 
 @pytest.fixture
 def demo_file(tmp_path) -> Path:
-    from libero_env.demos_write import DemoWriter, Episode, make_header
+    from libero_env.demos.write import DemoWriter, Episode, make_header
 
     frames = np.zeros((4, 8, 8, 3), np.uint8)
     obs = {"agentview_rgb": frames, "ee_pos": np.zeros((4, 3)), "ee_ori": np.zeros((4, 3))}

@@ -6,9 +6,10 @@ from pathlib import Path
 import h5py
 import pytest
 
-from libero_env.demos import read_demos
-from libero_env.demos_studio import Tally
-from lifelong import cli, cli_demos
+from libero_env.cli import demos as cli_demos
+from libero_env.demos.read import read_demos
+from libero_env.demos.record import Tally
+from lifelong.cli import main as cli
 from tests.libero_env.test_demos_replay import wander
 
 pytestmark = pytest.mark.sim
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.sim
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("demos")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("libero_env.demos_studio.run_experts", wander)
+        patch.setattr("libero_env.demos.record.run_experts", wander)
         argv = [
             "demos",
             "generate",
@@ -119,7 +120,7 @@ def test_wrong_input_is_one_line_and_a_status(argv, hint, tmp_path, monkeypatch,
 
 
 def test_pictures_can_be_left_out_and_drawn_later(tmp_path, monkeypatch):
-    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     argv = ["demos", "generate", "--task", "libero_goal/3", "--n", "1", "--no-images", "--workers", "1"]
     assert cli.main([*argv, "--folder", str(tmp_path)]) == 0
     (file,) = tmp_path.rglob("*.hdf5")

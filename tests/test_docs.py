@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from libero_env.env import LiberoEnv
+from libero_env.envs.env import LiberoEnv
 from libero_env.objects import catalog
 from libero_env.objects.builtin import BUILDERS
 from libero_env.tasks import Task, get_suite, suite_names

@@ -17,10 +17,10 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_dir
 
-from libero.lifelong.config import load_config
+from libero._adapters.lifelong.config import load_config
 from libero_env.objects import catalog
 from lifelong.algorithms import Algorithm
-from lifelong.cli import build_parser, main
+from lifelong.cli.main import build_parser, main
 from lifelong.launch import check_choices
 
 ROOT = Path(__file__).parents[1]

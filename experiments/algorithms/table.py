@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
-from lifelong.report_tables import duration, quantity
+from lifelong.report.tables import duration, quantity
 
 HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from libero_env.control import SUBSTEPS
-from libero_env.env import LiberoEnv
-from libero_env.render import open_context
+from libero_env.envs.env import LiberoEnv
+from libero_env.sim.render import open_context
+from libero_env.timing import SUBSTEPS
 
 
 def best(function: Callable[[], object], repeats: int) -> float:

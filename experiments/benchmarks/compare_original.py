@@ -25,10 +25,10 @@ from bare_mujoco import BareMujoco, best
 from comparison_table import BATCH, ROWS, THREADS, Figures, judged, line, machine
 from original_process import Original, one_core
 
-from libero_env.assets import Pack, select_pack
-from libero_env.env import LiberoEnv
-from libero_env.original_states import read_states
-from libero_env.vector import BatchEnv
+from libero_env.assets.pack import Pack, select_pack
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import LiberoEnv
+from libero_env.init_states.pickles import read_states
 
 PHYSICS_STEPS, CAMERA_STEPS = 100, 50
 FOREVER = 10**6  # steps, no episode ends by its length
@@ -178,7 +178,7 @@ class Comparison:
     def construction(self) -> Figures:
         """Fresh processes: imports, construction, and the first reset with pictures."""
         code = (
-            "import time; a = time.perf_counter(); from libero_env.env import LiberoEnv; b = time.perf_counter()\n"
+            "import time; a = time.perf_counter(); from libero_env.envs.env import LiberoEnv; b = time.perf_counter()\n"
             f"env = LiberoEnv('{self.task}', assets='builtin'); c = time.perf_counter()\n"
             "env.reset(options={'init_state': 0}); print(b - a, c - b, time.perf_counter() - c)"
         )
@@ -235,7 +235,7 @@ class Comparison:
     def memory(self) -> Figures:
         """Resident memory in a fresh process: after fifty resets with pictures, and after many more."""
         code = (
-            "import os; from libero_env.env import LiberoEnv\n"
+            "import os; from libero_env.envs.env import LiberoEnv\n"
             "page = os.sysconf('SC_PAGE_SIZE') / 2**20\n"
             "used = lambda: int(open('/proc/self/statm').read().split()[1]) * page\n"
             f"env = LiberoEnv('{self.task}', assets='builtin')\n"

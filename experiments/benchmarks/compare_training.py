@@ -30,10 +30,11 @@ from omegaconf import OmegaConf
 
 from lifelong.algorithms import Sequential
 from lifelong.data import DemoSource, open_windows
-from lifelong.distributed import Ranks
-from lifelong.nn.precision import keep_freed_memory
-from lifelong.step import Step
-from lifelong.training import FitSettings, generator
+from lifelong.seeding import generator
+from lifelong.training.distributed import Ranks
+from lifelong.training.precision import keep_freed_memory
+from lifelong.training.settings import FitSettings
+from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 
 CONFIGS = Path(__file__).parents[2] / "configs"

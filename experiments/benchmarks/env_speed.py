@@ -15,9 +15,9 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from libero_env.control import SUBSTEPS
-from libero_env.env import LiberoEnv
-from libero_env.vector import BatchEnv
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import LiberoEnv
+from libero_env.timing import SUBSTEPS
 
 TASK = "libero_object/0"
 
@@ -100,7 +100,7 @@ def reset_ms(repeats: int) -> float:
 def build_seconds(repeats: int) -> dict[str, float]:
     """Building the environment in a fresh process: all of it after the imports, and the imports."""
     code = (
-        "import time; a = time.perf_counter(); from libero_env.env import LiberoEnv; b = time.perf_counter(); "
+        "import time; a = time.perf_counter(); from libero_env.envs.env import LiberoEnv; b = time.perf_counter(); "
         f"env = LiberoEnv('{TASK}'); c = time.perf_counter(); env.reset(options={{'init_state': 0}}); "
         "print(b - a, c - b, time.perf_counter() - c)"
     )

@@ -4,7 +4,7 @@
     python experiments/benchmarks/training_speed.py --policy bc_transformer_small --image 64 --window 1 --batch 64
     python experiments/benchmarks/training_speed.py --variants bf16 bf16_graphs --profile
 
-A step is the trainer's own (lifelong/step.py): forward, backward, clipping, AdamW, on a batch that is there already;
+A step is the trainer's own (`lifelong.training.step`): forward, backward, clipping, AdamW, on a batch in memory;
 data_and_policy_speed.py measures how it comes there. Every variant runs in a process of its own, so that peak
 memory is its own, and one that the processor cannot do costs its row only. Operations are counted, not estimated.
 On some virtual machines bfloat16 needs ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16.
@@ -25,13 +25,14 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from lifelong.algorithms import Sequential
-from lifelong.costs import step_costs
 from lifelong.data import fake_batch
-from lifelong.distributed import Ranks
-from lifelong.nn.precision import keep_freed_memory
 from lifelong.policies import Policy
-from lifelong.step import Step
-from lifelong.training import FitSettings, generator
+from lifelong.seeding import generator
+from lifelong.training.costs import step_costs
+from lifelong.training.distributed import Ranks
+from lifelong.training.precision import keep_freed_memory
+from lifelong.training.settings import FitSettings
+from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "policy"

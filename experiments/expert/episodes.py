@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from libero_env.demos_studio import Recipe, Studio
+from libero_env.demos.record import Recipe, Studio
 from libero_env.tasks import get_suite
 
 MOMENTS = (0.0, 0.2, 0.4, 0.55, 0.8, 1.0)

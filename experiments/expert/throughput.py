@@ -11,8 +11,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from libero_env.demos_generate import cores, make_demos
-from libero_env.demos_studio import Recipe
+from libero_env.demos.generate import make_demos
+from libero_env.demos.record import Recipe
+from libero_env.parallel import cores
 from libero_env.tasks import get_suite
 
 

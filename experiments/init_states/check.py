@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from libero_env.assets import Pack, select_pack
-from libero_env.init_states import load_init_states, split_row, start_faults
-from libero_env.original_states import read_states
-from libero_env.predicates import StateView, evaluate
-from libero_env.scene import Scene, build_scene
-from libero_env.simulation import make_simulations
+from libero_env.assets.pack import Pack, select_pack
+from libero_env.init_states.pickles import read_states
+from libero_env.init_states.settle import start_faults
+from libero_env.init_states.store import load_init_states, split_row
+from libero_env.sim.predicates import evaluate
+from libero_env.sim.scene import Scene, build_scene
+from libero_env.sim.simulation import make_simulations
+from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_suite
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from libero_env.arena import WORKSPACES, add_arena, add_mount, load_workspace
-from libero_env.render import Renderer
-from libero_env.robot import add_panda
+from libero_env.assets.arena import WORKSPACES, add_arena, add_mount, load_workspace
+from libero_env.assets.robot import add_panda
+from libero_env.sim.render import Renderer
 
 
 def main() -> None:

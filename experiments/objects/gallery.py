@@ -15,10 +15,10 @@ import numpy as np
 from page import object_file, task_file, write_page
 from PIL import Image, ImageDraw, ImageFont
 
-from libero_env.init_states import generate_init_states, shipped_path, split_row
+from libero_env.envs.world import World
+from libero_env.init_states.store import generate_init_states, shipped_path, split_row
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.tasks import Task, get_suite, suite_names
-from libero_env.world import World
 
 FLOOR_COLOR = (0.86, 0.84, 0.80, 1.0)
 VISUAL_GROUP = 1

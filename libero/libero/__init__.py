@@ -43,7 +43,7 @@ def get_default_path_dict(custom_location: str | os.PathLike | None = None) -> d
 
     Nothing is written: `get_libero_path` lays the files out.
     """
-    from libero.libero.files import generated_paths
+    from libero._adapters.envs.files import generated_paths
 
     if custom_location is None:
         return {"benchmark_root": str(_HERE), **generated_paths()}
@@ -64,7 +64,7 @@ def get_libero_path(query_key: str) -> str:
     Raises:
         UnknownNameError: no such key.
     """
-    from libero.libero.files import ensure
+    from libero._adapters.envs.files import ensure
 
     if query_key not in _KEYS:
         raise UnknownNameError("path", query_key, _KEYS)

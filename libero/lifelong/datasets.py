@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
-from libero.lifelong.observations import picture
-from libero_env.demos import demo_files, demo_names, opened, read_demos
+from libero._adapters.lifelong.observations import picture
+from libero_env.demos.read import demo_files, demo_names, opened, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import SequenceVLDataset as Windows
 from lifelong.types import PolicySpec
@@ -122,7 +122,7 @@ def get_dataset(
         hdf5_cache_mode: without a meaning here: pictures are in memory as bytes.
         pairing: `stored` takes the file as it is, which in the original's files pairs an action with the
             observation after it; `aligned` with the one before it.
-        labels: see `libero_env.demos.read_demos`.
+        labels: see `libero_env.demos.read.read_demos`.
 
     Returns:
         The windows, and what a policy is built from: `ac_dim`, `all_shapes` (key -> shape), `all_obs_keys`,

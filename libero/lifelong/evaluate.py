@@ -5,21 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-BENCHMARKS = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90", "libero_100")
-ALGOS = {
-    "base": "Sequential",
-    "single_task": "SingleTask",
-    "multitask": "Multitask",
-    "er": "ER",
-    "agem": "AGEM",
-    "ewc": "EWC",
-    "packnet": "PackNet",
-}
-POLICIES = {
-    "bc_rnn_policy": "BCRNNPolicy",
-    "bc_transformer_policy": "BCTransformerPolicy",
-    "bc_vilt_policy": "BCViLTPolicy",
-}
+from libero._adapters.lifelong.config import ALGOS, BENCHMARKS, POLICIES
 
 
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:

@@ -14,7 +14,7 @@ def main() -> int:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from libero.lifelong.config import CONFIGS
+    from libero._adapters.lifelong.config import CONFIGS
     from libero.lifelong.run import run
     from libero_env.errors import LiberoError
     from lifelong.launch import check_choices

@@ -1,6 +1,6 @@
 """Success and loss of an algorithm's policy on a benchmark's tasks.
 
-Rollouts are those of `lifelong.evaluation`, many simulations at once in this process.
+Rollouts are those of `lifelong.evaluation.rollout`, many simulations at once in this process.
 
 Shape legend: B episodes, C H W image, L language embedding.
 """
@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from libero.libero.files import generated_paths
-from libero.lifelong.batches import map_tensors
-from libero.lifelong.observations import picture
+from libero._adapters.envs.files import generated_paths
+from libero._adapters.lifelong.batches import map_tensors
+from libero._adapters.lifelong.observations import picture
 from libero.lifelong.utils import present, safe_device
-from libero_env.init_states import NUM_INIT_STATES, split_row
-from libero_env.original_states import read_states
+from libero_env.envs.batch import BatchEnv
+from libero_env.init_states.pickles import read_states
+from libero_env.init_states.store import NUM_INIT_STATES, split_row
 from libero_env.tasks import Task, get_suite, read_task, suite_names
-from libero_env.vector import BatchEnv
-from lifelong.actors import Obs
-from lifelong.evaluation import Rollouts, play
-from lifelong.training import seeded
+from lifelong.evaluation.actors import Obs
+from lifelong.evaluation.rollout import Rollouts, play
+from lifelong.seeding import seeded
 
 CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
 SETTLE_STEPS = 5
@@ -193,7 +193,7 @@ def native_task(task: Any, bddl_folder: str | None) -> Task:
 
 @dataclass
 class _PolicyActor:
-    """An algorithm's policy; see `lifelong.actors.Actor`."""
+    """An algorithm's policy; see `lifelong.evaluation.actors.Actor`."""
 
     algo: Any
     cfg: Any

@@ -18,11 +18,11 @@ from typing import Any, cast
 import numpy as np
 import torch
 
+from libero._adapters.lifelong.batches import DictWindows
+from libero._adapters.lifelong.config import Config, notes, plain
 from libero.libero import get_libero_path
 from libero.libero.benchmark import get_benchmark
 from libero.lifelong.algos import Multitask, Sequential, get_algo_class
-from libero.lifelong.batches import DictWindows
-from libero.lifelong.config import Config, notes, plain
 from libero.lifelong.datasets import GroupedTaskDataset, SequenceDataset, SequenceVLDataset, get_dataset
 from libero.lifelong.metric import evaluate_loss, evaluate_success, native_task
 from libero.lifelong.utils import (
@@ -36,7 +36,7 @@ from libero.lifelong.utils import (
     safe_device,
     torch_load_model,
 )
-from libero_env.demos_generate import ensure_demos
+from libero_env.demos.generate import ensure_demos
 from lifelong import checkpoints
 from lifelong.errors import ConfigError
 from lifelong.tracking import Tracker

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from libero._adapters.lifelong.config import ALGOS, POLICIES
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.video_utils import VideoWriter
 from libero.lifelong.algos import PackNet, Sequential, get_algo_class
 from libero.lifelong.datasets import SequenceVLDataset
-from libero.lifelong.evaluate import ALGOS, POLICIES
 from libero.lifelong.metric import evaluate_loss, rollouts
 from libero.lifelong.run import fill_in, task_dataset
 from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
 from lifelong.errors import CheckpointError
-from lifelong.metrics import wilson_interval
+from lifelong.results.metrics import wilson_interval
 
 
 def evaluate(args: argparse.Namespace) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, default_collate, random_split
 from torch.utils.flop_counter import FlopCounterMode
 
-from libero.lifelong.config import Config, assign, plain
+from libero._adapters.lifelong.config import Config, assign, plain
 from libero_env.paths import cache_dir
 from lifelong.errors import CheckpointError
 from lifelong.language import embed
-from lifelong.metrics import wilson_interval
+from lifelong.results.metrics import wilson_interval
 
 __all__ = [
     "NpEncoder",

@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from libero.libero.utils.download_utils import datasets_folder
 from libero.scripts.command import run
-from libero_env.demos_tools import examine
+from libero_env.demos.curate import examine
 from libero_env.errors import DemoError
 
 

@@ -9,9 +9,9 @@ from tqdm import tqdm
 from libero.libero import get_libero_path
 from libero.libero.benchmark import Benchmark, get_benchmark, libero_suites
 from libero.scripts.command import run
-from libero_env import bddl
 from libero_env.errors import LiberoError
-from libero_env.original_states import read_states
+from libero_env.init_states.pickles import read_states
+from libero_env.tasks import bddl
 
 
 def main(argv: Sequence[str] | None = None) -> int:

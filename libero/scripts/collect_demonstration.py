@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from libero.scripts.command import run
+from libero_env.cli.teleop import add_device, run_teleop
 from libero_env.errors import LiberoError
 from libero_env.tasks import read_task
-from lifelong.cli_teleop import add_device, run_teleop
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,11 +12,11 @@ from tqdm import tqdm
 
 from libero.libero.utils.dataset_utils import get_dataset_info
 from libero.scripts.command import run
-from libero_env.demos import LOW_DIM_KEYS
-from libero_env.demos_film import Filmer, Shots, fixtures_of
-from libero_env.demos_replay import rerender
-from libero_env.demos_tools import header_of, read_episodes, task_of
-from libero_env.demos_write import DemoWriter
+from libero_env.demos.curate import header_of, read_episodes, task_of
+from libero_env.demos.observe import Filmer, Shots, fixtures_of
+from libero_env.demos.read import LOW_DIM_KEYS
+from libero_env.demos.replay import rerender
+from libero_env.demos.write import DemoWriter
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from libero.libero.benchmark import get_benchmark
 from libero.libero.envs import OffScreenRenderEnv
 from libero.scripts.command import run
-from libero_env.demos import read_demos
+from libero_env.demos.read import read_demos
 from libero_env.errors import LiberoError
 
 

@@ -1,7 +1,5 @@
-"""The scripted expert that makes demonstrations: goal -> skills -> actions."""
+"""The scripted expert that makes demonstrations: a goal becomes skills, skills become actions."""
 
-from libero_env.expert.expert import Expert
-from libero_env.expert.plan import Shapes, UnsupportedGoalError, plan_goal
-from libero_env.expert.style import Disturbance, Style
+import lazy_loader
 
-__all__ = ["Disturbance", "Expert", "Shapes", "Style", "UnsupportedGoalError", "plan_goal"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from libero_env.expert.grasp import (
+from libero_env.expert.arm.gripper import (
     FINGER_HALF_WIDTH,
     FINGER_THICKNESS,
     HAND_HALF_LENGTH,

@@ -4,16 +4,16 @@ from typing import Protocol
 
 import numpy as np
 
-from libero_env.expert.approach import takeable
-from libero_env.expert.arm import held_back
-from libero_env.expert.articulated import MoveJoint
-from libero_env.expert.drag import Drag
-from libero_env.expert.into_container import IntoContainer
-from libero_env.expert.motion import OPEN
-from libero_env.expert.pick_place import PickPlace
-from libero_env.expert.plan import JOINT_STATES, Shapes, Step, plan_goal
-from libero_env.expert.style import Style
-from libero_env.predicates import StateView
+from libero_env.expert.arm.reach import held_back
+from libero_env.expert.arm.servo import OPEN
+from libero_env.expert.planning.goal_plan import JOINT_STATES, Shapes, Step, plan_goal
+from libero_env.expert.planning.pick_plan import takeable
+from libero_env.expert.skills.drag import Drag
+from libero_env.expert.skills.drop_into_container import IntoContainer
+from libero_env.expert.skills.move_joint import MoveJoint
+from libero_env.expert.skills.pick_place import PickPlace
+from libero_env.expert.variation import Style
+from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 
 

@@ -2,13 +2,12 @@
 
 from functools import cached_property
 
-import mujoco
 import numpy as np
 
-from libero_env.expert.arm import Arm
-from libero_env.expert.geometry import Pose, body_points, surface_points
-from libero_env.predicates import StateView
-from libero_env.scene import Scene
+from libero_env.expert.arm.reach import Arm
+from libero_env.geometry import Pose, body_points, quat_to_mat, surface_points
+from libero_env.sim.scene import Scene
+from libero_env.sim.state import StateView
 
 FINE, COARSE, DENSE = (
     0.004,
@@ -56,7 +55,7 @@ class Shapes:
         for body in self._scene.bodies[name]:
             local = self._body(int(body), spacing)
             if len(local):
-                clouds.append(Pose(pos[body], _matrix(quat[body])).apply(local))
+                clouds.append(Pose(pos[body], quat_to_mat(quat[body])).apply(local))
         return np.concatenate([*clouds, np.zeros((0, 3))])
 
     def _body(self, body: int, spacing: float) -> np.ndarray:
@@ -67,10 +66,4 @@ class Shapes:
 
 def pose_of(view: StateView, name: str) -> Pose:
     """Pose of the root body of an object or fixture."""
-    return Pose(view.body_pos(name), _matrix(view.body_quat(name)))
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, quat)
-    return mat.reshape(3, 3)
+    return Pose(view.body_pos(name), quat_to_mat(view.body_quat(name)))

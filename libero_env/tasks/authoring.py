@@ -33,13 +33,13 @@ from typing import Any
 
 import yaml
 
-from libero_env.arena import WORKSPACES, load_workspace
-from libero_env.assets import select_pack
+from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.assets.pack import select_pack
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import ObjectModel
-from libero_env.problem import Problem
 from libero_env.tasks.builder import KEYS, build_problem, filled, language_from_name, load_scene, scene_names
-from libero_env.tasks.suites import Task
+from libero_env.tasks.problem import Problem
+from libero_env.tasks.task import Task
 
 EMPTY: Mapping[str, str] = {
     "kitchen": "kitchen_table",

@@ -26,11 +26,11 @@ from importlib import resources
 from string import Template
 from typing import Any
 
-from libero_env import bddl
-from libero_env.data_files import parse_yaml
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.problem import And, Atom, Expression, ForAll, Not, Problem, Region
-from libero_env.sexpr import number
+from libero_env.storage import parse_yaml
+from libero_env.tasks import bddl
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Problem, Region
+from libero_env.tasks.sexpr import number
 
 KEYS = (
     "problem",

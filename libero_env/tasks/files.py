@@ -4,9 +4,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.tasks import bddl
 from libero_env.tasks.authoring import read_facts, task_of
-from libero_env.tasks.suites import Suite, Task, read_task
+from libero_env.tasks.builder import language_from_name
+from libero_env.tasks.suites import get_suite, suite_names
+from libero_env.tasks.task import Suite, Task
 
 OWN = "own"  # suite of one's own files
 
@@ -58,3 +61,51 @@ def write_task(task: Task, path: str | Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(task.bddl_text, encoding="utf-8")
     return path
+
+
+ENDINGS = (".bddl", ".yaml", ".yml")  # of task files
+
+
+def get_task(key: str) -> Task:
+    """The task called `suite/index`, `suite-index` or by its name alone; or of a file, see `read_task`.
+
+    Raises:
+        UnknownNameError: no such suite, index or task.
+        LiberoError: the file is not a task.
+    """
+    if key.endswith(ENDINGS):
+        return read_task(key)
+    for mark in "/-":
+        suite_name, found, index = key.rpartition(mark)
+        if found:
+            suite = get_suite(suite_name)
+            if not index.isdecimal() or int(index) >= len(suite):
+                raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))
+            return suite.tasks[int(index)]
+    named = {task.name: task for name in suite_names() for task in get_suite(name).tasks}
+    if key not in named:
+        raise UnknownNameError("task", key, named)
+    return named[key]
+
+
+def read_task(path: str | Path) -> Task:
+    """A task of your own from a BDDL or YAML file; its suite is `file`, its name the file's.
+
+    A BDDL file's instruction is that of its name, as in the original; a YAML file's what it says, see
+    `libero_env.tasks.authoring`.
+
+    Raises:
+        BDDLError: the file is not a task; the message starts with file:line.
+        LiberoError: a YAML file that is not one task.
+    """
+    if str(path).endswith(ENDINGS[1:]):
+        from libero_env.tasks.files import read_yaml_tasks
+
+        tasks = read_yaml_tasks(path)
+        if len(tasks) != 1:
+            raise LiberoError(
+                f"{path} holds {len(tasks)} tasks, and one is wanted; put it in a file of its own"
+            )
+        return tasks[0]
+    problem, name = bddl.read(path), Path(path).stem
+    return Task("file", 0, name, language_from_name(name), problem.language, problem)

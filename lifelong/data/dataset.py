@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from libero_env.demos import Demo
+from libero_env.demos.read import Demo
 from lifelong.data.source import DemoArrays, DemoSource, check_fits, check_language, last_frames
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation, PolicySpec
@@ -64,7 +64,7 @@ class SequenceVLDataset:
             limit: the first so many demonstrations only.
             pairing: `aligned` pairs each action with the observation before it; `stored` takes the file as it
                 is, which in the original's files is the observation after it.
-            labels: `expert` or `executed`, see `libero_env.demos.read_demos`.
+            labels: `expert` or `executed`, see `libero_env.demos.read.read_demos`.
 
         Raises:
             DemoError: the file is broken; names file, demonstration, key and what was expected.

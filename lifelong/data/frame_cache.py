@@ -25,7 +25,7 @@ import torch
 from filelock import FileLock
 from torch import Tensor
 
-from libero_env.demos import demo_files
+from libero_env.demos.read import demo_files
 from libero_env.paths import cache_dir
 from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.source import DemoArrays, DemoSource, check_language, last_frames

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from libero_env.demos import demo_files, demo_names, opened
+from libero_env.demos.read import demo_files, demo_names, opened
 from lifelong.data.source import DemoSource, check_language
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation

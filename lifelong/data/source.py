@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from libero_env.demos import Demo, demo_lengths, iter_demos
+from libero_env.demos.read import Demo, demo_lengths, iter_demos
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
@@ -24,7 +24,7 @@ class DemoSource:
         limit: The first so many demonstrations only.
         pairing: `aligned` pairs each action with the observation before it; `stored` takes the file as it is,
             which in the original's files is the observation after it.
-        labels: `expert` or `executed`, see `libero_env.demos.read_demos`.
+        labels: `expert` or `executed`, see `libero_env.demos.read.read_demos`.
     """
 
     path: Path

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from libero._adapters.lifelong.config import Config, load_config
 from libero.libero.benchmark import Benchmark, get_benchmark
-from libero.lifelong.config import Config, load_config
 from libero.lifelong.datasets import SequenceVLDataset, get_dataset
-from libero_env.demos_write import DemoWriter, Episode
+from libero_env.demos.write import DemoWriter, Episode
 
 SIZE, LANGUAGE = 32, 16
 TINY = (

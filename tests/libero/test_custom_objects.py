@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero._adapters.envs.mjcf_models import model_of
 from libero.libero.envs import OffScreenRenderEnv
 from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject, register_object
-from libero.libero.envs.mjcf_models import model_of
 from libero.libero.envs.objects import ArticulatedObject, get_object_fn
 from libero.libero.utils import mu_utils, task_generation_utils
 from libero.libero.utils.mu_utils import InitialSceneTemplates, register_mu

@@ -11,12 +11,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from libero.libero.utils import download_utils
-from libero_env import demos_download
-from libero_env.assets_download import DownloadError
-from libero_env.demos_download import REPO, REVISION, demo_files, download_demos
+from libero_env.assets.http import fetch
+from libero_env.assets.hub import DownloadError
+from libero_env.demos import download as demos_download
+from libero_env.demos.download import REPO, REVISION, demo_files, download_demos
 from libero_env.errors import UnknownNameError
-from libero_env.fetch import fetch
-from lifelong.cli import main
+from lifelong.cli.main import main
 
 pytestmark = pytest.mark.unit
 

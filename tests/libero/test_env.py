@@ -9,7 +9,7 @@ import pytest
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
-from libero_env.render import Renderer
+from libero_env.sim.render import Renderer
 
 pytestmark = pytest.mark.sim
 BLIND = {"use_camera_obs": False}

@@ -14,10 +14,9 @@ from libero.libero.utils.task_generation_utils import (
     get_task_info,
     register_task_info,
 )
-from libero_env import bddl
 from libero_env.errors import BDDLError, LiberoError, UnknownNameError
-from libero_env.problem import And, Atom, Or, differences
-from libero_env.tasks import get_suite
+from libero_env.tasks import bddl, get_suite
+from libero_env.tasks.problem import And, Atom, Or, differences
 
 pytestmark = pytest.mark.unit
 
@@ -356,7 +355,7 @@ def test_places_of_things(capsys):
 @pytest.mark.usefixtures("demo_scene")
 def test_generated_tasks_simulate(tmp_path):
     from libero.libero.envs import OffScreenRenderEnv
-    from libero_env.env import LiberoEnv
+    from libero_env.envs.env import LiberoEnv
     from libero_env.tasks import read_task
 
     register_task_info(

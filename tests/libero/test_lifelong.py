@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
+from libero._adapters.lifelong.config import Config, load_config
 from libero.lifelong import utils
-from libero.lifelong.config import Config, load_config
 from libero.lifelong.datasets import (
     GroupedTaskDataset,
     SequenceVLDataset,

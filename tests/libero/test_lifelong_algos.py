@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 from torch import nn
 from torch.utils.data import DataLoader
 
+from libero._adapters.lifelong.config import Config, plain
 from libero.lifelong import algos, utils
 from libero.lifelong.algos import base, multitask
-from libero.lifelong.config import Config, plain
 from libero.lifelong.metric import evaluate_loss
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class
 from libero.lifelong.models.bc_transformer_policy import ExtraModalityTokens

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
+from libero._adapters.lifelong.config import load_config
 from libero.lifelong import models
-from libero.lifelong.config import load_config
 from libero.lifelong.models import bc_rnn_policy, bc_transformer_policy
 from libero.lifelong.models.modules import data_augmentation as aug
 from libero.lifelong.models.modules import language_modules, rgb_modules, transformer_modules

@@ -15,7 +15,7 @@ from libero.libero.envs import OffScreenRenderEnv
 from libero.lifelong import algos, evaluate, main, metric, utils
 from libero.lifelong import run as run_module
 from libero.lifelong.run import run
-from libero_env.original_states import write_states
+from libero_env.init_states.pickles import write_states
 from libero_env.tasks import get_task
 from lifelong import checkpoints
 from tests.libero.lifelong_data import (

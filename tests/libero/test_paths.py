@@ -9,9 +9,9 @@ import pytest
 
 from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
-from libero_env import bddl
 from libero_env.errors import UnknownNameError
-from libero_env.original_states import read_states, write_states
+from libero_env.init_states.pickles import read_states, write_states
+from libero_env.tasks import bddl
 
 pytestmark = pytest.mark.unit
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from libero._adapters.envs.workers import WorkerError
 from libero.libero.envs import ControlEnv, DummyVectorEnv, SubprocVectorEnv
 from libero.libero.envs.venv import CloudpickleWrapper, ShArray
-from libero.libero.envs.workers import WorkerError
 from libero_env.errors import LiberoError
 
 pytestmark = pytest.mark.sim

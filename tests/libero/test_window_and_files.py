@@ -3,7 +3,7 @@
 import mujoco.viewer
 import pytest
 
-from libero.libero.files import task_file
+from libero.libero.envs.bddl_utils import task_file
 
 NAME = "open_the_middle_drawer_of_the_cabinet.bddl"
 BLIND = {"use_camera_obs": False, "has_offscreen_renderer": False}

@@ -10,9 +10,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from libero_env import bddl
 from libero_env.errors import LiberoError
-from libero_env.tasks import Task, get_suite, suite_names
+from libero_env.tasks import Task, bddl, get_suite, suite_names
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 

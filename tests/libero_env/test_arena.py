@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env import bddl
-from libero_env.arena import WORKSPACES, add_arena, add_mount, load_workspace, workspace_of_problem
-from libero_env.arena_styles import load_styles, picture
+from libero_env.assets.arena import WORKSPACES, add_arena, add_mount, load_workspace, workspace_of_problem
+from libero_env.assets.styles import load_styles, picture
 from libero_env.errors import UnknownNameError
+from libero_env.tasks import bddl
 
 pytestmark = pytest.mark.sim
 

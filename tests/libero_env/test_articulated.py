@@ -9,7 +9,7 @@ import pytest
 from libero_env.objects import get_object, object_names
 from libero_env.objects.builtin.facts import load_facts
 from libero_env.objects.model import GLOW_GROUP
-from libero_env.render import Picture, Renderer
+from libero_env.sim.render import Picture, Renderer
 
 pytestmark = pytest.mark.sim
 

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from libero_env import assets_download
-from libero_env.assets import BuiltinPack, chosen_assets, select_pack
-from libero_env.assets_download import REPO, REVISION, DownloadError, download, read_manifest
+from libero_env.assets import hub as hub_module
+from libero_env.assets.download import REPO, REVISION, download, read_manifest
+from libero_env.assets.hub import DownloadError
+from libero_env.assets.original import FAMILIES, OriginalPack
+from libero_env.assets.pack import BuiltinPack, chosen_assets, select_pack
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.original import FAMILIES, OriginalPack
-from lifelong.cli import main
+from lifelong.cli.main import main
 
 pytestmark = pytest.mark.unit
 
@@ -245,8 +246,8 @@ def test_a_file_broken_afterwards_is_mended(hub, tmp_path):
 
 
 def test_no_room_is_told_before_anything_is_fetched(hub, tmp_path, monkeypatch):
-    usage = assets_download.shutil.disk_usage(tmp_path)._replace(free=1 << 20)
-    monkeypatch.setattr(assets_download.shutil, "disk_usage", lambda path: usage)
+    usage = hub_module.shutil.disk_usage(tmp_path)._replace(free=1 << 20)
+    monkeypatch.setattr(hub_module.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(DownloadError, match="MiB free"):
         download(tmp_path / "there")
     assert hub.got == []

@@ -10,18 +10,27 @@ import pytest
 import yaml
 from PIL import Image
 
-from libero_env import bddl, init_states
-from libero_env.arena import WORKSPACES
-from libero_env.env import LiberoEnv
+from libero_env.assets.arena import WORKSPACES
+from libero_env.design.preview import contact_sheet
+from libero_env.design.template import task_template
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.problem import Atom, Not, Or, differences
-from libero_env.scene import build_scene
-from libero_env.tasks import get_suite, get_task, make_task, read_suite, read_task, suite_names, write_task
+from libero_env.init_states import store as init_states
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import (
+    bddl,
+    get_suite,
+    get_task,
+    make_task,
+    read_suite,
+    read_task,
+    suite_names,
+    write_task,
+)
 from libero_env.tasks.authoring import EMPTY, places_of
 from libero_env.tasks.builder import load_data
-from libero_env.tasks.preview import contact_sheet
-from libero_env.tasks.template import task_template
-from lifelong.cli import main
+from libero_env.tasks.problem import Atom, Not, Or, differences
+from lifelong.cli.main import main
 from lifelong.errors import ConfigError
 from lifelong.settings import BenchmarkSettings
 

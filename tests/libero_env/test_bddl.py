@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import pytest
 
-from libero_env import bddl
-from libero_env.bddl import And, Atom, ForAll, Not, Or, Problem, Region
 from libero_env.errors import BDDLError
-from libero_env.sexpr import number, parse_tree
+from libero_env.tasks import bddl
+from libero_env.tasks.bddl import And, Atom, ForAll, Not, Or, Problem, Region
+from libero_env.tasks.sexpr import number, parse_tree
 from tests.libero_env.compare_bddl import all_tasks
 
 pytestmark = pytest.mark.unit

@@ -5,15 +5,17 @@ import json
 import numpy as np
 import pytest
 
-from libero_env import init_states
-from libero_env.assets import select_pack
-from libero_env.init_states import load_init_states, split_row, start_faults
-from libero_env.original_states import read_states
-from libero_env.predicates import StateView, evaluate
-from libero_env.problem import Atom
-from libero_env.scene import build_scene
-from libero_env.simulation import LoopSimulations
+from libero_env.assets.pack import select_pack
+from libero_env.init_states import store as init_states
+from libero_env.init_states.pickles import read_states
+from libero_env.init_states.settle import start_faults
+from libero_env.init_states.store import load_init_states, split_row
+from libero_env.sim.predicates import evaluate
+from libero_env.sim.scene import build_scene
+from libero_env.sim.simulation import LoopSimulations
+from libero_env.sim.state import StateView
 from libero_env.tasks import get_suite, get_task, read_task, suite_names
+from libero_env.tasks.problem import Atom
 
 pytestmark = pytest.mark.sim
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from libero_env import certify as module
-from libero_env.assets import BuiltinPack
-from libero_env.certify import Certificate, Outcome, certify, markdown_table, results
+from libero_env.assets.pack import BuiltinPack
+from libero_env.design import certify as module
+from libero_env.design.certify import Certificate, Outcome, certify, markdown_table, results
 from libero_env.errors import LiberoError
-from libero_env.problem import And, Atom
 from libero_env.tasks import get_suite, get_task, read_task
-from lifelong import cli
+from libero_env.tasks.problem import And, Atom
+from lifelong.cli import main as cli
 
 TASKS = get_suite("libero_object").tasks[:2]
 
@@ -115,7 +115,7 @@ def test_without_matplotlib_there_is_no_picture_and_no_error(tried, tmp_path, ca
 
 @pytest.mark.unit
 def test_tasks_are_named_once(tmp_path):
-    from lifelong.cli_tasks import find_tasks
+    from libero_env.cli.tasks import find_tasks
 
     files = [tmp_path / "a.bddl", tmp_path / "b.bddl"]
     for file in files:

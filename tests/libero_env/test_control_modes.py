@@ -5,10 +5,16 @@ import itertools
 import numpy as np
 import pytest
 
-from libero_env.controllers import CONTROLLERS, JOINT_SCALE, VELOCITY_SCALE, ControllerState, get_controller
-from libero_env.env import LiberoEnv
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
-from libero_env.vector import BatchEnv
+from libero_env.sim.controllers import (
+    CONTROLLERS,
+    JOINT_SCALE,
+    VELOCITY_SCALE,
+    ControllerState,
+    get_controller,
+)
 
 pytestmark = pytest.mark.sim
 TASK = "libero_object/2"

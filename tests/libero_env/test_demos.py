@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos import aligned, read_demos
-from libero_env.demos_write import DemoWriter, Episode, make_header
+from libero_env.demos.read import aligned, read_demos
+from libero_env.demos.write import DemoWriter, Episode, make_header
 from libero_env.errors import DemoError
 
 

@@ -12,13 +12,13 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos import read_demos
-from libero_env.demos_generate import demo_path, ensure_demos, generate
-from libero_env.demos_studio import Recipe, Studio
-from libero_env.demos_write import DemoWriter
-from libero_env.env import LiberoEnv
+from libero_env.demos.generate import demo_path, ensure_demos, generate
+from libero_env.demos.read import read_demos
+from libero_env.demos.record import Recipe, Studio
+from libero_env.demos.write import DemoWriter
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
-from libero_env.expert.driver import run_experts
+from libero_env.expert.rollout import run_experts
 from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim
@@ -102,7 +102,7 @@ def test_more_demonstrations_are_added_to_those_there_are(whole, tmp_path):
 def test_a_killed_recording_goes_on_to_the_same_file(whole, tmp_path):
     script = f"""
         import sys
-        from libero_env.demos_generate import generate
+        from libero_env.demos.generate import generate
         generate({TASK!r}, 30, path=sys.argv[1], workers=1, camera_size={SIZE}, progress=False)
     """
     path = tmp_path / "killed.hdf5"
@@ -158,7 +158,7 @@ def test_the_number_of_processes_does_not_matter(whole, tmp_path):
 def test_no_worker_outlives_a_killed_recording(tmp_path):
     script = f"""
         import multiprocessing, sys, threading, time
-        from libero_env.demos_generate import generate
+        from libero_env.demos.generate import generate
 
         def tell():
             while len(multiprocessing.active_children()) < 2:
@@ -200,7 +200,7 @@ def test_failed_attempts_are_counted_and_left_out(tmp_path, monkeypatch):
         first = len(calls) == 1
         return run_experts(stage, experts, noise, max_steps=5 if first else max_steps)
 
-    monkeypatch.setattr("libero_env.demos_studio.run_experts", sometimes)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", sometimes)
     path = generate(TASK, 1, path=tmp_path / "x.hdf5", seed=3, workers=1, **KINDS)
     with h5py.File(path) as handle:
         assert handle["data"].attrs["num_failed_attempts"] == 1 and handle["data"].attrs["num_demos"] == 1

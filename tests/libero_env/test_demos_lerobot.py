@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from libero_env.demos import read_demos
-from libero_env.demos_lerobot import export
+from libero_env.demos.lerobot import export
+from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
 from tests.libero_env.test_demos import episode
 from tests.libero_env.test_demos_tools import write

@@ -6,18 +6,18 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos import read_demos
-from libero_env.demos_film import Filmer, Shots, fixtures_of
-from libero_env.demos_generate import generate, make_demos
-from libero_env.demos_lerobot import export
-from libero_env.demos_replay import replay, rerender
-from libero_env.demos_studio import Recipe, Variation
-from libero_env.demos_tools import examine, read_episodes, task_of
-from libero_env.demos_write import Episode
-from libero_env.env import LiberoEnv
+from libero_env.demos.curate import examine, read_episodes, task_of
+from libero_env.demos.generate import generate, make_demos
+from libero_env.demos.lerobot import export
+from libero_env.demos.observe import Filmer, Shots, fixtures_of
+from libero_env.demos.read import read_demos
+from libero_env.demos.record import Recipe, Variation
+from libero_env.demos.replay import replay, rerender
+from libero_env.demos.write import Episode
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
-from libero_env.expert.driver import Attempt
+from libero_env.expert.rollout import Attempt
 from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim
@@ -46,7 +46,7 @@ def wander(stage, experts, noise, max_steps):
 def path(tmp_path_factory):
     """Two recordings of a scene with fixtures, without an expert."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("libero_env.demos_studio.run_experts", wander)
+        patch.setattr("libero_env.demos.record.run_experts", wander)
         out = tmp_path_factory.mktemp("demos") / "goal.hdf5"
         return generate(TASK, 2, path=out, camera_size=SIZE, workers=1, progress=False)
 
@@ -200,8 +200,8 @@ def test_a_task_beyond_the_expert_stops_no_other(tmp_path, monkeypatch):
             if task.id == TASK:
                 raise UnsupportedGoalError("no skill for that")
 
-    monkeypatch.setattr("libero_env.demos_studio.Expert", Choosy)
-    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    monkeypatch.setattr("libero_env.demos.record.Expert", Choosy)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     jobs = [
         (Recipe(t, (8, 8)), tmp_path / f"{t[-6:].replace('/', '')}.hdf5") for t in (TASK, "libero_goal/4")
     ]
@@ -219,7 +219,7 @@ def test_an_expert_that_always_fails_is_given_up(tmp_path, monkeypatch):
             Attempt(False, np.zeros((1, 9)), *[np.zeros((0, 7))] * 2, 0, "it did nothing") for _ in experts
         ]
 
-    monkeypatch.setattr("libero_env.demos_studio.run_experts", idle)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", idle)
     jobs = [(Recipe(TASK, (8, 8), variation=Variation(reserved=True)), tmp_path / "a.hdf5")]
     (tally,) = make_demos(jobs, 2, workers=1, progress=False).values()
     assert (
@@ -228,7 +228,7 @@ def test_an_expert_that_always_fails_is_given_up(tmp_path, monkeypatch):
 
 
 def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
-    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     recipe = Recipe(TASK, (8, 8), variation=Variation(reserved=True))
     make_demos([(recipe, tmp_path / "a.hdf5")], 2, workers=1, progress=False)
     env = LiberoEnv(TASK, cameras=())
@@ -239,7 +239,7 @@ def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
 
 
 def test_a_task_file_of_ones_own_is_recorded(tmp_path, monkeypatch):
-    monkeypatch.setattr("libero_env.demos_studio.run_experts", wander)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     file = tmp_path / "my_task.bddl"
     file.write_text(get_task("libero_object/9").bddl_text)
     path = generate(str(file), 1, path=tmp_path / "a.hdf5", camera_size=(8, 8), workers=1, progress=False)

@@ -6,10 +6,10 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos import read_demos
-from libero_env.demos_stats import QUANTILES, Histogram, Moments
-from libero_env.demos_tools import examine, filter_demos, noops, read_episodes, task_of
-from libero_env.demos_write import DemoWriter
+from libero_env.demos.curate import examine, filter_demos, noops, read_episodes, task_of
+from libero_env.demos.read import read_demos
+from libero_env.demos.statistics import QUANTILES, Histogram, Moments
+from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.tasks import get_task
 from tests.libero_env.test_demos import episode, header

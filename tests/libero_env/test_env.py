@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from libero_env import init_states
-from libero_env.env import LiberoEnv
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
-from libero_env.init_states import generate_init_states, load_init_states
-from libero_env.scene import build_scene
+from libero_env.init_states import store as init_states
+from libero_env.init_states.store import generate_init_states, load_init_states
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite
-from libero_env.vector import BatchEnv
 
 pytestmark = pytest.mark.sim
 TASK = "libero_object/2"

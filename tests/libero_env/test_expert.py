@@ -4,25 +4,22 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.env import LiberoEnv
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import LiberoEnv
 from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoalError, plan_goal
-from libero_env.expert.approach import (
-    Failure,
-    _alike,
-    choose_approach,
-    choose_place,
-)
-from libero_env.expert.arm import held_back
-from libero_env.expert.carry import Carry, Move
-from libero_env.expert.driver import run_experts
-from libero_env.expert.geometry import surface_points
-from libero_env.expert.grasp import MAX_OPENING, WIDEST, Grasp, GraspError, choose_grasp, grasps
-from libero_env.expert.hold_price import between_fingers, weak_price
-from libero_env.expert.motion import action_toward, downward, rotation_between
-from libero_env.predicates import _boxes, _inside, _over, atoms_of, evaluate
-from libero_env.problem import And, Atom, Not, Or
+from libero_env.expert.arm.gripper import MAX_OPENING, WIDEST
+from libero_env.expert.arm.reach import held_back
+from libero_env.expert.arm.servo import action_toward, downward, rotation_between
+from libero_env.expert.grasping.costs import between_fingers, weak_price
+from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, grasps
+from libero_env.expert.planning.pick_plan import Failure, _alike, choose_approach, choose_place
+from libero_env.expert.rollout import run_experts
+from libero_env.expert.skills.transport import Carry, Move
+from libero_env.geometry import surface_points
+from libero_env.sim.predicates import atoms_of, evaluate
+from libero_env.sim.regions import contains, is_over, region_boxes
 from libero_env.tasks import get_suite, get_task
-from libero_env.vector import BatchEnv
+from libero_env.tasks.problem import And, Atom, Not, Or
 
 X_AXIS = np.array([1.0, 0.0, 0.0])
 NOTHING = np.zeros((0, 3))
@@ -248,8 +245,8 @@ def test_at_a_place_the_atom_would_hold(task_id, view_of):
     (step,) = plan_goal(get_task(task_id).problem.goal, view)
     way = choose_approach(view, Shapes(view.scene), step.atom)
     np.testing.assert_allclose(way.hand_mat @ way.hand_mat.T, np.eye(3), atol=1e-9)
-    test = _inside if step.atom.predicate == "In" else _over
-    assert any(test(box, way.place.pos + [0, 0, 0.003]) for box in _boxes(view, step.atom.args[1]))
+    test = contains if step.atom.predicate == "In" else is_over
+    assert any(test(box, way.place.pos + [0, 0, 0.003]) for box in region_boxes(view, step.atom.args[1]))
 
 
 @pytest.mark.sim

@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
-from libero_env.expert.arm import Arm
-from libero_env.expert.articulated import MoveJoint
-from libero_env.expert.geometry import Pose
-from libero_env.expert.handles import Part, find_handle, turned
-from libero_env.expert.holds import OPEN_HALF, TIP, crowding, handle_hold, knob_hold, under
-from libero_env.expert.motion import downward
-from libero_env.expert.posture import bend, stretch, unease
-from libero_env.expert.style import Style
-from libero_env.predicates import evaluate
-from libero_env.problem import Atom
-from libero_env.robot import REST_QPOS
+from libero_env.assets.robot import REST_QPOS
+from libero_env.envs.batch import BatchEnv
+from libero_env.expert.arm.posture import bend, stretch, unease
+from libero_env.expert.arm.reach import Arm
+from libero_env.expert.arm.servo import downward
+from libero_env.expert.grasping.handle_grasps import OPEN_HALF, TIP, crowding, handle_hold, knob_hold, under
+from libero_env.expert.grasping.handles import Part, find_handle, turned
+from libero_env.expert.skills.move_joint import MoveJoint
+from libero_env.expert.variation import Style
+from libero_env.geometry import Pose
+from libero_env.sim.predicates import evaluate
 from libero_env.tasks import get_task, read_task
-from libero_env.vector import BatchEnv
+from libero_env.tasks.problem import Atom
 
 pytestmark = pytest.mark.sim
 

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.certify import certify
+from libero_env.design.certify import certify
 from libero_env.objects import ObjectModel, register_object
 from libero_env.objects.catalog import _registered
 from libero_env.tasks import get_suite, read_task, suite_names

@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.arena import WORKSPACES, load_workspace
-from libero_env.lint import KINDS, Finding, lint_file, lint_task, lint_text
-from libero_env.lint_scene import reach, stretched
-from libero_env.predicates import PREDICATES
-from libero_env.scene import build_scene
+from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.design.lint.checks import KINDS, Finding, lint_file, lint_task, lint_text
+from libero_env.design.lint.scene import reach, stretched
+from libero_env.sim.predicates import PREDICATES
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
-from lifelong import cli
+from lifelong.cli import main as cli
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
 GOAL = "(And (In akita_black_bowl_1 wooden_cabinet_1_top_region))"
@@ -136,7 +136,7 @@ def test_the_reach_is_a_ring_before_the_robot(category):
 
 @pytest.mark.sim
 def test_the_figures_of_the_arm_are_those_of_its_model():
-    from libero_env import lint_scene
+    from libero_env.design.lint import scene as lint_scene
 
     model = build_scene(get_task("libero_object/0").problem).model
     data = mujoco.MjData(model)
@@ -226,7 +226,7 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
 
 @pytest.mark.unit
 def test_linting_texts_needs_no_torch():
-    code = "import sys, libero_env.lint, libero_env.certify; print('torch' in sys.modules, 'matplotlib' in sys.modules)"
+    code = "import sys, libero_env.design.lint.checks, libero_env.design.certify\nprint('torch' in sys.modules, 'matplotlib' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=Path(__file__).parents[2],

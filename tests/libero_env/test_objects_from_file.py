@@ -10,16 +10,23 @@ import pytest
 import trimesh
 from PIL import Image
 
+from libero_env.design.objects import add_object, register_object_file
+from libero_env.design.objects.add import DENSITY, Options
+from libero_env.design.objects.collision import (
+    boxes_of,
+    collision_pieces,
+    hull_mass,
+    solid_mass,
+    volume_filled,
+)
+from libero_env.design.objects.mesh_file import bounds, is_closed, read_mesh, signed_volume, welded
 from libero_env.errors import LiberoError
-from libero_env.init_states import scene_digest
-from libero_env.objects import add_object, catalog, folder, get_object, object_names, register_object_file
-from libero_env.objects.collision import boxes_of, collision_pieces, hull_mass, solid_mass, volume_filled
-from libero_env.objects.from_file import DENSITY, Options
-from libero_env.objects.mesh_file import bounds, is_closed, read_mesh, signed_volume, welded
-from libero_env.scene import build_scene
+from libero_env.init_states.store import scene_digest
+from libero_env.objects import catalog, folder, get_object, object_names
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
 from libero_env.tasks.authoring import places_of
-from lifelong.cli import main
+from lifelong.cli.main import main
 
 pytestmark = pytest.mark.sim
 

@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from libero_env.env import LiberoEnv
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.observations import NAMES, PROPRIOCEPTION, product, rotated
-from libero_env.predicates import glowing_sites
+from libero_env.geometry import product, rotated
 from libero_env.registration import env_ids
-from libero_env.rewards import Reward, approach, joint_share, staged
+from libero_env.sim.observations import NAMES, PROPRIOCEPTION
+from libero_env.sim.predicates import glowing_sites
+from libero_env.sim.rewards import Reward, approach, joint_share, staged
 from libero_env.tasks import get_suite, suite_names
-from libero_env.vector import BatchEnv
 
 pytestmark = pytest.mark.sim
 TASK = "libero_object/2"

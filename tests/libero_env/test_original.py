@@ -6,15 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.arena import WORKSPACES, load_workspace
-from libero_env.assets import BuiltinPack
-from libero_env.assets_check import problems
+from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.assets.check import problems
+from libero_env.assets.original import OriginalPack, is_original
+from libero_env.assets.original_arena import TEXTURES
+from libero_env.assets.pack import BuiltinPack
+from libero_env.assets.simplify import decimate, nearest
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.lod import decimate, nearest
 from libero_env.objects import ObjectModel, register_object
 from libero_env.objects.catalog import _registered
-from libero_env.original import OriginalPack, is_original
-from libero_env.original_arena import TEXTURES
 
 pytestmark = pytest.mark.sim
 

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from libero_env.original_states import StateFileError, read_states, write_states
+from libero_env.init_states.pickles import StateFileError, read_states, write_states
 
 pytestmark = pytest.mark.unit
 

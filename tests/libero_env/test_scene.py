@@ -6,17 +6,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env import bddl
-from libero_env.env import LiberoEnv
+from libero_env.envs.env import LiberoEnv
+from libero_env.envs.world import axis_angle
 from libero_env.errors import PlacementError, RenderError, UnknownNameError
-from libero_env.placement import lowest_point, sample_qpos
-from libero_env.predicates import StateView, evaluate
-from libero_env.problem import And, Atom, ForAll, Not, Or
-from libero_env.render import Renderer, open_context
-from libero_env.scene import build_scene
-from libero_env.simulation import LoopSimulations
-from libero_env.tasks import get_suite, get_task
-from libero_env.world import axis_angle
+from libero_env.init_states.placement import lowest_point, sample_qpos
+from libero_env.sim.predicates import evaluate
+from libero_env.sim.render import Renderer, open_context
+from libero_env.sim.scene import build_scene
+from libero_env.sim.simulation import LoopSimulations
+from libero_env.sim.state import StateView
+from libero_env.tasks import bddl, get_suite, get_task
+from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
 
 pytestmark = pytest.mark.sim
 

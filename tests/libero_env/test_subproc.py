@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env.env import LiberoEnv
+from libero_env.envs.env import LiberoEnv
+from libero_env.envs.subproc import SubprocEnv, WorkerError
 from libero_env.errors import ActionError, LiberoError
-from libero_env.subproc import SubprocEnv, WorkerError
 
 
 def counter(fault="", at=3, size=2):

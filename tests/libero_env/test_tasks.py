@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from libero_env import bddl
-from libero_env.bddl import And, Atom, Not, Or
 from libero_env.errors import BDDLError, LiberoError, UnknownNameError
-from libero_env.tasks import builder, get_suite, get_task, read_task, suite_names, suites
+from libero_env.tasks import bddl, builder, get_suite, get_task, read_task, suite_names, suites
+from libero_env.tasks.bddl import And, Atom, Not, Or
 from libero_env.tasks.builder import build_problem, language_from_name, load_data
 from tests.libero_env.compare_bddl import all_tasks, compare
 from tests.libero_env.compare_bddl import main as compare_main

@@ -8,25 +8,16 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env import teleop_screens
-from libero_env.demos import read_demos
-from libero_env.demos_replay import replay
+from libero_env.demos.read import read_demos
+from libero_env.demos.replay import replay
 from libero_env.errors import LiberoError, RenderError
-from libero_env.render import choose_backend
+from libero_env.sim.render import choose_backend
 from libero_env.tasks import get_task
-from libero_env.teleop import (
-    GRIPPER,
-    MOTIONS,
-    QUIT,
-    RESET,
-    Keyboard,
-    SpaceMouse,
-    Status,
-    Teleop,
-    record_by_hand,
-)
-from libero_env.teleop_screens import MouseReader, as_text, key_name, open_screen, press_typed
-from lifelong import cli
+from libero_env.teleop import screens as teleop_screens
+from libero_env.teleop.devices import GRIPPER, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
+from libero_env.teleop.screens import MouseReader, as_text, key_name, open_screen, press_typed
+from libero_env.teleop.session import Status, Teleop, record_by_hand
+from lifelong.cli import main as cli
 
 TASK = "libero_90/0"  # KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet
 # (x, y, z) for the gripper, m: before the open drawer, down to its front, and against it

@@ -12,14 +12,15 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from lifelong import checkpoints
-from lifelong.distributed import Ranks, joined
-from lifelong.evaluation import EvalSettings
+from lifelong.evaluation.settings import EvalSettings
 from lifelong.nn.augmentation import RandomShift
 from lifelong.policies import BCTransformer
-from lifelong.records import LossRecord
-from lifelong.results import ResultLog
+from lifelong.results.log import ResultLog
+from lifelong.results.records import LossRecord
+from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
-from lifelong.training import FitSettings, seeded
+from lifelong.training.distributed import Ranks, joined
+from lifelong.training.settings import FitSettings
 from tests.lifelong import test_sequence as walk
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "algo"

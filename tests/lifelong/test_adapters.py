@@ -13,9 +13,11 @@ from lifelong.algorithms.dmpel import _padded
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import Router, change
 from lifelong.policies import BCRNN, BCTransformer, BCViLT
+from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
 from lifelong.streams import SomeWindows, StageWindows
-from lifelong.training import FitSettings, fit, generator, seeded
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
 from lifelong.types import Observation
 from tests.lifelong import test_sequence as walk
 from tests.lifelong.fakes import DeepPolicy, Windows

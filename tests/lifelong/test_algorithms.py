@@ -8,7 +8,9 @@ import torch
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Algorithm, PackNet, Sequential
 from lifelong.errors import ConfigError
-from lifelong.training import FitSettings, fit, generator
+from lifelong.seeding import generator
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
 from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
 
 SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precision="fp32")

@@ -9,10 +9,12 @@ from lifelong import checkpoints
 from lifelong.algorithms import AGEM, MAS, SI, Algorithm, DERpp, LwF, Multitask, SingleTask
 from lifelong.algorithms.agem import project
 from lifelong.algorithms.base import JoinedWindows
-from lifelong.records import EvalRecord, LossRecord, TaskEndRecord
-from lifelong.rundir import RunDirectory
+from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.results.run_directory import RunDirectory
+from lifelong.seeding import generator
 from lifelong.sequence import TaskSequence
-from lifelong.training import FitSettings, fit, generator
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
 from tests.lifelong import test_sequence as walk
 from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
 from tests.lifelong.test_algorithms import SETTINGS, learn

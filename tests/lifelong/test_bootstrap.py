@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lifelong.bootstrap import Member, resample
-from lifelong.metrics import METRIC_NAMES, Curve, Scores, lifelong_metrics
+from lifelong.results.bootstrap import Member, resample
+from lifelong.results.metrics import METRIC_NAMES, Curve, Scores, lifelong_metrics
 
 pytestmark = pytest.mark.unit
 TRUTH = 0.6

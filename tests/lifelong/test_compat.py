@@ -10,8 +10,10 @@ from hydra.utils import instantiate
 from lifelong import checkpoints
 from lifelong.algorithms import AGEM, ER, EWC, PackNet
 from lifelong.errors import ConfigError
+from lifelong.seeding import generator
 from lifelong.sequence import TaskSequence
-from lifelong.training import FitSettings, fit, generator
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
 from tests.lifelong import test_sequence as walk
 from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
 from tests.lifelong.test_algorithms import by_hand, learn, outputs

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import lifelong
 from lifelong.errors import ConfigError
-from lifelong.evaluation import EvalSettings
+from lifelong.evaluation.settings import EvalSettings
 from lifelong.experiment import GROUPS
 from lifelong.launch import check_choices
 from lifelong.settings import RunSettings
@@ -105,7 +105,7 @@ def test_values_on_the_command_line_win_over_the_preset(preset):
 def test_the_paper_preset_is_the_published_protocol():
     config = composed("preset=paper")
     assert OmegaConf.to_container(config.train) == {
-        "_target_": "lifelong.training.FitSettings",
+        "_target_": "lifelong.training.settings.FitSettings",
         "epochs": 50,
         "batch_size": 32,
         "steps_per_epoch": None,

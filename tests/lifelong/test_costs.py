@@ -10,11 +10,11 @@ from torch import nn
 from lifelong.algorithms import EWC, Algorithm, Sequential
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.er import ER
-from lifelong.costs import COSTS, action_costs, counting, peak_costs, step_costs, stored_bytes
 from lifelong.data import SequenceVLDataset
 from lifelong.policies import BCTransformer
 from lifelong.policies.bc_rnn import BCRNN
-from lifelong.training import generator, seeded
+from lifelong.seeding import generator, seeded
+from lifelong.training.costs import COSTS, action_costs, counting, peak_costs, step_costs, stored_bytes
 from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from libero_env.demos import Demo
+from libero_env.demos.read import Demo
 from libero_env.errors import DemoError
 from lifelong.data import ReplayMemory, SequenceVLDataset, batches, fake_batch
 from lifelong.errors import DataError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from libero_env.demos import Demo, demo_lengths, read_demos
+from libero_env.demos.read import Demo, demo_lengths, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import DemoSource, ReplayMemory, SequenceVLDataset, frame_cache, loading, open_windows
 from lifelong.data.frame_cache import cache_root

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from libero_env.tasks import get_suite
-from lifelong import demonstrations
+from lifelong.data import demonstrations
+from lifelong.data.settings import DataSettings
 from lifelong.errors import DataError
-from lifelong.settings import DataSettings
 
 pytestmark = pytest.mark.unit
 TASKS = get_suite("libero_object").tasks[:3]

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from lifelong import checkpoints
-from lifelong.distributed import Ranks, joined
 from lifelong.errors import ConfigError
+from lifelong.training.distributed import Ranks, joined
 from tests.lifelong import ranks_worker as worker
 
 ROOT = Path(__file__).parents[2]

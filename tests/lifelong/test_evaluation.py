@@ -7,7 +7,8 @@ from PIL import Image
 from torch import nn
 
 from lifelong.errors import ConfigError
-from lifelong.evaluation import EnvPool, rollout, save_animation
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.rollout import rollout, save_animation
 from lifelong.types import PolicySpec
 
 SPEC = PolicySpec(views=("agentview_rgb",), image_size=(4, 4), proprio={"x": 1}, language_dim=2)

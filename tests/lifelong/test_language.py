@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from lifelong import language
 from lifelong.errors import LanguageError
-from lifelong.language import LanguageEncoder, embed, normal_form, shipped
+from lifelong.language import encoder as language
+from lifelong.language.encoder import LanguageEncoder, embed, normal_form, shipped
 
 pytestmark = pytest.mark.unit
 TEXTS = ["turn on the stove", "close the microwave"]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lifelong.metrics import (
+from lifelong.results.metrics import (
     METRIC_NAMES,
     Curve,
     Scores,

@@ -25,10 +25,10 @@ from lifelong.nn import (
     SpatialSoftmax,
     TemporalTransformer,
 )
-from lifelong.nn.precision import bf16_runs_on_cpu
 from lifelong.nn.tokens import standardise
 from lifelong.nn.transformer import block_causal_mask
 from lifelong.nn.vision import FlatReadout
+from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit
@@ -244,7 +244,7 @@ def test_freed_memory_is_kept():
     """A process that asked for it holds a freed tensor's pages; another gives them back."""
     code = """
 import os, sys, torch
-from lifelong.nn.precision import keep_freed_memory
+from lifelong.training.precision import keep_freed_memory
 resident = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 kept = sys.argv[1] == "keep" and keep_freed_memory()
 before = resident()

@@ -6,8 +6,8 @@ from torch import nn
 
 from lifelong.data import fake_batch
 from lifelong.errors import PolicyError
-from lifelong.nn.precision import bf16_runs_on_cpu
 from lifelong.policies import BCTransformer
+from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import Observation, PolicySpec
 
 pytestmark = pytest.mark.unit

@@ -13,9 +13,12 @@ import yaml
 from PIL import Image
 
 from lifelong.errors import LifelongError
-from lifelong.figures import Line, forgetting_figure
-from lifelong.metrics import METRIC_NAMES
-from lifelong.records import (
+from lifelong.report.figures import Line, forgetting_figure
+from lifelong.report.page import write_report
+from lifelong.report.runs import group_runs, load_run, short_labels
+from lifelong.results.log import ResultLog
+from lifelong.results.metrics import METRIC_NAMES
+from lifelong.results.records import (
     CostRecord,
     EvalRecord,
     LossRecord,
@@ -24,9 +27,6 @@ from lifelong.records import (
     TaskEndRecord,
     start_record,
 )
-from lifelong.report import write_report
-from lifelong.results import ResultLog
-from lifelong.runs import group_runs, load_run, short_labels
 
 GROCERIES = [
     "alphabet soup",
@@ -389,7 +389,7 @@ def test_too_many_pictures_are_left_out_by_name(tmp_path: Path, monkeypatch: pyt
     for name in ("a", "b"):
         add_video(folder, name)
     (folder / "videos" / "a.txt").write_text("the first one")
-    monkeypatch.setattr("lifelong.report.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
+    monkeypatch.setattr("lifelong.report.page.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
     raw = write_report([folder]).read_text()
     assert "the first one" in raw and "Left out for their size: b.gif" in raw
     assert base64.b64encode((folder / "videos" / "a.gif").read_bytes()).decode() in raw

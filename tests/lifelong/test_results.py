@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lifelong.records import (
+from lifelong.errors import ResultsError
+from lifelong.results.log import ResultLog
+from lifelong.results.records import (
     RECORD_TYPES,
     CostRecord,
     EvalRecord,
@@ -19,7 +21,8 @@ from lifelong.records import (
     start_record,
     to_line,
 )
-from lifelong.results import ResultLog, Results, ResultsError, summarize, write_summary
+from lifelong.results.results import Results
+from lifelong.results.summary import summarize, write_summary
 
 START = start_record(
     algo="er",

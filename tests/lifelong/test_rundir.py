@@ -3,7 +3,7 @@
 import pytest
 
 from lifelong.errors import ConfigError, LifelongError
-from lifelong.rundir import RunDirectory
+from lifelong.results.run_directory import RunDirectory
 from lifelong.tracking import Tracker
 
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from lifelong.data import fake_batch
 from lifelong.errors import ConfigError
+from lifelong.evaluation.saliency import SaliencySettings, contact_sheet, overlay, saliency, window_at
 from lifelong.policies.base import Policy
-from lifelong.saliency import SaliencySettings, contact_sheet, overlay, saliency, window_at
-from lifelong.training import generator
+from lifelong.seeding import generator
 from lifelong.types import Batch, PolicySpec
 
 pytestmark = pytest.mark.unit

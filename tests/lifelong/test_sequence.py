@@ -8,15 +8,17 @@ import torch
 
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet, Sequential
-from lifelong.costs import COSTS
 from lifelong.data import SequenceVLDataset
-from lifelong.evaluation import EnvPool, EvalSettings
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies import BCTransformer
-from lifelong.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
-from lifelong.rundir import RunDirectory
+from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
+from lifelong.results.run_directory import RunDirectory
+from lifelong.seeding import generator, seeded
 from lifelong.sequence import Parts, TaskSequence
 from lifelong.tracking import Tracker
-from lifelong.training import FitSettings, generator, seeded
+from lifelong.training.costs import COSTS
+from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 
 SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)

@@ -14,12 +14,19 @@ from hydra.utils import instantiate
 from lifelong import checkpoints
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
 from lifelong.errors import CheckpointError, ConfigError
-from lifelong.metrics import lifelong_metrics
 from lifelong.pretraining import pretrain, weights_of
-from lifelong.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord, start_record, utc_now
-from lifelong.report import write_report
-from lifelong.results import ResultLog
-from lifelong.rundir import RunDirectory
+from lifelong.report.page import write_report
+from lifelong.results.log import ResultLog
+from lifelong.results.metrics import lifelong_metrics
+from lifelong.results.records import (
+    EvalRecord,
+    LossRecord,
+    RunEndRecord,
+    TaskEndRecord,
+    start_record,
+    utc_now,
+)
+from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import Parts, TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
 from lifelong.streams import StageData, StageWindows, StreamSettings, stages_of

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lifelong.records import EvalRecord, from_line, to_line
-from lifelong.subgoals import predicate_of, subgoals
+from lifelong.results.records import EvalRecord, from_line, to_line
+from lifelong.results.subgoals import predicate_of, subgoals
 
 pytestmark = pytest.mark.unit
 POT = ("(Turnon stove_1)", "(On pot_1 stove_1)")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from libero_env.tasks import get_suite
-from lifelong import cli
-from lifelong.actors import ORIGINAL_NAMES, CallableActor, as_original
-from lifelong.cli_eval import load_callable
+from lifelong.cli import main as cli
+from lifelong.cli.evaluate import load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError
-from lifelong.metrics import wilson_interval
-from lifelong.suite_eval import PROTOCOLS, Protocol, SuiteEvaluation, overall, starts
+from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
+from lifelong.evaluation.suite import PROTOCOLS, Protocol, SuiteEvaluation, overall, starts
+from lifelong.results.metrics import wilson_interval
 
 pytestmark = pytest.mark.unit
 TASKS = get_suite("libero_goal").tasks[:2]

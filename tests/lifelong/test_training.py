@@ -10,11 +10,13 @@ from torch import nn
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Sequential
 from lifelong.data import fake_batch
-from lifelong.distributed import Ranks
 from lifelong.errors import ConfigError, TrainingError
-from lifelong.nn.precision import check_compiler, compiled, deterministic
 from lifelong.policies import BCRNN, BCTransformer, BCViLT
-from lifelong.training import FitSettings, fit, generator, learning_rate
+from lifelong.seeding import generator
+from lifelong.training.distributed import Ranks
+from lifelong.training.fit import fit, learning_rate
+from lifelong.training.precision import check_compiler, compiled, deterministic
+from lifelong.training.settings import FitSettings
 from lifelong.types import Batch, PolicySpec
 from tests.lifelong import ranks_worker as worker
 from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows

@@ -9,8 +9,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from torch import distributions, nn
 
 from lifelong.nn import GMMHead, ResNetFiLMEncoder
-from lifelong.records import EvalRecord, TaskEndRecord, start_record
-from lifelong.results import Results, summarize
+from lifelong.results.records import EvalRecord, TaskEndRecord, start_record
+from lifelong.results.results import Results
+from lifelong.results.summary import summarize
 
 pytestmark = pytest.mark.unit
 

@@ -17,9 +17,8 @@ from libero.libero.envs import OffScreenRenderEnv
 from libero.libero.envs.base_object import get_object_fn
 from libero.libero.envs.predicates import get_predicate_fn_dict
 from libero.libero.utils.mu_utils import get_scene_class
-from libero_env import bddl
-from libero_env.problem import differences
-from libero_env.tasks import get_suite
+from libero_env.tasks import bddl, get_suite
+from libero_env.tasks.problem import differences
 from tests.walkthroughs.completions import Replay
 
 

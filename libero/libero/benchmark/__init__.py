@@ -9,9 +9,9 @@ import numpy as np
 
 from libero.libero import get_libero_path
 from libero_env.errors import UnknownNameError
-from libero_env.init_states import load_init_states
-from libero_env.original_states import read_states
-from libero_env.scene import build_scene
+from libero_env.init_states.pickles import read_states
+from libero_env.init_states.store import load_init_states
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, suite_names
 from libero_env.tasks import get_task as get_native_task
 from libero_env.tasks.builder import language_from_name, load_data

@@ -3,8 +3,8 @@
 from typing import Any
 
 from libero.libero.utils.mu_utils import MU_DICT, InitialSceneTemplates, register_mu, scene_key
-from libero_env.problem import Problem
 from libero_env.tasks.builder import build_problem, load_scene
+from libero_env.tasks.problem import Problem
 
 
 class BenchmarkScene(InitialSceneTemplates):

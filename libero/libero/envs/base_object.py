@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from libero.libero.envs.mjcf_models import STATES, accept_plain_files, model_of
-from libero_env.assets import chosen_assets, select_pack
+from libero._adapters.envs.mjcf_models import STATES, accept_plain_files, model_of
+from libero_env.assets.pack import chosen_assets, select_pack
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
@@ -243,7 +243,7 @@ class MujocoXMLObject(BaseObject):
     """An object from an MJCF file, with the interface of robosuite's class of that name.
 
     Args:
-        fname: MJCF file, see `libero.libero.envs.mjcf_models`; `custom_path` is another name for it.
+        fname: MJCF file, see `libero._adapters.envs.mjcf_models`; `custom_path` is another name for it.
         name: of the instance.
         joints: `[{"type": "free", "damping": "0.0005"}]`, or None for one that does not move.
         obj_type: accepted, of no effect.

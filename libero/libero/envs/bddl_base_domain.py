@@ -9,25 +9,26 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from libero._adapters.envs.observations import Observer, cameras
+from libero._adapters.envs.sim import MjSim
+from libero._adapters.envs.stepping import ObservedSimulations
+from libero._adapters.envs.stored_model import fixtures_of, write_model
+from libero._adapters.envs.window import Window
 from libero.libero.envs import bddl_utils as BDDLUtils
+from libero.libero.envs.bddl_utils import task_file
 from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState
-from libero.libero.envs.observations import Observer, cameras
 from libero.libero.envs.predicates import eval_predicate_fn
 from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
-from libero.libero.envs.sim import MjSim
-from libero.libero.envs.stepping import ObservedSimulations
-from libero.libero.envs.stored_model import fixtures_of, write_model
-from libero.libero.envs.window import Window
-from libero.libero.files import task_file
-from libero_env.assets import select_pack
-from libero_env.controllers import ControllerState
+from libero_env.assets.pack import select_pack
+from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.init_states import sample_settled
-from libero_env.placement import Start
-from libero_env.predicates import StateView, evaluate, glowing_sites
-from libero_env.robot import OPEN_FINGERS, REST_QPOS
-from libero_env.scene import build_scene, scene_spec
+from libero_env.init_states.placement import Start
+from libero_env.init_states.settle import sample_settled
+from libero_env.sim.controllers import ControllerState
+from libero_env.sim.predicates import evaluate, glowing_sites
+from libero_env.sim.scene import build_scene, scene_spec
+from libero_env.sim.state import StateView
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz

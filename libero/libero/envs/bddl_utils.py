@@ -1,18 +1,20 @@
 """Task files as the original's dictionaries and lists; names and predicates in lower case."""
 
+import os
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from libero.libero.files import task_file
-from libero_env import bddl
-from libero_env.problem import And, Atom, Expression, ForAll, Not, Or, Problem
+from libero._adapters.envs.files import suite_tasks
+from libero.libero import get_libero_path
+from libero_env.tasks import bddl
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem
 
 _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 
 
 def read_problem(problem_filename: str) -> Problem:
-    """A task file, see `libero.libero.files.task_file`; read once as long as it does not change.
+    """A task file, see `libero.libero.envs.bddl_utils.task_file`; read once as long as it does not change.
 
     Raises:
         BDDLError: it is not a task file.
@@ -110,3 +112,21 @@ def _by_category(things: Any) -> dict[str, list[str]]:
     for name, category in things.items():
         found.setdefault(category, []).append(name)
     return found
+
+
+def task_file(name: str | os.PathLike) -> str:
+    """A task file's path.
+
+    What exists is taken as it is. Else a name without a folder, such as `Task.bddl_file`, and a path into a checkout of
+    the original, `.../bddl_files/<suite>/<task>.bddl`, stand for the benchmark's file.
+    """
+
+    path = Path(name)
+    into_checkout = path.parts[-3:-2] == ("bddl_files",)
+    if path.exists() or (path.name != str(name) and not into_checkout):
+        return str(name)
+    suites = [path.parent.name] if into_checkout else list(suite_tasks())
+    found = [
+        file for suite in suites if (file := Path(get_libero_path("bddl_files"), suite, path.name)).exists()
+    ]
+    return str(found[0]) if len(found) == 1 else str(name)

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from libero._adapters.envs.sim import MjSim
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs import problems  # noqa: F401 - registers the problem classes
 from libero.libero.envs.bddl_base_domain import TASK_MAPPING, BDDLBaseDomain
 from libero.libero.envs.robots.single_arm import SingleArm
-from libero.libero.envs.sim import MjSim
 from libero_env.errors import PlacementError, UnknownNameError
 
 _RESETS = 5

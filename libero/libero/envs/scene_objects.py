@@ -10,7 +10,7 @@ from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObje
 from libero.libero.envs.objects.site_object import SiteObject
 from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.model import ObjectModel
-from libero_env.scene import Scene
+from libero_env.sim.scene import Scene
 
 _ROBOT_PARTS = OrderedDict(Panda0=("robot0_",), RethinkMount0=("mount0_",), PandaGripper0=("gripper0_",))
 

@@ -1,6 +1,6 @@
 """Task files from the facts of a scene and a task, the way the original's generators are called.
 
-The pieces are values of `libero_env.problem`; `PDDLDefinition` joins them to the text of a task file.
+The pieces are values of `libero_env.tasks.problem`; `PDDLDefinition` joins them to the text of a task file.
 """
 
 import functools
@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from libero.libero.envs.bddl_utils import as_expression
-from libero_env import bddl
-from libero_env.arena import load_workspace
+from libero_env.assets.arena import load_workspace
 from libero_env.errors import UnknownNameError
-from libero_env.problem import And, Atom, Expression, Problem, Region
+from libero_env.tasks import bddl
+from libero_env.tasks.problem import And, Atom, Expression, Problem, Region
 
 # What a workspace is called -> its category.
 WORKSPACE_CATEGORIES = {

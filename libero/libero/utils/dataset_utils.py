@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.demos import demo_names, opened
+from libero_env.demos.read import demo_names, opened
 from libero_env.errors import DemoError
 
 

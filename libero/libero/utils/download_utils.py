@@ -1,4 +1,4 @@
-"""Fetching the demonstrations of the original; see `libero_env.demos_download`."""
+"""Fetching the demonstrations of the original; see `libero_env.demos.download`."""
 
 import http.client
 import os
@@ -11,11 +11,11 @@ from tqdm import tqdm
 
 from libero.libero import get_path_dict
 from libero.libero.benchmark import get_benchmark
-from libero_env.assets_download import DownloadError
-from libero_env.demos_download import REPO as HF_REPO_ID
-from libero_env.demos_download import download_demos
+from libero_env.assets.http import fetch
+from libero_env.assets.hub import DownloadError
+from libero_env.demos.download import REPO as HF_REPO_ID
+from libero_env.demos.download import download_demos
 from libero_env.errors import UnknownNameError
-from libero_env.fetch import fetch
 
 __all__ = [
     "DATASET_LINKS",

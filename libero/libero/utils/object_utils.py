@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import mujoco
 
-from libero_env.assets import select_pack
+from libero_env.assets.pack import select_pack
 from libero_env.errors import LiberoError
 
 # Category -> its places, where they shall be others than its model's.

@@ -13,12 +13,12 @@ from libero.libero.utils.bddl_generation_utils import (
     suite_generator,
 )
 from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
-from libero_env.arena import WORKSPACES
-from libero_env.assets import select_pack
-from libero_env.bddl import parse
+from libero_env.assets.arena import WORKSPACES
+from libero_env.assets.pack import select_pack
+from libero_env.design.lint.checks import KINDS
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.lint import KINDS
-from libero_env.predicates import atoms_of
+from libero_env.sim.predicates import atoms_of
+from libero_env.tasks.bddl import parse
 
 # What may go wrong in a scene or task that somebody else wrote, and is told of that task alone.
 _FAULTS = (

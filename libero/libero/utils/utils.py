@@ -7,8 +7,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from libero_env.assets import chosen_assets
-from libero_env.robot import robosuite_assets
+from libero_env.assets.pack import chosen_assets
+from libero_env.assets.robot import robosuite_assets
 
 _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
 

@@ -7,7 +7,7 @@ from types import TracebackType
 
 import numpy as np
 
-from libero_env.demos_video import write_video
+from libero_env.demos.video import write_video
 from libero_env.errors import LiberoError
 
 _TINT = np.array([0, 255, 0])  # mixed into the pictures after success

@@ -11,13 +11,13 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
-from libero.lifelong.batches import DictBatch, DictWindows, map_tensors
-from libero.lifelong.config import named, plain
+from libero._adapters.lifelong.batches import DictBatch, DictWindows, map_tensors
+from libero._adapters.lifelong.config import named, plain
 from libero.lifelong.metric import evaluate_one_task_success
 from libero.lifelong.models import get_policy_class
 from libero.lifelong.utils import create_experiment_dir, safe_device, torch_load_model, torch_save_model
 from lifelong import algorithms
-from lifelong.training import generator
+from lifelong.seeding import generator
 
 REGISTERED_ALGOS: dict[str, type["Sequential"]] = {}
 

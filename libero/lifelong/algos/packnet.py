@@ -7,8 +7,8 @@ from typing import Any, cast
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from libero._adapters.lifelong.batches import DictWindows
 from libero.lifelong.algos.base import Sequential, members
-from libero.lifelong.batches import DictWindows
 from libero.lifelong.utils import torch_save_model
 from lifelong import algorithms
 

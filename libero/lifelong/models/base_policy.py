@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor, nn
 
-from libero.lifelong.batches import DictBatch, map_tensors
-from libero.lifelong.config import named, plain
+from libero._adapters.lifelong.batches import DictBatch, map_tensors
+from libero._adapters.lifelong.config import named, plain
 from libero.lifelong.models.modules.data_augmentation import AUGMENTATIONS, DataAugGroup
 
 REGISTERED_POLICIES: dict[str, type["BasePolicy"]] = {}

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from libero.lifelong.config import named, plain
+from libero._adapters.lifelong.config import named, plain
+from libero._adapters.lifelong.observations import spec_of, to_native
 from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS
 from libero.lifelong.models.modules.rgb_modules import fuse, resnet_sizes
 from libero.lifelong.models.policy_head import HEADS, GMMHead, check_activation, head_over
-from libero.lifelong.observations import spec_of, to_native
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import sinusoidal_positions
 from lifelong.policies.history import HistoryPolicy

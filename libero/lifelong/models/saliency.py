@@ -1,4 +1,4 @@
-"""Where a policy looks: `lifelong.saliency` for policies that take dictionaries.
+"""Where a policy looks: `lifelong.evaluation.saliency` for policies that take dictionaries.
 
 Shape legend: B batch, T time, C H W image, A action.
 """
@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from libero.lifelong.batches import map_tensors
-from libero.lifelong.observations import picture, pixels
-from lifelong.saliency import SaliencySettings, saliency
+from libero._adapters.lifelong.batches import map_tensors
+from libero._adapters.lifelong.observations import picture, pixels
+from lifelong.evaluation.saliency import SaliencySettings, saliency
 from lifelong.types import Batch, Observation
 
 
 class PerturbationAttention:
-    """How far a policy's action moves when a place of a picture is blurred; see `lifelong.saliency`.
+    """How far a policy's action moves when a place of a picture is blurred; see `lifelong.evaluation.saliency`.
 
     Args:
         model: a policy: `forward(data)` gives a distribution of actions, or actions.

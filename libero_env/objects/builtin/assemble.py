@@ -9,7 +9,7 @@ from types import MappingProxyType
 import mujoco
 import numpy as np
 
-from libero_env.mjspec import set_damping
+from libero_env.mujoco_compat import set_damping
 from libero_env.objects.builtin.facts import Facts, Part, load_facts
 from libero_env.objects.builtin.mesh import Mesh
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel, rest_quat

@@ -8,7 +8,7 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
-from libero_env.data_files import parse_yaml
+from libero_env.storage import parse_yaml
 
 Vector = tuple[float, ...]
 

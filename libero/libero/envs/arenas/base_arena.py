@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import mujoco
 
 from libero.libero.envs.arenas.style import STYLE_KINDS
-from libero_env.arena import load_workspace
-from libero_env.assets import select_pack
+from libero_env.assets.arena import load_workspace
+from libero_env.assets.pack import select_pack
 
 
 class Arena:

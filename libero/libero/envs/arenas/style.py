@@ -1,8 +1,8 @@
 """Styles of floors and walls by name."""
 
-from libero_env.arena_styles import load_styles
+from libero_env.assets.original_arena import TEXTURES
+from libero_env.assets.styles import load_styles
 from libero_env.errors import UnknownNameError
-from libero_env.original_arena import TEXTURES
 
 STYLE_KINDS = ("floor", "wall")
 STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}

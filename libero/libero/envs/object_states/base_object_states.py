@@ -1,12 +1,12 @@
-"""What predicates ask of objects, fixtures and regions; the answers are `libero_env.predicates`'."""
+"""What predicates ask of objects, fixtures and regions; the answers are `libero_env.sim.predicates`'."""
 
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
-from libero_env.predicates import evaluate
-from libero_env.problem import Atom
+from libero_env.sim.predicates import evaluate
+from libero_env.tasks.problem import Atom
 
 if TYPE_CHECKING:
     from libero.libero.envs.bddl_base_domain import BDDLBaseDomain

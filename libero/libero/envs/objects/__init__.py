@@ -52,12 +52,8 @@ from libero.libero.envs.objects.hope_objects import (
     SaladDressing,
     TomatoSauce,
 )
-from libero.libero.envs.objects.site_object import (
-    SiteObject,
-)
-from libero.libero.envs.objects.target_zones import (
-    TargetZone,
-)
+from libero.libero.envs.objects.site_object import SiteObject
+from libero.libero.envs.objects.target_zones import TargetZone
 from libero.libero.envs.objects.turbosquid_objects import (
     BlackBook,
     BowlDrainer,

@@ -1,4 +1,4 @@
-"""Predicates on object states; their truth is that of `libero_env.predicates`."""
+"""Predicates on object states; their truth is that of `libero_env.sim.predicates`."""
 
 from libero.libero.envs.predicates.base_predicates import (
     BinaryAtomic,

@@ -3,8 +3,8 @@
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-from libero_env.predicates import evaluate
-from libero_env.problem import Atom
+from libero_env.sim.predicates import evaluate
+from libero_env.tasks.problem import Atom
 
 
 class Expression(ABC):

@@ -1,6 +1,6 @@
 """Where objects go, for clients that place them themselves: name -> (pos (3,) m, quat wxyz (4,), object).
 
-The environments place things with `libero_env.placement`; these samplers share its rule of bounded tries.
+The environments place things with `libero_env.init_states.placement`; these samplers share its rule of bounded tries.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.arena import load_workspace
+from libero_env.assets.arena import load_workspace
 from libero_env.errors import PlacementError
 
 Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]

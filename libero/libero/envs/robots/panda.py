@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from libero_env.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_QPOS
+from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_QPOS
 
 
 class Panda:

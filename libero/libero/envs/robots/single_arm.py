@@ -7,10 +7,10 @@ import numpy as np
 
 from libero.libero.envs.robots.mounted_panda import MountedPanda
 from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
-from libero_env.control import checked_actions
-from libero_env.controllers import CONTROLLERS as KINDS
-from libero_env.controllers import ControllerState, get_controller
+from libero_env.envs.checks import checked_actions
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.sim.controllers import CONTROLLERS as KINDS
+from libero_env.sim.controllers import ControllerState, get_controller
 
 if TYPE_CHECKING:
     from libero.libero.envs.bddl_base_domain import BDDLBaseDomain

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from libero.lifelong.observations import pixels
+from libero._adapters.lifelong.observations import pixels
 from lifelong.nn.augmentation import Augmentation, ColorJitter, RandomShift
 
 __all__ = [

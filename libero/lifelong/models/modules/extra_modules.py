@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from libero._adapters.lifelong.observations import READINGS, reading
 from libero.lifelong.models.modules.language_modules import mlp
-from libero.lifelong.observations import READINGS, reading
 from lifelong.errors import PolicyError
 
 __all__ = ["ExtraModalities", "ExtraModalityTokens"]

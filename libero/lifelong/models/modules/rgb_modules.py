@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from libero.lifelong.observations import pixels
+from libero._adapters.lifelong.observations import pixels
 from lifelong.errors import PolicyError
 from lifelong.nn import patches, vision
 

@@ -1,0 +1,1 @@
+"""Parts of the facade that are no paths of the original."""

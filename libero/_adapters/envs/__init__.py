@@ -1,0 +1,1 @@
+"""Adapters between the original's environments and `libero_env`."""

@@ -1,0 +1,74 @@
+"""This package's tasks as the files that the original ships: `<suite>/<task>.bddl`, `<suite>/<task>.pruned_init`."""
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from libero_env.assets.pack import chosen_assets
+from libero_env.init_states.pickles import write_states
+from libero_env.init_states.store import shipped_path
+from libero_env.paths import cache_dir, demos_dir
+from libero_env.tasks import Task, get_suite, suite_names
+
+_COMPLETE = ".complete"  # written last, so that an interrupted layout is laid out again
+
+
+def generated_paths() -> dict[str, str]:
+    """Where task files, initial states, demonstrations and assets are without a configuration; not made yet."""
+    root = cache_dir() / "facade"
+    assets = chosen_assets().value
+    return {
+        "bddl_files": str(root / f"bddl_files-{_tasks_digest()}"),
+        "init_states": str(root / f"init_files-{_states_digest()}"),
+        "datasets": str(demos_dir()),
+        "assets": assets if Path(assets).is_dir() else str(Path(__file__).parents[2] / "libero" / "assets"),
+    }
+
+
+def ensure(key: str, path: str) -> None:
+    """Lay files out if `path` is where the generated ones belong."""
+    makers: dict[str, Callable[[Path], None]] = {"bddl_files": _write_tasks, "init_states": _write_states}
+    if key in makers and path == generated_paths()[key] and not (Path(path) / _COMPLETE).exists():
+        makers[key](Path(path))
+        (Path(path) / _COMPLETE).touch()
+
+
+def suite_tasks() -> dict[str, tuple[Task, ...]]:
+    """Suite with tasks of its own -> its tasks."""
+    suites = {name: get_suite(name).tasks for name in suite_names()}
+    return {name: tasks for name, tasks in suites.items() if all(task.suite == name for task in tasks)}
+
+
+@cache
+def _tasks_digest() -> str:
+    texts = [(task.id, task.name, task.bddl_text) for tasks in suite_tasks().values() for task in tasks]
+    return hashlib.sha256(repr(texts).encode()).hexdigest()[:12]
+
+
+def _states_digest() -> str:
+    files = [path for path in map(shipped_path, suite_names()) if path.exists()]
+    stamps = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    return hashlib.sha256(repr(stamps).encode()).hexdigest()[:12]
+
+
+def _write_tasks(root: Path) -> None:
+    for suite, tasks in suite_tasks().items():
+        folder = root / suite
+        folder.mkdir(parents=True, exist_ok=True)
+        for task in tasks:
+            (folder / f"{task.name}.bddl").write_text(task.bddl_text, encoding="utf-8")
+        names = "".join(f"{suite}/{task.name}.bddl\n" for task in tasks)
+        (folder / "tasks_info.txt").write_text(names, encoding="utf-8")
+
+
+def _write_states(root: Path) -> None:
+    root.mkdir(parents=True, exist_ok=True)
+    for suite, tasks in suite_tasks().items():
+        if not shipped_path(suite).exists():
+            continue
+        with np.load(shipped_path(suite), allow_pickle=False) as stored:
+            for task in tasks:
+                write_states(root / suite / f"{task.name}.pruned_init", stored[task.name])

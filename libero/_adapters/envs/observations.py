@@ -1,0 +1,153 @@
+"""What the original's environments observe, under robosuite's names; quaternions xyzw, pictures lowest row first."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from libero_env.assets.robot import GRIP_SITE
+from libero_env.errors import LiberoError, UnknownNameError
+
+if TYPE_CHECKING:
+    from libero._adapters.envs.sim import MjSim
+
+SEGMENTATIONS = ("instance", "class", "element")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera of the observations: pixels, whether depth is wanted, which segmentations are."""
+
+    name: str
+    height: int
+    width: int
+    depth: bool = False
+    segmentations: tuple[str, ...] = ()
+
+
+def cameras(
+    names: str | Sequence[str],
+    heights: int | Sequence[int],
+    widths: int | Sequence[int],
+    depths: bool | Sequence[bool],
+    segmentations: object,
+) -> tuple[Camera, ...]:
+    """Cameras from robosuite's arguments, where one value stands for all cameras.
+
+    Raises:
+        LiberoError: lists of different lengths.
+        UnknownNameError: no such segmentation.
+    """
+    names = [names] if isinstance(names, str) else list(names)
+    per_camera = isinstance(segmentations, Sequence) and any(
+        isinstance(s, list | tuple) for s in segmentations
+    )
+    kinds = list(segmentations) if per_camera else [segmentations] * len(names)  # type: ignore[call-overload]
+    columns = [_each(heights, len(names)), _each(widths, len(names)), _each(depths, len(names)), kinds]
+    if any(len(column) != len(names) for column in columns):
+        raise LiberoError(
+            f"camera_heights, _widths, _depths, _segmentations: one value, or {len(names)} as camera_names"
+        )
+    return tuple(
+        Camera(name, h, w, bool(depth), _kinds(kind))
+        for name, h, w, depth, kind in zip(names, *columns, strict=True)
+    )
+
+
+def _each(value: object, count: int) -> list:
+    return list(value) if isinstance(value, list | tuple) else [value] * count
+
+
+def _kinds(value: object) -> tuple[str, ...]:
+    kinds = tuple(kind for kind in _each(value, 1) if kind is not None)
+    for kind in kinds:
+        if kind not in SEGMENTATIONS:
+            raise UnknownNameError("segmentation", kind, SEGMENTATIONS)
+    return kinds
+
+
+@dataclass
+class Observer:
+    """Turns a simulation's state into the original's dictionary.
+
+    Attributes:
+        sim: what is observed.
+        objects: names of the movable objects.
+        cameras: drawn for each observation; empty for none.
+        segments: kind of segmentation -> (ngeom,) number of each geom, 1 and up, 0 for the background.
+    """
+
+    sim: "MjSim"
+    objects: Sequence[str]
+    cameras: Sequence[Camera] = ()
+    segments: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def observe(self) -> "OrderedDict[str, np.ndarray]":
+        """Everything, of the state whose kinematics are computed."""
+        robot, pictures, things = self._robot(), self._pictures(), self._things()
+        found = OrderedDict({**robot, **pictures, **things})
+        found["robot0_proprio-state"] = np.concatenate(list(robot.values()))
+        if things:
+            found["object-state"] = np.concatenate(list(things.values()))
+        return found
+
+    def _robot(self) -> dict[str, np.ndarray]:
+        data = self.sim.data
+        joints = data.qpos[:7].copy()
+        pos, quat = self._grip()
+        return {
+            "robot0_joint_pos": joints,
+            "robot0_joint_pos_cos": np.cos(joints),
+            "robot0_joint_pos_sin": np.sin(joints),
+            "robot0_joint_vel": data.qvel[:7].copy(),
+            "robot0_eef_pos": pos.copy(),
+            "robot0_eef_quat": np.roll(quat, -1),
+            "robot0_gripper_qpos": data.qpos[7:9].copy(),
+            "robot0_gripper_qvel": data.qvel[7:9].copy(),
+        }
+
+    def _grip(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position of the grip site and orientation of the hand, wxyz."""
+        return self.sim.data.get_site_xpos(GRIP_SITE), self.sim.data.get_body_xquat("robot0_right_hand")
+
+    def _things(self) -> dict[str, np.ndarray]:
+        found: dict[str, np.ndarray] = {}
+        grip_pos, grip_quat = self._grip()
+        inverse, rotation = np.empty(4), np.empty(9)
+        mujoco.mju_negQuat(inverse, grip_quat)
+        mujoco.mju_quat2Mat(rotation, inverse)
+        for name in self.objects:
+            pos, quat = (
+                self.sim.data.get_body_xpos(f"{name}_main"),
+                self.sim.data.get_body_xquat(f"{name}_main"),
+            )
+            relative = np.empty(4)
+            mujoco.mju_mulQuat(relative, inverse, quat)
+            found[f"{name}_pos"], found[f"{name}_quat"] = pos.copy(), np.roll(quat, -1)
+            found[f"{name}_to_robot0_eef_pos"] = rotation.reshape(3, 3) @ (pos - grip_pos)
+            found[f"{name}_to_robot0_eef_quat"] = np.roll(relative if relative[0] >= 0 else -relative, -1)
+        return found
+
+    def _pictures(self) -> dict[str, np.ndarray]:
+        found: dict[str, np.ndarray] = {}
+        for camera in self.cameras:
+            size: dict[str, Any] = {
+                "width": camera.width,
+                "height": camera.height,
+                "camera_name": camera.name,
+            }
+            if camera.depth:
+                image, depth = self.sim.render(**size, depth=True)
+                found[f"{camera.name}_image"], found[f"{camera.name}_depth"] = image, depth[..., None]
+            else:
+                found[f"{camera.name}_image"] = self.sim.render(**size)
+            if camera.segmentations:
+                elements = self.sim.render(**size, segmentation=True)[..., 1:]
+                for kind in camera.segmentations:
+                    # -1, the background, finds the last entry
+                    numbers = elements if kind == "element" else self.segments[kind][elements]
+                    found[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
+        return {key: np.ascontiguousarray(value) for key, value in found.items()}

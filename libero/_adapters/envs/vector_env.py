@@ -1,0 +1,197 @@
+"""Vectors of environments: observations are object arrays of dictionaries, the rest is stacked."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from libero._adapters.envs.subproc_worker import SubprocEnvWorker
+from libero._adapters.envs.workers import DummyEnvWorker, EnvWorker, WorkerError
+from libero_env.errors import LiberoError
+
+Ids = int | Sequence[int] | np.ndarray | None
+
+
+class BaseVectorEnv:
+    """Environments that are stepped together.
+
+    With `wait_num`, or a `timeout` to wait for them, `step` returns as soon as that many are ready; `info["env_id"]`
+    says which, and the others go on in the meantime.
+
+    Args:
+        env_fns: one factory for each environment.
+        worker_fn: makes a worker of a factory.
+        wait_num: how many to wait for; None for all.
+        timeout: s, how long to wait for the others.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], Any]],
+        worker_fn: Callable[[Callable[[], Any]], EnvWorker],
+        wait_num: int | None = None,
+        timeout: float | None = None,
+    ):
+        self.env_num = len(env_fns)
+        self.wait_num = wait_num or self.env_num
+        if not 1 <= self.wait_num <= self.env_num:
+            raise LiberoError(f"wait_num={wait_num} is not between 1 and the {self.env_num} environments")
+        if timeout is not None and timeout <= 0:
+            raise LiberoError(f"timeout={timeout} is not positive")
+        self.timeout = timeout
+        self.is_async = self.wait_num != self.env_num or timeout is not None
+        self.is_closed = False
+        self.workers = [worker_fn(env_fn) for env_fn in env_fns]
+        self.worker_class = type(self.workers[0])
+        self.waiting_id: list[int] = []
+        self.ready_id = list(range(self.env_num))
+
+    def __len__(self) -> int:
+        """Number of environments."""
+        return self.env_num
+
+    def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:
+        """An attribute of each environment."""
+        return [self.workers[i].get_env_attr(key) for i in self._ids(id)]
+
+    def set_env_attr(self, key: str, value: Any, id: Ids = None) -> None:
+        """Set an attribute of each environment."""
+        for i in self._ids(id):
+            self.workers[i].set_env_attr(key, value)
+
+    def reset(self, id: Ids = None, **kwargs: Any) -> np.ndarray:
+        """Observations (k,) after a reset."""
+        return _objects(self._call("reset", self._ids(id), **kwargs))
+
+    def step(self, action: Any, id: Ids = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Observations, rewards, successes and infos, each (k,); actions (k, 7)."""
+        ids = self._ids(id)
+        if len(action) != len(ids):
+            raise LiberoError(f"{len(action)} actions for {len(ids)} environments")
+        for i, own in zip(ids, action, strict=True):
+            self.workers[i].send("step", own)
+        if self.is_async:
+            self.waiting_id += ids
+            self.ready_id = [i for i in self.ready_id if i not in ids]
+            ids = self._ready()
+        results = self._receive(ids)
+        for i, (_, _, _, info) in zip(ids, results, strict=True):
+            info["env_id"] = i
+        observations, rewards, successes, infos = zip(*results, strict=True)
+        return _objects(observations), np.array(rewards), np.array(successes), _objects(infos)
+
+    def _ready(self) -> list[int]:
+        """Wait for some, and move them from waiting to ready."""
+        found: list[EnvWorker] = []
+        while not found:
+            found = self.worker_class.wait(
+                [self.workers[i] for i in self.waiting_id], self.wait_num, self.timeout
+            )
+        ids = [i for i in self.waiting_id if self.workers[i] in found]
+        self.waiting_id = [i for i in self.waiting_id if i not in ids]
+        self.ready_id += ids
+        return ids
+
+    def seed(self, seed: int | Sequence[int | None] | None = None) -> list[Any]:
+        """Seed the environments: with a list, or with numbers that count up from one."""
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + i for i in range(self.env_num)]
+        else:
+            seeds = list(seed)
+        return self._call("seed", range(self.env_num), seeds)
+
+    def render(self, **kwargs: Any) -> list[Any]:
+        """Call `render` of each environment."""
+        return self._call("render", range(self.env_num), **kwargs)
+
+    def check_success(self, id: Ids = None) -> list[bool]:
+        """Whether the goal of each environment holds."""
+        return self._call("check_success", self._ids(id))
+
+    def get_segmentation_of_interest(
+        self, segmentation_images: Sequence[np.ndarray], id: Ids = None
+    ) -> list[np.ndarray]:
+        """What the method of that name says in each environment."""
+        return self._call("get_segmentation_of_interest", self._ids(id), segmentation_images)
+
+    def get_sim_state(self, id: Ids = None) -> list[np.ndarray]:
+        """[time, qpos, qvel] of each environment."""
+        return self._call("get_sim_state", self._ids(id))
+
+    def set_init_state(self, init_state: Sequence[np.ndarray], id: Ids = None) -> np.ndarray:
+        """Go to states, one for each environment; observations (k,)."""
+        return _objects(self._call("set_init_state", self._ids(id), init_state))
+
+    def close(self) -> None:
+        """Close all environments. Idempotent."""
+        if not self.is_closed:
+            self.is_closed = True
+            for worker in self.workers:
+                worker.close()
+
+    def _call(
+        self, method: str, ids: Sequence[int], each: Sequence[Any] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method of these environments at once, each with its own argument."""
+        if each is not None and len(each) != len(ids):
+            raise LiberoError(f"{method}: {len(each)} values for {len(ids)} environments")
+        for k, i in enumerate(ids):
+            self.workers[i].send(method, *(() if each is None else (each[k],)), **kwargs)
+        return self._receive(ids)
+
+    def _receive(self, ids: Sequence[int]) -> list[Any]:
+        """All answers, so that none is left for the next call; then the first failure is raised."""
+        results, failures = [], []
+        for i in ids:
+            try:
+                results.append(self.workers[i].recv())
+            except WorkerError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
+        return results
+
+    def _ids(self, id: Ids) -> list[int]:
+        if self.is_closed:
+            raise LiberoError("this vector of environments is closed")
+        ids = list(range(self.env_num)) if id is None else [int(i) for i in np.atleast_1d(id)]
+        if busy := [i for i in ids if i in self.waiting_id]:
+            raise LiberoError(f"environments {busy} are still at their last step; wait for them with step")
+        return ids
+
+
+class DummyVectorEnv(BaseVectorEnv):
+    """Environments in this process, one after the other."""
+
+    def __init__(self, env_fns: Sequence[Callable[[], Any]], **kwargs: Any):
+        super().__init__(env_fns, DummyEnvWorker, **kwargs)
+
+
+class SubprocVectorEnv(BaseVectorEnv):
+    """Environments in processes of their own.
+
+    Args:
+        env_fns: one factory for each environment; lambdas will do.
+        share_memory: whether observations come back through shared memory.
+        call_timeout: s that any call may take before its worker is given up.
+        kwargs: further arguments of `BaseVectorEnv`.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], Any]],
+        share_memory: bool = False,
+        call_timeout: float | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            env_fns, lambda env_fn: SubprocEnvWorker(env_fn, share_memory, call_timeout), **kwargs
+        )
+
+
+def _objects(items: Sequence[Any]) -> np.ndarray:
+    """(k,) array of any things."""
+    array = np.empty(len(items), object)
+    for i, item in enumerate(items):
+        array[i] = item
+    return array

@@ -1,0 +1,1 @@
+"""Adapters between the original's learning side and `lifelong`."""

@@ -1,0 +1,32 @@
+from .demos.generate import ensure_demos
+from .demos.read import read_demos
+from .envs.batch import BatchEnv
+from .envs.env import LiberoEnv
+from .envs.subproc import SubprocEnv
+from .errors import LiberoError, UnknownNameError
+from .expert.expert import Expert
+from .objects.catalog import register_object
+from .sim.predicates import register_predicate
+from .tasks.authoring import make_task
+from .tasks.files import get_task, read_task
+from .tasks.suites import get_suite
+from .tasks.task import Suite, Task
+
+__all__ = [
+    "BatchEnv",
+    "Expert",
+    "LiberoEnv",
+    "LiberoError",
+    "SubprocEnv",
+    "Suite",
+    "Task",
+    "UnknownNameError",
+    "ensure_demos",
+    "get_suite",
+    "get_task",
+    "make_task",
+    "read_demos",
+    "read_task",
+    "register_object",
+    "register_predicate",
+]

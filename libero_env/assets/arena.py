@@ -1,0 +1,234 @@
+"""Where a task happens: floor or table, cameras, lights, walls, and the builtin pack's furniture around them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import mujoco
+
+from libero_env.assets.furniture import add_furniture, add_visual_mesh, furniture, solid
+from libero_env.assets.robot import robosuite_assets
+from libero_env.assets.styles import add_material, furniture_of, styles_of
+from libero_env.errors import UnknownNameError
+from libero_env.mujoco_compat import delete
+from libero_env.objects.builtin.mesh import Mesh, merge
+from libero_env.storage import read_yaml
+
+# Fixture category that is a workspace -> its file in `libero_env/assets/workspaces`.
+WORKSPACES: Mapping[str, str] = {
+    "table": "table",
+    "kitchen_table": "kitchen_table",
+    "living_room_table": "living_room_table",
+    "study_table": "study_table",
+    "coffee_table": "coffee_table",
+    "floor": "floor",
+}
+_ROOM = "room"  # the file with what all have in common
+_MOUNT_LIFT = 0.01  # m, the mount's origin over the arm's
+_SHARED = ("cameras", "lights", "walls", "floor")
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Where a task happens; the figures of one file in `libero_env/assets/workspaces`. Metres, world frame.
+
+    Attributes:
+        name: fixture category, such as `kitchen_table`.
+        problem: name of the problem class in task files.
+        offset: origin of the regions, (3,).
+        region_height: z of the surface that things stand on, over the offset.
+        zone_origin: of the flat boxes over regions that goals ask after, (3,): x and y of regions count from here, z is
+            the middle of the boxes. The original puts them at another height in each problem.
+        robot_base_pos: origin of `robot0_base`, (3,).
+        mount: what stands under the arm: `rethink` or None.
+        figures: all of the file.
+    """
+
+    name: str
+    problem: str
+    offset: tuple[float, float, float]
+    region_height: float
+    zone_origin: tuple[float, float, float]
+    robot_base_pos: tuple[float, float, float]
+    mount: str | None
+    figures: Mapping[str, Any]
+
+    @property
+    def surface_height(self) -> float:
+        """World z of the surface that things stand on, m."""
+        return self.offset[2] + self.region_height
+
+
+@cache
+def load_workspace(category: str) -> Workspace:
+    """The workspace that a fixture category stands for.
+
+    Raises:
+        UnknownNameError: no such workspace; the message lists the valid ones.
+    """
+    if category not in WORKSPACES:
+        raise UnknownNameError("workspace", category, WORKSPACES)
+    room, own = _read(_ROOM), _read(WORKSPACES[category])
+    figures = {**own, **{key: _merged(room[key], own.get(key, {})) for key in _SHARED}}
+    return Workspace(
+        name=category,
+        problem=figures["problem"],
+        offset=tuple(figures["offset"]),
+        region_height=figures["region_height"],
+        zone_origin=tuple(figures["zone_origin"]),
+        robot_base_pos=tuple(figures["robot"]["base_pos_world"]),
+        mount=figures["robot"]["mount"],
+        figures=figures,
+    )
+
+
+def workspace_of_problem(problem: str) -> Workspace:
+    """The workspace of a problem class, such as `LIBERO_Floor_Manipulation`, in whatever case.
+
+    Raises:
+        UnknownNameError: no such problem; the message lists the valid ones.
+    """
+    known = {load_workspace(category).problem: category for category in WORKSPACES}
+    for name, category in known.items():
+        if name.casefold() == problem.casefold():
+            return load_workspace(category)
+    raise UnknownNameError("problem", problem, known)
+
+
+def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]) -> None:
+    """Add cameras, lights, floor, walls and the table to a scene.
+
+    Args:
+        spec: the scene.
+        workspace: which.
+        scene_properties: what a task file's `:scene_properties` say: `floor` and `wall` name a style of each, `scene`
+            one of the whole scene; without them it looks as the workspace's file says.
+
+    Raises:
+        UnknownNameError: a property or a style that does not exist; the message lists the valid ones.
+    """
+    figures = workspace.figures
+    styles = styles_of(figures["styles"], scene_properties)
+    add_cameras_and_lights(spec, workspace)
+    _add_room(spec, figures, styles)
+    if "table" in figures:
+        _add_table(spec, figures["table"])
+    add_furniture(spec, furniture_of(figures.get("furniture", ()), scene_properties))
+
+
+def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
+    """Add the cameras that do not move with the robot, and the lights."""
+    world = spec.worldbody
+    for name, camera in workspace.figures["cameras"].items():
+        world.add_camera(name=name, pos=camera["pos"], quat=camera["quat"], fovy=camera["fovy_degrees"])
+    for name, light in workspace.figures["lights"].items():
+        added = world.add_light(name=name, pos=light["pos"], dir=light["dir"], castshadow=False)
+        added.diffuse, added.specular = [0.8] * 3, [light.get("specular", 0.3)] * 3
+        if light.get("directional"):
+            if hasattr(mujoco, "mjtLightType"):
+                added.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            else:  # before MuJoCo 3.4
+                added.directional = True
+
+
+def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
+    """Add what the arm stands on, where the workspace has it: names start with `mount0_`, the root is `mount0_base`.
+
+    Raises:
+        LiberoError: robosuite, which supplies the model, is not installed.
+    """
+    if workspace.mount is None:
+        return
+    mount = mujoco.MjSpec.from_file(str(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml"))
+    mount.compiler.degree = False
+    mount.body("base").pos = [0.0, 0.0, 0.0]
+    delete(mount, mount.geom("pedestal_vis"))  # 33,000 triangles
+    delete(mount, mount.mesh("pedestal"))
+    add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
+    pos = (*workspace.robot_base_pos[:2], workspace.robot_base_pos[2] + _MOUNT_LIFT)
+    spec.attach(mount, prefix="mount0_", frame=spec.worldbody.add_frame(pos=pos))
+
+
+def _add_room(
+    spec: mujoco.MjSpec, figures: Mapping[str, Any], styles: Mapping[str, Mapping[str, Any]]
+) -> None:
+    world = spec.worldbody
+    ground = world.add_body(name=figures["floor_body"]) if figures["floor_body"] else world
+    add_material(spec, "floor", styles["floor"])
+    ground.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=figures["floor"]["size"],
+        material="floor",
+        group=1,
+        condim=3,
+    )
+    add_material(spec, "wall", styles["wall"], *figures["wall_gloss"])
+    for name, wall in figures["walls"].items():
+        world.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=wall["pos"],
+            quat=wall["quat"],
+            size=wall["size"],
+            material="wall",
+            group=1,
+            contype=0,
+            conaffinity=0,
+        )
+
+
+def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
+    body = spec.worldbody
+    for name, pos in table["bodies"].items():
+        body = body.add_body(name=name, pos=pos)
+    body.quat = table.get("quat", [1.0, 0.0, 0.0, 0.0])
+    contact = table.get("contact", {})
+    for box in table["collision"]:
+        geom = body.add_geom(
+            name=box.get("name", ""),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.get("pos", [0.0] * 3),
+            quat=box.get("quat", [1.0, 0.0, 0.0, 0.0]),
+            size=box["size"],
+            friction=box.get("friction") or contact["friction"],
+            group=0,
+            rgba=[0.5, 0.5, 0.5, 0.3],
+        )
+        if "solref" in contact:
+            geom.solref, geom.solimp = contact["solref"], [*contact["solimp"], 0.5, 2.0]
+    add_material(spec, "table", table["style"], *table["gloss"])
+    for part in table.get("visual", ()):
+        body.add_geom(
+            name=part["name"],
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}"),
+            pos=part.get("pos", [0.0] * 3),
+            size=part["size"],
+            material="table",
+            group=1,
+            contype=0,
+            conaffinity=0,
+        )
+    if "shapes" in table:
+        first = spec.body(next(iter(table["bodies"])))
+        add_visual_mesh(spec, first, "table_visual", _from_above(table), "table")
+    for name, pos in table.get("sites", {}).items():
+        body.add_site(name=name, pos=pos, size=[0.001] * 3, rgba=[0.0] * 4)
+
+
+def _from_above(table: Mapping[str, Any]) -> Mesh:
+    """The table's shapes with the texture laid on from above, its second axis along y."""
+    mesh = merge([solid(shape) for shape in table["shapes"]])
+    period = table["style"]["period"]
+    return Mesh(mesh.vertices, mesh.faces, mesh.vertices[:, [1, 0]] / period)
+
+
+@cache
+def _read(name: str) -> Mapping[str, Any]:
+    return read_yaml(f"assets/workspaces/{name}.yaml")
+
+
+def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Both, one's own entries first choice; what is null in it is left out."""
+    return {key: value for key, value in {**common, **own}.items() if value is not None}

@@ -1,0 +1,39 @@
+"""Whether a pack is complete: every object and room can be built, every file is as it was published."""
+
+from pathlib import Path
+
+import mujoco
+
+from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.assets.download import read_manifest
+from libero_env.assets.hub import broken_files
+from libero_env.assets.original import OriginalPack
+from libero_env.assets.pack import Pack
+from libero_env.errors import LiberoError
+
+
+def problems(pack: Pack) -> list[str]:
+    """One line for each object or room that does not compile, and for each downloaded file that has changed."""
+    found = [f"{what}: {error}" for what in pack.categories() if (error := _build_error(pack, what))]
+    found += [f"{what}: {error}" for what in WORKSPACES if (error := _arena_error(pack, what))]
+    if isinstance(pack, OriginalPack) and (record := read_manifest(Path(pack.root))):
+        found += [f"{name}: missing or changed" for name in broken_files(Path(pack.root), record[1])]
+    return found
+
+
+def _build_error(pack: Pack, category: str) -> str | None:
+    try:
+        pack.build(category).spec.compile()
+    except (LiberoError, ValueError) as error:  # ValueError: MuJoCo's, of a broken mesh or picture
+        return str(error)
+    return None
+
+
+def _arena_error(pack: Pack, workspace: str) -> str | None:
+    spec = mujoco.MjSpec()
+    try:
+        pack.add_arena(spec, load_workspace(workspace), {})
+        spec.compile()
+    except (LiberoError, ValueError) as error:
+        return str(error)
+    return None

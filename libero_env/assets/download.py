@@ -1,0 +1,129 @@
+"""Fetching the original's assets from the Hugging Face Hub, pinned and verified.
+
+What arrives is compared with the digests that the Hub gives for the revision, and these are kept beside the files, so
+that a later check needs no network.
+"""
+
+import errno
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from libero_env.assets.hub import DownloadError, Remote, broken_files, check_room
+from libero_env.errors import LiberoError
+from libero_env.paths import cache_dir
+
+REPO = "lerobot/libero-assets"  # a data set; CC BY 4.0
+REVISION = "0b3ea86be5fe169d0fd036ae63d1070ec09e90f6"
+MANIFEST = "libero-assets.json"  # written beside the files when all of them are there and right
+
+
+def default_folder() -> Path:
+    """Where `download` puts the files."""
+    return cache_dir() / "assets"
+
+
+def download(dest: Path | None = None, revision: str = REVISION) -> Path:
+    """Fetch the assets, or what is missing of them; `HF_ENDPOINT` names another server than the Hub.
+
+    Args:
+        dest: the folder; `default_folder()` by default.
+        revision: commit, tag or branch of the repository.
+
+    Returns:
+        The folder, complete and verified.
+
+    Raises:
+        DownloadError: no network, no room, or files that stay different from what the Hub announces. Running it again
+            goes on where it stopped.
+        LiberoError: huggingface_hub is not installed.
+    """
+    folder = (dest or default_folder()).expanduser().absolute()
+    with _hub(folder) as hub:
+        endpoint = os.environ.get("HF_ENDPOINT")
+        remote = _listing(hub.HfApi(endpoint=endpoint), revision)
+        wrong = broken_files(folder, remote)
+        for _ in range(2):  # once more for files that arrived broken
+            if not wrong:
+                break
+            check_room(folder, sum(remote[name].size for name in wrong))
+            for name in wrong:
+                (folder / name).unlink(missing_ok=True)
+            hub.snapshot_download(
+                REPO, repo_type="dataset", revision=revision, local_dir=folder, endpoint=endpoint
+            )
+            wrong = broken_files(folder, remote)
+        if wrong:
+            raise DownloadError(
+                f"{len(wrong)} files in {folder} differ from what the Hub announces, such as {wrong[0]}: the server or "
+                "a proxy changes them, or the disk is failing; try again, or set HF_ENDPOINT to another server"
+            )
+        _write_manifest(folder, revision, remote)
+    return folder
+
+
+def read_manifest(folder: Path) -> tuple[str, dict[str, Remote]] | None:
+    """Revision and files of a download that was completed; None where there is no (valid) record of one."""
+    try:
+        record = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        return record["revision"], {name: Remote(**file) for name, file in record["files"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _write_manifest(folder: Path, revision: str, remote: Mapping[str, Remote]) -> None:
+    record = {
+        "repo": REPO,
+        "revision": revision,
+        "files": {name: asdict(file) for name, file in remote.items()},
+    }
+    partial = folder / f"{MANIFEST}.partial"
+    partial.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    partial.replace(folder / MANIFEST)
+
+
+def _listing(api: Any, revision: str) -> dict[str, Remote]:
+    entries = api.list_repo_tree(REPO, recursive=True, revision=revision, repo_type="dataset")
+    files = [entry for entry in entries if hasattr(entry, "blob_id")]  # the others are folders
+    if bad := [f.path for f in files if Path(f.path).is_absolute() or ".." in Path(f.path).parts]:
+        raise DownloadError(f"the server lists files outside the folder, such as {bad[0]}: do not trust it")
+    return {
+        f.path: Remote(f.lfs.size, "sha256", f.lfs.sha256) if f.lfs else Remote(f.size, "git", f.blob_id)
+        for f in files
+    }
+
+
+@contextmanager
+def _hub(folder: Path) -> Iterator[Any]:
+    """huggingface_hub with plain HTTP, which resumes and which mirrors speak; its errors become ours."""
+    try:
+        import huggingface_hub as hub
+        from huggingface_hub import constants
+        from huggingface_hub.errors import HfHubHTTPError
+    except ImportError as error:
+        raise LiberoError(
+            "huggingface_hub is not installed; it fetches the assets: pip install huggingface_hub"
+        ) from error
+    errors: tuple[type[Exception], ...] = (
+        OSError,
+        HfHubHTTPError.__mro__[1],
+    )  # and what the HTTP library raises
+    before = constants.HF_HUB_DISABLE_XET
+    constants.HF_HUB_DISABLE_XET = True
+    again = f"what arrived is kept in {folder}: run it again to go on"
+    try:
+        yield hub
+    except errors as error:
+        where = os.environ.get("HF_ENDPOINT", constants.ENDPOINT)
+        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            raise DownloadError(f"{folder}: the disk is full; make room. {again}") from error
+        if isinstance(error, PermissionError):
+            raise DownloadError(f"{error}; name a folder that you may write with --dest") from error
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DownloadError(f"downloading {REPO} from {where} failed: {reason}; {again}") from error
+    finally:
+        constants.HF_HUB_DISABLE_XET = before

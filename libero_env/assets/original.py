@@ -1,0 +1,138 @@
+"""The original benchmark's objects and rooms, from its own files.
+
+Collision geometry, masses, joints and contact parameters are those of the files, so that the original's states mean the
+same; how an object rests and what counts as open are facts of the benchmark, which no file holds.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+
+from libero_env.assets.original_mjcf import object_xml
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.objects.builtin.facts import load_facts
+from libero_env.objects.catalog import get_object, own_names
+from libero_env.objects.model import ObjectModel
+
+if TYPE_CHECKING:
+    from libero_env.assets.arena import Workspace
+
+# Folder -> categories, one file each.
+FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "articulated_objects": (
+            "basin_faucet", "faucet", "flat_stove", "microwave", "short_cabinet", "short_fridge", "slide_cabinet",
+            "white_cabinet", "window", "wooden_cabinet",
+        ),
+        "stable_hope_objects": (
+            "alphabet_soup", "bbq_sauce", "butter", "chocolate_pudding", "cookies", "cream_cheese", "ketchup",
+            "macaroni_and_cheese", "milk", "new_salad_dressing", "orange_juice", "popcorn", "salad_dressing",
+            "tomato_sauce",
+        ),
+        "stable_scanned_objects": (
+            "akita_black_bowl", "basket", "chefmate_8_frypan", "glazed_rim_porcelain_ramekin", "plate", "rack",
+            "white_bowl",
+        ),
+        "turbosquid_objects": (
+            "black_book", "bowl_drainer", "desk_caddy", "dining_set_group", "moka_pot", "porcelain_mug",
+            "red_coffee_mug", "white_storage_box", "white_yellow_mug", "wine_bottle", "wine_rack", "wooden_shelf",
+            "wooden_tray", "wooden_two_layer_shelf", "yellow_book",
+        ),
+    }
+)  # fmt: skip
+_STEMS = {"rack": "simple_rack"}
+_FIGURES = (  # of an `ObjectModel` that are facts of the benchmark
+    "joint_damping", "rotation", "rotation_axis", "bottom_offset", "top_offset", "horizontal_radius", "articulation",
+)  # fmt: skip
+_ROOM = "room_"
+_NAMED_ONLY = ("cherries", "corn", "mayo")  # the original has the names, its files were never published
+
+
+@dataclass(frozen=True)
+class OriginalPack:
+    """The original's asset folder.
+
+    Attributes:
+        root: the folder that holds `articulated_objects`, `scenes`, ...
+        lod: number of triangles that a visual mesh is simplified to; None leaves them as they are.
+    """
+
+    root: str
+    lod: int | None = None
+
+    @property
+    def name(self) -> str:
+        """`original`, with the level of detail where there is one."""
+        return "original" if self.lod is None else f"original-lod{self.lod}"
+
+    def categories(self) -> tuple[str, ...]:
+        """All categories, sorted, with those that users registered."""
+        return tuple(sorted({*own_names(), *(c for group in FAMILIES.values() for c in group)}))
+
+    def build(self, category: str) -> ObjectModel:
+        """Model of a category, anew at each call; what users registered comes first.
+
+        Raises:
+            UnknownNameError: no object has this name.
+            LiberoError: the pack has no model of it, or its files are missing.
+        """
+        if category in own_names():
+            return get_object(category)
+        if category in _NAMED_ONLY:
+            raise LiberoError(
+                f"the original assets have no model of {category!r}, only its name; add one with "
+                "libero_env.objects.register_object, or use the builtin pack where it has one (LIBERO_ASSETS=builtin)"
+            )
+        spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category))
+        self._simplify(spec)
+        facts = load_facts(category)
+        figures: dict[str, Any] = {name: getattr(facts, name) for name in _FIGURES}
+        return ObjectModel(category, spec, **figures)
+
+    def file(self, category: str) -> Path:
+        """The MJCF file of a category.
+
+        Raises:
+            UnknownNameError: no object has this name.
+        """
+        folder = next((name for name, group in FAMILIES.items() if category in group), None)
+        if folder is None:
+            raise UnknownNameError("object category", category, self.categories())
+        stem = _STEMS.get(category, category)
+        flat = Path(self.root) / folder / f"{stem}.xml"
+        return flat if folder == "articulated_objects" else flat.with_suffix("") / flat.name
+
+    def add_arena(
+        self, spec: mujoco.MjSpec, workspace: "Workspace", scene_properties: Mapping[str, str]
+    ) -> None:
+        """Attach the original's room, with its cameras and lights.
+
+        Raises:
+            UnknownNameError: a property names a style that does not exist.
+            LiberoError: files are missing.
+        """
+        from libero_env.assets.arena import add_cameras_and_lights
+        from libero_env.assets.original_arena import arena_spec
+
+        room = arena_spec(Path(self.root), workspace, scene_properties)
+        self._simplify(room)
+        spec.attach(room, prefix=_ROOM, frame=spec.worldbody.add_frame())
+        for item in (*spec.bodies, *spec.geoms, *spec.sites):
+            item.name = item.name.removeprefix(_ROOM)  # MuJoCo warns of an empty prefix; assets keep theirs
+        add_cameras_and_lights(spec, workspace)
+
+    def _simplify(self, spec: mujoco.MjSpec) -> None:
+        if self.lod is not None:
+            from libero_env.assets.simplify import simplify_visuals
+
+            simplify_visuals(spec, self.lod)
+
+
+def is_original(root: str | os.PathLike) -> bool:
+    """Whether a folder looks like the original's assets."""
+    return all((Path(root) / folder).is_dir() for folder in (*FAMILIES, "scenes"))

@@ -1,0 +1,126 @@
+"""The original's rooms: its scene files, with table, floor and walls set as its problem classes set them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree as ET
+
+import mujoco
+
+from libero_env.assets.original_mjcf import read_file, to_xml, used_assets
+from libero_env.assets.styles import load_styles, styles_of
+
+if TYPE_CHECKING:
+    from libero_env.assets.arena import Workspace
+
+# Workspace -> what its scene files are called.
+SCENES: Mapping[str, str] = MappingProxyType(
+    {
+        "coffee_table": "libero_coffee_table",
+        "floor": "libero_floor",
+        "kitchen_table": "libero_kitchen_tabletop",
+        "living_room_table": "libero_living_room_tabletop",
+        "study_table": "libero_study",
+        "table": "libero_tabletop",
+    }
+)
+# Name of a style in task files -> picture in `textures`.
+TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "floor": {
+            "brown-ceramic": "brown_ceramic_tile.png",
+            "dark": "dark_floor_texture.png",
+            "gray-ceramic": "gray_ceramic_tile.png",
+            "light-gray": "light-gray-floor-tile.png",
+            "rustic": "rustic_floor.png",
+            "tile_grigia_caldera": "tile_grigia_caldera_porcelain_floor.png",
+            "white-marble": "white_marble_floor.png",
+            "wood-plank": "seamless_wood_planks_floor.png",
+        },
+        "wall": {
+            "ceramic": "ceramic.png",
+            "dark-blue": "dark_blue_wall.png",
+            "dark-gray-plaster": "dark_gray_plaster.png",
+            "dark-green": "dark_green_plaster_wall.png",
+            "gray-plaster": "gray_plaster.png",
+            "light-blue": "light_blue_wall.png",
+            "light-gray-plaster": "light-gray-plaster.png",
+            "white": "white_wall.png",
+            "yellow-linen": "yellow_linen_wall_texture.png",
+        },
+    }
+)
+_TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
+_STIFF = 0.004  # s, the stiffest time constant that the timestep allows
+_FIRM_SOLREF = (0.02, 1.0)
+_DEEP_BOXES = tuple(int(n) for n in mujoco.__version__.split(".")[:2]) >= (3, 4)
+_NOT_HERE = ("camera", "light")  # they come with the workspace's figures
+
+
+def arena_spec(root: Path, workspace: "Workspace", scene_properties: Mapping[str, str]) -> mujoco.MjSpec:
+    """A room as a model of its own, without cameras and lights.
+
+    Args:
+        root: the asset folder.
+        workspace: which.
+        scene_properties: as `libero_env.assets.arena.add_arena` takes them.
+
+    Raises:
+        UnknownNameError: a property or a style that does not exist.
+        LiberoError: files are missing.
+    """
+    own = workspace.figures["styles"]
+    styles_of(own, scene_properties)  # raises what is wrong with them
+    wanted = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
+    scene = wanted.pop("scene", "base")
+    pictures = {**own, **load_styles()["scene"][scene], **wanted}
+    assets, world = read_file(scene_file(root, workspace.name, scene))
+    for element in assets:
+        for kind, name in _TEXTURE_NAMES.items():
+            if element.tag == "texture" and element.get("name") == name:
+                element.set("file", str(root / "textures" / TEXTURES[kind][pictures[kind]]))
+    for element in list(world):
+        if element.tag in _NOT_HERE:
+            world.remove(element)
+    _fit_table(world, workspace.figures.get("table", {}))
+    spec = mujoco.MjSpec.from_string(to_xml(workspace.name, used_assets(assets, world), world))
+    if _DEEP_BOXES:
+        _soften(spec)
+    return spec
+
+
+def _soften(spec: mujoco.MjSpec) -> None:
+    """Make stiff table tops as firm as before MuJoCo 3.4.
+
+    Since then the depth between two boxes is what they overlap by, where it was half of that; and a push grows with the
+    depth over the square of the time constant. Some of the original's states start three centimetres deep in the table
+    of the living room: the same figures would shoot things half a metre up.
+    """
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_BOX and geom.contype and geom.solref[0] < _STIFF:
+            geom.solref, geom.solimp = _FIRM_SOLREF, (0.9, 0.95, 0.001, 0.5, 2.0)
+
+
+def scene_file(root: Path, workspace: str, scene: str = "base") -> Path:
+    """The file of a scene; the base one where the workspace has none of that name."""
+    folder = root / "scenes"
+    path = folder / f"{SCENES[workspace]}_{scene}_style.xml"
+    return path if path.is_file() else folder / f"{SCENES[workspace]}_base_style.xml"
+
+
+def _fit_table(world: ET.Element, table: Mapping[str, Any]) -> None:
+    """Give the named parts of a table the size that they have in the workspace: the files hold placeholders."""
+    named: dict[tuple[str, str], Mapping[str, Any]] = {
+        ("geom", part["name"]): part
+        for key in ("collision", "visual")
+        for part in table.get(key, ())
+        if "name" in part
+    }
+    named |= {("site", name): {"pos": pos} for name, pos in table.get("sites", {}).items()}
+    named |= {("body", name): {"pos": pos} for name, pos in table.get("bodies", {}).items()}
+    for element in world.iter():
+        part = named.get((element.tag, element.get("name", "")), {})
+        for key in ("pos", "size", "friction"):
+            if key in part:
+                element.set(key, " ".join(map(repr, part[key])))

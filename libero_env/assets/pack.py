@@ -1,0 +1,121 @@
+"""Which models a scene is built from: the builtin pack, or the original's files where the user has them."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import mujoco
+
+from libero_env.assets.arena import Workspace, add_arena
+from libero_env.errors import LiberoError
+from libero_env.objects import ObjectModel, get_object, object_names
+from libero_env.paths import config_file, read_config
+
+BUILTIN = "builtin"
+VARIABLE = "LIBERO_ASSETS"
+
+
+class Pack(Protocol):
+    """Where the models of objects and rooms come from. Hashable: scenes are cached by it."""
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def name(self) -> str:
+        """What results and messages call it."""
+        ...
+
+    def build(self, category: str) -> ObjectModel:
+        """Model of a category, anew at each call.
+
+        Raises:
+            UnknownNameError: no object has this name.
+            LiberoError: this pack has no model of it.
+        """
+        ...
+
+    def categories(self) -> tuple[str, ...]:
+        """All categories that `build` knows, sorted."""
+        ...
+
+    def add_arena(
+        self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
+    ) -> None:
+        """Add floor, walls, table, lights and cameras to a scene.
+
+        Raises:
+            UnknownNameError: a property names a style that does not exist.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class BuiltinPack:
+    """The pack that is generated in code: nothing to download."""
+
+    @property
+    def name(self) -> str:
+        """`builtin`"""
+        return BUILTIN
+
+    def build(self, category: str) -> ObjectModel:
+        """See `Pack`."""
+        return get_object(category)
+
+    def categories(self) -> tuple[str, ...]:
+        """See `Pack`."""
+        return object_names()
+
+    def add_arena(
+        self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
+    ) -> None:
+        """See `Pack`."""
+        add_arena(spec, workspace, scene_properties)
+
+
+class Choice(NamedTuple):
+    """A pack and why it is in use."""
+
+    value: str  # `builtin`, or a folder
+    reason: str
+
+
+def chosen_assets(assets: str | os.PathLike | None = None) -> Choice:
+    """What `select_pack` goes by: the argument, `LIBERO_ASSETS`, the configuration file's `assets`, or the default."""
+    if assets is not None:
+        return Choice(os.fspath(assets), "asked for by the caller")
+    if value := os.environ.get(VARIABLE):
+        return Choice(value, f"${VARIABLE}")
+    if value := read_config().get("assets"):
+        return Choice(str(value), str(config_file()))
+    return Choice(BUILTIN, "the default")
+
+
+def select_pack(assets: str | os.PathLike | None = None, lod: int | None = None) -> Pack:
+    """The pack to build scenes from.
+
+    Args:
+        assets: `builtin`, or the folder of the original's files; by default `$LIBERO_ASSETS`, then the key `assets` of
+            `$LIBERO_CONFIG_PATH/config.yaml`, then `builtin`.
+        lod: number of triangles that a visual mesh of the original is simplified to; None leaves them as they are.
+
+    Raises:
+        LiberoError: the folder does not hold the original's files.
+    """
+    value, reason = chosen_assets(assets)
+    if value == BUILTIN:
+        return BuiltinPack()
+    from libero_env.assets.original import OriginalPack, is_original
+
+    root = Path(value).expanduser().absolute()
+    if is_original(root):
+        return OriginalPack(str(root), lod)
+    if reason == str(config_file()) and not root.exists():
+        return BuiltinPack()  # the original writes this key whether there are files or not
+    raise LiberoError(
+        f"{root} ({reason}) does not hold the original assets: a folder with articulated_objects, scenes, "
+        f"stable_hope_objects, ... is expected. `libero assets download` fetches them; {VARIABLE}={BUILTIN} "
+        "does without"
+    )

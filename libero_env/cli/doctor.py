@@ -1,0 +1,182 @@
+"""What this machine has and lacks: each finding with the way to mend it, and no crash."""
+
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from libero_env.paths import cache_dir, demos_dir
+from libero_env.storage import show_bytes
+
+ROBOSUITE = "1.4.1"
+GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
+BACKENDS = ("egl", "osmesa", "glfw")
+PROBE_SECONDS = 60
+PACKAGE_ROOT = str(Path(__file__).parents[2])
+
+# Runs in a process of its own: a broken driver takes the process with it.
+_PROBE = """
+import json, sys, time
+import mujoco, numpy
+from libero_env.errors import RenderError
+from libero_env.sim.render import Renderer, choose_backend
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 2'/><geom type='plane' size='1 1 1' group='1'/>"
+    "<camera name='above' pos='0 0 2'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+picture = numpy.zeros((128, 128, 3), numpy.uint8)
+try:
+    found = {"backend": choose_backend()}
+    with Renderer(model, 128, 128) as renderer:
+        camera = [renderer.camera_id("above")]
+        renderer.render(data, camera, [picture])
+        start = time.perf_counter()
+        renderer.render(data, camera, [picture])
+        found["milliseconds"] = 1e3 * (time.perf_counter() - start)
+        try:
+            from OpenGL.GL import GL_RENDERER, glGetString
+            found["device"] = glGetString(GL_RENDERER).decode()
+        except Exception:
+            found["device"] = "unknown device"
+    if not picture.any():
+        found = {"error": found["backend"] + " draws black pictures"}
+except RenderError as error:
+    found = {"error": str(error)}
+print(json.dumps(found), flush=True)
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing. Where it is not `ok`, `remedy` says how to mend it; an `essential` one stops the work."""
+
+    title: str
+    detail: str
+    ok: bool = True
+    remedy: str = ""
+    essential: bool = True
+
+
+def examine(gl_only: bool = False) -> list[Finding]:
+    """Look at everything the benchmark needs; takes a few seconds, most of them for one rendered frame."""
+    if gl_only:
+        return [check_gl()]
+    packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
+    return [check_python(), *packages, check_robot_models(), check_gl(), check_cache(), check_demos()]
+
+
+def check_python() -> Finding:
+    """The interpreter and the machine."""
+    detail = f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
+    remedy = "use Python 3.11 or newer: make PYTHON=/path/to/python3.11 setup"
+    return Finding("Python", detail, sys.version_info >= (3, 11), remedy)
+
+
+def check_package(name: str, remedy: str = "make setup", essential: bool = True) -> Finding:
+    """Whether a package is installed, without importing it."""
+    try:
+        return Finding(name, importlib.metadata.version(name), essential=essential)
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, "not installed", False, remedy, essential)
+
+
+def check_robot_models() -> Finding:
+    """robosuite's MJCF of the arm, found without importing robosuite."""
+    title = "robot models (robosuite)"
+    remedy = f"pip install --no-deps robosuite=={ROBOSUITE}"
+    spec = importlib.util.find_spec("robosuite")
+    if spec is None or spec.origin is None:
+        return Finding(title, "robosuite is not installed", False, remedy)
+    arm = Path(spec.origin).parent / "models" / "assets" / "robots" / "panda" / "robot.xml"
+    if not arm.is_file():
+        return Finding(title, f"{arm} is missing", False, remedy)
+    version = importlib.metadata.version("robosuite")
+    return Finding(title, version, version == ROBOSUITE, remedy, essential=False)
+
+
+def check_gl() -> Finding:
+    """Draw two 128 x 128 frames with the backend that the environment would take, in a process of its own."""
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if chosen.lower() not in ("", *BACKENDS):
+        remedy = f"unset MUJOCO_GL, or set it to one of {', '.join(BACKENDS)}"
+        return Finding("GL", f"MUJOCO_GL={chosen} is not a backend", False, remedy)
+    env = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH")))),
+    }
+    command = [sys.executable, "-c", _PROBE]
+    try:
+        done = subprocess.run(
+            command, env=env, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Finding("GL", f"no frame within {PROBE_SECONDS} s", False, GL_REMEDY)
+    lines = done.stdout.strip().splitlines()
+    if not lines or not lines[-1].startswith("{"):
+        reasons = [line for line in done.stderr.splitlines() if line]
+        detail = reasons[-1] if reasons else f"the process that drew ended with status {done.returncode}"
+        return Finding("GL", detail, False, GL_REMEDY)
+    found = json.loads(lines[-1])
+    if "error" in found:
+        return Finding("GL", found["error"], False, GL_REMEDY)
+    detail = f"{found['backend']} on {found['device']}, a 128x128 frame takes {found['milliseconds']:.1f} ms"
+    return Finding("GL", detail)
+
+
+def check_cache() -> Finding:
+    """The cache folder: where, how full, whether it can be written."""
+    path = cache_dir()
+    remedy = "set LIBERO_CACHE to a folder you can write to"
+    existing = next(parent for parent in [path, *path.parents] if parent.exists())
+    free = shutil.disk_usage(existing).free
+    detail = f"{path}, {show_bytes(folder_bytes(path))} used, {show_bytes(free)} free"
+    if not os.access(existing, os.W_OK) or not existing.is_dir():
+        return Finding("cache", f"{existing} cannot be written", False, remedy)
+    remedy = f"free some space (2 GB are needed), or {remedy}"
+    return Finding("cache", detail, free > 2e9, remedy, essential=False)
+
+
+def check_demos() -> Finding:
+    """The demonstrations that are there."""
+    path = demos_dir()
+    files = sorted(path.rglob("*.hdf5"))
+    remedy = "training makes what it needs; or: libero demos generate --benchmark libero_object --n 50"
+    if not files:
+        return Finding("demonstrations", f"none in {path}", False, remedy, essential=False)
+    return Finding("demonstrations", f"{len(files)} files in {path}, {show_bytes(folder_bytes(path))}")
+
+
+def folder_bytes(path: Path) -> int:
+    """Bytes of all files below a folder; files that vanish meanwhile do not count."""
+    total = 0
+    for folder, _, names in os.walk(path):
+        for name in names:
+            try:
+                total += os.lstat(os.path.join(folder, name)).st_size
+            except FileNotFoundError:
+                continue
+    return total
+
+
+def render_findings(findings: Iterable[Finding]) -> str:
+    """The findings as text, one line each and a second one where something is to be mended."""
+    rows = []
+    for finding in findings:
+        mark = "ok  " if finding.ok else ("FAIL" if finding.essential else "note")
+        rows.append(f"{mark}  {finding.title + ':':27} {finding.detail}")
+        if not finding.ok:
+            rows.append(f"      -> {finding.remedy}")
+    return "\n".join(rows)
+
+
+def is_broken(findings: Iterable[Finding]) -> bool:
+    """Whether something essential is missing."""
+    return any(finding.essential and not finding.ok for finding in findings)

@@ -1,0 +1,135 @@
+"""`libero objects`: objects made of files of one's own, kept where tasks find them."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+def register(subparsers: "argparse._SubParsersAction") -> None:
+    """`libero objects add|list|show|preview|remove`"""
+    parser = subparsers.add_parser("objects", help="objects of your own, from mesh and MJCF files")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _register_add(commands)
+    listing = commands.add_parser(
+        "list", help="the objects of your own; with --all those of the benchmark too"
+    )
+    listing.add_argument("--all", action="store_true", help="those of the benchmark too")
+    listing.set_defaults(run=run_list)
+    for name, run, text in (
+        ("show", run_show, "what is known of an object: size, mass, places, the gripper's hold"),
+        ("remove", run_remove, "remove objects of your own"),
+    ):
+        command = commands.add_parser(name, help=text)
+        command.add_argument("names", nargs="+", metavar="NAME")
+        command.set_defaults(run=run)
+    preview = commands.add_parser("preview", help="draw an object from all sides")
+    preview.add_argument("name", metavar="NAME")
+    preview.add_argument("--out", type=Path, help="the picture (default: NAME.png here)")
+    preview.set_defaults(run=run_preview)
+
+
+def _register_add(commands: "argparse._SubParsersAction") -> None:
+    add = commands.add_parser("add", help="make an object of a MJCF, OBJ, GLB, glTF, STL or PLY file")
+    add.add_argument("file", type=Path)
+    option = add.add_argument
+    option("--name", help="what task files call it (default: the file's name)")
+    option("--size", type=float, help="longest side, m (default: that of the file, whose unit is guessed)")
+    option("--mass", type=float, help="kg (default: by density)")
+    option("--density", type=float, help="kg/m^3 (default: 400)")
+    option(
+        "--up",
+        choices=("z", "y"),
+        help="axis of the file that points up (default: y for GLB and glTF, else z)",
+    )
+    option(
+        "--collision",
+        choices=("decompose", "hull", "boxes"),
+        default="decompose",
+        help="convex pieces, the convex hull, or boxes (default: decompose; without CoACD boxes)",
+    )
+    option("--faces", type=int, default=3000, help="triangles that its look may have (default: 3000)")
+    option("--container", action="store_true", help="things can be put In it: adds the place contain_region")
+    option("--replace", action="store_true", help="replace an object of yours that has this name")
+    option(
+        "--out",
+        type=Path,
+        help="folder (default: LIBERO_OBJECTS, else objects beside the configuration file)",
+    )
+    add.set_defaults(run=run_add)
+
+
+def run_add(args: argparse.Namespace) -> None:
+    """Make it, try it, and say what came of it."""
+    from libero_env.design.objects import add_object
+    from libero_env.paths import objects_dir
+
+    names = ("name", "size", "mass", "density", "up", "collision", "faces", "container", "replace", "out")
+    added = add_object(args.file, **{name: getattr(args, name) for name in names})
+    print(f"{added.name}: {added.folder}")
+    print("\n".join(describe(added.facts)))
+    for note in added.notes:
+        print(f"note: {note}")
+    if args.out and args.out.absolute() != objects_dir().absolute():
+        print(f"tasks find it with LIBERO_OBJECTS={args.out}")
+
+
+def describe(facts: Mapping[str, Any]) -> list[str]:
+    """Lines about an object, from its `object.yaml`."""
+    size, grasp, collision = facts.get("size", ()), facts.get("grasp") or {}, facts.get("collision") or {}
+    lines = [f"  size      {' x '.join(f'{100 * side:.1f}' for side in size)} cm"] if size else []
+    if "mass" in facts:
+        lines.append(f"  mass      {1000 * facts['mass']:.0f} g")
+    if collision:
+        lines.append(f"  collision {collision['pieces']} shapes, by {collision['method']}")
+    if grasp.get("width") is not None:
+        lines.append(
+            f"  hold      {100 * grasp['width']:.1f} cm wide, {100 * grasp['height']:.1f} cm over the ground"
+        )
+    elif grasp:
+        lines.append(f"  hold      none: {grasp['reason']}")
+    if "stands" in facts:
+        lines.append(f"  stands    {'yes' if facts['stands'] else 'no, it falls over or slides'}")
+    return lines
+
+
+def run_list(args: argparse.Namespace) -> None:
+    """One line for each object."""
+    from libero_env.objects import folder, object_names
+    from libero_env.paths import objects_dir
+
+    own = folder.names()
+    for name in object_names() if args.all else own:
+        print(f"{name:28} {objects_dir() / name if name in own else ''}".rstrip())
+    if not own and not args.all:
+        print(f"no objects in {objects_dir()}; make one: libero objects add FILE")
+
+
+def run_show(args: argparse.Namespace) -> None:
+    """Figures and places of objects."""
+    from libero_env.objects import folder, get_object
+    from libero_env.tasks.authoring import places_of
+
+    for name in args.names:
+        item, place = get_object(name), folder.find(name)
+        print(f"{name}: {place or 'builtin'}")
+        height = item.top_offset[2] - item.bottom_offset[2]
+        lines = describe(folder.read_facts(place)) if place else [f"  height    {100 * height:.1f} cm"]
+        print("\n".join([*lines, f"  radius    {100 * item.horizontal_radius:.1f} cm"]))
+        print(f"  places    {', '.join(places_of(name)) or 'none'}")
+
+
+def run_preview(args: argparse.Namespace) -> None:
+    """Draw it and say where the picture is."""
+    from libero_env.design.objects.trial import draw_object
+    from libero_env.objects import get_object
+
+    print(draw_object(get_object(args.name), args.out or Path(f"{args.name}.png")))
+
+
+def run_remove(args: argparse.Namespace) -> None:
+    """Remove them; the first that is not there ends it."""
+    from libero_env.objects import folder
+
+    for name in args.names:
+        print(f"removed {folder.remove(name)}")

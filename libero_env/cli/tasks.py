@@ -1,0 +1,206 @@
+"""`libero tasks`: list, show, certify, lint, create and preview tasks; make their initial states."""
+
+import argparse
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from libero_env.cli import tasks_new
+from libero_env.cli.arguments import Subparsers
+
+if TYPE_CHECKING:
+    from libero_env.design.lint.report import Finding
+    from libero_env.tasks import Task
+
+LEVELS = ("error", "warning", "info")
+
+
+def register(subparsers: Subparsers) -> None:
+    """`libero tasks list|show|init-states|certify|lint|new|preview`"""
+    parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    listing = commands.add_parser("list", help="the tasks of one suite, or of all")
+    listing.add_argument("suite", nargs="?", help="such as libero_object")
+    listing.add_argument("--order", type=int, default=0, help="one of the published sequences (0 to 20)")
+    listing.set_defaults(run=run_tasks_list)
+    show = commands.add_parser("show", help="the BDDL of a task")
+    show.add_argument("task", help="such as libero_object/3, the task's name, or a file of your own")
+    show.set_defaults(run=run_tasks_show)
+    states = commands.add_parser(
+        "init-states", help="make the 50 stored initial states of a suite or task file anew"
+    )
+    states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
+    states.add_argument(
+        "--out",
+        type=Path,
+        help="folder for the .npz files (default: those the package ships; of a file, the cache)",
+    )
+    states.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)"
+    )
+    states.set_defaults(run=run_tasks_init_states)
+    _register_checks(commands)
+    tasks_new.register(commands)
+
+
+def _register_checks(commands: Subparsers) -> None:
+    """Add `libero tasks certify|lint`."""
+    certify = commands.add_parser("certify", help="let the expert try tasks; goes on where it was stopped")
+    _add_tasks(certify)
+    certify.add_argument(
+        "--states", type=_states, default=50, help="starts of each task, 1 to 50 (default: 50)"
+    )
+    certify.add_argument("--jobs", type=int, default=0, help="processes (default: one for each core)")
+    certify.add_argument(
+        "--out", type=Path, default=Path("certificates"), help="folder (default: certificates)"
+    )
+    certify.add_argument(
+        "--require", type=float, default=0.8, help="share of success each task needs (default: 0.8)"
+    )
+    certify.add_argument("--disturb", action="store_true", help="disturb the actions as demonstrations do")
+    certify.add_argument("--again", action="store_true", help="run what is in the folder too")
+    certify.set_defaults(run=run_certify)
+    lint = commands.add_parser(
+        "lint", help="what is wrong or doubtful in the design of tasks, and how to mend it"
+    )
+    _add_tasks(lint)
+    lint.add_argument(
+        "--level", choices=LEVELS, default="warning", help="the least that is told (default: warning)"
+    )
+    lint.add_argument(
+        "--starts", type=int, default=5, help="starts to look at; 0 simulates nothing (default: 5)"
+    )
+    lint.set_defaults(run=run_lint)
+
+
+def _add_tasks(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "tasks",
+        nargs="+",
+        metavar="TASK",
+        help="such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml",
+    )
+    parser.add_argument("--assets", help="`builtin`, or the folder of the original's models")
+
+
+def _states(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 50:
+        raise argparse.ArgumentTypeError(f"{text} is not from 1 to 50")
+    return value
+
+
+def find_tasks(names: Sequence[str]) -> list["Task"]:
+    """The tasks that are meant, each once: suites, tasks of suites, and task files.
+
+    Raises:
+        LiberoError: no such suite, task or file, or a file that is no task.
+    """
+    from libero_env.tasks import get_suite, get_task, suite_names
+    from libero_env.tasks.files import read_yaml_tasks
+
+    found: dict[tuple[str, str], Task] = {}
+    for name in names:
+        if name.endswith((".yaml", ".yml")):
+            tasks: Sequence[Task] = read_yaml_tasks(name)
+        else:
+            tasks = get_suite(name).tasks if name in suite_names() else (get_task(name),)
+        found |= {(name if task.suite == "file" else task.suite, task.name): task for task in tasks}
+    return list(found.values())
+
+
+def run_certify(args: argparse.Namespace) -> int:
+    """Run what is missing, write the results and say which tasks fall short; 1 where one does."""
+    from libero_env.design.certify import certify
+    from libero_env.design.certify_figure import write_results
+    from libero_env.parallel import cores
+
+    jobs = args.jobs or cores()
+    found = certify(
+        find_tasks(args.tasks),
+        args.states,
+        jobs=jobs,
+        out=args.out,
+        assets=args.assets,
+        disturb=args.disturb,
+        again=args.again,
+    )
+    write_results(found, args.out, assets=args.assets, disturb=args.disturb)
+    short = [certificate for certificate in found if certificate.rate < args.require]
+    for certificate in short:
+        reason = next((o.reason for o in certificate.outcomes if not o.success), "")
+        print(
+            f"FAIL  {certificate.task} {certificate.name}: {100 * certificate.rate:.0f} %, such as: {reason}"
+        )
+    good, total = sum(len(c.lengths) for c in found), sum(len(c.outcomes) for c in found)
+    print(
+        f"{good}/{total} = {100 * good / total:.1f} %; {len(short)} of {len(found)} tasks under {args.require:.0%}"
+    )
+    return int(bool(short))
+
+
+def run_lint(args: argparse.Namespace) -> int:
+    """One line for each finding, and how many there are; 1 where one is an error."""
+    from collections import Counter
+
+    counts, number = Counter[str](), 0
+    for findings in _lint(args):
+        number += 1
+        counts.update(finding.level for finding in findings)
+        for finding in findings:
+            if LEVELS.index(finding.level) <= LEVELS.index(args.level):
+                print(finding, flush=True)
+    print(f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes")
+    return int(counts["error"] > 0)
+
+
+def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
+    """The findings of each task."""
+    from libero_env.assets.pack import select_pack
+    from libero_env.design.lint.checks import lint_file, lint_task, lint_text
+
+    pack = select_pack(args.assets)
+    for name in dict.fromkeys(args.tasks):
+        if name.endswith(".bddl"):
+            yield lint_file(name, pack, starts=args.starts)
+            continue
+        for task in find_tasks([name]):
+            if task.suite == "file":  # lines count in what `libero tasks show` prints
+                yield lint_text(task.bddl_text, name, task, pack, starts=args.starts)
+            else:
+                yield lint_task(task, pack, starts=args.starts)
+
+
+def run_tasks_list(args: argparse.Namespace) -> None:
+    """One line per task."""
+    from libero_env.tasks import get_suite, suite_names
+
+    names = [args.suite] if args.suite else suite_names()
+    tasks = {task.id: task for name in names for task in get_suite(name).order(args.order)}
+    for task in tasks.values():
+        print(f"{task.id:18} {task.language}")
+
+
+def run_tasks_show(args: argparse.Namespace) -> None:
+    """The task file, as generated."""
+    from libero_env.tasks import get_task
+
+    print(get_task(args.task).bddl_text, end="")
+
+
+def run_tasks_init_states(args: argparse.Namespace) -> None:
+    """Write the files, one for each suite that the tasks come from, and say where they are."""
+    from libero_env.init_states.store import cache_init_states, shipped_path, write_suite
+    from libero_env.tasks import get_suite
+    from libero_env.tasks.files import ENDINGS
+
+    if args.suite.endswith(ENDINGS) and not args.out:
+        for task in find_tasks([args.suite]):
+            print(cache_init_states(task))
+        return
+    tasks = find_tasks([args.suite]) if args.suite.endswith(ENDINGS) else get_suite(args.suite).tasks
+    for suite in dict.fromkeys(task.suite for task in tasks):
+        path = args.out / f"{suite}.npz" if args.out else shipped_path(suite)
+        write_suite(path, [task for task in tasks if task.suite == suite], args.jobs)
+        print(path)

@@ -1,0 +1,96 @@
+"""`libero tasks new` and `libero tasks preview`: write a task of one's own, and look at it."""
+
+import argparse
+from pathlib import Path
+
+
+def register(commands: "argparse._SubParsersAction") -> None:
+    """`libero tasks new|preview`"""
+    new = commands.add_parser("new", help="write a task file of your own, to start from")
+    add = new.add_argument
+    add("name", help="of the task; the file is NAME.yaml")
+    add(
+        "--scene",
+        default="kitchen",
+        help="kitchen, living_room, study, coffee, table, floor, or kitchen_scene1, ...",
+    )
+    add(
+        "--objects",
+        nargs="+",
+        default=(),
+        metavar="CATEGORY",
+        help="such as red_cup plate (default: bowl, plate)",
+    )
+    add("--furniture", nargs="+", default=(), metavar="CATEGORY", help="such as wooden_cabinet")
+    add(
+        "--goal",
+        nargs="+",
+        default=(),
+        metavar="ATOM",
+        help="such as 'On red_cup_1 plate_1' (default: first on last)",
+    )
+    add("--language", help="the instruction (default: of the goal)")
+    add("--out", type=Path, default=Path(), help="folder (default: here)")
+    add("--bddl", action="store_true", help="write the BDDL file too")
+    new.set_defaults(run=run_new)
+    preview = commands.add_parser("preview", help="pictures of a task's starts, and a video of the expert")
+    add = preview.add_argument
+    add("task", help="a file that ends in .yaml or .bddl, or such as libero_goal/3")
+    add("--starts", type=int, default=3, help="rows of the sheet (default: 3)")
+    add("--cameras", nargs="+", help="columns (default: agentview robot0_eye_in_hand birdview)")
+    add("--size", type=int, default=256, help="pixels of a picture (default: 256)")
+    add(
+        "--video",
+        nargs="?",
+        const="webp",
+        choices=("webp", "gif", "mp4"),
+        help="the expert too (default kind: webp)",
+    )
+    add("--out", type=Path, help="the sheet (default: TASK.png here); the video is put beside it")
+    preview.set_defaults(run=run_preview)
+
+
+def run_new(args: argparse.Namespace) -> None:
+    """Write the file and say how to go on.
+
+    Raises:
+        LiberoError: a name that does not exist, or the file is there.
+    """
+    from libero_env.design.template import task_template
+    from libero_env.errors import LiberoError
+    from libero_env.tasks import read_task
+    from libero_env.tasks.files import write_task
+
+    path = args.out / f"{args.name}.yaml"
+    if path.exists():
+        raise LiberoError(f"{path} is there already; choose another name, or remove it")
+    text, _ = task_template(args.scene, args.objects, args.furniture, args.goal, args.language)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    task = read_task(path)
+    print(f"{path}: {task.language}")
+    if args.bddl:
+        print(write_task(task, path.with_suffix(".bddl")))
+    for command in (
+        f"libero tasks preview {path} --video",
+        f"libero tasks lint {path}",
+        f"libero demos generate --task {path} --n 10",
+        f"python train.py benchmark=own benchmark.files='[{path}]' language=onehot",
+    ):
+        print(f"  {command}")
+
+
+def run_preview(args: argparse.Namespace) -> int:
+    """Draw, and say where the pictures are; 1 where the expert does not reach the goal."""
+    from libero_env.design.preview import CAMERAS, contact_sheet, expert_video
+    from libero_env.tasks import get_task
+
+    task = get_task(args.task)
+    out = args.out or Path(f"{task.name}.png")
+    print(contact_sheet(task, out, starts=args.starts, cameras=args.cameras or CAMERAS, size=args.size))
+    if not args.video:
+        return 0
+    video = out.with_suffix(f".{args.video}")
+    done, reason = expert_video(task, video, size=args.size)
+    print(f"{video}: the expert {'reaches the goal' if done else f'does not reach the goal: {reason}'}")
+    return int(not done)

@@ -1,0 +1,5 @@
+"""Demonstrations in HDF5: reading, recording with the expert, checking, replaying, converting."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,274 @@
+"""Demonstrations as a LeRobotDataset v3.0: low-dimensional data in Parquet, pictures in MP4, many episodes to a file.
+
+Needs the extra `export` (PyArrow and PyAV). Names are those of LeRobot's own LIBERO environment: `observation.state`
+(8: grip site position, hand axis-angle, fingers), `action` (7), `observation.images.image` for agentview,
+`observation.images.image2` for the hand, `observation.images.<camera>` for others. Pictures are upright, and each
+action stands beside the observation it was chosen on.
+"""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from libero_env.demos.curate import header_of, read_episodes, task_of
+from libero_env.demos.lerobot_files import (
+    DATA,
+    DATA_MB,
+    FILES_PER_CHUNK,
+    VIDEO,
+    VIDEO_MB,
+    Table,
+    Video,
+    import_arrow,
+)
+from libero_env.demos.read import BrokenDemoError
+from libero_env.demos.statistics import Histogram, Moments
+from libero_env.demos.video import PIXELS, import_av
+from libero_env.demos.write import Episode
+from libero_env.errors import DemoError
+from libero_env.timing import CONTROL_HZ
+
+VERSION = "v3.0"
+_EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+_STATE = ("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "finger1", "finger2")
+_ACTION = ("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "gripper")
+_CAMERAS = {"agentview": "image", "eye_in_hand": "image2"}
+_INDICES = ("frame_index", "episode_index", "index", "task_index")
+
+
+def export(
+    files: Sequence[Path],
+    root: Path,
+    *,
+    labels: Literal["expert", "executed"] = "expert",
+    video_mb: float = VIDEO_MB,
+    progress: bool | None = None,
+) -> tuple[int, int]:
+    """Write demonstration files as one data set; returns (episodes, frames).
+
+    Args:
+        files: read in this order; all have the same cameras and picture size.
+        root: a folder that is not there yet.
+        labels: as in `read_demos`.
+        video_mb: size from which a video goes on in another file, MB.
+        progress: show a bar; None where stderr is a terminal.
+
+    Raises:
+        DemoError: a file is broken or has other pictures than the first, or the folder exists.
+        LiberoError: PyArrow or PyAV is not installed.
+    """
+    if root.exists():
+        raise DemoError(f"{root} exists; choose another folder or remove it")
+    partial = root.with_name(f".{root.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    dataset = _Dataset(partial, video_mb)
+    try:
+        for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
+            language, pairing = _language(file), header_of(file).get("pairing", "libero")
+            for name, episode in read_episodes(file):
+                dataset.add(_row(f"{file}: {name}", episode, pairing, labels), language)
+        dataset.close()
+        counts = dataset.finish()
+        partial.rename(root)
+    finally:
+        dataset.close()
+        shutil.rmtree(partial, ignore_errors=True)
+    return counts
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One episode as it is exported."""
+
+    state: np.ndarray  # (T, 8) float32
+    action: np.ndarray  # (T, 7) float32
+    success: bool
+    pictures: dict[str, np.ndarray]  # feature -> (T, H, W, 3) uint8
+    where: str
+
+
+def _language(file: Path) -> str:
+    header = header_of(file)
+    try:
+        return json.loads(header["problem_info"])["language_instruction"]
+    except (KeyError, ValueError):
+        return task_of(file).language
+
+
+def _row(where: str, episode: Episode, pairing: str, labels: str) -> _Row:
+    wanted = episode.actions
+    if labels == "expert" and episode.expert_actions is not None:
+        wanted = episode.expert_actions
+    obs = episode.obs
+    for key in ("ee_pos", "ee_ori", "gripper_states"):
+        if key not in obs:
+            raise BrokenDemoError(f"{where}/obs/{key} is missing; expected it beside {', '.join(obs)}")
+    if pairing == "libero":  # the observation before action t + 1 is the one after action t
+        obs, wanted = {key: values[:-1] for key, values in obs.items()}, wanted[1:]
+    if not len(wanted):
+        raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
+    state = np.concatenate([obs["ee_pos"], obs["ee_ori"], obs["gripper_states"]], axis=1).astype(np.float32)
+    pictures = {feature_of(key): values for key, values in obs.items() if key.endswith("_rgb")}
+    return _Row(state, wanted.astype(np.float32), episode.success, pictures, where)
+
+
+def feature_of(key: str) -> str:
+    """The data set's name of a camera's pictures: `eye_in_hand_rgb` -> `observation.images.image2`."""
+    camera = key.removesuffix("_rgb")
+    return f"observation.images.{_CAMERAS.get(camera, camera)}"
+
+
+class _Dataset:
+    """A data set that grows by episodes."""
+
+    def __init__(self, root: Path, video_mb: float):
+        self._pa, self._pq = import_arrow()
+        import_av()
+        self.root, self._frames = root, 0
+        self._tasks: dict[str, int] = {}
+        self._episodes: list[dict[str, Any]] = []
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._videos: dict[str, Video] = {}
+        self._video_mb = video_mb
+        self._data = Table(root)
+        self._stats: dict[str, Any] = {}  # Moments or Histogram
+
+    def add(self, row: _Row, language: str) -> None:
+        """Append an episode."""
+        shapes = {key: frames.shape[1:] for key, frames in row.pictures.items()}
+        self._shapes = self._shapes or shapes
+        if shapes != self._shapes:
+            raise DemoError(f"{row.where} has pictures {shapes}; expected {self._shapes} as in the first")
+        number, steps = len(self._episodes), len(row.action)
+        task = self._tasks.setdefault(language, len(self._tasks))
+        first = self._frames
+        columns = {
+            "observation.state": row.state,
+            "action": row.action,
+            "timestamp": (np.arange(steps) / CONTROL_HZ).astype(np.float32),
+            "next.reward": np.append(np.zeros(steps - 1), float(row.success)).astype(np.float32),
+            "next.done": np.append(np.zeros(steps - 1, bool), True),
+            **dict(
+                zip(
+                    _INDICES,
+                    (
+                        np.arange(steps),
+                        np.full(steps, number),
+                        first + np.arange(steps),
+                        np.full(steps, task),
+                    ),
+                    strict=True,
+                )
+            ),
+        }
+        found = {"episode_index": number, "tasks": [language], "length": steps}
+        found |= self._data.add(columns)
+        found |= {"dataset_from_index": first, "dataset_to_index": first + steps}
+        for key, frames in row.pictures.items():
+            if key not in self._videos:
+                self._videos[key] = Video(self.root, key, self._video_mb)
+            found |= self._videos[key].add(frames)
+        found |= self._measure(columns, row.pictures)
+        self._episodes.append({**found, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
+        self._frames += steps
+
+    def _measure(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Statistics of an episode, which are counted into those of all."""
+        own: dict[str, Any] = {key: Moments.of(values) for key, values in columns.items()}
+        own |= {key: Histogram.of(frames) for key, frames in pictures.items()}
+        for key, stats in own.items():
+            self._stats[key] = stats if key not in self._stats else self._stats[key] + stats
+        return {f"stats/{key}/{name}": v for key, stats in own.items() for name, v in stats.values().items()}
+
+    def close(self) -> None:
+        """Close all files."""
+        self._data.close()
+        for video in self._videos.values():
+            video.close()
+
+    def finish(self) -> tuple[int, int]:
+        """Write what there is to say about the whole; returns (episodes, frames)."""
+        if not self._episodes:
+            raise DemoError("no demonstrations to export")
+        pa, meta = self._pa, self.root / "meta"
+        (self.root / _EPISODES).parent.mkdir(parents=True)
+        self._pq.write_table(pa.Table.from_pylist(self._episodes), self.root / _EPISODES)
+        self._pq.write_table(self._task_table(), meta / "tasks.parquet")
+        _write_json(meta / "stats.json", {key: stats.values() for key, stats in self._stats.items()})
+        _write_json(meta / "info.json", self._info())
+        return len(self._episodes), self._frames
+
+    def _task_table(self) -> Any:
+        """Task -> index; the tasks are the index of the table when pandas reads it."""
+        pa, kind = self._pa, {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+        table = pa.table(
+            {"task_index": pa.array(self._tasks.values(), pa.int64()), "task": list(self._tasks)}
+        )
+        text = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+        said = {
+            "index_columns": ["task"],
+            "column_indexes": [{"name": None, "field_name": None, **text}],
+            "columns": [
+                {"name": "task_index", "field_name": "task_index", **kind},
+                {"name": "task", "field_name": "task", **text},
+            ],
+            "creator": {"library": "pyarrow", "version": pa.__version__},
+            "pandas_version": "2.0.0",
+        }
+        return table.replace_schema_metadata({"pandas": json.dumps(said)})
+
+    def _info(self) -> dict[str, Any]:
+        number = {"shape": [1], "names": None}
+        features: dict[str, Any] = {key: _video_feature(*shape) for key, shape in self._shapes.items()}
+        features |= {
+            "observation.state": {"dtype": "float32", "shape": [8], "names": list(_STATE)},
+            "action": {"dtype": "float32", "shape": [7], "names": list(_ACTION)},
+            "timestamp": {"dtype": "float32", **number},
+            "next.reward": {"dtype": "float32", **number},
+            "next.done": {"dtype": "bool", **number},
+            **{key: {"dtype": "int64", **number} for key in _INDICES},
+        }
+        return {
+            "codebase_version": VERSION,
+            "robot_type": "panda",
+            "total_episodes": len(self._episodes),
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": FILES_PER_CHUNK,
+            "data_files_size_in_mb": DATA_MB,
+            "video_files_size_in_mb": VIDEO_MB,
+            "fps": CONTROL_HZ,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": DATA,
+            "video_path": VIDEO if self._shapes else None,
+            "features": features,
+        }
+
+
+def _video_feature(height: int, width: int, channels: int) -> dict[str, Any]:
+    info = {
+        "video.height": height,
+        "video.width": width,
+        "video.channels": channels,
+        "video.codec": "h264",
+        "video.pix_fmt": PIXELS,
+        "video.fps": CONTROL_HZ,
+        "video.is_depth_map": False,
+        "has_audio": False,
+    }
+    return {
+        "dtype": "video",
+        "shape": [height, width, channels],
+        "names": ["height", "width", "channel"],
+        "info": info,
+    }
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=4))

@@ -1,0 +1,261 @@
+"""Certificates: can the expert reach a task's goal, from which starts, how fast, and why not where it cannot.
+
+Work is cut into (task, 16 starts); what is done is on disk after each, so a stopped run goes on where it was. What
+happens from a start depends on the task and the start's number alone.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from libero_env.assets.pack import Pack, select_pack
+from libero_env.demos.record import GENERATOR
+from libero_env.envs.batch import BatchEnv
+from libero_env.errors import LiberoError, PlacementError
+from libero_env.expert import Disturbance, Expert, Shapes
+from libero_env.expert.rollout import run_experts
+from libero_env.init_states.store import scene_digest
+from libero_env.parallel import end_with_parent
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import Task
+
+BATCH = 16  # starts simulated together
+NO_HORIZON = 1_000_000  # steps; the driver says when an attempt is over
+FILE_SUITE = "file"  # tasks read from a file have no stored starts: theirs are drawn
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One attempt.
+
+    Attributes:
+        state: number of the start.
+        success: whether the goal was reached.
+        steps: control steps until then, or until the expert was stopped.
+        retries: how often it had to start over.
+        reason: why it did not succeed, or "".
+    """
+
+    state: int
+    success: bool
+    steps: int
+    retries: int
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is known of a task; `outcomes` in the order of their starts. `digest` is what they depend on."""
+
+    task: str  # `libero_object/3`
+    name: str
+    digest: str
+    outcomes: tuple[Outcome, ...] = ()
+
+    @property
+    def rate(self) -> float:
+        """Share of starts from which the goal was reached."""
+        return sum(o.success for o in self.outcomes) / max(len(self.outcomes), 1)
+
+    @property
+    def lengths(self) -> list[int]:
+        """Steps of the successful attempts."""
+        return [o.steps for o in self.outcomes if o.success]
+
+    @property
+    def retries(self) -> int:
+        """Times that an expert started over, in all attempts."""
+        return sum(o.retries for o in self.outcomes)
+
+    def summary(self) -> dict:
+        """Plain figures of the task, for JSON."""
+        lengths = self.lengths
+        return {
+            "id": self.task,
+            "task": self.name,
+            "states": len(self.outcomes),
+            "successes": len(lengths),
+            "median_length": median(lengths) if lengths else None,
+            "mean_length": round(float(np.mean(lengths)), 1) if lengths else None,
+            "max_length": max(lengths, default=None),
+            "retries": self.retries,
+            "failures": {o.state: o.reason for o in self.outcomes if not o.success},
+        }
+
+
+def certify(
+    tasks: Sequence[Task],
+    states: int = 50,
+    *,
+    jobs: int = 1,
+    out: Path | None = None,
+    assets: str | Path | None = None,
+    disturb: bool = False,
+    again: bool = False,
+    progress: bool | None = None,
+) -> list[Certificate]:
+    """Let the expert try the first starts of each task.
+
+    Args:
+        tasks: with stored starts, or read from a file (starts are then drawn, number i from seed i).
+        states: number of starts, at most the 50 that are stored.
+        jobs: processes; the outcomes do not depend on it. 1 stays in this one, with the objects registered in it.
+        out: folder with a JSON file for each task; what is there for the same scene and expert is not run again.
+        assets: where the models come from, as for `select_pack`.
+        disturb: disturb the actions as demonstrations do.
+        again: run what is there too.
+        progress: show a bar; None where stderr is a terminal.
+
+    Returns:
+        One certificate for each task, in order. A task that cannot be built, or whose goal the expert has no skill
+        for, fails from every start with that reason.
+    """
+    pack = select_pack(assets)
+    found = [Certificate(task.id, task.name, _digest(task, pack, disturb)) for task in tasks]
+    paths = [_path(out, task, disturb) if out else None for task in tasks]
+    if not again:
+        found = [_stored(path, empty) if path else empty for path, empty in zip(paths, found, strict=True)]
+    chunks = [(k, chunk) for k, known in enumerate(found) for chunk in _missing(known, states)]
+    total, left = states * len(tasks), sum(len(chunk) for _, chunk in chunks)
+    off = None if progress is None else not progress
+    with tqdm(total=total, initial=total - left, desc="certify", unit="start", disable=off) as bar:
+        for k, outcomes in _run(chunks, tasks, jobs, pack, disturb):
+            merged = {o.state: o for o in (*found[k].outcomes, *outcomes)}
+            found[k] = replace(found[k], outcomes=tuple(merged[i] for i in sorted(merged)))
+            if path := paths[k]:
+                _store(path, found[k])
+            bar.update(len(outcomes))
+    return [replace(c, outcomes=tuple(o for o in c.outcomes if o.state < states)) for c in found]
+
+
+def results(
+    certificates: Sequence[Certificate], *, assets: str | Path | None = None, disturb: bool = False
+) -> dict:
+    """All figures of a run with what they depend on, for `results.json`."""
+    return {
+        "mujoco": mujoco.__version__,
+        "generator": GENERATOR,
+        "assets": select_pack(assets).name,
+        "disturbed": disturb,
+        "successes": sum(len(c.lengths) for c in certificates),
+        "total": sum(len(c.outcomes) for c in certificates),
+        "tasks": [certificate.summary() for certificate in certificates],
+    }
+
+
+def markdown_table(certificates: Sequence[Certificate]) -> str:
+    """A table: success, lengths, retries and the commonest reasons of failure of each task."""
+    lines = [
+        "| task | success | steps, median (max) | retries | failures |",
+        "| --- | ---: | ---: | ---: | --- |",
+    ]
+    for certificate in certificates:
+        row = certificate.summary()
+        length = f"{row['median_length']:g} ({row['max_length']})" if row["successes"] else ""
+        reasons = Counter(row["failures"].values()).most_common(2)
+        why = "; ".join(f"{count}x {reason}" for reason, count in reasons).replace("|", "/")
+        name = f"{row['id']} {row['task'].replace('_', ' ')}"
+        lines.append(f"| {name} | {row['successes']}/{row['states']} | {length} | {row['retries']} | {why} |")
+    good, total = sum(len(c.lengths) for c in certificates), sum(len(c.outcomes) for c in certificates)
+    lines.append(f"| all | **{good}/{total} = {100 * good / max(total, 1):.1f} %** | | | |")
+    return "\n".join(lines) + "\n"
+
+
+def _missing(certificate: Certificate, states: int) -> Iterator[list[int]]:
+    done = {o.state for o in certificate.outcomes}
+    wanted = [i for i in range(states) if i not in done]
+    for i in range(0, len(wanted), BATCH):
+        yield wanted[i : i + BATCH]
+
+
+def _run(
+    chunks: Iterable[tuple[int, list[int]]], tasks: Sequence[Task], jobs: int, pack: Pack, disturb: bool
+) -> Iterator[tuple[int, list[Outcome]]]:
+    """Outcomes of (index of a task, starts) as each is done."""
+    if jobs <= 1:
+        for k, states in chunks:
+            yield k, attempt(tasks[k], states, pack, disturb)
+        return
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent)
+    try:
+        futures: dict[Future[list[Outcome]], int] = {
+            pool.submit(attempt, tasks[k], states, pack, disturb): k for k, states in chunks
+        }
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> list[Outcome]:
+    """Try some starts of a task, all at the same time. What cannot be tried fails with the reason."""
+    try:
+        env, shapes = _stage(task, pack)
+        number = np.resize(states, env.num_envs)
+        drawn = task.suite == FILE_SUITE
+        env.reset(
+            seed=number.tolist() if drawn else None,
+            options={"reset_mask": np.arange(env.num_envs) < len(states)}
+            | ({} if drawn else {"init_state": number}),
+        )
+        seeds = [np.random.SeedSequence([task.index, i]).spawn(2) for i in states]
+        experts = [Expert(task, np.random.default_rng(manner), shapes=shapes) for manner, _ in seeds]
+        noise = [Disturbance(np.random.default_rng(pushes)) for _, pushes in seeds] if disturb else None
+        attempts = run_experts(env, experts, noise)
+    except PlacementError as error:
+        if len(states) > 1:
+            return [outcome for i in states for outcome in attempt(task, [i], pack, disturb)]
+        return [Outcome(states[0], False, 0, 0, str(error))]
+    except LiberoError as error:
+        return [Outcome(i, False, 0, 0, str(error)) for i in states]
+    return [Outcome(i, a.success, len(a), a.retries, a.reason) for i, a in zip(states, attempts, strict=True)]
+
+
+@lru_cache(maxsize=1)
+def _stage(task: Task, pack: Pack) -> tuple[BatchEnv, Shapes]:
+    env = BatchEnv(task, BATCH, num_threads=1, cameras=(), horizon=NO_HORIZON, assets=pack)
+    return env, Shapes(env.world.scene)
+
+
+def _digest(task: Task, pack: Pack, disturb: bool) -> str:
+    """Changes with the task, its scene, the expert's version and MuJoCo's; 16 hex digits."""
+    try:
+        scene = scene_digest(build_scene(task.problem, pack))
+    except LiberoError as error:
+        scene = str(error)
+    parts = (task.bddl_text, scene, pack.name, GENERATOR, mujoco.__version__, disturb)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+def _path(folder: Path, task: Task, disturb: bool) -> Path:
+    return folder / "tasks" / task.suite / f"{task.name}{'-disturbed' if disturb else ''}.json"
+
+
+def _stored(path: Path, empty: Certificate) -> Certificate:
+    """The certificate on disk if it is of the same scene and expert."""
+    if not path.is_file():
+        return empty
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        outcomes = tuple(Outcome(**row) for row in found["outcomes"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise LiberoError(f"{path} is no certificate ({error}); remove it, or run with --again") from error
+    return replace(empty, outcomes=outcomes) if found.get("digest") == empty.digest else empty
+
+
+def _store(path: Path, certificate: Certificate) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(asdict(certificate), indent=1) + "\n", encoding="utf-8")
+    partial.replace(path)

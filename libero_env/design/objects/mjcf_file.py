@@ -1,0 +1,185 @@
+"""MJCF files of the user's, whatever their conventions -> the files of an object that scenes can attach."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import mujoco
+import numpy as np
+
+from libero_env.design.objects.mesh_file import Tell
+from libero_env.errors import LiberoError
+from libero_env.mujoco_compat import delete
+from libero_env.objects.folder import MODEL, read_spec
+from libero_env.objects.model import ROOT_BODY
+
+INSIDE = 0.8  # share of the bounds that `contain_region` takes
+_HIDDEN = 3  # group of geoms that no viewer shows at first
+
+
+def store_mjcf(path: Path, name: str, place: Path, *, container: bool, tell: Tell) -> dict[str, Any]:
+    """Write an object's MJCF file, with the meshes and pictures that it names; its mass and collision shapes.
+
+    The object is the one body of the file's world or, where that has a body `object` in it as the original's files
+    do, that one. What collides goes to group 0 and what only is seen to group 1; what would not be seen gets a look.
+
+    Args:
+        path: MJCF.
+        name: category.
+        place: folder.
+        container: add a place `contain_region` unless it has one.
+        tell: takes a line where something is left out.
+
+    Raises:
+        LiberoError: it cannot be read, names a missing file, or does not hold one object.
+    """
+    spec = _read(path, name)
+    root = _root(spec, path, tell)
+    _sort_geoms(spec)
+    _gather_files(spec, name, place)
+    low, high = bounds_of(_compiled(spec, path))
+    if container and all(site.name != "contain_region" for site in spec.sites):
+        root.add_site(
+            name="contain_region",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(low + high) / 2,
+            size=INSIDE * (high - low) / 2,
+            rgba=(0, 0, 0, 0),
+            group=3,
+        )
+    model = _compiled(spec, path)
+    kilograms = float(model.body_subtreemass[model.body(ROOT_BODY).id])
+    if kilograms < 1e-6:
+        raise LiberoError(f"{path}: it weighs nothing; give its collision geoms a mass or density")
+    text = spec.to_xml().replace(f"{place.absolute()}/", "")
+    (place / MODEL).write_text(text, encoding="utf-8")
+    solid = int(((model.geom_contype | model.geom_conaffinity) > 0).sum())
+    return {"mass": round(kilograms, 5), "collision": {"method": "mjcf", "pieces": solid}}
+
+
+def bounds_of(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner of what an object of its own collides with, (3,) and (3,), in its frame, m.
+
+    Raises:
+        LiberoError: nothing of it collides.
+    """
+    from libero_env.geometry import surface_points
+
+    points = surface_points(model, model.body(ROOT_BODY).id)
+    if not len(points):
+        raise LiberoError("nothing of it collides; give it a geom with contype and conaffinity 1")
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _read(path: Path, name: str) -> mujoco.MjSpec:
+    from libero_env.assets.original_mjcf import attachable_xml, read_file
+
+    try:
+        inner = ET.parse(path).getroot().find("worldbody/body/body[@name='object']")
+    except (OSError, ET.ParseError) as error:
+        raise LiberoError(f"{path}: {error}; an MJCF file is expected") from error
+    if inner is None:
+        spec = read_spec(path)
+        _rename(spec, name)
+        return spec
+    assets, world = read_file(path)
+    body = world.find("body/body[@name='object']")
+    assert body is not None
+    try:
+        return mujoco.MjSpec.from_string(attachable_xml(name, assets, body))
+    except ValueError as error:
+        raise LiberoError(f"{path}: {error}") from error
+
+
+def _root(spec: mujoco.MjSpec, path: Path, tell: Tell) -> mujoco.MjsBody:
+    """The object's body, alone in the world, at its origin, called `main`, without a joint."""
+    bodies = list(spec.worldbody.bodies)
+    if len(bodies) != 1:
+        raise LiberoError(
+            f"{path}: its world has {len(bodies)} bodies, and an object is one; move all its parts below one body"
+        )
+    body = bodies[0]
+    body.name, body.pos, body.quat = ROOT_BODY, (0, 0, 0), (1, 0, 0, 0)
+    around = (spec.worldbody.geoms, spec.worldbody.sites, spec.cameras, spec.lights)
+    about = (spec.actuators, spec.sensors, spec.keys)
+    left_out = [element for group in (*around, *about) for element in group]
+    moving = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    if left_out or moving:
+        tell(
+            f"{path.name}: left out are {len(left_out)} elements around the object (lights, cameras, actuators, ...) "
+            f"and {len(moving)} joints of its outermost body, which scenes give a free one"
+        )
+    for element in [*left_out, *body.joints]:
+        delete(spec, element)
+    return body
+
+
+def _sort_geoms(spec: mujoco.MjSpec) -> None:
+    """Groups as scenes expect them: 0 collides, 1 is seen. What collides gets a look where nothing else has one."""
+    geoms = list(spec.geoms)
+    solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
+    looks = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]
+    for number, geom in enumerate(solid):
+        if not looks:
+            _add_look(geom)
+        geom.group, geom.name = 0, geom.name or f"g{number}"
+    for geom in looks:
+        geom.group = 1
+
+
+def _add_look(geom: mujoco.MjsGeom) -> None:
+    look = geom.parent.add_geom(
+        type=geom.type,
+        size=geom.size,
+        pos=geom.pos,
+        quat=geom.quat,
+        fromto=geom.fromto,
+        rgba=geom.rgba,
+        material=geom.material,
+        meshname=geom.meshname,
+        group=1,
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+    )
+    look.alt = geom.alt
+
+
+def _rename(spec: mujoco.MjSpec, name: str) -> None:
+    """The category in front of each asset's name: scenes share one namespace for them."""
+    for group, users, key in (
+        (spec.meshes, spec.geoms, "meshname"),
+        (spec.materials, spec.geoms, "material"),
+        (spec.materials, spec.sites, "material"),
+    ):
+        known = {asset.name for asset in group}
+        for user in users:
+            if getattr(user, key) in known:
+                setattr(user, key, f"{name}_{getattr(user, key)}")
+    textures = {texture.name for texture in spec.textures}
+    for material in spec.materials:
+        material.textures = [f"{name}_{t}" if t in textures else t for t in material.textures]
+    for asset in (*spec.meshes, *spec.materials, *spec.textures):
+        asset.name = f"{name}_{asset.name}"
+
+
+def _gather_files(spec: mujoco.MjSpec, name: str, place: Path) -> None:
+    """Copy the meshes and pictures that are used into the folder."""
+    for kind, elements in (("mesh", spec.meshes), ("texture", spec.textures)):
+        for element in elements:
+            if not element.file:
+                continue
+            source = Path(element.file)
+            if not source.is_file():
+                raise LiberoError(f"{kind} {source} is missing; put it there, or mend the file's path")
+            target = place / f"{element.name.removeprefix(f'{name}_') or kind}_{source.name}"
+            shutil.copyfile(source, target)
+            element.file = str(target.absolute())
+
+
+def _compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise LiberoError(f"{path}: {error}") from error

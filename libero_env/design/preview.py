@@ -1,0 +1,86 @@
+"""What a task looks like: its starts through several cameras, and how the expert does it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from libero_env.demos.video import write_video
+from libero_env.envs.env import LiberoEnv
+from libero_env.expert import Expert
+from libero_env.expert.rollout import MAX_STEPS
+from libero_env.sim.observations import entry
+from libero_env.tasks.task import Task
+from libero_env.timing import CONTROL_HZ
+
+CAMERAS = ("agentview", "robot0_eye_in_hand", "birdview")
+_EVERY = 2  # control steps between frames of a video
+_BAND = 14  # pixels of writing over a picture
+
+
+def contact_sheet(
+    task: Task, path: Path, *, starts: int = 3, cameras: Sequence[str] = CAMERAS, size: int = 256
+) -> Path:
+    """A PNG of the first starts of a task, a row for each, a column for each camera.
+
+    A task of a suite shows its stored starts, one of a file those of the seeds 0, 1, ...
+
+    Raises:
+        PlacementError: there is no room for what the task places.
+        UnknownNameError: there is no such camera.
+    """
+    env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
+    try:
+        rows = [
+            np.concatenate([_shown(env, i)[entry(c, "rgb")] for c in cameras], axis=1) for i in range(starts)
+        ]
+    finally:
+        env.close()
+    sheet = Image.fromarray(np.concatenate(rows))
+    draw = ImageDraw.Draw(sheet)
+    for i in range(starts):
+        for k, camera in enumerate(cameras):
+            words = f"{camera}, start {i}"
+            draw.rectangle((k * size, i * size, k * size + 7 * len(words), i * size + _BAND), fill=(0, 0, 0))
+            draw.text((k * size + 3, i * size + 1), words, fill=(255, 255, 255))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sheet.save(path)
+    return path
+
+
+def expert_video(
+    task: Task, path: Path, *, start: int = 0, camera: str = "agentview", size: int = 256
+) -> tuple[bool, str]:
+    """A video (.webp, .gif or .mp4) of the expert at a task.
+
+    Returns:
+        Whether it reached the goal, and why not.
+
+    Raises:
+        UnsupportedGoalError: the goal needs a skill that the expert does not have.
+    """
+    env = LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS)
+    try:
+        frames = [_shown(env, start)[entry(camera, "rgb")]]
+        expert, terminated, truncated, step = Expert(task, np.random.default_rng(start)), False, False, 0
+        while not (terminated or truncated or expert.trouble):
+            env.draw = step % _EVERY == _EVERY - 1
+            obs, _, terminated, truncated, _ = env.step(expert.act(env.view))
+            if env.draw or terminated:
+                frames.append(
+                    env.render_frames()[entry(camera, "rgb")] if terminated else obs[entry(camera, "rgb")]
+                )
+            step += 1
+    finally:
+        env.close()
+    write_video(path, np.stack(frames), CONTROL_HZ // _EVERY)
+    reason = expert.trouble or f"in phase {expert.phase} after {step} steps"
+    return terminated, "" if terminated else reason
+
+
+def _shown(env: LiberoEnv, start: int) -> dict[str, np.ndarray]:
+    """Observations of a start."""
+    if env.task.suite == "file":
+        return env.reset(seed=start)[0]
+    return env.reset(options={"init_state": start})[0]

@@ -1,0 +1,5 @@
+"""Gymnasium environments: one simulation, many of one task, many tasks in worker processes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

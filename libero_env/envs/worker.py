@@ -1,0 +1,235 @@
+"""One environment in a process of its own: both ends of the pipe, and the memory they share."""
+
+import contextlib
+import os
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing import connection, get_context
+from multiprocessing.connection import Connection
+from multiprocessing.shared_memory import SharedMemory
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import CloudpickleWrapper
+
+from libero_env.errors import LiberoError
+
+_JOIN = 5.0  # s, for a worker to end by itself
+
+
+class Shared:
+    """The observation of one environment in shared memory: `views`, name -> array."""
+
+    def __init__(self, space: spaces.Dict, name: str | None = None):
+        """Make a block, or attach to the one of this name."""
+        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in space.items()]
+        starts = np.cumsum(
+            [0, *(-(-int(np.prod(s)) * d.itemsize // 64) * 64 for _, s, d in boxes)]
+        )  # aligned
+        self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
+        self.name = self._memory.name
+        self._owner = name is None
+        self.views = {
+            key: np.ndarray(shape, dtype, self._memory.buf, int(start))
+            for (key, shape, dtype), start in zip(boxes, starts, strict=False)
+        }
+
+    def write(self, observation: Mapping[str, np.ndarray]) -> None:
+        """Copy an observation in."""
+        for key, view in self.views.items():
+            view[...] = observation[key]
+
+    def close(self) -> None:
+        """Let go of the block; who made it frees it. Idempotent."""
+        self.views = {}
+        with contextlib.suppress(BufferError):  # somebody still holds a view; it goes with that
+            self._memory.close()
+        if self._owner:
+            self._owner = False
+            self._memory.unlink()
+
+
+def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
+    """A `LiberoEnv` from its arguments; imported here, in the worker."""
+    from libero_env.envs.env import LiberoEnv
+
+    return LiberoEnv(**spec)
+
+
+def serve(pipe: Connection, make: Callable[[], gymnasium.Env], variables: Mapping[str, str]) -> None:
+    """Answer commands until told to close, or until the other end is gone."""
+    os.environ.update(variables)
+    host = _Host(make)
+    try:
+        while True:
+            command, *args = pipe.recv()
+            try:
+                pipe.send((True, getattr(host, command)(*args)))
+            except Exception:  # noqa: BLE001 - whatever it is, the other end raises it
+                pipe.send((False, traceback.format_exc()))
+            if command == "close":
+                return
+    except (EOFError, BrokenPipeError, KeyboardInterrupt):
+        host.close()
+
+
+class _Host:
+    """The commands."""
+
+    def __init__(self, make: Callable[[], gymnasium.Env]):
+        self._make = make
+        self._env: Any = None
+        self._shared: Any = None
+
+    def open(self) -> tuple[spaces.Space, spaces.Space]:
+        self._env = self._make()
+        return self._env.observation_space, self._env.action_space
+
+    def attach(self, name: str) -> None:
+        self._shared = Shared(self._env.observation_space, name)
+
+    def reset(self, seed: int | None, options: dict[str, Any]) -> dict[str, Any]:
+        observation, info = self._env.reset(seed=seed, options=options)
+        self._shared.write(observation)
+        return info
+
+    def step(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
+        observation, *outcome = self._env.step(action)
+        self._shared.write(observation)
+        return tuple(outcome)  # type: ignore[return-value]
+
+    def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        value = getattr(self._env.unwrapped, name)
+        return value(*args, **kwargs) if callable(value) else value
+
+    def close(self) -> None:
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+        if self._shared is not None:
+            self._shared.close()
+            self._shared = None
+
+
+@dataclass
+class Worker:
+    """The parent's end of one worker.
+
+    Attributes:
+        task: what messages call it.
+        make: makes the environment, in the worker.
+        variables: set in the worker's environment, such as the GPU to draw on.
+    """
+
+    task: str
+    make: Callable[[], gymnasium.Env]
+    variables: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        self.shared: Shared | None = None
+        self.opened = False
+        self.start()
+
+    def start(self) -> None:
+        """Start the process and have it make its environment; `wait_for` collects the answer to that."""
+        context = get_context("spawn")
+        self.pipe, other = context.Pipe()
+        arguments = (other, CloudpickleWrapper(self.make), self.variables)
+        self.process = context.Process(target=serve, args=arguments, daemon=True)
+        self.process.start()
+        other.close()
+        self.opened = False
+        self.send("open")
+
+    def send(self, command: str, *args: Any) -> None:
+        """Ask for something; to a worker that is gone, nothing happens."""
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.pipe.send((command, *args))
+
+    def restart(self) -> None:
+        """Replace the process by a new one."""
+        self.kill()
+        self.start()
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self.process.kill()
+        self.process.join(_JOIN)
+        self.pipe.close()
+
+    def share(self, space: spaces.Dict) -> None:
+        """Have observations written to shared memory, the same as before a restart."""
+        if self.shared is None:
+            self.shared = Shared(space)
+        self.send("attach", self.shared.name)
+
+    def free(self) -> None:
+        """Free the shared memory."""
+        if self.shared is not None:
+            self.shared.close()
+            self.shared = None
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a worker did not answer; `lost` if its process is of no more use."""
+
+    why: str
+    lost: bool
+
+
+def wait_for(workers: Mapping[int, Worker], timeout: float) -> tuple[dict[int, Any], dict[int, Failure]]:
+    """The answers of workers to what they were asked last, and why others gave none within `timeout` seconds."""
+    answers: dict[int, Any] = {}
+    failures: dict[int, Failure] = {}
+    waiting, end = dict(workers), time.monotonic() + timeout
+    while waiting:
+        of = {w.pipe: i for i, w in waiting.items()} | {w.process.sentinel: i for i, w in waiting.items()}
+        ready = connection.wait(list(of), max(0.0, end - time.monotonic()))
+        for i in {of[item] for item in ready}:  # type: ignore[index]
+            worker = waiting.pop(i)
+            try:
+                if not worker.pipe.poll():
+                    raise EOFError
+                done, value = worker.pipe.recv()
+            except (EOFError, ConnectionResetError):
+                worker.process.join(_JOIN)
+                failures[i] = Failure(f"its process ended (exit code {worker.process.exitcode})", True)
+                continue
+            if done:
+                answers[i] = value
+            else:
+                failures[i] = Failure(f"it raised\n{value}", False)
+        if not ready:
+            break
+    for i in waiting:
+        failures[i] = Failure(f"no answer within {timeout:g} s", True)
+    return answers, failures
+
+
+def shut_down(workers: Sequence[Worker]) -> None:
+    """Close environments, end processes and free memory; those that do not answer are killed."""
+    for worker in workers:
+        if worker.process.is_alive():
+            worker.send("close")
+    end = time.monotonic() + _JOIN
+    for worker in workers:
+        worker.process.join(max(0.0, end - time.monotonic()))
+        if not worker.pipe.closed:
+            worker.kill()
+        worker.free()
+
+
+def checked_space(space: spaces.Space, task: str) -> spaces.Dict:
+    """The observation space, a dictionary of boxes.
+
+    Raises:
+        LiberoError: it is something else.
+    """
+    if not isinstance(space, spaces.Dict) or not all(isinstance(box, spaces.Box) for box in space.values()):
+        raise LiberoError(f"{task}: observations must be a dictionary of arrays to be shared, not {space}")
+    return space

@@ -1,0 +1,1 @@
+"""Where to grasp a body: from above, by a wall, by a handle."""

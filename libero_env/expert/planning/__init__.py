@@ -1,0 +1,1 @@
+"""What to do next: goal to steps, pick plans, poses for placing."""

@@ -1,0 +1,25 @@
+from .settle import sample_settled, settle, start_faults
+from .store import (
+    NUM_INIT_STATES,
+    cache_init_states,
+    generate_init_states,
+    load_init_states,
+    scene_digest,
+    shipped_path,
+    split_row,
+    write_suite,
+)
+
+__all__ = [
+    "NUM_INIT_STATES",
+    "cache_init_states",
+    "generate_init_states",
+    "load_init_states",
+    "sample_settled",
+    "scene_digest",
+    "settle",
+    "shipped_path",
+    "split_row",
+    "start_faults",
+    "write_suite",
+]

@@ -1,0 +1,142 @@
+"""The fixed initial states of each task: complete, settled, and tied to the model they were made for."""
+
+import hashlib
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from importlib import resources
+from multiprocessing import get_context
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from libero_env.assets.pack import BUILTIN
+from libero_env.errors import LiberoError
+from libero_env.init_states.settle import sample_settled
+from libero_env.paths import cache_dir
+from libero_env.sim.scene import Scene, build_scene
+from libero_env.sim.simulation import LoopSimulations
+from libero_env.tasks.task import Task
+
+NUM_INIT_STATES = 50
+_RESERVED = 0x1B3E0  # separates the seeds of these states from those of `reset(seed=...)`
+
+
+def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -> np.ndarray:
+    """The initial states of a task, made anew: (num, 1 + nq + nv + 7 nfixtures).
+
+    Rows are [time, qpos, qvel, pos and quat (wxyz) of each fixture]; row i depends on the task's name and i alone.
+    """
+    simulations, nv = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies), scene.model.nv
+    name = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
+    rows = []
+    for i in range(num):
+        start = sample_settled(scene, simulations, 0, np.random.default_rng([_RESERVED, name, i]))
+        rows.append(np.concatenate([[0.0], start.qpos, np.zeros(nv), start.fixtures.ravel()]))
+    return np.array(rows)
+
+
+def split_row(model: mujoco.MjModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (k, n) of initial states -> qpos (k, nq), qvel (k, nv), fixtures (k, nfixtures, 7)."""
+    _, qpos, qvel, fixtures = np.split(rows, np.cumsum([1, model.nq, model.nv]), axis=1)
+    return qpos, qvel, fixtures.reshape(len(rows), -1, 7)
+
+
+def load_init_states(task: Task, scene: Scene) -> np.ndarray:
+    """The task's 50 initial states, rows as of `generate_init_states`: those shipped, else made once and cached.
+
+    Raises:
+        LiberoError: the shipped states were made for another model.
+    """
+    digest = scene_digest(scene)
+    shipped = _shipped(task.suite).get(task.name)
+    if shipped is not None and (shipped[0] == digest or scene.pack.name == BUILTIN):
+        if shipped[0] != digest:
+            raise LiberoError(
+                f"the initial states of {task.id} were made for another model ({shipped[0]}, this one is {digest}); "
+                f"make them anew: libero tasks init-states {task.suite}"
+            )
+        return shipped[1]
+    path = _cached_path(task, digest)
+    if path.exists():
+        with np.load(path, allow_pickle=False) as stored:
+            return stored["states"]
+    states = generate_init_states(task, scene)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write(path, {"states": states})
+    return states
+
+
+def cache_init_states(task: Task) -> Path:
+    """Make the initial states of a task that none are shipped for, unless they are there, and say where."""
+    scene = build_scene(task.problem)
+    load_init_states(task, scene)
+    return _cached_path(task, scene_digest(scene))
+
+
+def _cached_path(task: Task, digest: str) -> Path:
+    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[
+        :16
+    ]  # regions and atoms, which the digest knows not
+    return cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{said}.npz"
+
+
+def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
+    """Make the initial states of tasks and write them to one npz: `<task>` states, `<task>.digest`.
+
+    Args:
+        path: the file.
+        tasks: of one suite.
+        jobs: processes; the states do not depend on it.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        made = zip(tasks, pool.map(_generate, tasks), strict=True)
+        for task, (states, digest) in tqdm(made, unit="task", desc="initial states", total=len(tasks)):
+            arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
+    _write(path, arrays)
+
+
+def _generate(task: Task) -> tuple[np.ndarray, str]:
+    scene = build_scene(task.problem)
+    return generate_init_states(task, scene), scene_digest(scene)
+
+
+def shipped_path(suite: str) -> Path:
+    """Where the package keeps the initial states of a suite."""
+    return Path(str(resources.files("libero_env"))) / "tasks" / "init_states" / f"{suite}.npz"
+
+
+def scene_digest(scene: Scene) -> str:
+    """What initial states depend on: joints in order, collision shapes of objects and fixtures; 16 hex digits."""
+    model = scene.model
+    parts = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
+    for name, thing in scene.things.items():
+        if thing.digest:
+            parts.append((name, thing.digest))
+        for body in scene.bodies[name]:
+            for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+                if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
+                    figures = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
+                    parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in figures)))
+            parts.append((name, f"{model.body_mass[body]:.6f}"))
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+@lru_cache(maxsize=8)
+def _shipped(suite: str) -> dict[str, tuple[str, np.ndarray]]:
+    path = shipped_path(suite)
+    if not path.exists():
+        return {}
+    with np.load(path, allow_pickle=False) as stored:
+        names = [name for name in stored.files if not name.endswith(".digest")]
+        return {name: (str(stored[f"{name}.digest"]), stored[name]) for name in names}
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    partial = path.with_suffix(".partial.npz")
+    np.savez_compressed(partial, **arrays)
+    partial.replace(path)

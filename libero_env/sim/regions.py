@@ -1,0 +1,53 @@
+"""The boxes of regions, and whether a point is in or over one."""
+
+import mujoco
+import numpy as np
+
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.sim.scene import zone_boxes
+from libero_env.sim.state import StateView
+from libero_env.tasks.problem import Region
+
+BOX_BELOW = 0.01  # m, how far below its box a region still holds a point
+
+
+_ON_BELOW, _ON_ABOVE = 0.005, 0.10  # m, how far around the top of a region's box a point lies on it
+
+
+Box = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre (3,), orientation to world (3, 3), half size (3,)
+
+
+def region_of(view: StateView, address: str) -> Region:
+    region = view.scene.problem.region(address)
+    if region is None:
+        valid = [r.address for r in view.scene.problem.regions] + list(view.scene.objects)
+        raise UnknownNameError("region or object", address, valid)
+    return region
+
+
+def region_boxes(view: StateView, address: str) -> list[Box]:
+    """The boxes of a region: the site of that name, or a flat box over each rectangle on its surface."""
+    region = region_of(view, address)
+    if not region.ranges:
+        site = mujoco.mj_name2id(view.scene.model, mujoco.mjtObj.mjOBJ_SITE, address)
+        if site < 0:
+            raise LiberoError(
+                f"region {address}: {region.target} has no site {region.name!r}, and no ranges are given"
+            )
+        return [(view.site_pos(address), view.site_mat(address), view.scene.model.site_size[site])]
+    boxes = zone_boxes(region, view.scene.workspace)
+    return [(centre, np.eye(3), half) for centre, half in boxes]
+
+
+def contains(box: Box, point: np.ndarray) -> bool:
+    centre, mat, size = box
+    half = np.abs(mat @ size)
+    low, high = centre - half, centre + half
+    low[2] -= BOX_BELOW
+    return bool((point > low).all() and (point < high).all())
+
+
+def is_over(box: Box, point: np.ndarray) -> bool:
+    centre, mat, size = box
+    delta = mat @ (point - centre)
+    return bool(size[2] - _ON_BELOW < delta[2] < size[2] + _ON_ABOVE and (np.abs(delta[:2]) < size[:2]).all())

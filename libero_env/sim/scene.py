@@ -1,0 +1,254 @@
+"""Problem + assets + workspace -> one MuJoCo model.
+
+Joint order is the original's: arm, gripper, then the objects and the fixtures in the order of the task file; so states
+of the original have the same layout. Where fixtures stand is state, not model; `Simulations` keeps it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import mujoco
+import numpy as np
+
+from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, load_workspace
+from libero_env.assets.pack import Pack, select_pack
+from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS, add_panda
+from libero_env.errors import UnknownNameError
+from libero_env.mujoco_compat import set_damping
+from libero_env.objects.model import ROOT_BODY, ObjectModel
+from libero_env.tasks.bddl import Problem
+from libero_env.tasks.problem import Region
+from libero_env.timing import TIMESTEP
+
+ROBOT = "robot"  # what contacts call arm and gripper
+_MAX_FRAME = 1024  # pixels, the largest picture the offscreen buffer holds
+_FIXTURE_LIFT = 0.01  # m, the original's height of fixtures over the underside of the table top
+_ZONE_HEIGHT = 0.014  # m, of the box over a flat region
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled task. The model is shared by all environments of the task: nobody writes to it.
+
+    Attributes:
+        problem: what the task file says.
+        pack: where the models come from.
+        workspace: table or floor.
+        workspace_name: what the task file calls it, such as `main_table`.
+        model: the compiled model.
+        objects: instance name -> movable object, in the order of the task file.
+        fixtures: instance name -> fixture, without the workspace, in the order of the task file.
+    """
+
+    problem: Problem
+    pack: Pack
+    workspace: Workspace
+    workspace_name: str
+    model: mujoco.MjModel
+    objects: Mapping[str, ObjectModel]
+    fixtures: Mapping[str, ObjectModel]
+
+    @property
+    def nq_robot(self) -> int:
+        """Number of position coordinates that belong to arm and gripper; objects follow."""
+        return len(REST_QPOS) + len(OPEN_FINGERS)
+
+    @property
+    def things(self) -> dict[str, ObjectModel]:
+        """Objects and fixtures."""
+        return {**self.objects, **self.fixtures}
+
+    @cached_property
+    def fixture_poses(self) -> np.ndarray:
+        """Where fixtures stand unless a state says otherwise: mid-region, (nfixtures, 7) pos and quat wxyz."""
+        return np.concatenate([self.model.body_pos, self.model.body_quat], axis=1)[self.fixture_bodies]
+
+    @property
+    def fixture_bodies(self) -> np.ndarray:
+        """Ids of the fixtures' root bodies, (nfixtures,)."""
+        return np.array([self.model.body(f"{name}_{ROOT_BODY}").id for name in self.fixtures], np.int64)
+
+    @cached_property
+    def bodies(self) -> Mapping[str, np.ndarray]:
+        """Name of an object, fixture, the workspace or `robot` -> ids of its bodies."""
+        model = self.model
+        root = {n: model.body(f"{n}_{ROOT_BODY}").id for n in self.things}
+        found = {name: np.flatnonzero(model.body_rootid == body) for name, body in root.items()}
+        names = [model.body(b).name for b in range(model.nbody)]
+        robot = [b for b, name in enumerate(names) if name.startswith(("robot0_", "gripper0_"))]
+        rest = np.setdiff1d(np.arange(model.nbody), np.concatenate([*found.values(), robot]))
+        return {**found, ROBOT: np.array(robot), self.workspace_name: rest}
+
+    @cached_property
+    def joints(self) -> Mapping[str, tuple[int, ...]]:
+        """Object, fixture or address of a site -> its articulated joints; for a site those of its own body."""
+        model = self.model
+        moving = [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
+        owners: dict[str, tuple[int, ...]] = {}
+        for name in self.things:
+            bodies = set(self.bodies[name].tolist())
+            own = [j for j in moving if int(model.jnt_bodyid[j]) in bodies]
+            owners[name] = tuple(own)
+            for site in range(model.nsite):
+                if (body := int(model.site_bodyid[site])) in bodies:
+                    owners[model.site(site).name] = tuple(j for j in own if model.jnt_bodyid[j] == body)
+        return owners
+
+    def owner(self, address: str) -> str | None:
+        """The object or fixture that a name or the address of one of its regions belongs to."""
+        if address in self.things:
+            return address
+        region = self.problem.region(address)
+        return region.target if region is not None and region.target in self.things else None
+
+
+def build_scene(problem: Problem, pack: Pack | None = None) -> Scene:
+    """Compile a problem; the result is cached for the process.
+
+    Args:
+        problem: what to build.
+        pack: where the models come from; by default as `select_pack` says.
+
+    Raises:
+        UnknownNameError: a fixture or object category that has no model.
+    """
+    return _build_scene(problem, pack or select_pack())
+
+
+@lru_cache(maxsize=160)
+def _build_scene(problem: Problem, pack: Pack) -> Scene:
+    name, workspace = workspace_of(problem)
+    things = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
+    model = scene_spec(problem, pack, things).compile()
+    objects = {n: things[n] for n in problem.objects}
+    fixtures = {n: things[n] for n in problem.fixtures if n != name}
+    return Scene(problem, pack, workspace, name, model, objects, fixtures)
+
+
+def scene_spec(
+    problem: Problem, pack: Pack | None = None, things: Mapping[str, ObjectModel] | None = None
+) -> mujoco.MjSpec:
+    """A fresh, editable model of a problem's scene, with these objects and fixtures or with those of the pack.
+
+    Raises:
+        UnknownNameError: a fixture or object category that has no model.
+    """
+    pack = pack or select_pack()
+    name, workspace = workspace_of(problem)
+    spec = mujoco.MjSpec()
+    spec.modelname = "libero"
+    _set_options(spec)
+    pack.add_arena(spec, workspace, problem.scene_properties)
+    add_mount(spec, workspace)
+    add_panda(spec, workspace.robot_base_pos)
+    _add_zones(spec, problem, name, workspace)
+    for thing, category in problem.objects.items():
+        _add_object(spec, thing, pack.build(category) if things is None else things[thing])
+    for thing, category in problem.fixtures.items():
+        if thing != name:
+            item = pack.build(category) if things is None else things[thing]
+            _add_fixture(spec, thing, item, fixture_pose(problem, name, workspace, thing, item))
+    return spec
+
+
+def workspace_of(problem: Problem) -> tuple[str, Workspace]:
+    """The fixture of a problem that is its workspace: its name and what it is.
+
+    Raises:
+        UnknownNameError: none of the fixtures is one.
+    """
+    for name, category in problem.fixtures.items():
+        if category in WORKSPACES:
+            return name, load_workspace(category)
+    raise UnknownNameError("workspace among the fixtures", list(problem.fixtures.values()), WORKSPACES)
+
+
+def fixture_pose(
+    problem: Problem,
+    workspace_name: str,
+    workspace: Workspace,
+    name: str,
+    item: ObjectModel,
+    rng: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Pose of a fixture in the region its init atom names, (7,): pos, quat wxyz; without a generator in its middle."""
+    region = next(
+        (
+            problem.region(atom.args[1])
+            for atom in problem.init
+            if atom.predicate == "On" and atom.args[0] == name and len(atom.args) == 2
+        ),
+        None,
+    )
+    height = _FIXTURE_LIFT - workspace.figures.get("table_thickness", 0.05) - item.bottom_offset[2]
+    if region is None or not region.ranges or region.target != workspace_name:
+        x, y, yaw = 0.0, 0.0, 0.0
+    elif rng is None:
+        x0, y0, x1, y1 = region.ranges[0]
+        x, y, yaw = (x0 + x1) / 2, (y0 + y1) / 2, float(np.mean(region.yaw[0])) if region.yaw else 0.0
+    else:
+        x0, y0, x1, y1 = region.ranges[rng.integers(len(region.ranges))]
+        x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
+        yaw = rng.uniform(*region.yaw[0]) if region.yaw else 0.0
+    pos = np.add(workspace.offset, (x, y, height))
+    return np.array([*pos, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def zone_boxes(region: Region, workspace: Workspace) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The flat box over each rectangle of a region on the workspace: centre (3,), half size (3,), world frame, m."""
+    origin = np.array(workspace.zone_origin)
+    return [
+        (origin + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.array([x1 - x0, y1 - y0, _ZONE_HEIGHT]) / 2)
+        for x0, y0, x1, y1 in region.ranges
+    ]
+
+
+def initial_qpos(scene: Scene) -> np.ndarray:
+    """Positions with the arm at rest, the gripper open and every object at its model's origin; (nq,)."""
+    qpos = scene.model.qpos0.copy()
+    qpos[: scene.nq_robot] = REST_QPOS + OPEN_FINGERS
+    return qpos
+
+
+def _set_options(spec: mujoco.MjSpec) -> None:
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = TIMESTEP
+    option.impratio = 20.0
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.density, option.viscosity = 1.2, 2e-5
+    visual = spec.visual
+    visual.map.znear = 0.001
+    visual.quality.offsamples = 0  # multisampling doubles the cost of a picture
+    visual.quality.shadowsize = 0
+    visual.global_.offwidth = visual.global_.offheight = _MAX_FRAME
+    visual.headlight.ambient, visual.headlight.diffuse = [0.1] * 3, [0.4] * 3
+    visual.headlight.specular = [0.5] * 3
+
+
+def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Workspace) -> None:
+    """A hidden site for each region on the workspace, so that clients find it by its address."""
+    for region in problem.regions:
+        if region.target == name and region.ranges:
+            centre, half = zone_boxes(region, workspace)[0]
+            spec.worldbody.add_site(
+                name=region.address,
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=centre,
+                size=np.maximum(half, 1e-4),
+                rgba=(0.0, 0.0, 0.0, 0.0),
+                group=3,
+            )
+
+
+def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectModel) -> None:
+    joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
+    set_damping(joint, item.joint_damping)
+    spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())
+
+
+def _add_fixture(spec: mujoco.MjSpec, name: str, item: ObjectModel, pose: np.ndarray) -> None:
+    body = item.spec.body(ROOT_BODY)
+    body.pos, body.quat = pose[:3], pose[3:]
+    spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())

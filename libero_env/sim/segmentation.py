@@ -1,0 +1,61 @@
+"""What the numbers of a segmentation mean."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from libero_env.errors import UnknownNameError
+from libero_env.sim.scene import Scene
+
+SEGMENTATIONS = ("instance", "class", "element")
+ARENA, ARM, GRIPPER = "arena", "robot", "gripper"
+
+
+@dataclass(frozen=True)
+class Labels:
+    """How drawn elements are labelled, and what the labels are called.
+
+    Attributes:
+        of: (1 + ngeom + nsite,) int32, label of each number that `libero_env.sim.render` draws.
+        names: label -> name.
+    """
+
+    of: np.ndarray
+    names: dict[int, str]
+
+
+def labels(scene: Scene, kind: str) -> Labels:
+    """Labels of a kind of segmentation.
+
+    `instance`: 0 is the arena and all that has no name of its own, 1 the robot with its mount, 2 the gripper, then
+    objects and fixtures in the order of the task file. `class`: the same, one number for each category. `element`:
+    1 + index of the geom, or 1 + number of geoms + index of the site; 0 where nothing is.
+
+    Raises:
+        UnknownNameError: no such kind.
+    """
+    model = scene.model
+    if kind == "element":
+        geoms = {1 + i: model.geom(i).name or f"geom{i}" for i in range(model.ngeom)}
+        sites = {1 + model.ngeom + i: model.site(i).name or f"site{i}" for i in range(model.nsite)}
+        return Labels(
+            np.arange(1 + model.ngeom + model.nsite, dtype=np.int32), {0: "nothing", **geoms, **sites}
+        )
+    if kind not in SEGMENTATIONS:
+        raise UnknownNameError("segmentation", kind, SEGMENTATIONS)
+    things = {**scene.objects, **scene.fixtures}
+    called = {name: name if kind == "instance" else item.category for name, item in things.items()}
+    numbers = {
+        label: number for number, label in enumerate(dict.fromkeys((ARENA, ARM, GRIPPER, *called.values())))
+    }
+    of_body = np.zeros(model.nbody, np.int32)
+    for body in range(model.nbody):
+        name = model.body(body).name
+        if name.startswith(("robot0_", "mount0_")):
+            of_body[body] = numbers[ARM]
+        elif name.startswith("gripper0_"):
+            of_body[body] = numbers[GRIPPER]
+    for name, label in called.items():
+        of_body[scene.bodies[name]] = numbers[label]
+    of = np.concatenate([[0], of_body[model.geom_bodyid], of_body[model.site_bodyid]])
+    return Labels(of.astype(np.int32), {number: label for label, number in numbers.items()})

@@ -1,0 +1,24 @@
+from .authoring import make_task
+from .files import get_task, read_suite, read_task, write_task
+from .problem import And, Atom, ForAll, Not, Or, Problem, Region
+from .suites import get_suite, suite_names
+from .task import Suite, Task
+
+__all__ = [
+    "And",
+    "Atom",
+    "ForAll",
+    "Not",
+    "Or",
+    "Problem",
+    "Region",
+    "Suite",
+    "Task",
+    "get_suite",
+    "get_task",
+    "make_task",
+    "read_suite",
+    "read_task",
+    "suite_names",
+    "write_task",
+]

@@ -1,0 +1,323 @@
+"""Task files: BDDL text <-> frozen `Problem`.
+
+The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:language ...) (:regions ...)
+(:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with
+`;` comments. `:requirements` is read and dropped. Goals may nest and, or, not and forall. Numbers may be
+arithmetic with `pi`; nothing in a file is ever executed.
+"""
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NoReturn
+
+from libero_env.tasks.problem import (
+    And,
+    Atom,
+    Expression,
+    ForAll,
+    Not,
+    Or,
+    Problem,
+    Region,
+    differences,
+    same_meaning,
+)
+from libero_env.tasks.sexpr import List, Word, fail, number, parse_tree, show
+
+__all__ = [
+    "And",
+    "Atom",
+    "Expression",
+    "ForAll",
+    "Not",
+    "Or",
+    "Problem",
+    "Region",
+    "differences",
+    "parse",
+    "parse_atom",
+    "parse_expression",
+    "read",
+    "same_meaning",
+    "write",
+]
+
+SECTIONS = (
+    ":domain",
+    ":requirements",
+    ":language",
+    ":regions",
+    ":fixtures",
+    ":objects",
+    ":obj_of_interest",
+    ":scene_properties",
+    ":init",
+    ":goal",
+)
+
+_PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
+
+
+def parse(text: str, file: str = "<string>") -> Problem:
+    """Read a task from BDDL text; `file` is only for messages.
+
+    Raises:
+        BDDLError: "file:line: what; expected ..." for anything that is not the dialect, a name declared
+            twice, or an atom about a name that the file does not declare.
+    """
+    return _Reader(file).problem(text)
+
+
+def read(path: str | Path) -> Problem:
+    """Read a task file; see `parse`."""
+    content = Path(path).read_bytes()
+    try:
+        return parse(content.decode("utf-8-sig"), str(path))
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        fail(str(path), line, f"the byte 0x{content[error.start]:02x}", "UTF-8 text")
+
+
+def parse_expression(text: str, known: Collection[str], file: str = "<string>") -> Expression:
+    """Read one atom or goal, such as `On plate_1 stove_1` or `(Or (Open a) (Not (On b c)))`.
+
+    Args:
+        known: the names it may speak of.
+
+    Raises:
+        BDDLError: as in `parse`.
+    """
+    return _Reader(file).expression(_one_list(text, file), set(known))
+
+
+def parse_atom(text: str, known: Collection[str], file: str = "<string>") -> Atom:
+    """Read one atom, such as `On plate_1 stove_1`; see `parse_expression`."""
+    return _Reader(file).atom(_one_list(text, file), set(known))
+
+
+def _one_list(text: str, file: str) -> List:
+    return parse_tree(text if text.lstrip().startswith("(") else f"({text})", file)
+
+
+def write(problem: Problem) -> str:
+    """The problem as BDDL text; `parse(write(problem)) == problem`, in the original's layout."""
+    sections = [
+        f"  (:domain {problem.domain})",
+        f"  (:language {problem.language})",
+        _block(":regions", [_region_text(region) for region in problem.regions]),
+        _block(":fixtures", _typed_names(problem.fixtures)),
+        _block(":objects", _typed_names(problem.objects)),
+        _block(":obj_of_interest", problem.obj_of_interest),
+    ]
+    if problem.scene_properties:
+        sections.append(
+            _block(":scene_properties", [f"(:{k} {v})" for k, v in problem.scene_properties.items()])
+        )
+    sections += [
+        _block(":init", map(_expression_text, problem.init)),
+        _block(":goal", [_expression_text(problem.goal)]),
+    ]
+    return f"(define (problem {problem.name})\n" + "\n".join(sections) + "\n)\n"
+
+
+def _block(head: str, lines: Iterable[str]) -> str:
+    return "\n".join([f"  ({head}", *(f"    {line}" for line in lines), "  )"])
+
+
+def _typed_names(names: Mapping[str, str]) -> list[str]:
+    groups = groupby(names, key=names.__getitem__)
+    return [f"{' '.join(group)} - {category}" for category, group in groups]
+
+
+def _region_text(region: Region) -> str:
+    rows = [f"({region.name} (:target {region.target})"]
+    for key, tuples in ((":ranges", region.ranges), (":yaw_rotation", region.yaw)):
+        if tuples:
+            rows.append(f"({key} ({' '.join(map(_numbers, tuples))}))")
+    if region.rgba:
+        rows.append(f"(:rgba {_numbers(region.rgba)})")
+    return " ".join(rows) + ")"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return f"({' '.join(repr(float(value)) for value in values)})"
+
+
+def _expression_text(node: Expression) -> str:
+    match node:
+        case Atom(predicate, args):
+            return f"({' '.join((predicate, *args))})"
+        case And(parts) | Or(parts):
+            return f"({' '.join((type(node).__name__, *map(_expression_text, parts)))})"
+        case Not(part):
+            return f"(Not {_expression_text(part)})"
+        case ForAll(variables, body):
+            names = " ".join(f"{name} - {category}" for name, category in variables)
+            return f"(ForAll ({names}) {_expression_text(body)})"
+    raise TypeError(f"not a goal expression: {node!r}")
+
+
+class _Reader:
+    """One file on its way to a `Problem`; holds the file name for messages."""
+
+    def __init__(self, file: str):
+        self.file = file
+
+    def fail(self, line: int, what: str, expected: str) -> NoReturn:
+        fail(self.file, line, what, expected)
+
+    def problem(self, text: str) -> Problem:
+        root = parse_tree(text, self.file)
+        if root.head != "define" or len(root.items) < 2:
+            self.fail(root.line, "not a problem", "(define (problem NAME) ...)")
+        title, *rest = root.items[1:]
+        if not isinstance(title, List) or title.head != "problem" or len(title.items) != 2:
+            self.fail(title.line, "no problem name", "(problem NAME)")
+        sections: dict[str, List] = {}
+        for part in rest:
+            section = part if isinstance(part, List) else List((), part.line)
+            head, line = section.head, section.line
+            if head not in SECTIONS:
+                self.fail(line, f"unknown section {head or show(part)!r}", f"one of {', '.join(SECTIONS)}")
+            if head in sections:
+                self.fail(line, f"a second {head}", f"one (the first is on line {sections[head].line})")
+            sections[head] = section
+        return self.assemble(self.word(title.items[1]), root.line, sections)
+
+    def assemble(self, name: str, line: int, sections: dict[str, List]) -> Problem:
+        for needed in (":language", ":fixtures", ":objects", ":init", ":goal"):
+            if needed not in sections:
+                self.fail(
+                    line, f"no ({needed} ...) section", f"all of {', '.join(SECTIONS)} but the optional ones"
+                )
+        items = {key: section.items[1:] for key, section in sections.items()}
+        regions = self.regions(items.get(":regions", ()))
+        fixtures, objects = self.names(sections[":fixtures"]), self.names(sections[":objects"])
+        known = {*fixtures, *objects, *(region.address for region in regions)}
+        goal_line, goals = sections[":goal"].line, items[":goal"]
+        if len(goals) != 1:
+            self.fail(goal_line, f"{len(goals)} goals", "one, such as (And (On plate_1 stove_1))")
+        twice = sorted(fixtures.keys() & objects.keys())
+        if twice:
+            self.fail(sections[":objects"].line, f"{twice[0]} is a fixture too", "each name declared once")
+        return Problem(
+            name=name,
+            domain=" ".join(map(self.word, items.get(":domain", ()))) or "robosuite",
+            language=" ".join(map(self.word, items[":language"])),
+            regions=regions,
+            fixtures=fixtures,
+            objects=objects,
+            obj_of_interest=tuple(map(self.word, items.get(":obj_of_interest", ()))),
+            scene_properties=dict(map(self.scene_property, items.get(":scene_properties", ()))),
+            init=tuple(self.atom(item, known) for item in items[":init"]),
+            goal=self.expression(goals[0], known),
+        )
+
+    def word(self, node: Word | List) -> str:
+        if isinstance(node, List):
+            self.fail(node.line, f"a list {show(node)}", "a word")
+        return node.text
+
+    def names(self, section: List) -> dict[str, str]:
+        """`a_1 a_2 - a  b_1 - b` -> {a_1: a, a_2: a, b_1: b}."""
+        found: dict[str, str] = {}
+        waiting: list[tuple[str, int]] = []
+        items = iter(section.items[1:])
+        for item in items:
+            if (word := self.word(item)) != "-":
+                waiting.append((word, item.line))
+                continue
+            category = next(items, None)
+            if not waiting or category is None:
+                self.fail(
+                    item.line, "a - without names before it or a category after it", "NAME NAME - CATEGORY"
+                )
+            for name, line in waiting:
+                if name in found:
+                    self.fail(line, f"{name} is declared twice", "each name declared once")
+                found[name] = self.word(category)
+            waiting = []
+        if waiting:
+            name, line = waiting[0]
+            self.fail(line, f"{name} has no category", "NAME NAME - CATEGORY")
+        return found
+
+    def regions(self, nodes: tuple[Word | List, ...]) -> tuple[Region, ...]:
+        found: dict[str, Region] = {}
+        for node in nodes:
+            region = self.region(node)
+            if region.address in found:
+                self.fail(node.line, f"{region.address} is declared twice", "each region of a target once")
+            found[region.address] = region
+        return tuple(found.values())
+
+    def region(self, node: Word | List) -> Region:
+        if not isinstance(node, List) or len(node.items) < 2:
+            self.fail(node.line, f"not a region: {show(node)}", "(NAME (:target NAME) ...)")
+        found: dict[str, Any] = {}
+        seen: set[str] = set()
+        for part in node.items[1:]:
+            head = part.head if isinstance(part, List) and len(part.items) == 2 else ""
+            value = part.items[1] if isinstance(part, List) and head else part
+            if head in seen:
+                self.fail(part.line, f"a second {head} in a region", "one")
+            seen.add(head)
+            if head == ":target":
+                found["target"] = self.word(value)
+            elif head in (":ranges", ":yaw_rotation"):
+                width, key = (4, "ranges") if head == ":ranges" else (2, "yaw")
+                if not isinstance(value, List):
+                    self.fail(value.line, f"{head} {value.text}", "a list of lists of numbers")
+                found[key] = tuple(self.numbers(row, width, head) for row in value.items)
+            elif head == ":rgba":
+                found["rgba"] = self.numbers(value, 4, head)
+            else:
+                valid = "(:target X), (:ranges (...)), (:yaw_rotation (...)) or (:rgba (...))"
+                self.fail(part.line, f"{show(part)} in a region", valid)
+        if "target" not in found:
+            self.fail(node.line, f"region {show(node.items[0])} has no target", "(:target NAME)")
+        return Region(name=self.word(node.items[0]), **found)
+
+    def numbers(self, node: Word | List, count: int, head: str) -> tuple[float, ...]:
+        if not isinstance(node, List) or len(node.items) != count:
+            self.fail(node.line, f"{show(node)} in {head}", f"a list of {count} numbers")
+        return tuple(self.number(item) for item in node.items)
+
+    def number(self, node: Word | List) -> float:
+        try:
+            return number(self.word(node))
+        except ValueError:
+            self.fail(node.line, f"{show(node)} is no number", "a finite number such as 0.25 or -pi/4")
+
+    def scene_property(self, node: Word | List) -> tuple[str, str]:
+        if not isinstance(node, List) or not node.head.startswith(":"):
+            self.fail(node.line, f"not a scene property: {show(node)}", "(:floor STYLE) or (:wall STYLE)")
+        return node.head[1:], " ".join(map(self.word, node.items[1:]))
+
+    def atom(self, node: Word | List, known: set[str]) -> Atom:
+        if not isinstance(node, List) or len(node.items) < 2:
+            self.fail(node.line, f"not an atom: {show(node)}", "(PREDICATE NAME ...)")
+        predicate, *args = map(self.word, node.items)
+        if not _PREDICATE.fullmatch(predicate):
+            self.fail(node.line, f"{predicate} is no predicate", "letters, such as On, In, Open or Turnon")
+        for name, item in zip(args, node.items[1:], strict=True):
+            if name not in known:
+                valid = ", ".join(sorted(known)) or "a name, but none is declared"
+                self.fail(item.line, f"{name} is not declared", f"one of {valid}")
+        return Atom(predicate.capitalize(), tuple(args))
+
+    def expression(self, node: Word | List, known: set[str]) -> Expression:
+        parts = node.items[1:] if isinstance(node, List) else ()
+        head = node.head if isinstance(node, List) else ""
+        if head in ("and", "or"):
+            return (And if head == "and" else Or)(tuple(self.expression(part, known) for part in parts))
+        if head == "not" and len(parts) == 1:
+            return Not(self.expression(parts[0], known))
+        if head == "forall" and len(parts) == 2 and isinstance(parts[0], List):
+            variables = self.names(List((Word("forall", node.line), *parts[0].items), node.line))
+            return ForAll(tuple(variables.items()), self.expression(parts[1], known | variables.keys()))
+        if head in ("not", "forall"):
+            self.fail(node.line, show(node), "(Not EXPRESSION) or (ForAll (?x - CATEGORY) EXPRESSION)")
+        return self.atom(node, known)

@@ -1,0 +1,1 @@
+"""Recording demonstrations by hand: input devices, the recording session, screens."""

@@ -1,0 +1,258 @@
+"""Windows and terminals of a teleoperation session: events go to the device, pictures to the user."""
+
+import importlib
+import os
+import select
+import shutil
+import sys
+import time
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from libero_env.envs.world import World
+from libero_env.errors import LiberoError, RenderError
+from libero_env.objects.model import GLOW_GROUP
+from libero_env.sim.predicates import glowing_sites
+from libero_env.teleop.devices import GRIPPER, HELP, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
+from libero_env.teleop.session import Status
+from libero_env.timing import CONTROL_HZ
+
+KINDS = ("auto", "window", "terminal")
+_ESCAPE = "\x1b"
+
+
+class OpenScreen(Protocol):
+    """A `Screen` that can be closed."""
+
+    def poll(self, world: World) -> None:
+        """See `Screen`."""
+        ...
+
+    def show(self, world: World, status: Status) -> None:
+        """See `Screen`."""
+        ...
+
+    def close(self) -> None:
+        """Give back what it holds."""
+        ...
+
+
+def open_screen(
+    kind: str, keyboard: Keyboard, camera: str = "agentview", reader: "MouseReader | None" = None
+) -> OpenScreen:
+    """A window, or a terminal where there is none.
+
+    Args:
+        kind: `window`, `terminal`, or `auto` for the first that works.
+        keyboard: gets the keys.
+        camera: what is shown.
+        reader: of a 3D mouse, to be read beside the keys.
+
+    Raises:
+        RenderError: neither works here; the message says why.
+    """
+    problems = []
+    if kind in ("auto", "window"):
+        try:
+            return Window(keyboard, camera, reader)
+        except RenderError as error:
+            problems.append(str(error))
+    if kind in ("auto", "terminal"):
+        try:
+            return Terminal(keyboard, camera, reader)
+        except RenderError as error:
+            problems.append(str(error))
+    raise RenderError("; ".join(problems) or f"screen {kind!r}; valid: {', '.join(KINDS)}")
+
+
+class MouseReader:
+    """Reads a 3D mouse through the package hidapi.
+
+    Args:
+        mouse: gets the reports.
+        vendor_id, product_id: of the device.
+
+    Raises:
+        LiberoError: hidapi or the device is missing.
+    """
+
+    def __init__(self, mouse: SpaceMouse, vendor_id: int = 9583, product_id: int = 50741):
+        self.mouse = mouse
+        try:
+            hid: Any = importlib.import_module("hid")
+        except ImportError as error:
+            raise LiberoError("a 3D mouse is read with hidapi: pip install hidapi") from error
+        self.device = hid.device()
+        try:
+            self.device.open(vendor_id, product_id)
+        except OSError as error:
+            raise LiberoError(
+                f"no 3D mouse {vendor_id}:{product_id} can be opened ({error}); name yours with --vendor-id and "
+                "--product-id, and see that you may read it"
+            ) from error
+        self.device.set_nonblocking(True)
+
+    def poll(self) -> None:
+        """Hand on all reports that are waiting."""
+        while data := self.device.read(13):
+            self.mouse.report(bytes(data))
+
+
+class _Clock:
+    """Lets a control step last as long as it does on the robot."""
+
+    def __init__(self) -> None:
+        self.next = time.monotonic()
+
+    def wait(self) -> None:
+        self.next = max(self.next + 1.0 / CONTROL_HZ, time.monotonic())
+        time.sleep(max(self.next - time.monotonic(), 0.0))
+
+
+class Window:
+    """A window of GLFW that MuJoCo draws into.
+
+    Raises:
+        RenderError: no window opens here.
+    """
+
+    def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None, size: int = 640):
+        if sys.platform.startswith("linux") and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        ):
+            raise RenderError("no window: neither DISPLAY nor WAYLAND_DISPLAY names a screen")
+        try:
+            self.glfw: Any = importlib.import_module("glfw")
+        except ImportError as error:
+            raise RenderError(f"no window: {error}; pip install glfw") from error
+        if not self.glfw.init():
+            raise RenderError("no window: GLFW finds no screen")
+        self.window = self.glfw.create_window(size, size, "libero teleop", None, None)
+        if not self.window:
+            self.glfw.terminate()
+            raise RenderError("no window: GLFW cannot open one with OpenGL")
+        self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
+        self.glfw.set_key_callback(self.window, self._on_key)
+        self.context: mujoco.MjrContext | None = None
+
+    def poll(self, world: World) -> None:
+        """See `Screen`."""
+        self.glfw.poll_events()
+        if self.reader is not None:
+            self.reader.poll()
+        if self.glfw.window_should_close(self.window):
+            self.keyboard.press(QUIT)
+
+    def show(self, world: World, status: Status) -> None:
+        """See `Screen`."""
+        model, data = world.simulations.model, world.simulations.data(0)
+        self.glfw.make_context_current(self.window)
+        if self.context is None:
+            self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+            self.scene, self.option = mujoco.MjvScene(model, 2000), mujoco.MjvOption()
+            self.option.geomgroup[0] = 0  # collision shapes
+            self.view = mujoco.MjvCamera()
+            self.view.type, self.view.fixedcamid = (
+                mujoco.mjtCamera.mjCAMERA_FIXED,
+                model.camera(self.camera).id,
+            )
+        area = mujoco.MjrRect(0, 0, *self.glfw.get_framebuffer_size(self.window))
+        mujoco.mj_camlight(model, data)
+        self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(world.views[0]))  # a stove that is on
+        mujoco.mjv_updateScene(
+            model, data, self.option, None, self.view, mujoco.mjtCatBit.mjCAT_ALL, self.scene
+        )
+        mujoco.mjr_render(area, self.scene, self.context)
+        corner = mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
+        mujoco.mjr_overlay(
+            mujoco.mjtFont.mjFONT_NORMAL, corner, area, str(status).replace(" | ", "\n"), "", self.context
+        )
+        self.glfw.swap_buffers(self.window)
+        self.clock.wait()
+
+    def close(self) -> None:
+        """Give the window back."""
+        if self.context is not None:
+            self.glfw.make_context_current(self.window)
+            self.context.free()
+            self.context = None
+        self.glfw.terminate()
+
+    def _on_key(self, _: Any, code: int, scancode: int, action: int, mods: int) -> None:
+        if (key := key_name(code)) is None:
+            return
+        if action == self.glfw.PRESS:
+            self.keyboard.press(key, held=True)
+        elif action == self.glfw.RELEASE:
+            self.keyboard.release(key)
+
+
+def key_name(code: int) -> str | None:
+    """GLFW's number of a key as `Keyboard` calls it; None for those without a meaning."""
+    if code == 256:
+        return QUIT
+    name = chr(code).lower() if 0 <= code < 128 else ""
+    return name if name in MOTIONS or name in (GRIPPER, RESET) else None
+
+
+class Terminal:
+    """Keys from a terminal and pictures as coloured characters: for machines without a screen.
+
+    Raises:
+        RenderError: standard input is no terminal.
+    """
+
+    def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None):
+        if not sys.stdin.isatty():
+            raise RenderError("no terminal: standard input is not one")
+        try:
+            self.termios: Any = importlib.import_module("termios")
+            tty: Any = importlib.import_module("tty")
+        except ImportError as error:
+            raise RenderError(f"no terminal: {error}") from error
+        self.before = self.termios.tcgetattr(sys.stdin)
+        tty.setcbreak(sys.stdin)
+        self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
+        print(f"\x1b[2J{HELP}")
+
+    def poll(self, world: World) -> None:
+        """See `Screen`."""
+        while select.select([sys.stdin], [], [], 0.0)[0]:
+            press_typed(self.keyboard, os.read(sys.stdin.fileno(), 64).decode(errors="ignore"))
+        if self.reader is not None:
+            self.reader.poll()
+
+    def show(self, world: World, status: Status) -> None:
+        """See `Screen`; every fourth state is drawn."""
+        if status.step % 4 == 1:
+            columns, lines = shutil.get_terminal_size()
+            edge = max(min(columns, 2 * (lines - 6)) // 2 * 2, 8)
+            picture = Image.fromarray(world.frame(0, self.camera)).resize((edge, edge))
+            print(f"\x1b[4;1H{as_text(np.asarray(picture))}\n\x1b[K{status}", flush=True)
+        self.clock.wait()
+
+    def close(self) -> None:
+        """Give the terminal back."""
+        self.termios.tcsetattr(sys.stdin, self.termios.TCSADRAIN, self.before)
+
+
+def press_typed(keyboard: Keyboard, typed: str) -> None:
+    """Hand on characters as a terminal sends them; escape alone stops, the sequences of arrow keys mean nothing."""
+    if typed == _ESCAPE:
+        keyboard.press(QUIT)
+    elif not typed.startswith(_ESCAPE):
+        for key in typed:
+            keyboard.press(key)
+
+
+def as_text(picture: np.ndarray) -> str:
+    """A picture (H, W, 3), H even, as lines of half blocks in 24-bit colour."""
+    lines = []
+    for upper, lower in zip(picture[::2].tolist(), picture[1::2].tolist(), strict=True):
+        pairs = zip(upper, lower, strict=True)
+        cells = ["\x1b[38;2;{};{};{}m\x1b[48;2;{};{};{}m▀".format(*above, *below) for above, below in pairs]
+        lines.append("".join(cells) + "\x1b[0m")
+    return "\n".join(lines)

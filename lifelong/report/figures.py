@@ -1,0 +1,261 @@
+"""Figures of a report: matplotlib's object interface only, sized for a paper's column or a page."""
+
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap, LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from lifelong.results.metrics import Curve, mean_and_standard_error, wilson_interval
+
+# Okabe & Ito's colours, safe for colour-blind readers, without the yellow that fades on white.
+LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
+LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+_INK = "#010203"  # stands for the page's text colour, light or dark, in SVG
+_STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "lifelong",
+    "pdf.fonttype": 42,
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.linewidth": 0.7,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "text.color": _INK,
+    "axes.edgecolor": _INK,
+    "axes.labelcolor": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "legend.frameon": False,
+}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One success matrix with its title and row and column labels."""
+
+    title: str
+    rates: NDArray[np.float64]  # (K, K), NaN where there is nothing
+    labels: Sequence[str]  # K short task names
+
+
+@dataclass(frozen=True)
+class Line:
+    """One labelled curve over the tasks learned: a row for each seed, NaN beyond what it learned."""
+
+    label: str
+    values: NDArray[np.float64]  # (runs, K)
+
+
+def success_colours() -> Colormap:
+    """Light to dark through one change of hue; lightness falls evenly, so it also prints in grey."""
+    stops = ("#f4f6ec", "#cfe8d2", "#8fcfc3", "#45aabf", "#2379ab", "#1d4a8c", "#14265e")
+    return LinearSegmentedColormap.from_list("success", stops)
+
+
+def cell_colours(rate: float) -> tuple[str, str]:
+    """Background and text colour of a cell with this success rate, as #rrggbb."""
+    channels = np.array(success_colours()(rate)[:3])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    luminance = float(linear @ (0.2126, 0.7152, 0.0722))
+    back = "#{:02x}{:02x}{:02x}".format(*(round(255 * c) for c in channels))
+    return back, "#ffffff" if luminance < 0.24 else "#0d1820"
+
+
+def heatmap_figure(panels: Sequence[Panel]) -> Figure:
+    """Success matrices side by side, up to four in a row, in percent, with one colour bar."""
+    columns = min(len(panels), 4)
+    rows = math.ceil(len(panels) / columns)
+    with matplotlib.rc_context(_STYLE):
+        single = len(panels) == 1
+        width, height = (4.4, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
+        figure = Figure(figsize=(width, height), layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False)
+        image = None
+        for place, axes in enumerate(grid.flat):
+            if place >= len(panels):
+                axes.set_axis_off()
+                continue
+            image = _draw_matrix(axes, panels[place], label_rows=single)
+            if place % columns == 0:
+                axes.set_ylabel("after learning task")
+            if place + columns >= len(panels):
+                axes.set_xlabel("success on task")
+        if single and len(panels[0].rates) > 5:  # in the empty triangle
+            place = grid[0, 0].inset_axes((0.56, 0.93, 0.42, 0.035))
+            bar = figure.colorbar(image, cax=place, orientation="horizontal", ticks=(0, 50, 100))
+            bar.set_label("success (%)", labelpad=1)
+        else:
+            bar = figure.colorbar(image, ax=grid, shrink=0.85, pad=0.02, aspect=28, label="success (%)")
+        bar.outline.set_visible(False)
+    return figure
+
+
+def learning_figure(
+    curves: Mapping[int, Curve],
+    losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]],
+    labels: Sequence[str],
+) -> Figure:
+    """For each task, success (with Wilson's 95 % band, best epoch ringed) above training loss."""
+    tasks = sorted(curves.keys() | losses.keys())
+    columns = min(5, len(tasks))
+    # Inches. Placed by hand: automatic layout of a hundred panels takes a minute.
+    left, panel, gap, upper, lower, between, row_height = 0.7, 1.93, 0.24, 1.1, 0.68, 0.13, 2.5
+    width, height = left + columns * (panel + gap), math.ceil(len(tasks) / columns) * row_height + 0.2
+    limits = _loss_limits(losses)
+    epochs = [c.epochs for c in curves.values()] + [e for e, _ in losses.values()]
+    last = max(1, *(int(e.max(initial=1)) for e in epochs))
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(width, height))
+        for place, task in enumerate(tasks):
+            row, column = divmod(place, columns)
+            x, top = left + column * (panel + gap), height - 0.25 - row * row_height
+            bottoms = ((top - upper, upper), (top - upper - between - lower, lower))
+            boxes = [(x / width, y / height, panel / width, h / height) for y, h in bottoms]
+            above, below = (figure.add_axes(box) for box in boxes)
+            above.set_title(f"{task + 1}  {shorten(labels[task], 24)}", loc="left", fontsize=8.5)
+            _draw_curve(above, curves.get(task))
+            if task in losses:
+                marker = "o" if len(losses[task][0]) < 4 else None
+                below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2, marker=marker, ms=2.6)
+            below.set_ylim(*limits)
+            below.yaxis.set_major_locator(MaxNLocator(3))
+            for axes, name in ((above, "success (%)"), (below, "loss")):
+                _clean(axes)
+                axes.set_xlim(-0.03 * last, 1.03 * last)
+                axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+                axes.tick_params(labelleft=column == 0, labelbottom=axes is below)
+                if column == 0:
+                    axes.set_ylabel(name)
+                    axes.yaxis.set_label_coords(-0.5 / panel, 0.5)
+            if place + columns >= len(tasks):
+                below.set_xlabel("epoch")
+    return figure
+
+
+def forgetting_figure(lines: Sequence[Line]) -> Figure:
+    """Average success over the tasks learned so far against their number; ± one standard error.
+
+    Beyond as many lines as there are colours, the next ones are dashed with open markers.
+    """
+    named = any(line.label for line in lines)
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(5.6, 3.1) if named else (3.5, 2.7), layout="constrained")
+        axes = figure.subplots()
+        for number, line in enumerate(lines):
+            mean, error = zip(*(mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T), strict=True)
+            x, mean, error = np.arange(1, len(mean) + 1), 100 * np.array(mean), 100 * np.array(error)
+            turn, place = divmod(number, len(LINE_COLOURS))
+            colour, look = LINE_COLOURS[place], {"ls": "--", "mfc": "white"} if turn else {}
+            marker = LINE_MARKERS[place % len(LINE_MARKERS)]
+            axes.plot(
+                x, mean, color=colour, marker=marker, ms=3.8, lw=1.4, label=line.label, clip_on=False, **look
+            )
+            band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
+            axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)
+        longest = max(line.values.shape[1] for line in lines)
+        axes.set_xlim(0.8, longest + 0.2)
+        axes.set_ylim(0, 100)
+        axes.set_xticks(range(1, longest + 1, max(1, longest // 10)))
+        axes.set_xlabel("tasks learned")
+        axes.set_ylabel("average success (%)")
+        axes.grid(axis="y", lw=0.4, alpha=0.3, color=_INK)
+        _clean(axes)
+        if named:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
+    return figure
+
+
+def as_svg(figure: Figure) -> str:
+    """The figure as an inline SVG on a clear background, in the page's own font and text colour."""
+    buffer = io.StringIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].replace(_INK, "currentColor")
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"(font(?:-family)?: [^;\"]*?)'DejaVu Sans'[^;\"]*", r"\1inherit", text)
+    # "font: 8px inherit" is not valid CSS: name the page's family through a variable instead.
+    return re.sub(r"(font: [^;\"]*?)inherit", r"\1var(--font)", text)
+
+
+def save(figure: Figure, stem: Path) -> None:
+    """Writes `stem`.png (300 dpi) and `stem`.pdf, black on white."""
+    with matplotlib.rc_context(_STYLE):
+        FigureCanvasAgg(figure)
+        for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
+            figure.savefig(
+                stem.with_suffix(suffix), facecolor="white", bbox_inches="tight", pad_inches=0.05, **options
+            )
+
+
+def shorten(text: str, length: int) -> str:
+    """The text, cut at a word with an ellipsis if it is longer than `length`."""
+    if len(text) <= length:
+        return text
+    cut = text[: length - 1].rsplit(" ", 1)[0] if " " in text[: length - 1] else text[: length - 1]
+    return cut.rstrip(" ,") + "…"
+
+
+def _draw_matrix(axes: Axes, panel: Panel, label_rows: bool) -> matplotlib.image.AxesImage:
+    size = len(panel.rates)
+    image = axes.imshow(100 * panel.rates, cmap=success_colours(), vmin=0, vmax=100)
+    axes.set_title(panel.title)
+    every = 1 if size <= 12 else math.ceil(size / 10)
+    ticks = range(0, size, every)
+    named = label_rows and every == 1
+    names = [f"{shorten(panel.labels[t], 20)}  {t + 1}" if named else str(t + 1) for t in ticks]
+    axes.set_yticks(ticks, names)
+    axes.set_xticks(ticks, [str(t + 1) for t in ticks])
+    axes.tick_params(length=0)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    if size <= 12:
+        axes.set_xticks(np.arange(size + 1) - 0.5, minor=True)
+        axes.set_yticks(np.arange(size + 1) - 0.5, minor=True)
+        axes.grid(which="minor", color="white", lw=1.2)
+        axes.tick_params(which="minor", length=0)
+        font = 7.5 if label_rows else 6
+        for i, j in zip(*np.nonzero(~np.isnan(panel.rates)), strict=True):
+            colour = cell_colours(float(panel.rates[i, j]))[1]
+            text = f"{100 * panel.rates[i, j]:.0f}"
+            axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=font)
+    return image
+
+
+def _draw_curve(axes: Axes, curve: Curve | None) -> None:
+    axes.set_ylim(0, 100)
+    axes.grid(axis="y", lw=0.4, alpha=0.3, color=_INK)
+    if curve is None or len(curve.rates) == 0:
+        return
+    low, high = wilson_interval(curve.rates * curve.episodes, curve.episodes)
+    colour = LINE_COLOURS[0]
+    axes.fill_between(curve.epochs, 100 * low, 100 * high, color=colour, alpha=0.16, lw=0)
+    axes.plot(curve.epochs, 100 * curve.rates, color=colour, lw=1.4, marker="o", ms=2.6, clip_on=False)
+    best = (curve.epochs[curve.best], 100 * curve.rates[curve.best])
+    axes.plot(*best, "o", ms=6.5, mfc="none", mec=_INK, mew=0.9, clip_on=False)
+
+
+def _loss_limits(losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]]) -> tuple[float, float]:
+    values = np.concatenate([v for _, v in losses.values()]) if losses else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return 0.0, 1.0
+    margin = 0.06 * max(float(np.ptp(values)), 1e-6)
+    return float(values.min()) - margin, float(values.max()) + margin
+
+
+def _clean(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)

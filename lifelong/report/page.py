@@ -1,0 +1,273 @@
+"""One self-contained page about one run, or about several side by side."""
+
+import base64
+import os
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from lifelong.errors import LifelongError
+from lifelong.report.comparison import compare, write_comparison
+from lifelong.report.figures import (
+    Line,
+    Panel,
+    as_svg,
+    forgetting_figure,
+    heatmap_figure,
+    learning_figure,
+    save,
+)
+from lifelong.report.heat_table import mean_heatmap, run_heatmap
+from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
+from lifelong.report.tables import atom_rows, cost_table, duration, most_forgotten, task_costs
+from lifelong.results.metrics import METRIC_NAMES, average_success
+from lifelong.results.records import RunRecord
+
+METRIC_TEXTS = {
+    "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
+    "nbt": ("NBT", "forgetting: success lost on a task, averaged over the later ones", "down"),
+    "auc": ("AUC", "success on a task averaged over learning it and all later tasks", "up"),
+    "final_success": ("Final", "success over all tasks at the end of the sequence", "up"),
+    "just_learned": ("Just learned", "success on each task right after learning it", "up"),
+}
+MEDIA_TYPES = {
+    ".gif": "image/gif",
+    ".webp": "image/webp",
+    ".png": "image/png",
+    ".mp4": "video/mp4",
+    ".webm": "video/webm",
+}
+MEDIA_LIMIT = 48 * 2**20  # bytes of rollout pictures in one page
+
+
+def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
+    """Writes report.html, heatmap.png and heatmap.pdf; for several runs also forgetting.png, .pdf, comparison.json.
+
+    Args:
+        run_dirs: One run to describe, or several to compare. Unfinished runs count as far as they are.
+        out: The page, or an existing folder for it. Default: in the run directory; for several runs,
+            in the current folder.
+
+    Returns:
+        The page's path. It needs no other file and no network.
+
+    Raises:
+        LifelongError: No run is given, a run directory lacks its results, or `out` cannot be written.
+    """
+    if not run_dirs:
+        raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
+    runs = [load_run(Path(d)) for d in run_dirs]
+    out = Path(out) if out is not None else (runs[0].path if len(runs) == 1 else Path.cwd())
+    if out.is_dir() or out.suffix == "":
+        out = out / "report.html"
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        context = _single(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
+        page = _template().render(**context, metric_texts=METRIC_TEXTS)
+        part = out.with_name(out.name + ".part")
+        part.write_text(page, encoding="utf-8")
+        os.replace(part, out)
+    except OSError as error:
+        raise LifelongError(f"{out}: the report cannot be written ({error})") from error
+    return out
+
+
+def _single(run: Run, folder: Path) -> dict[str, Any]:
+    """What the template shows of one run; writes the heatmap beside the page."""
+    record, labels = run.record, short_labels(run.record.instructions)
+    rates, _ = run.results.success_matrix()
+    save(heatmap_figure([Panel(f"{record.algo}, {record.benchmark}", rates, labels)]), folder / "heatmap")
+    curves, losses = run.results.curves(), run.results.losses()
+    average = np.full((1, len(record.tasks)), np.nan)
+    average[0, : run.learned] = average_success(rates[: run.learned, : run.learned])
+    times = {k: v for k, v in run.results.seconds_by_phase().items() if v > 0}
+    return {
+        "title": f"{record.algo} on {record.benchmark}",
+        "facts": _facts(record),
+        "notes": run.notes,
+        "metrics": _metric_rows(run),
+        "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run))]),
+        "heatmaps": [run_heatmap(run.results, labels)],
+        "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
+        "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
+        "tasks": _task_rows(run, rates),
+        "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
+        "total_time": duration(sum(times.values())),
+        "subgoals": run.results.subgoals().predicates,
+        "atoms": atom_rows(run.results.subgoals(), labels),
+        "most_forgotten": most_forgotten(run.results.subgoals().atoms),
+        "costs": task_costs(run, labels),
+        "media": _media(run.path / "videos"),
+        "saliency": _media(run.path / "saliency"),
+        "config_text": run.config_text,
+        "versions": dict(record.versions),
+        "run_dir": run.path.resolve().name,
+    }
+
+
+def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
+    """What the template shows of several runs; writes heatmaps, forgetting curves and numbers beside the page."""
+    groups = group_runs(runs)
+    found = compare(groups)
+    write_comparison(found, folder / "comparison.json")
+    panels, heatmaps, lines = [], [], []
+    for group in groups:
+        labels = group.labels
+        matrices = np.stack([r.results.success_matrix()[0] for r in group.runs])
+        present = ~np.isnan(matrices)
+        mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
+        panels.append(Panel(group.label, mean, labels))
+        single = len(group.runs) == 1
+        heatmap = (
+            run_heatmap(group.runs[0].results, labels) if single else mean_heatmap(matrices, mean, labels)
+        )
+        heatmaps.append(heatmap | {"title": group.label, "seeds": [r.record.seed for r in group.runs]})
+        values = np.full((len(group.runs), matrices.shape[1]), np.nan)
+        for row, run in zip(values, group.runs, strict=True):
+            row[: run.learned] = average_success(
+                run.results.success_matrix()[0][: run.learned, : run.learned]
+            )
+        lines.append(Line(group.label, values))
+    save(heatmap_figure(panels), folder / "heatmap")
+    save(forgetting_figure(lines), folder / "forgetting")
+    benchmarks = sorted({r.record.benchmark for r in runs})
+    return {
+        "title": f"{len(groups)} methods on {', '.join(benchmarks)}" if len(groups) > 1 else groups[0].label,
+        "facts": [("runs", len(runs)), ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs}))))],
+        "notes": [f"{r.path}: {note}" for r in runs for note in r.notes],
+        "groups": _group_rows(groups, found),
+        "differences": found["differences"],
+        "forgotten_tasks": _forgotten_tasks(groups, found),
+        "forgotten_subgoals": _forgotten_subgoals(found),
+        "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
+        "heatmaps": heatmaps,
+        "forgetting": as_svg(forgetting_figure(lines)),
+        "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
+    }
+
+
+def _facts(record: RunRecord) -> list[tuple[str, Any]]:
+    facts = [("policy", record.policy), ("preset", record.preset), ("seed", record.seed)]
+    facts += [
+        ("tasks", len(record.tasks)),
+        ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),
+    ]
+    return facts + [("CPUs", record.cpu_count)] + ([("commit", record.commit[:10])] if record.commit else [])
+
+
+def _metric_rows(run: Run) -> list[dict[str, Any]]:
+    if run.metrics is None:
+        return []
+    return [{"name": n, "estimate": getattr(run.metrics, n)} for n in METRIC_NAMES]
+
+
+def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every metric of a group over its runs, the best of each column marked."""
+    rows: list[dict[str, Any]] = []
+    for group in groups:
+        measured = found["groups"][group.label]
+        cells = measured["metrics"]
+        rows.append({"label": group.label, "count": measured["measured"], "cells": cells, "best": set()})
+    for name in METRIC_NAMES:
+        means = np.array([row["cells"][name]["mean"] for row in rows])
+        if len(rows) > 1 and not np.isnan(means).all():
+            best = np.nanmax(means) if METRIC_TEXTS[name][2] == "up" else np.nanmin(means)
+            for row, mean in zip(rows, means, strict=True):
+                if np.isclose(mean, best):
+                    row["best"].add(name)
+    return rows
+
+
+def _forgotten_tasks(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """NBT of every task, a cell for each method; tasks as they come in the first run."""
+    texts: dict[str, str] = {}
+    for run in (run for group in groups for run in group.runs):
+        texts |= dict(zip(run.record.tasks, short_labels(run.record.instructions), strict=True))
+    tables = [group["forgetting_by_task"] for group in found["groups"].values()]
+    return [
+        {"label": text, "cells": [table.get(name) for table in tables]}
+        for name, text in texts.items()
+        if any(name in table for table in tables)
+    ]
+
+
+def _forgotten_subgoals(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """What is lost of every predicate, a cell for each method."""
+    tables = [group["subgoals"] for group in found["groups"].values()]
+    names = dict.fromkeys(name for table in tables for name in table)
+    return [{"label": name, "cells": [table.get(name) for table in tables]} for name in names]
+
+
+def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
+    page = run.path / "report.html"
+    return {
+        "label": label,
+        "seed": run.record.seed,
+        "metrics": run.metrics,
+        "learned": f"{run.learned} of {len(run.record.tasks)}",
+        "time": duration(sum(run.results.seconds_by_phase().values())),
+        "path": str(run.path),
+        "link": os.path.relpath(page, folder) if page.is_file() else None,
+    }
+
+
+def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
+    rows = []
+    for task, (name, text) in enumerate(zip(run.record.tasks, run.record.instructions, strict=True)):
+        row = run.results.learned_with(task)
+        end, done = run.results.task_end(row), task < run.learned
+        last = row == run.learned - 1
+        rows.append(
+            {
+                "name": name,
+                "instruction": text,
+                "best_epoch": end.best_epoch if end else None,
+                "learned": rates[row, task] if done else np.nan,
+                "final": rates[run.learned - 1, task] if done else np.nan,
+                "fwt": run.metrics.fwt_by_task[task] if done and run.metrics else np.nan,
+                "nbt": run.metrics.nbt_by_task[task] if done and run.metrics and not last else np.nan,
+                "seconds": duration(end.seconds) if end and row == task else None,
+            }
+        )
+    return rows
+
+
+def _media(folder: Path) -> dict[str, Any]:
+    """Rollout pictures as data URLs; a text file of the same stem is the caption."""
+    items, left_out, used = [], [], 0
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        kind = MEDIA_TYPES.get(path.suffix.lower())
+        if kind is None:
+            continue
+        used += path.stat().st_size
+        if used > MEDIA_LIMIT:
+            left_out.append(path.name)
+            continue
+        note = path.with_suffix(".txt")
+        caption = note.read_text(encoding="utf-8").strip() if note.is_file() else path.stem.replace("_", " ")
+        data = base64.b64encode(path.read_bytes()).decode()
+        items.append(
+            {"url": f"data:{kind};base64,{data}", "video": kind.startswith("video"), "caption": caption}
+        )
+    return {"items": items, "left_out": left_out}
+
+
+def _percent(value: float | None, digits: int = 1) -> str:
+    """A share as percent with a true minus sign; a dash where it is undefined."""
+    if value is None or np.isnan(value):
+        return "–"
+    text = f"{100 * value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["percent"] = _percent
+    text = resources.files("lifelong.report").joinpath("page.html").read_text(encoding="utf-8")
+    return environment.from_string(text)

@@ -1,0 +1,140 @@
+"""Run directories read back: one run as far as it went, or groups of runs that differ in seed and order."""
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lifelong.errors import LifelongError, ResultsError
+from lifelong.results.log import ResultLog
+from lifelong.results.metrics import Metrics, lifelong_metrics
+from lifelong.results.records import RunRecord
+from lifelong.results.results import Results
+
+_BASICS = ("algo", "benchmark", "policy", "preset")
+# sections of the config
+_COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark", "stream", "pretrain")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run directory as far as it could be read."""
+
+    path: Path
+    results: Results
+    record: RunRecord
+    config: dict[str, Any]
+    config_text: str
+    notes: tuple[str, ...]
+    learned: int
+    metrics: Metrics | None  # None before the first task is learned
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but their seed and the order of their tasks."""
+
+    label: str
+    runs: tuple[Run, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """Short names of the positions in the sequence: the tasks there, or numbers if they differ."""
+        first = self.runs[0].record
+        if all(r.record.tasks == first.tasks for r in self.runs):
+            return short_labels(first.instructions)
+        return [f"task {i + 1}" for i in range(len(first.tasks))]
+
+
+def load_run(path: Path) -> Run:
+    """Reads a run directory. Raises: LifelongError naming what is missing."""
+    if not path.is_dir():
+        raise LifelongError(f"{path}: no such run directory")
+    log = path / "results.jsonl"
+    if not log.is_file():
+        present = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
+        raise LifelongError(
+            f"{path}: results.jsonl is missing, so this is no run directory (it has: {present})"
+        )
+    results = ResultLog(log).read()
+    try:
+        record = results.run
+    except ResultsError as error:
+        raise LifelongError(f"{log}: {error}") from error
+    config, text, notes = _load_config(path / "config.yaml")
+    learned = results.learned_tasks()
+    metrics = lifelong_metrics(results.scores()) if learned else None
+    if not results.finished:
+        so_far = f"{learned} of {len(record.tasks)} tasks are learned"
+        notes.insert(0, f"This run is not finished: {so_far}, and the metrics are over these.")
+    return Run(path, results, record, config, text, (*notes, *results.problems), learned, metrics)
+
+
+def short_labels(instructions: Sequence[str]) -> list[str]:
+    """Instructions without the words that all of them begin and end with; whole if nothing would be left."""
+    words = [text.split() for text in instructions]
+    start = len(os.path.commonprefix(words)) if len(words) > 1 else 0
+    end = len(os.path.commonprefix([w[::-1] for w in words])) if len(words) > 1 else 0
+    cut = [w[start : len(w) - end] for w in words]
+    fits = all(cut) and all(len(w) >= start + end for w in words)
+    return [" ".join(w) for w in (cut if fits else words)]
+
+
+def group_runs(runs: Sequence[Run]) -> list[Group]:
+    """Runs that differ only in seed and order of tasks together, as they come; labels name what differs."""
+    groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(_identity(run), []).append(run)
+    identities = [dict(key) for key in groups]
+    return [
+        Group(_label(identity, identities), tuple(members))
+        for identity, members in zip(identities, groups.values(), strict=True)
+    ]
+
+
+def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
+    """The algorithm's name and what else tells it apart; settings count among runs of one algorithm."""
+    rivals = [o for o in others if o["algo"] == identity["algo"]]
+    differs = {
+        k: v
+        for k, v in identity.items()
+        if k != "algo" and any(o.get(k) != v for o in (others if k in _BASICS else rivals))
+    }
+    words = [str(v) if k in _BASICS else f"{k.rpartition('.')[2]} {v}" for k, v in differs.items()]
+    if len(words) > 3:
+        words = [*words[:3], "…"]
+    return f"{identity['algo']} ({', '.join(words)})" if words else str(identity["algo"])
+
+
+def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
+    record = run.record
+    basic = {n: getattr(record, n) for n in _BASICS}
+    flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
+    passed = ("seed", "_target_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
+    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(passed)}
+    if begun_from := run.config.get("init_from"):  # each seed may begin from a run of its own
+        flat["init_from"] = re.sub(r"seed\d+", "seed", str(begun_from))
+    return tuple((basic | dict(sorted(flat.items()))).items())
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(value, dict):
+        parts = (_flatten(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
+        return {k: v for part in parts for k, v in part.items()}
+    return {prefix: value if isinstance(value, str | int | float | bool | None) else str(value)}
+
+
+def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return {}, "", [f"{path.name} is missing; the configuration is not shown."]
+    try:
+        config = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        return {}, text, [f"{path.name} is not valid YAML ({' '.join(str(error).split())})."]
+    return (config if isinstance(config, dict) else {}), text, []

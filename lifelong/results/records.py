@@ -1,0 +1,275 @@
+"""The records of a run: frozen values, one JSON line each. Tasks are positions in the sequence."""
+
+import hashlib
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+VERSIONED_PACKAGES = (
+    "libero-lifelong",
+    "mujoco",
+    "torch",
+    "numpy",
+    "robosuite",
+    "gymnasium",
+    "h5py",
+    "transformers",
+)
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One start of the process; a resumed run has several. The first names the run."""
+
+    kind: Literal["run"] = field(default="run", init=False)
+    algo: str
+    benchmark: str
+    policy: str
+    seed: int
+    preset: str
+    tasks: tuple[str, ...]  # names, in learning order
+    instructions: tuple[str, ...]  # what the policy is told, in the same order
+    config_digest: str
+    versions: Mapping[str, str]
+    commit: str | None
+    cpu_count: int
+    started: str  # ISO 8601, UTC
+    group_size: int = 1  # tasks learned together as one step of the sequence
+
+    def __post_init__(self) -> None:
+        if len(self.tasks) != len(self.instructions):
+            raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.instructions)} instructions")
+
+
+@dataclass(frozen=True)
+class LossRecord:
+    """The mean training loss of one epoch (epochs count from 1) and its wall time."""
+
+    kind: Literal["loss"] = field(default="loss", init=False)
+    task: int
+    epoch: int
+    loss: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class EvalRecord:
+    """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
+
+    The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). Which of
+    the goal's atoms held before the policy acted, at any time from then on, and at the end is said for each
+    episode; older records do not say it.
+    """
+
+    kind: Literal["eval"] = field(default="eval", init=False)
+    phase: Literal["curve", "matrix"]
+    learned: int
+    epoch: int
+    task: int
+    successes: tuple[bool, ...]  # one for each episode
+    lengths: tuple[int, ...]  # control steps
+    init_states: tuple[int, ...]
+    seconds: float
+    atoms: tuple[str, ...] = ()  # the parts of the goal: (On plate_1 stove_1)
+    atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
+    atoms_ever: tuple[tuple[bool, ...], ...] = ()
+    atoms_at_end: tuple[tuple[bool, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.phase not in ("curve", "matrix"):
+            raise ValueError(f"phase of an evaluation is 'curve' or 'matrix', not {self.phase!r}")
+        if not len(self.successes) == len(self.lengths) == len(self.init_states) > 0:
+            raise ValueError(
+                "an evaluation has as many successes as lengths and initial states, at least one; got "
+                f"{len(self.successes)}, {len(self.lengths)} and {len(self.init_states)}"
+            )
+        for name in ("atoms_at_start", "atoms_ever", "atoms_at_end"):
+            shape = [len(row) for row in getattr(self, name)]
+            if self.atoms and shape != [len(self.atoms)] * len(self.successes):
+                raise ValueError(
+                    f"{name} of an evaluation has a row for each episode, a column for each atom"
+                )
+
+    @property
+    def rate(self) -> float:
+        """Share of the episodes that succeeded."""
+        return sum(self.successes) / len(self.successes)
+
+
+@dataclass(frozen=True)
+class PhaseRecord:
+    """Wall time of something that is neither a training epoch nor an evaluation, such as "demos"."""
+
+    kind: Literal["phase"] = field(default="phase", init=False)
+    phase: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CostRecord:
+    """What learning a task took beside the time of its epochs and evaluations; names as in `lifelong.training.costs`.
+
+    A task may have several, each with some of the costs.
+    """
+
+    kind: Literal["cost"] = field(default="cost", init=False)
+    task: int
+    costs: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class TaskEndRecord:
+    """A task is learned and its row of the matrix complete."""
+
+    kind: Literal["task_end"] = field(default="task_end", init=False)
+    task: int
+    best_epoch: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class RunEndRecord:
+    """The whole sequence is learned."""
+
+    kind: Literal["run_end"] = field(default="run_end", init=False)
+    seconds: float
+    finished: str
+
+
+Record = RunRecord | LossRecord | EvalRecord | PhaseRecord | CostRecord | TaskEndRecord | RunEndRecord
+RECORD_TYPES: Mapping[str, type] = {
+    t.__dataclass_fields__["kind"].default: t
+    for t in (RunRecord, LossRecord, EvalRecord, PhaseRecord, CostRecord, TaskEndRecord, RunEndRecord)
+}
+
+
+def start_record(
+    *,
+    algo: str,
+    benchmark: str,
+    policy: str,
+    seed: int,
+    preset: str,
+    tasks: Sequence[str],
+    instructions: Sequence[str],
+    config: str,
+    group_size: int = 1,
+) -> RunRecord:
+    """The record of a start, now and on this machine.
+
+    Args:
+        tasks: Names in learning order.
+        instructions: What the policy is told, in the same order.
+        config: The resolved configuration as text; its SHA-256 is kept.
+        group_size: Tasks learned together.
+    """
+    return RunRecord(
+        algo=algo,
+        benchmark=benchmark,
+        policy=policy,
+        seed=seed,
+        preset=preset,
+        tasks=tuple(tasks),
+        instructions=tuple(instructions),
+        config_digest=hashlib.sha256(config.encode()).hexdigest(),
+        versions=installed_versions(),
+        commit=source_commit(),
+        cpu_count=os.cpu_count() or 1,
+        started=utc_now(),
+        group_size=group_size,
+    )
+
+
+def utc_now() -> str:
+    """The time as ISO 8601 with seconds, UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of Python, this package and what a result depends on; `models` says whose objects were simulated."""
+    from libero_env.assets.pack import select_pack
+
+    versions = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in VERSIONED_PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return {**versions, "models": select_pack().name}
+
+
+def source_commit() -> str | None:
+    """The git commit of this source tree, with "+changes" if it was edited; None outside a checkout."""
+    if not (_SOURCE / ".git").exists():
+        return None
+    try:
+        commit, changes = (_git("rev-parse", "HEAD"), _git("status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return commit + ("+changes" if changes else "")
+
+
+def to_line(record: Record) -> bytes:
+    """One line of strict JSON with its newline; numbers that are not finite become null."""
+    values = {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(record).items()
+    }
+    return (json.dumps(values, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def from_line(line: bytes) -> Record:
+    """The record on a line.
+
+    Raises:
+        ValueError: Not a record; says which key is wrong and what was expected.
+    """
+    try:
+        values = json.loads(line)
+    except ValueError as error:
+        raise ValueError(f"not JSON ({error})") from error
+    kind = values.pop("kind", None) if isinstance(values, dict) else None
+    if kind not in RECORD_TYPES:
+        raise ValueError(f"unknown kind of record {kind!r}; valid: {', '.join(RECORD_TYPES)}")
+    known = [f for f in fields(RECORD_TYPES[kind]) if f.init]
+    expected = {f.name: f.type for f in known}
+    optional = {f.name for f in known if f.default is not MISSING}  # of records that older versions wrote
+    if odd := sorted((expected.keys() ^ values.keys()) - (optional - values.keys())):
+        raise ValueError(f"a {kind!r} record has the keys {', '.join(expected)}; missing or unknown: {odd}")
+    return RECORD_TYPES[kind](**{k: _checked(kind, k, v, expected[k]) for k, v in values.items()})
+
+
+_SOURCE = Path(__file__).parents[2]
+
+
+def _git(*args: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(_SOURCE), *args], capture_output=True, text=True, timeout=10, check=True
+    )
+    return done.stdout.strip()
+
+
+def _checked(kind: str, key: str, value: Any, wanted: Any) -> Any:
+    """The value as the field's type wants it: lists become tuples, null among floats becomes NaN."""
+    origin = get_origin(wanted)
+    if wanted is float and value is None:
+        return math.nan
+    if origin is tuple and isinstance(value, list):
+        return tuple(_checked(kind, key, v, get_args(wanted)[0]) for v in value)
+    if origin is Literal:
+        valid = value in get_args(wanted)
+    elif origin is Mapping:
+        valid = isinstance(value, dict)
+    else:
+        accepted = (int, float) if wanted is float else wanted
+        valid = isinstance(value, accepted) and (wanted is bool or not isinstance(value, bool))
+    if origin is tuple or not valid:
+        raise ValueError(f"{key!r} of a {kind!r} record should be {wanted}, not {value!r}")
+    return value

@@ -1,0 +1,150 @@
+"""A run's directory: its configuration, its records, its checkpoints, and a lock while it is written.
+
+config.yaml      the resolved configuration
+results.jsonl    records, append-only
+checkpoints/     task_<k>.safetensors after each task, progress and best of the present one
+videos/          recorded rollouts
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lifelong import checkpoints
+from lifelong.errors import ConfigError, LifelongError
+from lifelong.results.log import ResultLog
+
+# What may differ between the start of a run and its resumption: it changes no result.
+VOLATILE = (
+    "device",
+    "progress",
+    "resume",
+    "run_id",
+    "runs_dir",
+    "threads",
+    "wandb",
+    "data.memory",
+    "data.backend",
+)
+
+
+class RunDirectory:
+    """Where everything a run did is kept; made new, or found again with the same configuration."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.log = ResultLog(path / "results.jsonl")
+        self.videos = path / "videos"
+
+    @contextmanager
+    def opened(self, config: Mapping[str, Any], resume: bool) -> Iterator["RunDirectory"]:
+        """Hold the directory's lock, with its configuration written or found to be the same.
+
+        Args:
+            config: The resolved configuration as plain data.
+            resume: Whether to go on with what is there; otherwise it is moved aside.
+
+        Raises:
+            ConfigError: What is there was made with another configuration.
+            LifelongError: Another process is writing there.
+        """
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(self.path.with_name(f".{self.path.name}.lock")):
+            if not resume and self.path.exists():
+                os.rename(self.path, _free_name(self.path))
+            self.path.mkdir(exist_ok=True)
+            for part in self.path.rglob("*.part"):  # half written by a process that was killed
+                part.unlink()
+            self._agree(dict(config))
+            yield self
+
+    def _agree(self, config: dict[str, Any]) -> None:
+        file = self.path / "config.yaml"
+        if not file.exists():
+            part = file.with_suffix(".part")
+            part.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True), encoding="utf-8")
+            os.replace(part, file)
+            return
+        old = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+        was, now = decisive(old), decisive(config)
+        changed = [k for k in {**was, **now} if was.get(k, "absent") != now.get(k, "absent")]
+        if changed:
+            pairs = [(k, was.get(k, "absent"), now.get(k, "absent")) for k in changed[:4]]
+            listed = ", ".join(f"{k} {old!r} -> {new!r}" for k, old, new in pairs)
+            more = f" and {len(changed) - 4} more" if len(changed) > 4 else ""
+            raise ConfigError(
+                f"{self.path} holds a run of another configuration ({listed}{more}). Give this one a name of "
+                "its own with run_id=NAME, or start afresh with resume=false (the old run is kept beside it)"
+            )
+
+    @property
+    def started(self) -> bool:
+        """Whether anything is saved of a task."""
+        return any((self.path / "checkpoints").glob("*.safetensors"))
+
+    def task_path(self, task: int) -> Path:
+        """The checkpoint made after a task."""
+        return self.path / "checkpoints" / f"task_{task}.safetensors"
+
+    @property
+    def progress_path(self) -> Path:
+        """The checkpoint made while learning a task."""
+        return self.path / "checkpoints" / "progress.safetensors"
+
+    @property
+    def best_path(self) -> Path:
+        """The best weights so far of the task being learned."""
+        return self.path / "checkpoints" / "best.safetensors"
+
+    def last_task(self) -> int:
+        """The last task that has a checkpoint; -1 if none has."""
+        task = -1
+        while self.task_path(task + 1).exists():
+            task += 1
+        return task
+
+    def progress(self, task: int, device: Any = "cpu") -> dict[str, Any] | None:
+        """What is saved of a task being learned; None if nothing is."""
+        if not self.progress_path.exists():
+            return None
+        state = checkpoints.load(self.progress_path, device)
+        return state if state["task"] == task else None
+
+
+def decisive(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a configuration decides the results, by dotted key."""
+    volatile = tuple(f"{key}." for key in VOLATILE)
+    return {k: v for k, v in _flat(dict(config)).items() if not f"{k}.".startswith(volatile)}
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file lock; the system frees it when the process ends, however it ends."""
+    with open(path, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise LifelongError(
+                f"another process is writing to {path.parent / path.name[1:-5]}; wait for it, or give this "
+                "run a name of its own with run_id=NAME"
+            ) from error
+        yield
+
+
+def _free_name(path: Path) -> Path:
+    number = 1
+    while (candidate := path.with_name(f"{path.name}.old{number}")).exists():
+        number += 1
+    return candidate
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix: value}
+    parts = (_flat(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
+    return {k: v for part in parts for k, v in part.items()}

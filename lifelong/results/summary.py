@@ -1,0 +1,101 @@
+"""`results.json`: the matrix, curves, metrics and times of a run."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lifelong.errors import ResultsError
+from lifelong.results.metrics import METRIC_NAMES, lifelong_metrics, wilson_interval
+from lifelong.results.records import TaskEndRecord
+from lifelong.results.results import Results
+
+
+def write_summary(path: Path | str, results: Results, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes `results.json`: matrix, curves, metrics with intervals, config, versions and wall times.
+
+    The file is replaced in one step, so a reader never sees half of it.
+
+    Args:
+        path: Usually `run_dir/results.json`.
+        results: What is recorded so far; an unfinished run is summed up as far as it is.
+        config: The resolved configuration as plain data.
+
+    Returns:
+        What was written. Rates are in [0, 1]; NaN is null.
+    """
+    summary = plain(summarize(results) | {"config": dict(config)})
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        with open(part, "w", encoding="utf-8") as file:
+            json.dump(summary, file, indent=1, ensure_ascii=False, allow_nan=False)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ResultsError(
+            f"{path}: the summary cannot be written ({error}); results.jsonl is intact"
+        ) from error
+    return summary
+
+
+def summarize(results: Results) -> dict[str, Any]:
+    """The summary as plain data: who ran, what succeeded, the metrics, the times."""
+    run, size = results.run, results.learned_tasks()
+    rates, episodes = results.success_matrix()
+    low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
+    unseen = np.isnan(rates)
+    ends = {r.task: r.best_epoch for r in results.of(TaskEndRecord)}
+    return {
+        "run": {k: v for k, v in asdict(run).items() if k != "kind"},
+        "finished": results.finished,
+        "tasks_learned": size,
+        "metrics": _metrics(results, "matrix") if size else None,
+        "metrics_diagonal_from_curve": _metrics(results, "curve") if size else None,
+        "success_matrix": {
+            "rates": rates.tolist(),
+            "episodes": episodes.tolist(),
+            "wilson_low": np.where(unseen, np.nan, low).tolist(),
+            "wilson_high": np.where(unseen, np.nan, high).tolist(),
+        },
+        "curves": {
+            str(task): {name: getattr(curve, name).tolist() for name in ("epochs", "rates", "episodes")}
+            for task, curve in sorted(results.curves().items())
+        },
+        "losses": {
+            str(task): {"epochs": epochs.tolist(), "losses": losses.tolist()}
+            for task, (epochs, losses) in sorted(results.losses().items())
+        },
+        "best_epochs": {str(task): ends[task] for task in sorted(ends)},
+        "subgoals": asdict(results.subgoals()),
+        "costs": {
+            str(task): results.costs(task)
+            | {f"{k}_seconds": v for k, v in results.task_seconds(task).items()}
+            for task in range(len(run.tasks))
+            if results.costs(task)
+        },
+        "seconds_by_phase": results.seconds_by_phase(),
+        "problems": list(results.problems),
+    }
+
+
+def _metrics(results: Results, diagonal: Literal["matrix", "curve"]) -> dict[str, Any]:
+    found = lifelong_metrics(results.scores(diagonal))
+    by_task = {name: getattr(found, f"{name}_by_task").tolist() for name in ("fwt", "nbt", "auc")}
+    return {name: asdict(getattr(found, name)) for name in METRIC_NAMES} | {"by_task": by_task}
+
+
+def plain(value: Any) -> Any:
+    """The same data with None for numbers that are not finite: JSON has no NaN."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,54 @@
+"""How a task is trained."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from lifelong.errors import ConfigError
+from lifelong.training.precision import COMPILE_MODES
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a task is trained; the defaults are those of the paper (appendix B) and its code.
+
+    Attributes:
+        epochs: Passes over the task's windows.
+        batch_size: Windows per step.
+        steps_per_epoch: Steps that count as one epoch; None: every window once (the last batch is
+            topped up).
+        lr: Learning rate of AdamW at the start.
+        lr_min: Where the cosine schedule ends, at the last step of the task.
+        warmup_steps: Steps over which the rate rises linearly from zero.
+        betas: AdamW's decay rates.
+        weight_decay: AdamW's decoupled weight decay.
+        grad_clip: Largest norm of the gradient; 0 switches clipping off.
+        precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor has it.
+        accumulate: Micro-batches that a batch is cut into, one after the other in memory. The gradient is that
+            of the whole batch, up to rounding and to what the policy draws for itself (dropout).
+        compile: `torch.compile` of the policy's loss: `off`, `default`, or `reduce-overhead`, which on a GPU
+            replays CUDA graphs. It changes rounding.
+    """
+
+    epochs: int = 50
+    batch_size: int = 32
+    steps_per_epoch: int | None = None
+    lr: float = 1e-4
+    lr_min: float = 1e-5
+    warmup_steps: int = 0
+    betas: Sequence[float] = (0.9, 0.999)
+    weight_decay: float = 1e-4
+    grad_clip: float = 100.0
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    accumulate: int = 1
+    compile: Literal["off", "default", "reduce-overhead"] = "off"
+
+    def __post_init__(self) -> None:
+        if self.compile is False:  # what YAML makes of an unquoted off
+            object.__setattr__(self, "compile", "off")
+        for name, valid in (("precision", ("auto", "bf16", "fp32")), ("compile", COMPILE_MODES)):
+            if getattr(self, name) not in valid:
+                raise ConfigError(f"train.{name} is {getattr(self, name)!r}; valid: {', '.join(valid)}")
+        for name in ("epochs", "batch_size", "accumulate"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"train.{name} is {getattr(self, name)}; it must be at least 1")
