@@ -189,4 +189,4 @@ class World:
         self.simulations.close()
 
     def _exists(self, name: str) -> bool:
-        return name in self.scene.things or self.task.problem.region(name) is not None
+        return name in self.scene.entities or self.task.problem.region(name) is not None

@@ -45,7 +45,7 @@ class Shapes:
 
     def others(self, view: StateView, *names: str, spacing: float = COARSE) -> np.ndarray:
         """Points on all objects and fixtures but these, world frame, (M, 3)."""
-        clouds = [self.points(view, name, spacing) for name in self._scene.things if name not in names]
+        clouds = [self.points(view, name, spacing) for name in self._scene.entities if name not in names]
         return np.concatenate([*clouds, np.zeros((0, 3))])
 
     def points(self, view: StateView, name: str, spacing: float) -> np.ndarray:

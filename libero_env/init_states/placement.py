@@ -138,9 +138,9 @@ def _places(scene: Scene) -> Mapping[str, Place]:
 def _place_of(scene: Scene, atom: Atom) -> Place:
     target, region = atom.args[1], scene.problem.region(atom.args[1])
     if atom.predicate in ("On", "In"):
-        if target in scene.things:
+        if target in scene.entities:
             return Place(target, None, inside=False)
-        targets = {scene.workspace_name} if region is not None and region.ranges else set(scene.things)
+        targets = {scene.workspace_name} if region is not None and region.ranges else set(scene.entities)
         if region is not None and region.target in targets:
             return Place(region.target, region, atom.predicate == "In")
     raise PlacementError(
@@ -163,7 +163,7 @@ def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) 
         if (state := _CONDITIONS.get(atom.predicate)) is None:
             continue
         owner = scene.owner(atom.args[0])
-        ranges = scene.things[owner].articulation if owner is not None else {}
+        ranges = scene.entities[owner].articulation if owner is not None else {}
         joints = scene.joints.get(atom.args[0], ())
         if state not in ranges or not joints:
             raise PlacementError(
@@ -236,7 +236,7 @@ def _touching(scene: Scene, data: mujoco.MjData) -> set[str]:
     """Objects in contact with another object, a fixture or the robot."""
     model = scene.model
     roots = model.body_rootid[model.geom_bodyid[data.contact.geom[: data.ncon]]]
-    owners = {int(scene.bodies[name][0]): name for name in scene.things} | {
+    owners = {int(scene.bodies[name][0]): name for name in scene.entities} | {
         int(scene.bodies[ROBOT][0]): ROBOT
     }
     found = set()

@@ -114,7 +114,7 @@ def scene_digest(scene: Scene) -> str:
     """What initial states depend on: joints in order, collision shapes of objects and fixtures; 16 hex digits."""
     model = scene.model
     parts = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
-    for name, thing in scene.things.items():
+    for name, thing in scene.entities.items():
         if thing.digest:
             parts.append((name, thing.digest))
         for body in scene.bodies[name]:

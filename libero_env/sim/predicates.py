@@ -191,7 +191,7 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
 def glowing_sites(view: StateView) -> set[int]:
     """Ids of the sites that glow because their object is turned on, such as a stove's burner."""
     model, found = view.scene.model, set()
-    for name, item in view.scene.things.items():
+    for name, item in view.scene.entities.items():
         if "turnon" in item.articulation and turn_on(view, name):
             own = np.isin(model.site_bodyid, view.scene.bodies[name])
             found |= set(np.flatnonzero(own & (model.site_group == GLOW_GROUP)).tolist())
@@ -218,11 +218,11 @@ def _beyond(view: StateView, place: str, state: str, opposite: str) -> list[bool
     owner = view.scene.owner(place)
     if owner is None:
         raise UnknownNameError("object, fixture or region of one", place, view.scene.joints)
-    ranges, values = view.scene.things[owner].articulation, view.joint_positions(place).values()
+    ranges, values = view.scene.entities[owner].articulation, view.joint_positions(place).values()
     if not values:
         return []
     if state not in ranges:
-        category = view.scene.things[owner].category
+        category = view.scene.entities[owner].category
         raise LiberoError(f"{owner}: nothing says when a {category} is {state!r}; it has no such joint range")
     low, high = sorted(ranges[state])
     upwards = opposite not in ranges or low + high > sum(ranges[opposite])

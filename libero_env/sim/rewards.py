@@ -85,14 +85,14 @@ def place(view: StateView, name: str) -> np.ndarray:
     if region is not None and region.ranges:
         return zone_boxes(region, view.scene.workspace)[0][0]
     if mujoco.mj_name2id(view.scene.model, mujoco.mjtObj.mjOBJ_SITE, name) < 0:
-        raise UnknownNameError("object, fixture or region", name, view.scene.things)
+        raise UnknownNameError("object, fixture or region", name, view.scene.entities)
     return view.site_pos(name)
 
 
 def joint_share(view: StateView, address: str, state: str) -> float:
     """Share of the way that joints have come to a state such as `open`, in [0, 1]; where all count, of the last one."""
     owner = view.scene.owner(address)
-    ranges: Mapping[str, tuple[float, float]] = view.scene.things[owner].articulation if owner else {}
+    ranges: Mapping[str, tuple[float, float]] = view.scene.entities[owner].articulation if owner else {}
     values = np.array(list(view.joint_positions(address).values()))
     if state not in ranges or _OPPOSITE[state] not in ranges or not values.size:
         return 0.0

@@ -55,7 +55,7 @@ class Scene:
         return len(REST_QPOS) + len(OPEN_FINGERS)
 
     @property
-    def things(self) -> dict[str, ObjectModel]:
+    def entities(self) -> dict[str, ObjectModel]:
         """Objects and fixtures."""
         return {**self.objects, **self.fixtures}
 
@@ -73,7 +73,7 @@ class Scene:
     def bodies(self) -> Mapping[str, np.ndarray]:
         """Name of an object, fixture, the workspace or `robot` -> ids of its bodies."""
         model = self.model
-        root = {n: model.body(f"{n}_{ROOT_BODY}").id for n in self.things}
+        root = {n: model.body(f"{n}_{ROOT_BODY}").id for n in self.entities}
         found = {name: np.flatnonzero(model.body_rootid == body) for name, body in root.items()}
         names = [model.body(b).name for b in range(model.nbody)]
         robot = [b for b, name in enumerate(names) if name.startswith(("robot0_", "gripper0_"))]
@@ -86,7 +86,7 @@ class Scene:
         model = self.model
         moving = [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
         owners: dict[str, tuple[int, ...]] = {}
-        for name in self.things:
+        for name in self.entities:
             bodies = set(self.bodies[name].tolist())
             own = [j for j in moving if int(model.jnt_bodyid[j]) in bodies]
             owners[name] = tuple(own)
@@ -97,10 +97,10 @@ class Scene:
 
     def owner(self, address: str) -> str | None:
         """The object or fixture that a name or the address of one of its regions belongs to."""
-        if address in self.things:
+        if address in self.entities:
             return address
         region = self.problem.region(address)
-        return region.target if region is not None and region.target in self.things else None
+        return region.target if region is not None and region.target in self.entities else None
 
 
 def build_scene(problem: Problem, pack: Pack | None = None) -> Scene:
@@ -119,15 +119,15 @@ def build_scene(problem: Problem, pack: Pack | None = None) -> Scene:
 @lru_cache(maxsize=160)
 def _build_scene(problem: Problem, pack: Pack) -> Scene:
     name, workspace = workspace_of(problem)
-    things = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
-    model = scene_spec(problem, pack, things).compile()
-    objects = {n: things[n] for n in problem.objects}
-    fixtures = {n: things[n] for n in problem.fixtures if n != name}
+    entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
+    model = scene_spec(problem, pack, entities).compile()
+    objects = {n: entities[n] for n in problem.objects}
+    fixtures = {n: entities[n] for n in problem.fixtures if n != name}
     return Scene(problem, pack, workspace, name, model, objects, fixtures)
 
 
 def scene_spec(
-    problem: Problem, pack: Pack | None = None, things: Mapping[str, ObjectModel] | None = None
+    problem: Problem, pack: Pack | None = None, entities: Mapping[str, ObjectModel] | None = None
 ) -> mujoco.MjSpec:
     """A fresh, editable model of a problem's scene, with these objects and fixtures or with those of the pack.
 
@@ -143,12 +143,12 @@ def scene_spec(
     add_mount(spec, workspace)
     add_panda(spec, workspace.robot_base_pos)
     _add_zones(spec, problem, name, workspace)
-    for thing, category in problem.objects.items():
-        _add_object(spec, thing, pack.build(category) if things is None else things[thing])
-    for thing, category in problem.fixtures.items():
-        if thing != name:
-            item = pack.build(category) if things is None else things[thing]
-            _add_fixture(spec, thing, item, fixture_pose(problem, name, workspace, thing, item))
+    for entity, category in problem.objects.items():
+        _add_object(spec, entity, pack.build(category) if entities is None else entities[entity])
+    for entity, category in problem.fixtures.items():
+        if entity != name:
+            item = pack.build(category) if entities is None else entities[entity]
+            _add_fixture(spec, entity, item, fixture_pose(problem, name, workspace, entity, item))
     return spec
 
 

@@ -118,5 +118,5 @@ class StateView:
 
     def _body(self, name: str) -> int:
         if not self.is_thing(name):
-            raise UnknownNameError("object or fixture", name, self.scene.things)
+            raise UnknownNameError("object or fixture", name, self.scene.entities)
         return self.scene.model.body(f"{name}_{ROOT_BODY}").id

@@ -226,7 +226,10 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
 
 @pytest.mark.unit
 def test_linting_texts_needs_no_torch():
-    code = "import sys, libero_env.design.lint.checks, libero_env.design.certify\nprint('torch' in sys.modules, 'matplotlib' in sys.modules)"
+    code = (
+        "import sys, libero_env.design.lint.checks, libero_env.design.certify\n"
+        "print('torch' in sys.modules, 'matplotlib' in sys.modules)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=Path(__file__).parents[2],

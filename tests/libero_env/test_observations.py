@@ -98,9 +98,9 @@ def test_kinds_of_segmentation_agree(kitchen):
     scene = world.scene
     for instance, category, element in {*zip(*(of[kind].ravel().tolist() for kind in of), strict=True)}:
         name = names["instance"][instance]
-        expected = scene.things[name].category if name in scene.things else name
+        expected = scene.entities[name].category if name in scene.entities else name
         assert names["class"][category] == expected
-        if name in scene.things:
+        if name in scene.entities:
             assert scene.model.geom_bodyid[element - 1] in scene.bodies[name]
     with pytest.raises(LiberoError, match="one kind"):
         LiberoEnv(TASK, observations=["segmentation_class", "segmentation_element"])
@@ -108,7 +108,7 @@ def test_kinds_of_segmentation_agree(kitchen):
 
 def test_poses_seen_from_the_hand_lead_back_to_the_world(kitchen):
     seen = kitchen.set_state(kitchen.get_state())
-    for name in kitchen.world.scene.things:
+    for name in kitchen.world.scene.entities:
         back = rotated(seen["ee_quat"][None], seen[f"{name}_to_ee_pos"][None])[0] + seen["ee_pos"]
         np.testing.assert_allclose(back, seen[f"{name}_pos"], atol=1e-9)
         quat = product(seen["ee_quat"][None], seen[f"{name}_to_ee_quat"][None])[0]

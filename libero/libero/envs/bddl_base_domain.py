@@ -189,9 +189,9 @@ class BDDLBaseDomain:
         self.objects_dict, self.fixtures_dict = scene_objects(scene), scene_fixtures(scene)
         self.object_sites_dict = scene_sites(scene)
         self.objects, self.fixtures = list(self.objects_dict.values()), list(self.fixtures_dict.values())
-        self.obj_body_id = {n: self.sim.model.body_name2id(f"{n}_main") for n in scene.things}
+        self.obj_body_id = {n: self.sim.model.body_name2id(f"{n}_main") for n in scene.entities}
         self.object_states_dict: dict[str, BaseObjectState] = {
-            name: ObjectState(self, name, is_fixture=name in scene.fixtures) for name in scene.things
+            name: ObjectState(self, name, is_fixture=name in scene.fixtures) for name in scene.entities
         }
         for name, site in self.object_sites_dict.items():
             fixed = site.parent_name not in scene.objects

@@ -73,9 +73,9 @@ class TaskModel:
         self.mujoco_model = model
         geoms, sites = self._owners(scene, model, "geom"), self._owners(scene, model, "site")
         robot = [name for name in _ROBOT_PARTS if name in geoms]
-        names = [*scene.things, *robot]
+        names = [*scene.entities, *robot]
         categories = {
-            **{n: _class_name(m.category) for n, m in scene.things.items()},
+            **{n: _class_name(m.category) for n, m in scene.entities.items()},
             **{n: n[:-1] for n in robot},
         }
         self.instances_to_ids = {n: {"geom": geoms.get(n, []), "site": sites.get(n, [])} for n in names}
@@ -95,7 +95,7 @@ class TaskModel:
     def _owners(scene: Scene, model: mujoco.MjModel, kind: str) -> dict[str, list[int]]:
         """Instance -> its geoms or sites."""
         bodies = getattr(model, f"{kind}_bodyid")
-        found = {n: np.flatnonzero(np.isin(bodies, scene.bodies[n])).tolist() for n in scene.things}
+        found = {n: np.flatnonzero(np.isin(bodies, scene.bodies[n])).tolist() for n in scene.entities}
         names = [model.body(b).name for b in range(model.nbody)]
         for part, prefixes in _ROBOT_PARTS.items():
             own = [b for b in range(model.nbody) if names[b].startswith(prefixes)]

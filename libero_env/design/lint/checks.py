@@ -115,7 +115,7 @@ def _syntax(error: BDDLError, file: str) -> Finding:
 def _check_declared(report: Report, tree: List) -> None:
     """Every name of an atom that nothing declares, where the parser stops at the first."""
     lines = report.lines
-    known = {*lines.things, *lines.regions}
+    known = {*lines.entities, *lines.regions}
 
     def visit(node: Word | List, bound: frozenset[str]) -> None:
         if not isinstance(node, List) or not node.items:
@@ -230,13 +230,13 @@ def _check_regions(report: Report, problem: Problem) -> None:
     seen: dict[tuple, str] = {}
     for region in problem.regions:
         line, address = report.lines.regions.get(region.address, 1), region.address
-        kind = kind_of(problem, region.target) if region.target in report.lines.things else ""
+        kind = kind_of(problem, region.target) if region.target in report.lines.entities else ""
         if address not in used | set(problem.obj_of_interest):
             lost = "" if kind else f", and its target {region.target} is not declared"
             report.info(line, "unused-region", f"no atom names {address}{lost}", "remove it, or use it")
         elif not kind:
             what = f"{address}: its target {region.target} is not declared"
-            report.error(line, "region-target", what, report.suggest(region.target, report.lines.things))
+            report.error(line, "region-target", what, report.suggest(region.target, report.lines.entities))
         elif kind == "workspace" and not region.ranges:
             report.error(
                 line, "region-ranges", f"{address} has no extent", "add (:ranges ((X0 Y0 X1 Y1))), metres"
@@ -272,7 +272,7 @@ def _check_places(report: Report, problem: Problem) -> None:
             where = "" if name in problem.objects else "; it stands in the middle of the workspace"
             remedy = f"add (On {name} REGION) to :init"
             tell(report.lines.of(name), "not-placed", f"no init atom places {name}{where}", remedy)
-    known: Iterable[str] = {*report.lines.things, *report.lines.regions}
+    known: Iterable[str] = {*report.lines.entities, *report.lines.regions}
     for name in problem.obj_of_interest:
         if name not in known:
             line = report.lines.section(":obj_of_interest")

@@ -36,7 +36,7 @@ class Lines:
     """Where in a task file things are said.
 
     Attributes:
-        things: name of an object or fixture -> line.
+        entities: name of an object or fixture -> line.
         regions: address of a region -> line.
         init: line of each init atom.
         goal: line of each atom of the goal, in reading order.
@@ -44,7 +44,7 @@ class Lines:
 
     def __init__(self, tree: List):
         self._sections = {node.head: node for node in tree.items if isinstance(node, List)}
-        self.things = {name: line for head in (":fixtures", ":objects") for name, line in self._names(head)}
+        self.entities = {name: line for head in (":fixtures", ":objects") for name, line in self._names(head)}
         self.regions = dict(self._regions())
         self.init = [item.line for item in self._items(":init")]
         self.goal = [line for item in self._items(":goal") for line in _atom_lines(item)]
@@ -55,7 +55,7 @@ class Lines:
 
     def of(self, name: str) -> int:
         """Line of the declaration of an object, fixture or region."""
-        return self.things.get(name, self.regions.get(name, 1))
+        return self.entities.get(name, self.regions.get(name, 1))
 
     def _items(self, head: str) -> tuple[Word | List, ...]:
         return self._sections[head].items[1:] if head in self._sections else ()

@@ -74,7 +74,7 @@ def _check_addresses(report: Report, scene: Scene) -> None:
         state, owner = _STATES.get(atom.predicate), scene.owner(atom.args[0]) if atom.args else None
         if state is None or owner is None:
             continue
-        known = scene.things[owner].articulation
+        known = scene.entities[owner].articulation
         if not scene.joints.get(atom.args[0]):
             what, remedy = (
                 f"{spell(atom)}: it has no joint",
@@ -82,7 +82,7 @@ def _check_addresses(report: Report, scene: Scene) -> None:
             )
             report.error(line, "no-joint", what, remedy)
         elif state not in known:
-            what = f"{spell(atom)}: nothing says when a {scene.things[owner].category} is {state!r}"
+            what = f"{spell(atom)}: nothing says when a {scene.entities[owner].category} is {state!r}"
             remedy = f"it can be {', '.join(sorted(known)) or 'in no such state'}"
             report.error(line, "no-joint", what, remedy)
 
@@ -259,7 +259,7 @@ def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
     shoulder = np.array(scene.workspace.robot_base_pos) + (0.0, 0.0, _SHOULDER)
     for atom, line in zip(atoms_of(scene.problem.goal), report.lines.goal, strict=True):
         for name in atom.args:
-            if name in scene.things:
+            if name in scene.entities:
                 pos = view.body_pos(name)
             elif mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_SITE, name) >= 0:
                 pos = view.site_pos(name)

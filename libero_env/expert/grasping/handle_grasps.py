@@ -63,7 +63,7 @@ def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
     """
     cloud = part.cloud(view, 0.004)
     high = cloud[cloud[:, 2] > cloud[:, 2].max() - 0.03]
-    around = surroundings(view, part.body, cloud.mean(axis=0), view.scene.things)
+    around = surroundings(view, part.body, cloud.mean(axis=0), view.scene.entities)
     grasp = choose_grasp(high, around, cloud[:, 2].min(), finger_axis(view.eef_mat), "knob")
     fingers = np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0.0])
     ways = [

@@ -127,7 +127,7 @@ def _belongs(place: str, name: str) -> bool:
 def _joint_owner(place: str, scene: Scene) -> str | None:
     """The address whose joints give access to a region: its own part's, else those of the whole thing."""
     owner = scene.owner(place)
-    if owner is None or owner not in scene.fixtures or "open" not in scene.things[owner].articulation:
+    if owner is None or owner not in scene.fixtures or "open" not in scene.entities[owner].articulation:
         return None
     return place if scene.joints.get(place) else owner
 

@@ -125,7 +125,7 @@ class MoveJoint:
             self.trouble = str(error)
             return False
         self._part = part
-        self._around = surroundings(view, -1, hold.held.pos, view.scene.things)
+        self._around = surroundings(view, -1, hold.held.pos, view.scene.entities)
         self._hold = hold.within(part.pose(view))
         self._begun = value
         self._failed.append(hold.ready)
@@ -136,7 +136,7 @@ class MoveJoint:
     def _limits(self, view: StateView) -> tuple[float, float, float, float]:
         """(threshold, end, margin, upwards) of the state, m or rad."""
         owner = view.scene.owner(self.address)
-        ranges = view.scene.things[owner].articulation
+        ranges = view.scene.entities[owner].articulation
         low, high = sorted(ranges[self.state])
         opposite = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}[self.state]
         upwards = opposite not in ranges or low + high > sum(ranges[opposite])

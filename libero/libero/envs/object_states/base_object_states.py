@@ -98,7 +98,7 @@ class ObjectState(BaseObjectState):
         self.has_turnon_affordance = "turnon" in self._model().articulation
 
     def _model(self) -> Any:
-        return self.env.scene.things[self.object_name]
+        return self.env.scene.entities[self.object_name]
 
     def get_geom_state(self) -> dict[str, np.ndarray]:
         """`pos` (3,) m and `quat` (4,) wxyz in the world frame."""
