@@ -5,7 +5,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import connection, get_context
 from multiprocessing.connection import Connection
 from multiprocessing.shared_memory import SharedMemory
@@ -22,11 +22,15 @@ _JOIN = 5.0  # s, for a worker to end by itself
 
 
 class Shared:
-    """The observation of one environment in shared memory: `views`, name -> array."""
+    """The observation of one environment in shared memory: `views`, name -> array.
 
-    def __init__(self, space: spaces.Dict, name: str | None = None):
-        """Make a block, or attach to the one of this name."""
-        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in space.items()]
+    Args:
+        layout: For each name something with `shape` and `dtype`: a space, or an array.
+        name: Name of the block to attach to; by default a new block is made.
+    """
+
+    def __init__(self, layout: Mapping[str, Any], name: str | None = None):
+        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in layout.items()]
         starts = np.cumsum(
             [0, *(-(-int(np.prod(s)) * d.itemsize // 64) * 64 for _, s, d in boxes)]
         )  # aligned
@@ -60,10 +64,10 @@ def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
     return LiberoEnv(**spec)
 
 
-def serve(pipe: Connection, make: Callable[[], gymnasium.Env], variables: Mapping[str, str]) -> None:
-    """Answer commands until told to close, or until the other end is gone."""
+def serve(pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str], host_class: Any) -> None:
+    """Answer commands until `close`, or until the other end is gone."""
     os.environ.update(variables)
-    host = _Host(make)
+    host = host_class(make)
     try:
         while True:
             command, *args = pipe.recv()
@@ -77,8 +81,8 @@ def serve(pipe: Connection, make: Callable[[], gymnasium.Env], variables: Mappin
         host.close()
 
 
-class _Host:
-    """The commands."""
+class GymHost:
+    """The commands of a worker with a Gymnasium environment: each method is one."""
 
     def __init__(self, make: Callable[[], gymnasium.Env]):
         self._make = make
@@ -120,14 +124,16 @@ class Worker:
     """The parent's end of one worker.
 
     Attributes:
-        task: what messages call it.
-        make: makes the environment, in the worker.
-        variables: set in the worker's environment, such as the GPU to draw on.
+        task: Name of the environment in messages.
+        make: Factory of the environment, called in the worker.
+        variables: Environment variables of the worker, such as the GPU to draw on.
+        host: Class whose methods are the commands; it is built with `make`, and needs `open` and `close`.
     """
 
     task: str
-    make: Callable[[], gymnasium.Env]
-    variables: Mapping[str, str]
+    make: Callable[[], Any]
+    variables: Mapping[str, str] = field(default_factory=dict)
+    host: type = GymHost
 
     def __post_init__(self) -> None:
         self.shared: Shared | None = None
@@ -138,7 +144,7 @@ class Worker:
         """Start the process and have it make its environment; `wait_for` collects the answer to that."""
         context = get_context("spawn")
         self.pipe, other = context.Pipe()
-        arguments = (other, CloudpickleWrapper(self.make), self.variables)
+        arguments = (other, CloudpickleWrapper(self.make), self.variables, self.host)
         self.process = context.Process(target=serve, args=arguments, daemon=True)
         self.process.start()
         other.close()
@@ -182,14 +188,16 @@ class Failure:
     lost: bool
 
 
-def wait_for(workers: Mapping[int, Worker], timeout: float) -> tuple[dict[int, Any], dict[int, Failure]]:
-    """The answers of workers to what they were asked last, and why others gave none within `timeout` seconds."""
+def wait_for(
+    workers: Mapping[int, Worker], timeout: float | None
+) -> tuple[dict[int, Any], dict[int, Failure]]:
+    """Return the answers to the last commands, and why other workers gave none within `timeout` seconds (None: any)."""
     answers: dict[int, Any] = {}
     failures: dict[int, Failure] = {}
-    waiting, end = dict(workers), time.monotonic() + timeout
+    waiting, end = dict(workers), None if timeout is None else time.monotonic() + timeout
     while waiting:
         of = {w.pipe: i for i, w in waiting.items()} | {w.process.sentinel: i for i, w in waiting.items()}
-        ready = connection.wait(list(of), max(0.0, end - time.monotonic()))
+        ready = connection.wait(list(of), None if end is None else max(0.0, end - time.monotonic()))
         for i in {of[item] for item in ready}:  # type: ignore[index]
             worker = waiting.pop(i)
             try:

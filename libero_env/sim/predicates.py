@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.objects.model import GLOW_GROUP
+from libero_env.objects.model import GLOW_GROUP, ObjectModel
 from libero_env.sim.regions import BOX_BELOW, contains, is_over, region_boxes, region_of
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
@@ -58,22 +58,22 @@ def stack(view: StateView, thing: str, place: str) -> bool:
 
 def open_(view: StateView, place: str) -> bool:
     """Any joint of the thing, or of the part that the region is on, is as far out as `open` begins."""
-    return any(_beyond(view, place, "open", "close"))
+    return any(_in_state(view, place, "open", "close"))
 
 
 def close(view: StateView, place: str) -> bool:
     """All joints of the thing, or of the part that the region is on, are as far in as `close` begins."""
-    return all(_beyond(view, place, "close", "open"))
+    return all(_in_state(view, place, "close", "open"))
 
 
 def turn_on(view: StateView, thing: str) -> bool:
     """Any joint is as far as `turnon` begins."""
-    return any(_beyond(view, thing, "turnon", "turnoff"))
+    return any(_in_state(view, thing, "turnon", "turnoff"))
 
 
 def turn_off(view: StateView, thing: str) -> bool:
     """All joints are as far back as `turnoff` begins."""
-    return all(_beyond(view, thing, "turnoff", "turnon"))
+    return all(_in_state(view, thing, "turnoff", "turnon"))
 
 
 def print_joint_state(view: StateView, thing: str) -> bool:
@@ -210,25 +210,41 @@ def atoms_of(expression: Expression) -> tuple[Atom, ...]:
     raise TypeError(f"not a goal: {expression!r}")
 
 
-def _beyond(view: StateView, place: str, state: str, opposite: str) -> list[bool]:
-    """For each joint whether it is in a state, such as `open`: as far as its range begins, seen from the opposite's.
+def _in_state(view: StateView, place: str, state: str, opposite: str) -> list[bool]:
+    """Return for each joint whether it is in a state, see `reaches_state`.
 
     A thing without joints has none that is open, and all it has are closed, as in the original.
     """
     owner = view.scene.owner(place)
     if owner is None:
         raise UnknownNameError("object, fixture or region of one", place, view.scene.joints)
-    ranges, values = view.scene.entities[owner].articulation, view.joint_positions(place).values()
-    if not values:
-        return []
+    values = view.joint_positions(place).values()
+    return [reaches_state(view.scene.entities[owner], value, state, opposite) for value in values]
+
+
+def reaches_state(model: ObjectModel, qpos: float, state: str, opposite: str) -> bool:
+    """Return whether a joint is as far as the range of a state begins, seen from the range of the opposite.
+
+    Args:
+        model: Object or fixture with the joint.
+        qpos: Position of the joint, rad or m.
+        state: `open`, `close`, `turnon` or `turnoff`.
+        opposite: The state at the other end.
+
+    Raises:
+        LiberoError: The model has no range for the state.
+    """
+    ranges = model.articulation
     if state not in ranges:
-        category = view.scene.entities[owner].category
-        raise LiberoError(f"{owner}: nothing says when a {category} is {state!r}; it has no such joint range")
+        raise LiberoError(
+            f"a {model.category} has no joint range for the state {state!r}; it has ranges for: "
+            f"{', '.join(ranges) or 'no state'}"
+        )
     low, high = sorted(ranges[state])
     upwards = opposite not in ranges or low + high > sum(ranges[opposite])
     if state == "turnon":
-        return [v >= low if upwards else v <= high for v in values]
-    return [v > low if upwards else v < high for v in values]
+        return qpos >= low if upwards else qpos <= high
+    return qpos > low if upwards else qpos < high
 
 
 def _bindings(variables: tuple[tuple[str, str], ...], view: StateView) -> list[dict[str, str]]:

@@ -10,11 +10,12 @@ import numpy as np
 
 from libero._adapters.envs.mjcf_models import STATES, accept_plain_files, model_of
 from libero_env.assets.pack import chosen_assets, select_pack
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import UnknownNameError
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.builtin.facts import Facts, load_facts
+from libero_env.sim.predicates import reaches_state
 
 OBJECTS_DICT: dict[str, Any] = {}
 VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
@@ -146,36 +147,24 @@ class BaseObject:
 
     def is_open(self, qpos: float) -> bool:
         """Whether a joint position counts as open."""
-        return self._reached(qpos, "open", "close")
+        return reaches_state(self.model, qpos, "open", "close")
 
     def is_close(self, qpos: float) -> bool:
         """Whether a joint position counts as closed."""
-        return self._reached(qpos, "close", "open")
+        return reaches_state(self.model, qpos, "close", "open")
 
     def turn_on(self, qpos: float) -> bool:
         """Whether a joint position counts as on."""
-        return self._reached(qpos, "turnon", "turnoff")
+        return reaches_state(self.model, qpos, "turnon", "turnoff")
 
     def turn_off(self, qpos: float) -> bool:
         """Whether a joint position counts as off."""
-        return self._reached(qpos, "turnoff", "turnon")
+        return reaches_state(self.model, qpos, "turnoff", "turnon")
 
     _fixed = False
 
     def _names(self, elements: Any) -> list[str]:
         return [f"{self.name}_{element.name}" for element in elements]
-
-    def _reached(self, qpos: float, state: str, opposite: str) -> bool:
-        ranges = self.model.articulation
-        if state not in ranges:
-            raise LiberoError(
-                f"{self.category_name}: nothing says when it is {state!r}; it has {', '.join(ranges)}"
-            )
-        low, high = sorted(ranges[state])
-        upwards = opposite not in ranges or low + high > sum(ranges[opposite])
-        if state == "turnon":
-            return qpos >= low if upwards else qpos <= high
-        return qpos > low if upwards else qpos < high
 
 
 class BuiltinObject(BaseObject):
