@@ -17,7 +17,7 @@ from libero_env.demos.read import Pairing
 from libero_env.demos.write import DemoWriter, Episode, make_header
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import PlacementError
-from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoalError
+from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError
 from libero_env.expert.rollout import MAX_STEPS, Attempt, run_experts
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.sim.observations import DEFAULT_CAMERAS
@@ -191,9 +191,9 @@ class Studio:
                 failed.append((k, Take(False, empty, empty, empty, 0, f"placement: {error}")))
                 continue
             placed.append(k)
-            style = None if variation.style else Style()
+            style = None if variation.style else MotionStyle()
             experts.append(Expert(self.task, np.random.default_rng(manner), shapes=self.shapes, style=style))
-            disturbance = Disturbance(np.random.default_rng(pushes), variation.noise, variation.push_rate)
+            disturbance = ActionNoise(np.random.default_rng(pushes), variation.noise, variation.push_rate)
             noise.append(disturbance if self.recipe.disturb else None)
         fixtures = self.stage.world.simulations.fixtures.copy()
         attempts = run_experts(self.stage, experts, noise, max_steps=MAX_STEPS)

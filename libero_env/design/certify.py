@@ -23,7 +23,7 @@ from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.record import GENERATOR
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, PlacementError
-from libero_env.expert import Disturbance, Expert, Shapes
+from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.init_states.store import scene_digest
 from libero_env.parallel import end_with_parent
@@ -211,7 +211,7 @@ def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> lis
         )
         seeds = [np.random.SeedSequence([task.index, i]).spawn(2) for i in states]
         experts = [Expert(task, np.random.default_rng(manner), shapes=shapes) for manner, _ in seeds]
-        noise = [Disturbance(np.random.default_rng(pushes)) for _, pushes in seeds] if disturb else None
+        noise = [ActionNoise(np.random.default_rng(pushes)) for _, pushes in seeds] if disturb else None
         attempts = run_experts(env, experts, noise)
     except PlacementError as error:
         if len(states) > 1:

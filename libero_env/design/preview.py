@@ -64,7 +64,7 @@ def expert_video(
     try:
         frames = [_shown(env, start)[entry(camera, "rgb")]]
         expert, terminated, truncated, step = Expert(task, np.random.default_rng(start)), False, False, 0
-        while not (terminated or truncated or expert.trouble):
+        while not (terminated or truncated or expert.failure_reason):
             env.draw = step % _EVERY == _EVERY - 1
             obs, _, terminated, truncated, _ = env.step(expert.act(env.view))
             if env.draw or terminated:
@@ -75,7 +75,7 @@ def expert_video(
     finally:
         env.close()
     write_video(path, np.stack(frames), CONTROL_HZ // _EVERY)
-    reason = expert.trouble or f"in phase {expert.phase} after {step} steps"
+    reason = expert.failure_reason or f"in phase {expert.phase} after {step} steps"
     return terminated, "" if terminated else reason
 
 

@@ -1,13 +1,13 @@
 from .expert import Expert
 from .planning.goal_plan import UnsupportedGoalError, plan_goal
 from .shapes import Shapes
-from .variation import Disturbance, Style
+from .variation import ActionNoise, MotionStyle
 
 __all__ = [
-    "Disturbance",
+    "ActionNoise",
     "Expert",
     "Shapes",
-    "Style",
+    "MotionStyle",
     "UnsupportedGoalError",
     "plan_goal",
 ]

@@ -4,15 +4,15 @@ from typing import Protocol
 
 import numpy as np
 
-from libero_env.expert.arm.reach import held_back
+from libero_env.expert.arm.reach import limit_elbow_extension
 from libero_env.expert.arm.servo import OPEN
 from libero_env.expert.planning.goal_plan import JOINT_STATES, Shapes, Step, plan_goal
-from libero_env.expert.planning.pick_plan import takeable
+from libero_env.expert.planning.pick_plan import is_graspable
 from libero_env.expert.skills.drag import Drag
-from libero_env.expert.skills.drop_into_container import IntoContainer
+from libero_env.expert.skills.drop_into_container import DropIntoContainer
 from libero_env.expert.skills.move_joint import MoveJoint
 from libero_env.expert.skills.pick_place import PickPlace
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 
@@ -22,10 +22,10 @@ class Skill(Protocol):
 
     phase: str
     retries: int
-    trouble: str
+    failure_reason: str
 
     @property
-    def steadiness(self) -> float:
+    def noise_scale(self) -> float:
         """How much disturbance the moment bears, in [0, 1]."""
 
     def act(self, view: StateView) -> np.ndarray:
@@ -56,10 +56,10 @@ class Expert:
         rng: np.random.Generator,
         *,
         shapes: Shapes | None = None,
-        style: Style | None = None,
+        style: MotionStyle | None = None,
     ):
         self.task, self.shapes = task, shapes
-        self.style = Style.draw(rng) if style is None else style
+        self.style = MotionStyle.sample(rng) if style is None else style
         self.skill: Skill | None = None
         self._retries = 0  # of skills that are over
 
@@ -69,9 +69,9 @@ class Expert:
         return "rest" if self.skill is None else self.skill.phase
 
     @property
-    def steadiness(self) -> float:
+    def noise_scale(self) -> float:
         """How much disturbance the moment bears, in [0, 1]: none while the fingers move."""
-        return 0.0 if self.skill is None else self.skill.steadiness
+        return 0.0 if self.skill is None else self.skill.noise_scale
 
     @property
     def retries(self) -> int:
@@ -79,9 +79,13 @@ class Expert:
         return self._retries + (0 if self.skill is None else self.skill.retries)
 
     @property
-    def trouble(self) -> str:
+    def failure_reason(self) -> str:
         """Why it cannot go on, or ""."""
-        return "" if self.skill is None or isinstance(self.skill, IntoContainer) else self.skill.trouble
+        return (
+            ""
+            if self.skill is None or isinstance(self.skill, DropIntoContainer)
+            else self.skill.failure_reason
+        )
 
     def act(self, view: StateView) -> np.ndarray:
         """The next action, (7,) in [-1, 1].
@@ -97,18 +101,20 @@ class Expert:
             self.skill = self._skill_for(steps[0], view) if steps else None
         if self.skill is None:
             return np.array([0.0] * 6 + [OPEN])
-        if isinstance(self.skill, IntoContainer) and self.skill.trouble:
+        if isinstance(self.skill, DropIntoContainer) and self.skill.failure_reason:
             self._retries = self.retries + 1
             self.skill = PickPlace(self.skill.atom, style=self.style, shapes=self.shapes)
-        return held_back(view, self.skill.act(view))
+        return limit_elbow_extension(view, self.skill.act(view))
 
     def _skill_for(self, step: Step, view: StateView) -> Skill:
         state = JOINT_STATES.get(step.atom.predicate)
         if state is not None:
             return MoveJoint(step.atom.args[0], state, style=self.style)
-        container = IntoContainer.container_of(view, self.shapes, step.atom)
+        container = DropIntoContainer.container_of(view, self.shapes, step.atom)
         if container is not None:
-            return IntoContainer(step.atom, container, style=self.style, shapes=self.shapes)
-        if Drag.suits(view, self.shapes, step.atom) and not takeable(view, self.shapes, step.atom.args[0]):
+            return DropIntoContainer(step.atom, container, style=self.style, shapes=self.shapes)
+        if Drag.suits(view, self.shapes, step.atom) and not is_graspable(
+            view, self.shapes, step.atom.args[0]
+        ):
             return Drag(step.atom, style=self.style, shapes=self.shapes)
         return PickPlace(step.atom, style=self.style, shapes=self.shapes, share=step.share)

@@ -7,7 +7,7 @@ import numpy as np
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.expert.expert import Expert
-from libero_env.expert.variation import Disturbance
+from libero_env.expert.variation import ActionNoise
 
 MAX_STEPS = 600
 
@@ -30,7 +30,7 @@ class Attempt:
 def run_experts(
     env: BatchEnv,
     experts: Sequence[Expert],
-    disturbances: Sequence[Disturbance | None] | None = None,
+    disturbances: Sequence[ActionNoise | None] | None = None,
     *,
     max_steps: int = MAX_STEPS,
 ) -> list[Attempt]:
@@ -51,14 +51,14 @@ def run_experts(
     wanted: list[list[np.ndarray]] = [[] for _ in experts]
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
-        live = [i for i in np.flatnonzero(env.running) if i < len(experts) and not experts[i].trouble]
+        live = [i for i in np.flatnonzero(env.running) if i < len(experts) and not experts[i].failure_reason]
         if not live:
             break
         actions = np.zeros((env.num_envs, 7))
         for i in live:
             label = experts[i].act(world.views[i])
             noise = disturbances[i]
-            actions[i] = label if noise is None else noise.apply(label, experts[i].steadiness)
+            actions[i] = label if noise is None else noise.apply(label, experts[i].noise_scale)
             states[i].append(world.physics_state(i))
             executed[i].append(actions[i].copy())
             wanted[i].append(label)
@@ -79,4 +79,4 @@ def run_experts(
 
 
 def _reason(expert: Expert, steps: int) -> str:
-    return expert.trouble or f"in phase {expert.phase} after {steps} steps, {expert.retries} retries"
+    return expert.failure_reason or f"in phase {expert.phase} after {steps} steps, {expert.retries} retries"

@@ -6,7 +6,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Style:
+class MotionStyle:
     """The manner of one demonstration. Small and continuous on purpose: what to do stays a function of the state."""
 
     gain: float = 1.6  # action per full-scale error
@@ -21,7 +21,7 @@ class Style:
     pause: int = 0  # steps of waiting before lifting and before letting go
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> "Style":
+    def sample(cls, rng: np.random.Generator) -> "MotionStyle":
         """A manner at random."""
         return cls(
             gain=rng.uniform(1.45, 1.75),
@@ -37,7 +37,7 @@ class Style:
         )
 
 
-class Disturbance:
+class ActionNoise:
     """Smooth noise on the executed action, and now and then a push; the expert then shows how to recover.
 
     Injecting noise into the supervisor keeps a clone on the states that it will visit (Laskey et al., "DART: Noise

@@ -6,11 +6,11 @@ import pytest
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
-from libero_env.expert import Disturbance, Expert, Shapes, Style, UnsupportedGoalError, plan_goal
+from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
 from libero_env.expert.arm.gripper import MAX_OPENING, WIDEST
-from libero_env.expert.arm.reach import held_back
+from libero_env.expert.arm.reach import limit_elbow_extension
 from libero_env.expert.arm.servo import action_toward, downward, rotation_between
-from libero_env.expert.grasping.costs import between_fingers, weak_price
+from libero_env.expert.grasping.costs import finger_offset, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, grasps
 from libero_env.expert.planning.pick_plan import Failure, _alike, choose_approach, choose_place
 from libero_env.expert.rollout import run_experts
@@ -105,7 +105,7 @@ def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
     cloud = box((0.03, 0.008, 0.03))
     middle = np.array([0.0, 0.0, 0.04])
     firm, corner, edge = (
-        weak_price(cloud, Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0))
+        grip_cost(cloud, Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0))
         for pos, yaw in (
             (middle, np.pi / 2),
             (middle + [0.03, 0, 0], 0.9),
@@ -113,15 +113,15 @@ def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
         )
     )
     assert firm < 0.02 < min(corner, edge)
-    assert weak_price(cloud, Grasp(middle + [0.2, 0, 0], downward(0.0, X_AXIS), 0.0, 0.0)) > 0.5  # of nothing
+    assert grip_cost(cloud, Grasp(middle + [0.2, 0, 0], downward(0.0, X_AXIS), 0.0, 0.0)) > 0.5  # of nothing
 
 
 @pytest.mark.parametrize("aside", [-0.02, 0.0, 0.015])
 def test_fingers_know_how_far_off_the_middle_they_close(aside):
     cloud, mat = box((0.03, 0.01, 0.02)), downward(np.pi / 2, X_AXIS)
     pos = np.array([0.0, 0.0, 0.02]) + aside * mat[:, 0]
-    assert between_fingers(cloud, pos, mat) == pytest.approx(-aside, abs=1e-6)
-    assert between_fingers(cloud, pos + [0.2, 0, 0], mat) == 0.0  # nothing there
+    assert finger_offset(cloud, pos, mat) == pytest.approx(-aside, abs=1e-6)
+    assert finger_offset(cloud, pos + [0.2, 0, 0], mat) == 0.0  # nothing there
 
 
 def test_actions_point_at_the_goal_and_stay_in_range():
@@ -149,12 +149,12 @@ def test_rotations():
 
 
 def test_manners_are_drawn_from_the_generator_alone():
-    first, second, other = (Style.draw(np.random.default_rng(seed)) for seed in (3, 3, 4))
+    first, second, other = (MotionStyle.sample(np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert first == second != other
 
 
 def test_a_disturbance_leaves_the_gripper_alone_and_can_be_switched_off():
-    noise = Disturbance(np.random.default_rng(0))
+    noise = ActionNoise(np.random.default_rng(0))
     action = np.array([0.5, 0, 0, 0, 0, 0, 1.0])
     assert all(noise.apply(action)[6] == 1.0 for _ in range(50))
     np.testing.assert_array_equal(noise.apply(action, 0.0), action)
@@ -282,7 +282,7 @@ def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     shapes = Shapes(view.scene)
     way = choose_approach(view, shapes, step.atom)
     assert way.place.entry[2] < -0.5
-    carry = Carry(view, step.atom, way, style=Style(), shapes=shapes)
+    carry = Carry(view, step.atom, way, style=MotionStyle(), shapes=shapes)
     low = shapes.span(view, step.atom.args[0])[0]
     rim = shapes.span(view, "desk_caddy_1")[1]
     move = carry.next(view, np.ones(3))
@@ -306,12 +306,12 @@ def test_the_arm_keeps_its_elbow_bent(view_of):
 def test_a_nearly_straight_arm_is_held_back(view_of):
     view = view_of("libero_goal/1")
     qpos, outward = view.simulations.fields["qpos"][view.index], np.array([1.0, 0, 0, 0.2, 0, 0, -1.0])
-    np.testing.assert_array_equal(held_back(view, outward), outward)  # bent, as it starts
+    np.testing.assert_array_equal(limit_elbow_extension(view, outward), outward)  # bent, as it starts
     elbow = view.scene.model.joint("robot0_joint4").qposadr[0]
     qpos[elbow] = -0.75
-    held = held_back(view, outward)
+    held = limit_elbow_extension(view, outward)
     assert held[0] < 0.3 and np.array_equal(held[3:], outward[3:])
-    np.testing.assert_array_equal(held_back(view, -outward), -outward)  # back is free
+    np.testing.assert_array_equal(limit_elbow_extension(view, -outward), -outward)  # back is free
 
 
 @pytest.mark.sim
@@ -359,7 +359,7 @@ def test_walls_plates_mugs_and_books(task_id):
 def test_every_task_is_reached_and_stays_reached(task):
     env = BatchEnv(task, 1, cameras=())
     env.reset(options={"init_state": 31})
-    expert, noise = Expert(task, np.random.default_rng(0)), Disturbance(np.random.default_rng(5))
+    expert, noise = Expert(task, np.random.default_rng(0)), ActionNoise(np.random.default_rng(5))
     (attempt,) = run_experts(env, [expert], [noise], max_steps=200)
     assert attempt.reason == "" and attempt.success
     assert np.abs(attempt.actions).max() <= 1.0 and len(attempt) < 160
@@ -379,7 +379,7 @@ def test_what_one_simulation_does_depends_on_no_other():
         env.reset(seed=starts)
         shapes = Shapes(env.world.scene)
         experts = [Expert(task, np.random.default_rng(s), shapes=shapes) for s in starts]
-        noise = [Disturbance(np.random.default_rng(s)) for s in starts]
+        noise = [ActionNoise(np.random.default_rng(s)) for s in starts]
         attempt = run_experts(env, experts, noise, max_steps=60)[slot]
         env.close()
         return attempt
@@ -394,7 +394,7 @@ def test_a_slip_is_mended():
     task = get_task("libero_object/7")
     env = LiberoEnv(task, cameras=())
     env.reset(options={"init_state": 3})
-    expert = Expert(task, np.random.default_rng(0), style=Style())
+    expert = Expert(task, np.random.default_rng(0), style=MotionStyle())
     dropped, success = 0, False
     for _ in range(250):
         action = expert.act(env.view)
@@ -414,7 +414,7 @@ def test_a_finger_on_the_rim_goes_up_again():
     manner, pushes = np.random.SeedSequence([0, 8]).spawn(2)
     env = BatchEnv(task, 1, cameras=())
     env.reset(options={"init_state": 8})
-    expert, noise = Expert(task, np.random.default_rng(manner)), Disturbance(np.random.default_rng(pushes))
+    expert, noise = Expert(task, np.random.default_rng(manner)), ActionNoise(np.random.default_rng(pushes))
     (attempt,) = run_experts(env, [expert], [noise])
     env.close()
     assert attempt.success and len(attempt) < 160

@@ -5,13 +5,13 @@ import pytest
 
 from libero_env.assets.robot import REST_QPOS
 from libero_env.envs.batch import BatchEnv
-from libero_env.expert.arm.posture import bend, stretch, unease
+from libero_env.expert.arm.posture import posture_cost, reach_violation, wrist_bend
 from libero_env.expert.arm.reach import Arm
 from libero_env.expert.arm.servo import downward
 from libero_env.expert.grasping.handle_grasps import OPEN_HALF, TIP, crowding, handle_hold, knob_hold, under
 from libero_env.expert.grasping.handles import Part, find_handle, turned
 from libero_env.expert.skills.move_joint import MoveJoint
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
 from libero_env.tasks import get_task, read_task
@@ -102,7 +102,9 @@ def test_it_moves_and_stays(tmp_path, case):
     env.reset(seed=0)
     atom = Atom(case[2].capitalize(), (address,))
     assert not any(evaluate(atom, view) for view in env.world.views)
-    skills = [MoveJoint(address, case[2], style=Style.draw(np.random.default_rng(i))) for i in range(SEEDS)]
+    skills = [
+        MoveJoint(address, case[2], style=MotionStyle.sample(np.random.default_rng(i))) for i in range(SEEDS)
+    ]
     actions, reached = run(env, skills)
     assert np.abs(actions).max() <= 1.0
     rest = np.tile([0.0] * 6 + [-1.0], (SEEDS, 1))
@@ -115,7 +117,7 @@ def test_it_moves_and_stays(tmp_path, case):
     assert reached.sum() >= least * SEEDS
     if case[0] == "short_fridge" and case[2] == "close":
         return
-    assert held >= least * SEEDS, [(skill.phase, skill.trouble) for skill in skills]
+    assert held >= least * SEEDS, [(skill.phase, skill.failure_reason) for skill in skills]
 
 
 def test_the_same_manner_gives_the_same_actions(tmp_path):
@@ -124,7 +126,7 @@ def test_the_same_manner_gives_the_same_actions(tmp_path):
     for _ in range(2):
         env = BatchEnv(task, 1, num_threads=1, cameras=())
         env.reset(seed=3)
-        taken.append(run(env, [MoveJoint(address, "open", style=Style(gain=1.5))], 60)[0])
+        taken.append(run(env, [MoveJoint(address, "open", style=MotionStyle(gain=1.5))], 60)[0])
         env.close()
     np.testing.assert_array_equal(*taken)
 
@@ -144,7 +146,7 @@ def test_a_fixture_without_the_joint_is_said(tmp_path):
     env.reset(seed=0)
     skill = MoveJoint("thing_1_top_side", "open")
     np.testing.assert_array_equal(skill.act(env.world.views[0])[:6], 0.0)
-    assert "thing_1_top_side" in skill.trouble
+    assert "thing_1_top_side" in skill.failure_reason
     env.close()
 
 
@@ -182,7 +184,7 @@ def test_the_wrist_bends_as_inverse_kinematics_says():
     arm, base = Arm(env.world.scene.model), np.array(env.world.scene.workspace.robot_base_pos)
     env.close()
     pos, mat = poses(60)
-    expected = bend(pos, mat, base)
+    expected = wrist_bend(pos, mat, base)
     found = [arm.reach(np.array(REST_QPOS), p, m) for p, m in zip(pos, mat, strict=True)]
     errors = np.array(
         [angles[5] - e for (angles, miss), e in zip(found, expected, strict=True) if miss == 0.0]
@@ -194,9 +196,9 @@ def test_the_wrist_bends_as_inverse_kinematics_says():
 def test_ease_is_the_same_wherever_the_robot_stands():
     pos, mat = poses(30)
     base, shift = np.array([-0.66, 0.0, 0.912]), np.array([0.3, -0.2, 0.1])
-    np.testing.assert_allclose(unease(pos + shift, mat, base + shift), unease(pos, mat, base))
-    far = stretch(pos + [1.0, 0.0, 0.0], mat, base)
-    assert (far > 0.4).all() and (stretch(pos, mat, base) < far).all()
+    np.testing.assert_allclose(posture_cost(pos + shift, mat, base + shift), posture_cost(pos, mat, base))
+    far = reach_violation(pos + [1.0, 0.0, 0.0], mat, base)
+    assert (far > 0.4).all() and (reach_violation(pos, mat, base) < far).all()
 
 
 def test_a_hand_meets_what_is_in_it():
@@ -221,8 +223,8 @@ def test_a_hand_leans_over_a_knob_close_to_the_base():
     hold, base = knob_hold(view, part, 0.8), np.array(view.scene.workspace.robot_base_pos)
     ends = [hold.held, part.moved(view, hold.held, 0.8)]
     upright = downward(np.arctan2(hold.held.mat[1, 0], hold.held.mat[0, 0]), hold.held.mat[:, 0])
-    assert bend(hold.held.pos[None], upright[None], base)[0] > 2.9
-    assert all(bend(pose.pos[None], pose.mat[None], base)[0] < 2.9 for pose in ends)
+    assert wrist_bend(hold.held.pos[None], upright[None], base)[0] > 2.9
+    assert all(wrist_bend(pose.pos[None], pose.mat[None], base)[0] < 2.9 for pose in ends)
     assert hold.held.mat[2, 2] < -0.8 and abs(hold.held.mat[2, 0]) < 1e-6  # the fingers stay level
     env.close()
 

@@ -12,7 +12,7 @@ _BENT = (
 )
 
 
-def unease(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
+def posture_cost(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     """What poses of the grip site cost the arm: turned wrists, folded and stretched elbows, and wrists bent back.
 
     Args:
@@ -23,11 +23,11 @@ def unease(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     Returns:
         (N,), 0 where the arm is at ease; about 1 where a joint is at its limit.
     """
-    back = np.maximum(bend(pos, mat, base) - _BENT, 0.0)
-    return 0.12 * strain(pos, mat, base) ** 2 + 20.0 * stretch(pos, mat, base) + 1.5 * back
+    back = np.maximum(wrist_bend(pos, mat, base) - _BENT, 0.0)
+    return 0.12 * wrist_twist(pos, mat, base) ** 2 + 20.0 * reach_violation(pos, mat, base) + 1.5 * back
 
 
-def strain(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
+def wrist_twist(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     """How far hands are turned from where the wrist's joints are in the middle, (N,), rad."""
     yaw = _WRIST_MIDDLE + np.arctan2(pos[:, 1] - base[1], pos[:, 0] - base[0])
     c, s = np.cos(yaw), np.sin(yaw)
@@ -35,13 +35,13 @@ def strain(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 
-def stretch(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
+def reach_violation(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     """How far wrists are out of easy reach, too close or too far, (N,), m."""
     distance = np.linalg.norm(_wrist(pos, mat, base), axis=1)
     return np.maximum(0.0, np.maximum(distance - _REACH[1], _REACH[0] - distance))
 
 
-def bend(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
+def wrist_bend(pos: np.ndarray, mat: np.ndarray, base: np.ndarray) -> np.ndarray:
     """Angle of joint 6 with the elbow straight above the line from the shoulder to the wrist, (N,), rad.
 
     At pi the hand points along the forearm and the wrist is singular; far beyond, at 3.75, is the joint's limit.

@@ -24,7 +24,7 @@ _ROLLS, _SWING = (
 _SITE = "gripper0_grip_site"
 
 
-def held_back(view: StateView, action: np.ndarray) -> np.ndarray:
+def limit_elbow_extension(view: StateView, action: np.ndarray) -> np.ndarray:
     """An action (7,) without what would straighten the elbow, and with a little of the opposite where it is nearly so.
 
     The way out that is left of bent links a and b, an angle d short of straight, is a b d^2 / (2 (a + b)).

@@ -11,7 +11,7 @@ _BITE = 0.010  # m of a body, along and across the pads, that make a firm hold
 _BEFORE = (0.04, 0.08, 0.13)  # m, before a hold, where the hand must have room too
 
 
-def between_fingers(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
+def finger_offset(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
     """How far the middle of what open fingers close on is from the middle between them, m along their opening."""
     u = _between_pads(cloud, pos, mat)[:, 0]
     return 0.5 * float(u.min() + u.max()) if len(u) else 0.0
@@ -25,7 +25,7 @@ def _between_pads(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.nda
     return local[pads & (np.abs(u) < 0.5 * MAX_OPENING)]
 
 
-def weak_price(cloud: np.ndarray, grasp: Grasp) -> float:
+def grip_cost(cloud: np.ndarray, grasp: Grasp) -> float:
     """What it costs that the pads have little of the body between them, or meet its faces askew."""
     u, v, depth = _between_pads(cloud, grasp.pos_world, grasp.mat).T
     if not len(u):
@@ -37,7 +37,7 @@ def weak_price(cloud: np.ndarray, grasp: Grasp) -> float:
     return float(price + 30.0 * max(askew - 0.003, 0.0))
 
 
-def crowd_price(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
+def collision_cost(voxels: Voxels, near: np.ndarray, grasp: Grasp) -> float:
     """What it costs that others are in the hand's way, at the hold and before it."""
     crowd = crowding(near, grasp.pos_world, grasp.mat)
     below = max(voxels.floor - float((grasp.pos_world + HAND @ grasp.mat.T)[:, 2].min()), 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from libero_env.expert.arm.gripper import FINGER_HALF_WIDTH, TIP_BELOW
-from libero_env.expert.arm.posture import strain, stretch, unease
+from libero_env.expert.arm.posture import posture_cost, reach_violation, wrist_twist
 from libero_env.expert.arm.servo import downward, finger_axis
 from libero_env.expert.grasping.grasps import GraspError, choose_grasp
 from libero_env.expert.grasping.handles import UP, Handle, Part, surroundings, turned
@@ -31,7 +31,7 @@ _FORTH = (0.0, -0.005, -0.0075)  # m, of the grip site beyond the middle of the 
 _SIDEWAYS = (0.35, -0.35)  # rad, of the hand at a bar that stands
 _CLEAR = 0.10  # m, that a hand withdraws
 _SPARE = 0.002  # m, around the hand
-_TWISTED = 0.5 * np.pi + 0.4  # rad, of strain that is too much
+_TWISTED = 0.5 * np.pi + 0.4  # rad, of wrist_twist that is too much
 _LEANS = (0.0, 0.2, -0.2, 0.35, -0.35, 0.5, -0.5)  # rad, of the hand over a knob
 
 
@@ -76,7 +76,7 @@ def knob_hold(view: StateView, part: Part, delta: float) -> Hold:
         part.moved_all(view, grasp.pos_world[None], mat, delta),
     )
     base = np.array(view.scene.workspace.robot_base_pos)
-    cost = unease(pos, mat, base) + unease(np.tile(end[0], (len(ways), 1)), end[1], base)
+    cost = posture_cost(pos, mat, base) + posture_cost(np.tile(end[0], (len(ways), 1)), end[1], base)
     for k, (lean, _) in enumerate(ways):
         depths = [crowding(around, Pose(p[k % len(p)], m[k]), 0.0, OPEN_HALF) for p, m in ((pos, mat), end)]
         cost[k] += 0.3 * abs(lean) + _blocked(max(depths))
@@ -107,9 +107,9 @@ def handle_hold(
     if not len(ways.cost):
         raise GraspError(f"no way to take the handle: it is more than {100 * TAKES:.0f} cm thick")
     moved = [part.moved_all(view, ways.held, ways.mat, share * delta, ways.follow) for share in (0.5, 1.0)]
-    cost = ways.cost + unease(ways.ready, ways.mat, base) + unease(*moved[1], base)
+    cost = ways.cost + posture_cost(ways.ready, ways.mat, base) + posture_cost(*moved[1], base)
     end, mat = moved[1]
-    cost += 20.0 * stretch(end - _CLEAR * mat[:, :, 2], mat, base)  # it withdraws from there
+    cost += 20.0 * reach_violation(end - _CLEAR * mat[:, :, 2], mat, base)  # it withdraws from there
     turn = 0.5 * (np.einsum("ij,nij->n", view.eef_mat, ways.mat) - 1.0)
     cost += 0.1 * np.arccos(np.clip(turn, -1.0, 1.0))
     for pose in failed:
@@ -188,7 +188,7 @@ def _candidates(handle: Handle, grips: bool, swings: bool, base: np.ndarray) -> 
     """All approaches, what is around not yet considered."""
     rows: list[tuple] = []
     for mat, steep, extra in _orientations(handle, grips):
-        if strain(handle.pos[None], mat[None], base)[0] > _TWISTED:
+        if wrist_twist(handle.pos[None], mat[None], base)[0] > _TWISTED:
             continue
         if grips:
             found = _grips(handle, mat)

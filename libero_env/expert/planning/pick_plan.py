@@ -7,7 +7,7 @@ import numpy as np
 
 from libero_env.expert.arm.servo import finger_axis, rotation_between
 from libero_env.expert.clearance import Voxels
-from libero_env.expert.grasping.costs import HAND, crowd_price, weak_price
+from libero_env.expert.grasping.costs import HAND, collision_cost, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, grasps
 from libero_env.expert.planning.place_poses import DOWN, Place, places
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
@@ -141,7 +141,7 @@ def choose_place(
     return _reachable(view, shapes, _pairs(voxels, [hold], spots, pose), both_ways=False)[0]
 
 
-def takeable(view: StateView, shapes: Shapes, thing: str) -> bool:
+def is_graspable(view: StateView, shapes: Shapes, thing: str) -> bool:
     """Whether something of a body fits between the fingers from above."""
     try:
         grasps(
@@ -208,7 +208,7 @@ def _free_holds(
             error = error or problem
             continue
         for g in own:
-            price = crowd_price(voxels, near, g) + weak_price(cloud, g) + _failed_price(pose, g, failures)
+            price = collision_cost(voxels, near, g) + grip_cost(cloud, g) + _failed_price(pose, g, failures)
             found.append(replace(g, cost=g.cost + lean + price))
     if not found:
         raise error or GraspError(f"{thing} cannot be grasped")

@@ -6,7 +6,7 @@ from libero_env.expert.arm.gripper import TIP_BELOW
 from libero_env.expert.arm.servo import CLOSE, action_toward, downward, finger_axis
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.skills.pick_place import CONTROL_HZ
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.regions import region_boxes
 from libero_env.sim.state import StateView
@@ -21,10 +21,10 @@ LIGHT = -0.006  # m over the bottom of the hollow: it presses, and friction help
 class Drag:
     """Makes an (On thing region-of-the-table) true for a body with a hollow, such as a plate; as `PickPlace`."""
 
-    def __init__(self, atom: Atom, *, style: Style, shapes: Shapes):
+    def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes):
         self.atom, self.style, self.shapes = atom, style, shapes
         self.phase = "reach"
-        self.retries, self.trouble = 0, ""
+        self.retries, self.failure_reason = 0, ""
         self._steps = 0
         self._before: np.ndarray | None = None
         self._velocity = np.zeros(3)
@@ -40,7 +40,7 @@ class Drag:
         return flat and upright and len(inner) > 0 and points[:, 2].max() - inner.max() > 0.006
 
     @property
-    def steadiness(self) -> float:
+    def noise_scale(self) -> float:
         """How much disturbance the moment bears, in [0, 1]."""
         return {"reach": 1.0, "carry": 0.3}.get(self.phase, 0.0)
 
@@ -75,7 +75,7 @@ class Drag:
                 self.phase, self._steps = "withdraw", 0
                 self.retries += int(lost)
                 if self.retries > ATTEMPTS:
-                    self.trouble = f"{thing} does not follow the hand"
+                    self.failure_reason = f"{thing} does not follow the hand"
             ahead = way / max(left, 1e-9) * min(left + 0.01, LEAD)
             return self._toward(view, np.array([*(pos[:2] + ahead), low]), mat, 0.6)
         if self._steps > 8:

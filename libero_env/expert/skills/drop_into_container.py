@@ -9,7 +9,7 @@ from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward, downward, fi
 from libero_env.expert.grasping.grasps import GraspError
 from libero_env.expert.grasping.top_grasps import TopGrasp, choose_top_grasp
 from libero_env.expert.shapes import Shapes, pose_of
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
@@ -30,7 +30,7 @@ OUT_OF_REACH = 0.005  # m, by which the arm may miss where it should take hold
 HAND_OVER_RIM = 0.045  # m, of the grip site, so that the palm stays above a container
 
 
-class IntoContainer:
+class DropIntoContainer:
     """Makes (In thing site) true where the site belongs to a container that can be moved, such as a basket.
 
     Shorter and surer than `PickPlace` for what it can do, and what it does is easy to clone. Phases: reach (down a
@@ -46,15 +46,15 @@ class IntoContainer:
     Attributes:
         phase: what it is doing.
         retries: how often it had to start over.
-        trouble: why it cannot go on, or ""; `PickPlace` may, which looks further for holds.
+        failure_reason: why it cannot go on, or ""; `PickPlace` may, which looks further for holds.
     """
 
-    def __init__(self, atom: Atom, container: str, *, style: Style, shapes: Shapes):
+    def __init__(self, atom: Atom, container: str, *, style: MotionStyle, shapes: Shapes):
         self.atom, self.container, self.style, self.shapes = atom, container, style, shapes
         self.thing, self.site = atom.args
         self.phase: Phase = "reach"
         self.retries = 0
-        self.trouble = ""
+        self.failure_reason = ""
         self._grasp: tuple[TopGrasp, Pose] | None = None  # and where the object was then
         self._rise = 0.0  # m, over the grasp, at which the fingertips pass over the object
         self._hold: tuple[np.ndarray, np.ndarray] | None = None  # pose to keep while the fingers move
@@ -77,7 +77,7 @@ class IntoContainer:
         ):
             return None
         try:
-            pos, mat = cls(atom, region.target, style=Style(), shapes=shapes)._grasp_pose(view)
+            pos, mat = cls(atom, region.target, style=MotionStyle(), shapes=shapes)._grasp_pose(view)
         except GraspError:
             return None
         angles = view.simulations.fields["qpos"][view.index][:7]
@@ -85,7 +85,7 @@ class IntoContainer:
         return region.target if miss < OUT_OF_REACH else None
 
     @property
-    def steadiness(self) -> float:
+    def noise_scale(self) -> float:
         """How much disturbance the moment bears, in [0, 1]: none while the fingers move."""
         return {"reach": 1.0, "carry": 0.7}.get(self.phase, 0.0)
 
@@ -110,7 +110,7 @@ class IntoContainer:
     def _again(self) -> None:
         self.retries += 1
         if self.retries > ATTEMPTS:
-            self.trouble = f"{self.atom.args} not reached in {self.retries} attempts"
+            self.failure_reason = f"{self.atom.args} not reached in {self.retries} attempts"
         self._grasp = None
         self._enter("reach")
 
@@ -119,7 +119,7 @@ class IntoContainer:
         try:
             goal, mat = self._grasp_pose(view)
         except GraspError as error:
-            self.trouble = str(error)
+            self.failure_reason = str(error)
             return np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, OPEN])
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
@@ -145,7 +145,7 @@ class IntoContainer:
         if self._pressed >= 3 and not self._backing:
             self._backing, self._backings = True, self._backings + 1
             if self._backings > BACKINGS:
-                self.trouble = f"something is in the way of taking {self.thing} from above"
+                self.failure_reason = f"something is in the way of taking {self.thing} from above"
         clear = height > goal_height + self._rise - TIP_BELOW + 0.01
         if away < 0.006 and clear:
             self._backing = False

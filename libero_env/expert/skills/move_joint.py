@@ -9,7 +9,7 @@ from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward, rotation_bet
 from libero_env.expert.grasping.grasps import GraspError
 from libero_env.expert.grasping.handle_grasps import Hold, handle_hold, knob_hold
 from libero_env.expert.grasping.handles import Part, find_handle, inner_side, is_knob, surroundings
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
@@ -46,14 +46,14 @@ class MoveJoint:
     Attributes:
         phase: what it is doing.
         retries: how often it had to begin again.
-        trouble: why it cannot go on, or "".
+        failure_reason: why it cannot go on, or "".
     """
 
-    def __init__(self, address: str, state: State, *, style: Style | None = None):
+    def __init__(self, address: str, state: State, *, style: MotionStyle | None = None):
         self.address, self.state = address, state
-        self.style = style or Style()
+        self.style = style or MotionStyle()
         self.phase: Phase = "reach"
-        self.retries, self.trouble = 0, ""
+        self.retries, self.failure_reason = 0, ""
         self._part: Part | None = None
         self._hold: Hold | None = None  # in the frame of the part
         self._around = np.zeros((0, 3))
@@ -66,7 +66,7 @@ class MoveJoint:
         self._failed: list[Pose] = []  # holds of earlier attempts
 
     @property
-    def steadiness(self) -> float:
+    def noise_scale(self) -> float:
         """How much disturbance the moment bears, in [0, 1]."""
         return {"reach": 1.0, "withdraw": 0.7, "move": 0.4}.get(self.phase, 0.0)
 
@@ -80,7 +80,7 @@ class MoveJoint:
         self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
         self._before = pos
         self._steps += 1
-        if self.trouble or self.phase == "rest" and self._moved(view):
+        if self.failure_reason or self.phase == "rest" and self._moved(view):
             return self._stay()
         if self.phase == "rest":
             self._again()
@@ -95,7 +95,7 @@ class MoveJoint:
         model = view.scene.model
         parts = [Part.of(model, joint) for joint in view.scene.joints.get(self.address, ())]
         if not parts:
-            self.trouble = f"{self.address} has no joint to {self.state}"
+            self.failure_reason = f"{self.address} has no joint to {self.state}"
             return False
         gaps = [abs(self._goal(view, part) - part.value(view)) for part in parts]
         # one joint is enough to open, all have to be closed
@@ -122,7 +122,7 @@ class MoveJoint:
                     view, part, inner_side(view, part, way), self._aim - value, False, self._failed
                 )
         except GraspError as error:
-            self.trouble = str(error)
+            self.failure_reason = str(error)
             return False
         self._part = part
         self._around = surroundings(view, -1, hold.held.pos, view.scene.entities)
@@ -174,7 +174,7 @@ class MoveJoint:
         self.retries += 1
         self._hold = None
         if self.retries > ATTEMPTS:
-            self.trouble = f"{self.address} did not get to {self.state} in {self.retries} attempts"
+            self.failure_reason = f"{self.address} did not get to {self.state} in {self.retries} attempts"
         self._enter("reach")
 
     def _reach(self, view: StateView) -> np.ndarray:

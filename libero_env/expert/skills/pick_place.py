@@ -8,12 +8,12 @@ from libero_env.errors import LiberoError
 from libero_env.expert.arm.gripper import MAX_OPENING, TIP_BELOW
 from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward, rotation_between
 from libero_env.expert.clearance import lowest, obstacle_height
-from libero_env.expert.grasping.costs import between_fingers
+from libero_env.expert.grasping.costs import finger_offset
 from libero_env.expert.grasping.grasps import crowding
 from libero_env.expert.planning.pick_plan import Approach, Failure, choose_approach, choose_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.skills.transport import Carry, Move
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
@@ -53,13 +53,13 @@ class PickPlace:
     Attributes:
         phase: what it is doing.
         retries: how often it had to begin again.
-        trouble: why it cannot go on, or "".
+        failure_reason: why it cannot go on, or "".
     """
 
-    def __init__(self, atom: Atom, *, style: Style, shapes: Shapes, share: tuple[int, int] = (0, 1)):
+    def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes, share: tuple[int, int] = (0, 1)):
         self.atom, self.style, self.shapes, self.share = atom, style, shapes, share
         self.phase: Phase = "reach"
-        self.retries, self.trouble = 0, ""
+        self.retries, self.failure_reason = 0, ""
         self._thing = atom.args[0]
         self._way: Approach | None = None
         self._rise = 0.0  # m, back along the approach, where the fingers are clear of the object
@@ -80,7 +80,7 @@ class PickPlace:
         self._waited = 0  # steps, for the object to come to rest
 
     @property
-    def steadiness(self) -> float:
+    def noise_scale(self) -> float:
         """How much disturbance the moment bears, in [0, 1]: none while the fingers move."""
         return {"reach": 1.0, "carry": 0.7, "withdraw": 0.7}.get(self.phase, 0.0)
 
@@ -94,7 +94,7 @@ class PickPlace:
         self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
         self._before = pos
         self._steps += 1
-        if self.trouble or self.phase in ("reach", "rest") and not self._plan(view):
+        if self.failure_reason or self.phase in ("reach", "rest") and not self._plan(view):
             return np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, OPEN])
         if self._steps > STUCK:
             self._hold = Pose(pos, view.eef_mat)
@@ -117,7 +117,7 @@ class PickPlace:
             try:
                 self._way = choose_approach(view, self.shapes, self.atom, self.share, self._failures)
             except LiberoError as error:
-                self.trouble = str(error)
+                self.failure_reason = str(error)
                 return False
             grasp = self._way.grasp
             depth = (self.shapes.cloud(view, self._thing) - grasp.pos_world) @ -grasp.mat[:, 2]
@@ -144,7 +144,7 @@ class PickPlace:
         self.retries += 1
         self._way = None
         if self.retries > ATTEMPTS:
-            self.trouble = f"{self.atom.args} not reached in {self.retries} attempts"
+            self.failure_reason = f"{self.atom.args} not reached in {self.retries} attempts"
         self._enter("reach")
 
     def _reach(self, view: StateView) -> np.ndarray:
@@ -156,7 +156,7 @@ class PickPlace:
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, mat)))
         if aside < ARRIVED and abs(error @ back) < ARRIVED and turn < ARRIVED_TURN:
             self._hold = Pose(goal, mat)
-            self._aside = between_fingers(self.shapes.cloud(view, self._thing), goal, mat) * mat[:, 0]
+            self._aside = finger_offset(self.shapes.cloud(view, self._thing), goal, mat) * mat[:, 0]
             self._enter("close")
             return self._close(view)
         still = np.linalg.norm(self._velocity) < 0.008 and abs(turn - self._turn) < 0.01

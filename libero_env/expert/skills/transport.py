@@ -9,7 +9,7 @@ from libero_env.expert.arm.servo import rotation_between
 from libero_env.expert.clearance import lowest, obstacle_height
 from libero_env.expert.planning.pick_plan import ASIDE, Approach
 from libero_env.expert.shapes import Shapes, pose_of
-from libero_env.expert.variation import Style
+from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
@@ -61,7 +61,7 @@ class Carry:
         atom: Atom,
         way: Approach,
         *,
-        style: Style,
+        style: MotionStyle,
         shapes: Shapes,
         out: Pose | None = None,
     ):
