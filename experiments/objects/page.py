@@ -53,13 +53,13 @@ def write_page(docs: Path) -> None:
 
 
 def families() -> dict[str, list[str]]:
-    """Family -> its categories, sorted; those without figures are of the family ''."""
-    figures = files("libero_env.objects.builtin") / "figures"
+    """Family -> its categories, sorted; those without parameters are of the family ''."""
+    parameters = files("libero_env.objects.builtin") / "parameters"
     owner = {
         name: family
         for family in FAMILIES
         if family
-        for name in yaml.safe_load((figures / f"{family}.yaml").read_text(encoding="utf-8"))
+        for name in yaml.safe_load((parameters / f"{family}.yaml").read_text(encoding="utf-8"))
     }
     names = object_names()
     return {family: [n for n in names if owner.get(n, "") == family] for family in FAMILIES}

@@ -31,7 +31,7 @@ _SHARED = ("cameras", "lights", "walls", "floor")
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a task happens; the figures of one file in `libero_env/assets/workspaces`. Metres, world frame.
+    """Where a task happens; the parameters of one file in `libero_env/assets/workspaces`. Metres, world frame.
 
     Attributes:
         name: fixture category, such as `kitchen_table`.
@@ -42,7 +42,7 @@ class Workspace:
             the middle of the boxes. The original puts them at another height in each problem.
         robot_base_pos: origin of `robot0_base`, (3,).
         mount: what stands under the arm: `rethink` or None.
-        figures: all of the file.
+        parameters: all of the file.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Workspace:
     zone_origin: tuple[float, float, float]
     robot_base_pos: tuple[float, float, float]
     mount: str | None
-    figures: Mapping[str, Any]
+    parameters: Mapping[str, Any]
 
     @property
     def surface_height(self) -> float:
@@ -70,16 +70,16 @@ def load_workspace(category: str) -> Workspace:
     if category not in WORKSPACES:
         raise UnknownNameError("workspace", category, WORKSPACES)
     room, own = _read(_ROOM), _read(WORKSPACES[category])
-    figures = {**own, **{key: _merged(room[key], own.get(key, {})) for key in _SHARED}}
+    parameters = {**own, **{key: _merged(room[key], own.get(key, {})) for key in _SHARED}}
     return Workspace(
         name=category,
-        problem=figures["problem"],
-        offset=tuple(figures["offset"]),
-        region_height=figures["region_height"],
-        zone_origin=tuple(figures["zone_origin"]),
-        robot_base_pos=tuple(figures["robot"]["base_pos_world"]),
-        mount=figures["robot"]["mount"],
-        figures=figures,
+        problem=parameters["problem"],
+        offset=tuple(parameters["offset"]),
+        region_height=parameters["region_height"],
+        zone_origin=tuple(parameters["zone_origin"]),
+        robot_base_pos=tuple(parameters["robot"]["base_pos_world"]),
+        mount=parameters["robot"]["mount"],
+        parameters=parameters,
     )
 
 
@@ -108,21 +108,21 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     Raises:
         UnknownNameError: a property or a style that does not exist; the message lists the valid ones.
     """
-    figures = workspace.figures
-    styles = styles_of(figures["styles"], scene_properties)
+    parameters = workspace.parameters
+    styles = styles_of(parameters["styles"], scene_properties)
     add_cameras_and_lights(spec, workspace)
-    _add_room(spec, figures, styles)
-    if "table" in figures:
-        _add_table(spec, figures["table"])
-    add_furniture(spec, furniture_of(figures.get("furniture", ()), scene_properties))
+    _add_room(spec, parameters, styles)
+    if "table" in parameters:
+        _add_table(spec, parameters["table"])
+    add_furniture(spec, furniture_of(parameters.get("furniture", ()), scene_properties))
 
 
 def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     """Add the cameras that do not move with the robot, and the lights."""
     world = spec.worldbody
-    for name, camera in workspace.figures["cameras"].items():
+    for name, camera in workspace.parameters["cameras"].items():
         world.add_camera(name=name, pos=camera["pos"], quat=camera["quat"], fovy=camera["fovy_degrees"])
-    for name, light in workspace.figures["lights"].items():
+    for name, light in workspace.parameters["lights"].items():
         added = world.add_light(name=name, pos=light["pos"], dir=light["dir"], castshadow=False)
         added.diffuse, added.specular = [0.8] * 3, [light.get("specular", 0.3)] * 3
         if light.get("directional"):
@@ -151,21 +151,21 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
 
 
 def _add_room(
-    spec: mujoco.MjSpec, figures: Mapping[str, Any], styles: Mapping[str, Mapping[str, Any]]
+    spec: mujoco.MjSpec, parameters: Mapping[str, Any], styles: Mapping[str, Mapping[str, Any]]
 ) -> None:
     world = spec.worldbody
-    ground = world.add_body(name=figures["floor_body"]) if figures["floor_body"] else world
+    ground = world.add_body(name=parameters["floor_body"]) if parameters["floor_body"] else world
     add_material(spec, "floor", styles["floor"])
     ground.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=figures["floor"]["size"],
+        size=parameters["floor"]["size"],
         material="floor",
         group=1,
         condim=3,
     )
-    add_material(spec, "wall", styles["wall"], *figures["wall_gloss"])
-    for name, wall in figures["walls"].items():
+    add_material(spec, "wall", styles["wall"], *parameters["wall_gloss"])
+    for name, wall in parameters["walls"].items():
         world.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX,

@@ -15,7 +15,7 @@ import mujoco
 
 from libero_env.assets.original_mjcf import object_xml
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.objects.builtin.facts import load_facts
+from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.catalog import get_object, own_names
 from libero_env.objects.model import ObjectModel
 
@@ -46,7 +46,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )  # fmt: skip
 _STEMS = {"rack": "simple_rack"}
-_FIGURES = (  # of an `ObjectModel` that are facts of the benchmark
+_PHYSICS_FIELDS = (  # of an `ObjectModel` that the files do not hold
     "joint_damping", "rotation", "rotation_axis", "bottom_offset", "top_offset", "horizontal_radius", "articulation",
 )  # fmt: skip
 _ROOM = "room_"
@@ -90,9 +90,9 @@ class OriginalPack:
             )
         spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category))
         self._simplify(spec)
-        facts = load_facts(category)
-        figures: dict[str, Any] = {name: getattr(facts, name) for name in _FIGURES}
-        return ObjectModel(category, spec, **figures)
+        physics = load_physics(category)
+        fields: dict[str, Any] = {name: getattr(physics, name) for name in _PHYSICS_FIELDS}
+        return ObjectModel(category, spec, **fields)
 
     def file(self, category: str) -> Path:
         """The MJCF file of a category.

@@ -55,7 +55,7 @@ _TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
 _STIFF = 0.004  # s, the stiffest time constant that the timestep allows
 _FIRM_SOLREF = (0.02, 1.0)
 _DEEP_BOXES = tuple(int(n) for n in mujoco.__version__.split(".")[:2]) >= (3, 4)
-_NOT_HERE = ("camera", "light")  # they come with the workspace's figures
+_NOT_HERE = ("camera", "light")  # they come with the parameters of the workspace
 
 
 def arena_spec(root: Path, workspace: "Workspace", scene_properties: Mapping[str, str]) -> mujoco.MjSpec:
@@ -70,7 +70,7 @@ def arena_spec(root: Path, workspace: "Workspace", scene_properties: Mapping[str
         UnknownNameError: a property or a style that does not exist.
         LiberoError: files are missing.
     """
-    own = workspace.figures["styles"]
+    own = workspace.parameters["styles"]
     styles_of(own, scene_properties)  # raises what is wrong with them
     wanted = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
     scene = wanted.pop("scene", "base")
@@ -83,7 +83,7 @@ def arena_spec(root: Path, workspace: "Workspace", scene_properties: Mapping[str
     for element in list(world):
         if element.tag in _NOT_HERE:
             world.remove(element)
-    _fit_table(world, workspace.figures.get("table", {}))
+    _fit_table(world, workspace.parameters.get("table", {}))
     spec = mujoco.MjSpec.from_string(to_xml(workspace.name, used_assets(assets, world), world))
     if _DEEP_BOXES:
         _soften(spec)
@@ -95,7 +95,7 @@ def _soften(spec: mujoco.MjSpec) -> None:
 
     Since then the depth between two boxes is what they overlap by, where it was half of that; and a push grows with the
     depth over the square of the time constant. Some of the original's states start three centimetres deep in the table
-    of the living room: the same figures would shoot things half a metre up.
+    of the living room: the same parameters would shoot things half a metre up.
     """
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_BOX and geom.contype and geom.solref[0] < _STIFF:

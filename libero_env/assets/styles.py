@@ -15,12 +15,12 @@ _SIZE = 128  # pixels, side of a texture unless the style says otherwise
 
 @cache
 def load_styles() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
-    """kind (`floor`, `wall`, `scene`) -> name -> figures."""
+    """kind (`floor`, `wall`, `scene`) -> name -> parameters."""
     return read_yaml("assets/workspaces/styles.yaml")
 
 
 def styles_of(own: Mapping[str, str], scene_properties: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
-    """`floor` and `wall` -> figures of the style: that of the properties, else of their scene, else one's own.
+    """`floor` and `wall` -> parameters of the style: that of the properties, else of their scene, else one's own.
 
     Raises:
         UnknownNameError: a property or a style that does not exist; the message lists the valid ones.

@@ -181,7 +181,7 @@ def fixture_pose(
         ),
         None,
     )
-    height = _FIXTURE_LIFT - workspace.figures.get("table_thickness", 0.05) - item.bottom_offset[2]
+    height = _FIXTURE_LIFT - workspace.parameters.get("table_thickness", 0.05) - item.bottom_offset[2]
     if region is None or not region.ranges or region.target != workspace_name:
         x, y, yaw = 0.0, 0.0, 0.0
     elif rng is None:

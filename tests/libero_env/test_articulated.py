@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from libero_env.objects import get_object, object_names
-from libero_env.objects.builtin.facts import load_facts
+from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.render import Picture, Renderer
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.sim
 ARTICULATED = tuple(
     name
     for name in object_names()
-    if name != "target_zone" and any(part.joint for part in load_facts(name).parts.values())
+    if name != "target_zone" and any(part.joint for part in load_physics(name).parts.values())
 )
 STOPPED = {  # category -> how far its parts get, m: to the frame, the shelf, the back
     "short_cabinet": (-0.0015, 0.16),

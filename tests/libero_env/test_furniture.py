@@ -11,7 +11,9 @@ from libero_env.objects.builtin import books, containers, racks, shelves
 
 pytestmark = pytest.mark.sim
 
-FURNITURE = sorted({**books.LOOKS, **containers.LOOKS, **racks.LOOKS, **shelves.LOOKS})
+FURNITURE = sorted(
+    {**books.APPEARANCES, **containers.APPEARANCES, **racks.APPEARANCES, **shelves.APPEARANCES}
+)
 OPENINGS = {  # category -> (site of the region, the way into it from outside)
     "desk_caddy": [(f"{place}_contain_region", (0, 0, -1)) for place in ("left", "right", "front", "back")],
     "white_storage_box": [("bottom_side", (0, 1, 0)), ("bottom_side", (0, -1, 0))],
@@ -82,7 +84,7 @@ def test_shelves_and_boxes_stand_with_their_tops_up():
         assert data.site(name).xpos[2] > 0.13
 
 
-@pytest.mark.parametrize("category", sorted(books.LOOKS))
+@pytest.mark.parametrize("category", sorted(books.APPEARANCES))
 def test_books_show_their_colour_from_all_sides_but_the_pages(category):
     pixels = get_object(category).spec.compile().tex_data.reshape(-1, 3).astype(float)
     dark, yellow = pixels.max(axis=1) < 60, (pixels[:, 0] > 200) & (pixels[:, 2] < 90) & (pixels[:, 1] > 150)

@@ -10,7 +10,7 @@ import pytest
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import ObjectModel, catalog, get_object, object_names, register_object
 from libero_env.objects.builtin import BUILDERS
-from libero_env.objects.builtin.facts import load_facts
+from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import rest_quat
 
 pytestmark = pytest.mark.sim
@@ -115,7 +115,7 @@ def test_conventions_of_the_model(category):
     assert model.category == category
     assert [body.name for body in model.spec.worldbody.bodies] == ["main"]
     compiled = model.spec.compile()
-    parts = load_facts(category).parts
+    parts = load_physics(category).parts
     assert compiled.nbody == 2 + len(parts)
     assert compiled.njnt == sum(part.joint is not None for part in parts.values())
     solid = collision_geoms(compiled)
@@ -172,7 +172,7 @@ def test_meshes_are_closed_surfaces(category):
 def test_mass_and_inertia(category, record):
     compiled = get_object(category).spec.compile()
     assert compiled.body_mass.sum() == pytest.approx(record["mass"], rel=0.01)
-    if load_facts(category).parts:
+    if load_physics(category).parts:
         return  # the original gave most moving parts a mass and inertia of their own
     body = compiled.body("main")
     low, high = bounds(compiled, collision_geoms(compiled))
@@ -393,4 +393,4 @@ def test_bad_registrations_are_named(scratch_catalog):
 
 def test_every_builtin_has_figures():
     for name in set(BUILDERS) - set(SITES_ONLY):
-        assert load_facts(name).mass > 0
+        assert load_physics(name).mass > 0

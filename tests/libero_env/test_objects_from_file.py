@@ -118,7 +118,7 @@ def test_a_textured_mesh_becomes_an_object_of_a_scene(tmp_path):
 @pytest.mark.parametrize("ending", [".obj", ".stl", ".ply", ".glb"])
 def test_every_format_gives_the_same_shape(tmp_path, ending):
     notes: list[str] = []
-    surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up="z", tell=notes.append)
+    surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up="z", notify=notes.append)
     low, high = bounds(surfaces)
     assert high - low == pytest.approx([0.04, 0.05, 0.06]) and low + high == pytest.approx(
         [0, 0, 0], abs=1e-9
@@ -131,7 +131,7 @@ def test_every_format_gives_the_same_shape(tmp_path, ending):
 def test_y_is_up_where_the_format_says_so(tmp_path):
     sizes = {}
     for ending in (".glb", ".stl"):
-        surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up=None, tell=print)
+        surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up=None, notify=print)
         sizes[ending] = np.subtract(*bounds(surfaces)[::-1])
     assert sizes[".stl"] == pytest.approx([0.04, 0.05, 0.06])
     assert sizes[".glb"] == pytest.approx([0.04, 0.06, 0.05])
@@ -141,7 +141,7 @@ def test_y_is_up_where_the_format_says_so(tmp_path):
 def test_units_are_guessed_and_said(tmp_path, scale, unit):
     notes: list[str] = []
     path = box(tmp_path / "box.stl", np.array([0.04, 0.05, 0.08]) * scale)
-    low, high = bounds(read_mesh(path, size=None, up=None, tell=notes.append))
+    low, high = bounds(read_mesh(path, size=None, up=None, notify=notes.append))
     assert max(high - low) == pytest.approx(0.08)
     assert unit in notes[0] if unit else not notes
 

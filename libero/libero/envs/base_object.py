@@ -14,7 +14,7 @@ from libero_env.errors import UnknownNameError
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin import BUILDERS
-from libero_env.objects.builtin.facts import Facts, load_facts
+from libero_env.objects.builtin.physics import Physics, load_physics
 from libero_env.sim.predicates import reaches_state
 
 OBJECTS_DICT: dict[str, Any] = {}
@@ -195,13 +195,13 @@ class BuiltinObject(BaseObject):
         if self.family and self.category_name not in BUILDERS:
             self._own_file(obj_name or self.category_name, joints)
             return
-        facts = model or _figures(self.category_name)
-        self.rotation = dict(facts.rotation) or None
-        self.rotation_axis = facts.rotation_axis
+        physics = model or _parameters(self.category_name)
+        self.rotation = dict(physics.rotation) or None
+        self.rotation_axis = physics.rotation_axis
         if self.rotation and self.rotation_axis in self.rotation and len(self.rotation) == 1:
             self.rotation = self.rotation[self.rotation_axis]
         articulation = {
-            f"default_{state}_ranges": list(facts.articulation.get(state, ())) for state in STATES
+            f"default_{state}_ranges": list(physics.articulation.get(state, ())) for state in STATES
         }
         self.object_properties = {"articulation": articulation, "vis_site_names": {}}
 
@@ -220,10 +220,10 @@ class BuiltinObject(BaseObject):
         return select_pack().build(self.category_name)
 
 
-def _figures(category: str) -> ObjectModel | Facts:
+def _parameters(category: str) -> ObjectModel | Physics:
     """How a category rests and moves; without building its model where figures are kept apart."""
     try:
-        return load_facts(category)
+        return load_physics(category)
     except KeyError:
         return get_object(category)
 

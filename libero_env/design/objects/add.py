@@ -182,7 +182,7 @@ def _make(path: Path, name: str, place: Path, options: Options) -> Added:
                 raise LiberoError(
                     f"{path}: an MJCF file says {', '.join(options.of_meshes)} itself; leave it out"
                 )
-            facts = store_mjcf(path, name, scratch, container=options.container, tell=notes.append)
+            facts = store_mjcf(path, name, scratch, container=options.container, notify=notes.append)
         else:
             facts = _from_mesh(path, name, scratch, options, notes)
         model = ObjectModel(name, folder.read_spec(scratch / folder.MODEL))
@@ -199,7 +199,7 @@ def _make(path: Path, name: str, place: Path, options: Options) -> Added:
 
 def _from_mesh(path: Path, name: str, place: Path, options: Options, notes: list[str]) -> dict[str, Any]:
     """Write the files of an object made of a mesh; its figures."""
-    surfaces = read_mesh(path, size=options.size, up=options.up, tell=notes.append)
+    surfaces = read_mesh(path, size=options.size, up=options.up, notify=notes.append)
     low, high = bounds(surfaces)
     if max(high - low) > _LARGEST:
         raise LiberoError(

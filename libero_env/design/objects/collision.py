@@ -7,7 +7,7 @@ from itertools import permutations
 import mujoco
 import numpy as np
 
-from libero_env.design.objects.mesh_file import Tell, is_closed, signed_volume
+from libero_env.design.objects.mesh_file import Notify, is_closed, signed_volume
 from libero_env.errors import LiberoError
 
 METHODS = ("decompose", "hull", "boxes")
@@ -37,7 +37,7 @@ class Pieces:
         return len(self.meshes) + len(self.boxes)
 
 
-def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, tell: Tell) -> Pieces:
+def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notify: Notify) -> Pieces:
     """Collision shapes of a mesh.
 
     Args:
@@ -45,7 +45,7 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, tell:
         faces: (f, 3).
         method: `hull`; `decompose`, by CoACD (Wei et al. 2022, Approximate Convex Decomposition for 3D Meshes with
             Collision-Aware Concavity and Tree Search); or `boxes`. A mesh that is convex anyway is its hull.
-        tell: takes a line where something else had to be done.
+        notify: takes a line where something else had to be done.
 
     Raises:
         LiberoError: there is no such method.
@@ -59,7 +59,9 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, tell:
         try:
             import coacd
         except ImportError:
-            tell(f"CoACD is not installed, so that it collides as boxes; finer: {INSTALL}, and add it again")
+            notify(
+                f"CoACD is not installed, so that it collides as boxes; finer: {INSTALL}, and add it again"
+            )
             return Pieces("boxes", boxes=boxes_of(vertices, faces))
         return Pieces("decompose", _decomposed(coacd, vertices, faces))
     return Pieces("boxes", boxes=boxes_of(vertices, faces))

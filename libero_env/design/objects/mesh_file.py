@@ -19,7 +19,7 @@ _METRES = (0.01, 0.6)  # m, longest side of what is taken to be in metres
 _TYPICAL = 0.1  # m, the side that a guess of the unit comes nearest to
 _GREY = (0.7, 0.7, 0.7, 1.0)
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class Surface:
     rgba: tuple[float, ...] = _GREY
 
 
-def read_mesh(path: Path, *, size: float | None, up: str | None, tell: Tell) -> list[Surface]:
+def read_mesh(path: Path, *, size: float | None, up: str | None, notify: Notify) -> list[Surface]:
     """The surfaces of a mesh file, z up, the origin in the middle of their bounds.
 
     Args:
         path: the file.
         size: longest side wanted, m; None keeps the file's, after a guess of its unit.
         up: axis of the file that points up, `z` or `y`; None for what the format says.
-        tell: takes a line about each guess.
+        notify: takes a line about each guess.
 
     Raises:
         LiberoError: not a format that is read, no triangles, or a picture is missing; the message names the file.
@@ -68,7 +68,7 @@ def read_mesh(path: Path, *, size: float | None, up: str | None, tell: Tell) -> 
     low, high = bounds(surfaces)
     if min(high - low) <= 1e-4 * max(high - low):
         raise LiberoError(f"{path}: it is flat, and nothing can be taken hold of; give it a thickness")
-    scale = size / max(high - low) if size else _unit(float(max(high - low)), path, tell)
+    scale = size / max(high - low) if size else _unit(float(max(high - low)), path, notify)
     middle = (low + high) / 2
     return [replace(s, vertices=(s.vertices - middle) * scale) for s in surfaces]
 
@@ -127,15 +127,15 @@ def _surface(part: Any) -> Surface:
     return Surface(vertices, faces, rgba=rgba)
 
 
-def _unit(longest: float, path: Path, tell: Tell) -> float:
+def _unit(longest: float, path: Path, notify: Notify) -> float:
     """Metres for one unit of the file, guessed from its longest side."""
     if _METRES[0] <= longest <= _METRES[1]:
         return 1.0
     if longest < _METRES[0]:
-        tell(f"{path.name} is {1000 * longest:.3g} mm long in metres; if that is wrong, say --size (m)")
+        notify(f"{path.name} is {1000 * longest:.3g} mm long in metres; if that is wrong, say --size (m)")
         return 1.0
     name, unit = min(_UNITS.items(), key=lambda item: abs(log(longest * item[1] / _TYPICAL)))
-    tell(
+    notify(
         f"{path.name} is {longest:.4g} units long: taken for {name}, so that it is {100 * longest * unit:.3g} cm; "
         "if that is wrong, say --size (m)"
     )

@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import mujoco
 import numpy as np
 
-from libero_env.design.objects.mesh_file import Tell
+from libero_env.design.objects.mesh_file import Notify
 from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import delete
 from libero_env.objects.folder import MODEL, read_spec
@@ -18,7 +18,7 @@ INSIDE = 0.8  # share of the bounds that `contain_region` takes
 _HIDDEN = 3  # group of geoms that no viewer shows at first
 
 
-def store_mjcf(path: Path, name: str, place: Path, *, container: bool, tell: Tell) -> dict[str, Any]:
+def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
     """Write an object's MJCF file, with the meshes and pictures that it names; its mass and collision shapes.
 
     The object is the one body of the file's world or, where that has a body `object` in it as the original's files
@@ -29,13 +29,13 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, tell: Tel
         name: category.
         place: folder.
         container: add a place `contain_region` unless it has one.
-        tell: takes a line where something is left out.
+        notify: takes a line where something is left out.
 
     Raises:
         LiberoError: it cannot be read, names a missing file, or does not hold one object.
     """
     spec = _read(path, name)
-    root = _root(spec, path, tell)
+    root = _root(spec, path, notify)
     _sort_geoms(spec)
     _gather_files(spec, name, place)
     low, high = bounds_of(_compiled(spec, path))
@@ -92,7 +92,7 @@ def _read(path: Path, name: str) -> mujoco.MjSpec:
         raise LiberoError(f"{path}: {error}") from error
 
 
-def _root(spec: mujoco.MjSpec, path: Path, tell: Tell) -> mujoco.MjsBody:
+def _root(spec: mujoco.MjSpec, path: Path, notify: Notify) -> mujoco.MjsBody:
     """The object's body, alone in the world, at its origin, called `main`, without a joint."""
     bodies = list(spec.worldbody.bodies)
     if len(bodies) != 1:
@@ -106,7 +106,7 @@ def _root(spec: mujoco.MjSpec, path: Path, tell: Tell) -> mujoco.MjsBody:
     left_out = [element for group in (*around, *about) for element in group]
     moving = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
     if left_out or moving:
-        tell(
+        notify(
             f"{path.name}: left out are {len(left_out)} elements around the object (lights, cameras, actuators, ...) "
             f"and {len(moving)} joints of its outermost body, which scenes give a free one"
         )

@@ -8,8 +8,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from libero_env.design.objects.collision import Pieces
-from libero_env.design.objects.mesh_file import Surface, Tell
-from libero_env.objects.builtin.facts import FRICTION, SOLIMP, SOLREF
+from libero_env.design.objects.mesh_file import Notify, Surface
+from libero_env.objects.builtin.physics import FRICTION, SOLIMP, SOLREF
 from libero_env.objects.folder import MODEL
 from libero_env.objects.model import ROOT_BODY
 
@@ -38,7 +38,7 @@ class Body:
     inside: tuple[float, ...] | None = None
 
 
-def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int, tell: Tell) -> None:
+def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int, notify: Notify) -> None:
     """Write the files of an object.
 
     Args:
@@ -46,7 +46,7 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
         body: what it is.
         surfaces: what it looks like.
         faces: triangles that the whole look may have.
-        tell: takes a line where it is simplified.
+        notify: takes a line where it is simplified.
     """
     root = ET.Element("mujoco", {"model": body.name})
     ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
@@ -60,7 +60,7 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
     _add_collision(place, body, assets, main)
     total = sum(len(surface.faces) for surface in surfaces)
     if total > faces:
-        tell(f"its look has {total} triangles and is simplified to about {faces}; --faces keeps more")
+        notify(f"its look has {total} triangles and is simplified to about {faces}; --faces keeps more")
     for number, surface in enumerate(surfaces):
         share = max(faces * len(surface.faces) // total, 50)
         _add_look(place, f"{body.name}_visual{number}", surface, share, assets, main, number)

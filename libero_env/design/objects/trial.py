@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from libero_env.design.objects.mesh_file import Tell
+from libero_env.design.objects.mesh_file import Notify
 from libero_env.errors import LiberoError
 from libero_env.expert.arm.gripper import FINGER_HALF_WIDTH, PAD_ABOVE, PAD_BELOW, WIDEST
 from libero_env.expert.grasping.grasps import Grasp, GraspError, grasps
@@ -26,12 +26,12 @@ VIEWS = 8
 _PIXELS = 224
 
 
-def try_object(item: ObjectModel, tell: Tell, picture: Path | None = None) -> dict[str, Any]:
+def try_object(item: ObjectModel, notify: Notify, picture: Path | None = None) -> dict[str, Any]:
     """Put an object down, look for a hold, and draw it from all sides.
 
     Args:
         item: fresh; its spec is used up.
-        tell: takes a line about what tasks with it would suffer from.
+        notify: takes a line about what tasks with it would suffer from.
         picture: PNG to write; None for none.
 
     Returns:
@@ -47,7 +47,7 @@ def try_object(item: ObjectModel, tell: Tell, picture: Path | None = None) -> di
     mujoco.mj_forward(model, data)
     if picture is not None:
         turntable(model, data, found["size"], picture)
-    found |= {"stands": _stands(model, data, tell), "grasp": _grasp(model, data, item.category, tell)}
+    found |= {"stands": _stands(model, data, notify), "grasp": _grasp(model, data, item.category, notify)}
     return found
 
 
@@ -131,7 +131,7 @@ def _aim(model: mujoco.MjModel, middle: np.ndarray, distance: float, yaw: float)
     mujoco.mju_mat2Quat(model.cam_quat[0], axes.ravel())
 
 
-def _stands(model: mujoco.MjModel, data: mujoco.MjData, tell: Tell) -> bool:
+def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
     """Whether it stays as it is put down; the state is left where it came to rest."""
     for _ in range(round(_SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
@@ -140,14 +140,14 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, tell: Tell) -> bool:
     slid = float(np.linalg.norm(body.xpos[:2]))
     stands = tilt < _TILTED and slid < _SHIFTED
     if not stands:
-        tell(
+        notify(
             f"it does not stay as it is put down: it tilts by {tilt:.0f} degrees and moves by {100 * slid:.0f} cm. "
             "Say which axis is up (--up), or give it a level bottom (--collision hull)"
         )
     return stands
 
 
-def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, tell: Tell) -> dict[str, Any]:
+def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify) -> dict[str, Any]:
     """The narrowest square hold from above that the expert knows where the object lies now, or why there is none."""
     body = data.body(_BODY)
     cloud = surface_points(model, body.id, _FINE) @ body.xmat.reshape(3, 3).T + body.xpos
@@ -162,7 +162,7 @@ def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, tell: Tell) ->
     if square:
         best = min(square, key=lambda hold: (round(float(hold.width), 3), hold.cost))
         return {"width": round(float(best.width), 4), "height": round(float(best.pos_world[2]), 4)}
-    tell(
+    notify(
         f"{reason}. It can carry or hold other things; to be picked up, a part of it must be at most "
         f"{100 * WIDEST:.1f} cm wide (--size)"
     )

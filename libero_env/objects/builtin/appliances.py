@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import (
     TILE,
     Palette,
@@ -23,7 +23,7 @@ RIDGES = (0.008, 0.021, 0.034, 0.047, 0.060)  # radii of the burner's ridges, me
 GLOW_HEIGHT, RIDGE_HEIGHT = 0.0205, 0.0255  # the glowing disc lies between these
 
 
-def microwave() -> dict[str, Look | tuple[Look, ...]]:
+def microwave() -> dict[str, Appearance | tuple[Appearance, ...]]:
     """Charcoal box, steel handle, tinted window, keypad with a green clock."""
     tiles = {
         "shell": brushed((74, 76, 82), seed=30, depth=0.03),
@@ -40,15 +40,15 @@ def microwave() -> dict[str, Look | tuple[Look, ...]]:
     door, pane = (in_body(mesh, "microwave", "microdoorroot") for mesh in (_microwave_door(palette), pane))
     picture = palette.png()
     return {
-        "main": Look(_microwave_shell(palette), picture, specular=0.5, shininess=0.6, frame="body"),
+        "main": Appearance(_microwave_shell(palette), picture, specular=0.5, shininess=0.6, frame="body"),
         "microdoorroot": (
-            Look(door, picture, specular=0.5, shininess=0.6, frame="body"),
-            Look(pane, glass.png(), specular=0.9, shininess=0.9, alpha=0.55, frame="body"),
+            Appearance(door, picture, specular=0.5, shininess=0.6, frame="body"),
+            Appearance(pane, glass.png(), specular=0.9, shininess=0.9, alpha=0.55, frame="body"),
         ),
     }
 
 
-def short_fridge() -> dict[str, Look]:
+def short_fridge() -> dict[str, Appearance]:
     """Brushed silver, white inside, a steel rail as handle."""
     tiles = {
         "shell": brushed((172, 176, 182), seed=40, depth=0.03, upright=True),
@@ -63,12 +63,12 @@ def short_fridge() -> dict[str, Look]:
     parts = {"base": _fridge_body(palette), "door": _fridge_door(palette)}
     picture = palette.png()
     return {
-        body: Look(in_body(mesh, "short_fridge", body), picture, specular=0.4, frame="body")
+        body: Appearance(in_body(mesh, "short_fridge", body), picture, specular=0.4, frame="body")
         for body, mesh in parts.items()
     }
 
 
-def flat_stove() -> dict[str, Look]:
+def flat_stove() -> dict[str, Appearance]:
     """Steel plate with a black ridged burner, and a black knob beside it."""
     tiles = {
         "steel": brushed((186, 189, 194), seed=50, depth=0.03),
@@ -85,12 +85,14 @@ def flat_stove() -> dict[str, Look]:
     }
     picture = palette.png()
     return {
-        body: Look(in_body(mesh, "flat_stove", body), picture, specular=0.5, shininess=0.5, frame="body")
+        body: Appearance(
+            in_body(mesh, "flat_stove", body), picture, specular=0.5, shininess=0.5, frame="body"
+        )
         for body, mesh in parts.items()
     }
 
 
-LOOKS = {"flat_stove": flat_stove, "microwave": microwave, "short_fridge": short_fridge}
+APPEARANCES = {"flat_stove": flat_stove, "microwave": microwave, "short_fridge": short_fridge}
 
 
 def _microwave_shell(palette: Palette) -> Mesh:

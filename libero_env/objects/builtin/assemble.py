@@ -1,4 +1,4 @@
-"""Figures and a look become an `ObjectModel`."""
+"""Build an `ObjectModel` from the physics of a category and the appearance that a function makes."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from libero_env.mujoco_compat import set_damping
-from libero_env.objects.builtin.facts import Facts, Part, load_facts
 from libero_env.objects.builtin.mesh import Mesh
+from libero_env.objects.builtin.physics import Part, Physics, load_physics
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel, rest_quat
 
 HIDDEN_GROUP = 3
@@ -19,16 +19,16 @@ GLOWING_SITES = ("burner",)
 
 
 @dataclass(frozen=True)
-class Look:
-    """What an object looks like: a mesh and the picture on it.
+class Appearance:
+    """Visual of a body: a mesh and its texture.
 
     Attributes:
-        mesh: in the frame that `frame` names, metres: z up, front towards +x.
-        image: texture, PNG bytes; the file's first row is v = 0.
-        specular: strength of highlights, 0..1.
-        shininess: sharpness of highlights, 0..1.
-        alpha: 1 is opaque; glass is less.
-        frame: `rest`: origin at the root, axes of the world when the object stands at rest; `body`: that of the body.
+        mesh: Triangles in the frame that `frame` names, [m]: z up, front towards +x.
+        image: Texture as PNG bytes; the first row of the file is v = 0.
+        specular: Strength of highlights, in [0, 1].
+        shininess: Sharpness of highlights, in [0, 1].
+        alpha: Opacity, in [0, 1]; 1 is opaque.
+        frame: `rest` (origin at the root, axes of the world when the object is at rest) or `body` (frame of the body).
     """
 
     mesh: Mesh
@@ -39,46 +39,60 @@ class Look:
     frame: str = "rest"
 
 
-# Of the root body, or of several: body name (`main` is the root) -> its look, or several: a frame and its glass.
-Looks = Look | Mapping[str, Look | tuple[Look, ...]]
+# Appearance of the root body, or body name (`main` is the root) -> one or several, such as a window's frame and glass.
+Appearances = Appearance | Mapping[str, Appearance | tuple[Appearance, ...]]
+AppearanceFunction = Callable[[], Appearances]
 
 
-def builders_of(looks: Mapping[str, Callable[[], Looks]]) -> Mapping[str, Callable[[], ObjectModel]]:
-    """Makes object builders of look functions; each look is drawn once per process, when first asked for."""
-    return MappingProxyType({name: partial(build, name, cache(look)) for name, look in looks.items()})
+def builders_of(functions: Mapping[str, AppearanceFunction]) -> Mapping[str, Callable[[], ObjectModel]]:
+    """Return a builder for each category; an appearance is drawn once per process, on its first use.
+
+    Args:
+        functions: Category -> function that makes its appearance.
+    """
+    return MappingProxyType(
+        {category: partial(build, category, cache(function)) for category, function in functions.items()}
+    )
 
 
-def build(category: str, look: Callable[[], Looks]) -> ObjectModel:
-    """Builds one builtin object."""
-    facts = load_facts(category)
+def build(category: str, make_appearance: AppearanceFunction) -> ObjectModel:
+    """Build the model of a builtin category.
+
+    Args:
+        category: Name of the category in `parameters/`.
+        make_appearance: Returns what the bodies look like.
+    """
+    physics = load_physics(category)
     spec = mujoco.MjSpec()
     spec.modelname = category
     spec.compiler.degree = False
     bodies = {ROOT_BODY: spec.worldbody.add_body(name=ROOT_BODY)}
-    for name, part in facts.parts.items():
+    for name, part in physics.parts.items():
         bodies[name] = bodies[part.parent].add_body(name=name, pos=part.pos, quat=part.quat)
     numbers = count()
-    for name, part in {ROOT_BODY: facts.root, **facts.parts}.items():
+    for name, part in {ROOT_BODY: physics.root, **physics.parts}.items():
         _add_mass(bodies[name], part)
         _add_joint(bodies[name], part)
-        _add_collision(bodies[name], part, facts, numbers)
+        _add_collision(bodies[name], part, physics, numbers)
         _add_sites(bodies[name], part, name == ROOT_BODY)
-    looks = look()
-    turned = _conjugate(rest_quat(facts.rotation))
-    for name, several in looks.items() if isinstance(looks, Mapping) else [(ROOT_BODY, looks)]:
+    appearances = make_appearance()
+    turned = _conjugate(rest_quat(physics.rotation))
+    for name, several in (
+        appearances.items() if isinstance(appearances, Mapping) else [(ROOT_BODY, appearances)]
+    ):
         for index, one in enumerate(several if isinstance(several, tuple) else (several,)):
             mesh = one.mesh if one.frame == "body" else one.mesh.rotated(turned)
             _add_visual(spec, bodies[name], category, one, mesh, suffix=f"_{index}" if index else "")
     return ObjectModel(
         category=category,
         spec=spec,
-        joint_damping=facts.joint_damping,
-        rotation=facts.rotation,
-        rotation_axis=facts.rotation_axis,
-        bottom_offset=facts.bottom_offset,
-        top_offset=facts.top_offset,
-        horizontal_radius=facts.horizontal_radius,
-        articulation=facts.articulation,
+        joint_damping=physics.joint_damping,
+        rotation=physics.rotation,
+        rotation_axis=physics.rotation_axis,
+        bottom_offset=physics.bottom_offset,
+        top_offset=physics.top_offset,
+        horizontal_radius=physics.horizontal_radius,
+        articulation=physics.articulation,
     )
 
 
@@ -101,39 +115,45 @@ def _add_joint(body: mujoco.MjsBody, part: Part) -> None:
     set_damping(joint, part.joint.damping)
 
 
-def _add_collision(body: mujoco.MjsBody, part: Part, facts: Facts, numbers: Iterator[int]) -> None:
-    for solid in part.boxes:
+def _add_collision(body: mujoco.MjsBody, part: Part, physics: Physics, numbers: Iterator[int]) -> None:
+    for shape in part.boxes:
         body.add_geom(
             name=f"g{next(numbers)}",
-            type=getattr(mujoco.mjtGeom, f"mjGEOM_{solid.type.upper()}"),
-            pos=solid.pos,
-            size=_padded(solid.size),
-            quat=solid.quat,
-            friction=solid.friction or facts.friction,
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.type.upper()}"),
+            pos=shape.pos,
+            size=_padded(shape.size),
+            quat=shape.quat,
+            friction=shape.friction or physics.friction,
             condim=3,
-            solref=solid.solref or facts.solref,
-            solimp=(*(solid.solimp or facts.solimp), 0.5, 2.0),
+            solref=shape.solref or physics.solref,
+            solimp=(*(shape.solimp or physics.solimp), 0.5, 2.0),
             group=0,
             rgba=(0.8, 0.8, 0.8, 0.3),
         )
 
 
 def _add_visual(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, category: str, look: Look, mesh: Mesh, *, suffix: str
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    category: str,
+    appearance: Appearance,
+    mesh: Mesh,
+    *,
+    suffix: str,
 ) -> None:
     root = body.name == ROOT_BODY
     prefix = (category if root else f"{category}_{body.name}") + suffix
     # The category goes in front of each name: scenes share one namespace for textures and materials.
     # A file in `assets`, not a buffer: only so can a scene be written as XML.
     picture = f"{prefix}.png"
-    spec.assets[picture] = look.image
+    spec.assets[picture] = appearance.image
     texture = spec.add_texture(name=f"{prefix}_texture", type=mujoco.mjtTexture.mjTEXTURE_2D, file=picture)
     material = spec.add_material(
         name=f"{prefix}_material",
-        specular=look.specular,
-        shininess=look.shininess,
+        specular=appearance.specular,
+        shininess=appearance.shininess,
         reflectance=0.0,
-        rgba=(1.0, 1.0, 1.0, look.alpha),
+        rgba=(1.0, 1.0, 1.0, appearance.alpha),
     )
     textures = list(material.textures)
     textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft
 from libero_env.objects.builtin.paint import png
 
@@ -10,12 +10,12 @@ COLUMNS, ROWS = 28, 14  # strands of the weave around and over the picture's hei
 RIM_V = 0.88  # the braided rim takes the picture above
 
 
-def basket() -> Look:
+def basket() -> Appearance:
     """Brown basket whose walls are where the collision boxes are."""
-    return Look(_basket_mesh(), png(_weave()), specular=0.05, shininess=0.1)
+    return Appearance(_basket_mesh(), png(_weave()), specular=0.05, shininess=0.1)
 
 
-LOOKS = {"basket": basket}
+APPEARANCES = {"basket": basket}
 
 
 def _basket_mesh() -> Mesh:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import TILE, Palette, block
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.paint import Canvas, Color
@@ -11,7 +11,7 @@ from libero_env.objects.builtin.surfaces import painted, plain
 BOARD, OVERHANG = 0.0022, 0.0030  # thickness of the cover, metres; by how much it is larger than the pages
 
 
-def black_book() -> Look:
+def black_book() -> Appearance:
     """Black cloth, a golden frame, moon and stars."""
     black, gold = (26, 26, 30), (222, 180, 84)
     cover = Canvas(black)
@@ -29,7 +29,7 @@ def black_book() -> Look:
     return _book(low, high, cover, spine, black, pages=(232, 226, 210))
 
 
-def yellow_book() -> Look:
+def yellow_book() -> Appearance:
     """Yellow cover, a red sun over blue hills, a dark title."""
     yellow, ink, red = (247, 200, 38), (58, 44, 28), (214, 62, 40)
     cover = Canvas(yellow)
@@ -47,10 +47,10 @@ def yellow_book() -> Look:
     return _book(low, high, cover, spine, yellow, pages=(246, 242, 232))
 
 
-LOOKS = {"black_book": black_book, "yellow_book": yellow_book}
+APPEARANCES = {"black_book": black_book, "yellow_book": yellow_book}
 
 
-def _book(low, high, cover: Canvas, spine: Canvas, cloth: Color, *, pages: Color) -> Look:
+def _book(low, high, cover: Canvas, spine: Canvas, cloth: Color, *, pages: Color) -> Appearance:
     tiles = {
         "cover": painted(cover),
         "spine": painted(spine),
@@ -58,7 +58,7 @@ def _book(low, high, cover: Canvas, spine: Canvas, cloth: Color, *, pages: Color
         "pages": _leaves(pages),
     }
     palette = Palette(tiles)
-    return Look(_bound(low, high, palette), palette.png(), specular=0.25, shininess=0.5, frame="body")
+    return Appearance(_bound(low, high, palette), palette.png(), specular=0.25, shininess=0.5, frame="body")
 
 
 def _bound(low, high, palette: Palette) -> Mesh:

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft
 from libero_env.objects.builtin.paint import Canvas, Color
 
 CAP = 0.80  # the texture shows the body below, the cap above
 
 
-def ketchup() -> Look:
+def ketchup() -> Appearance:
     """Red squeeze bottle, white cap, white shield with a tomato."""
     canvas = _bottle((196, 24, 16), cap=(240, 240, 236), groove=(198, 198, 196))
     for u in (0.0, 0.5, 1.0):
@@ -18,10 +18,10 @@ def ketchup() -> Look:
         canvas.text("KETCHUP", (u - 0.15, 0.39, u + 0.15, 0.46), (255, 255, 255))
         canvas.disc(u, 0.25, 0.065, 0.085, (222, 40, 24))
         canvas.polygon([(u - 0.04, 0.345), (u, 0.30), (u + 0.04, 0.345)], (40, 130, 50))
-    return Look(_ketchup_mesh(), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(_ketchup_mesh(), canvas.png(), specular=0.5, shininess=0.6)
 
 
-def salad_dressing() -> Look:
+def salad_dressing() -> Appearance:
     """White bottle with a waist, green cap, a leaf and the word RANCH."""
     canvas = _bottle((246, 244, 236), cap=(22, 128, 58), groove=(12, 92, 40))
     for u in (0.0, 0.5, 1.0):
@@ -31,10 +31,10 @@ def salad_dressing() -> Look:
         canvas.disc(u - 0.04, 0.25, 0.045, 0.055, (240, 130, 36))
         canvas.disc(u + 0.045, 0.25, 0.05, 0.05, (60, 150, 56))
         canvas.disc(u, 0.50, 0.05, 0.03, (60, 150, 56))
-    return Look(_salad_mesh(), canvas.png(), specular=0.4, shininess=0.5)
+    return Appearance(_salad_mesh(), canvas.png(), specular=0.4, shininess=0.5)
 
 
-def bbq_sauce() -> Look:
+def bbq_sauce() -> Appearance:
     """Brown bottle, orange cap, yellow label with flames."""
     canvas = _bottle((92, 36, 18), cap=(226, 84, 20), groove=(176, 56, 10))
     for u in (0.0, 0.5, 1.0):
@@ -44,15 +44,15 @@ def bbq_sauce() -> Look:
         for shift, height in ((-0.075, 0.10), (0.0, 0.15), (0.075, 0.10)):
             flame = [(u + shift - 0.035, 0.20), (u + shift + 0.035, 0.20), (u + shift, 0.20 + height)]
             canvas.polygon(flame, (250, 140, 30))
-    return Look(_bbq_mesh(), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(_bbq_mesh(), canvas.png(), specular=0.5, shininess=0.6)
 
 
-def new_salad_dressing() -> dict[str, Look]:
+def new_salad_dressing() -> dict[str, Appearance]:
     """The same bottle, on a body that stands beside its root."""
     return {"sald_dressing_body": salad_dressing()}
 
 
-def mayo() -> Look:
+def mayo() -> Appearance:
     """Glass jar of cream, blue lid, blue label with a yellow band."""
     canvas = _bottle((250, 243, 218), cap=(24, 66, 158), groove=(14, 44, 116))
     canvas.band(0.10, 0.58, (30, 84, 182))
@@ -63,10 +63,10 @@ def mayo() -> Look:
         canvas.disc(u, 0.34, 0.178, 0.155, (255, 252, 240))
         canvas.text("MAYO", (u - 0.135, 0.29, u + 0.135, 0.42), (24, 66, 158))
         canvas.disc(u, 0.235, 0.030, 0.032, (250, 190, 40))
-    return Look(_jar_mesh(), canvas.png(), specular=0.6, shininess=0.7)
+    return Appearance(_jar_mesh(), canvas.png(), specular=0.6, shininess=0.7)
 
 
-LOOKS = {
+APPEARANCES = {
     "bbq_sauce": bbq_sauce,
     "ketchup": ketchup,
     "mayo": mayo,

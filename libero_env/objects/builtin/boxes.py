@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import box
 from libero_env.objects.builtin.paint import Canvas
 
@@ -26,7 +26,7 @@ UPRIGHT = {  # a packet that stands: the large faces, the sides, the lid
 WHITE = (255, 252, 244)
 
 
-def butter() -> Look:
+def butter() -> Appearance:
     """Yellow packet, red ends, a pat of butter."""
     canvas = Canvas((250, 214, 70), (128, 128))
     canvas.rect(0.0, 0.0, 0.5, 0.30, (204, 40, 30))
@@ -38,10 +38,10 @@ def butter() -> Look:
     canvas.rect(0.5, 0.5, 1.0, 0.75, (204, 40, 30))
     canvas.text("BUTTER", (0.55, 0.55, 0.95, 0.70), (255, 240, 170))
     canvas.text("BUTTER", (0.58, 0.83, 0.92, 0.97), (196, 34, 26))
-    return Look(box((0.0384, 0.0197, 0.0088), (0, 0, 0), CELLS), canvas.png(), specular=0.15)
+    return Appearance(box((0.0384, 0.0197, 0.0088), (0, 0, 0), CELLS), canvas.png(), specular=0.15)
 
 
-def cream_cheese() -> Look:
+def cream_cheese() -> Appearance:
     """Pale silver-blue packet with a blue oval."""
     canvas = Canvas((206, 216, 236), (128, 128))
     for v in (0.04, 0.92):
@@ -53,10 +53,10 @@ def cream_cheese() -> Look:
     canvas.disc(0.75, 0.625, 0.18, 0.10, (52, 76, 176))
     canvas.text("CREAM", (0.63, 0.585, 0.87, 0.665), (255, 255, 255))
     canvas.text("CREAM CHEESE", (0.54, 0.84, 0.96, 0.96), (52, 76, 176))
-    return Look(box((0.0410, 0.0213, 0.0092), (0, 0, 0), CELLS), canvas.png(), specular=0.4)
+    return Appearance(box((0.0410, 0.0213, 0.0092), (0, 0, 0), CELLS), canvas.png(), specular=0.4)
 
 
-def chocolate_pudding() -> Look:
+def chocolate_pudding() -> Appearance:
     """Dark brown packet, a cup of pudding with cream, cream-coloured letters."""
     canvas = Canvas((78, 40, 22), (128, 128))
     canvas.rect(0.0, 0.94, 0.5, 1.0, (214, 52, 34))
@@ -68,10 +68,10 @@ def chocolate_pudding() -> Look:
     canvas.rect(0.5, 0.5, 1.0, 0.53, (214, 52, 34))
     canvas.text("PUDDING", (0.55, 0.57, 0.95, 0.71), (252, 224, 168))
     canvas.text("PUDDING", (0.56, 0.83, 0.94, 0.97), (252, 224, 168))
-    return Look(box((0.0412, 0.0238, 0.0141), (0.0, 0, 0.0006), CELLS), canvas.png(), specular=0.2)
+    return Appearance(box((0.0412, 0.0238, 0.0141), (0.0, 0, 0.0006), CELLS), canvas.png(), specular=0.2)
 
 
-def cookies() -> Look:
+def cookies() -> Appearance:
     """Red and white checks, a heap of cookies with raisins."""
     red, brown = (206, 34, 40), (84, 36, 44)
     canvas = Canvas(WHITE, (192, 192))
@@ -88,10 +88,10 @@ def cookies() -> Look:
         canvas.rect(*cell, red)
         canvas.text("COOKIES", text, WHITE)
     canvas.rect(0.5, 0.0, 1.0, 0.45, brown)
-    return Look(box((0.0415, 0.0309, 0.0098), (0, 0, 0), CELLS), canvas.png(), specular=0.2)
+    return Appearance(box((0.0415, 0.0309, 0.0098), (0, 0, 0), CELLS), canvas.png(), specular=0.2)
 
 
-def popcorn() -> Look:
+def popcorn() -> Appearance:
     """Blue packet, white puffs, red letters on a yellow burst."""
     blue, yellow, red = (32, 92, 190), (252, 216, 48), (210, 30, 34)
     canvas = Canvas(blue, (192, 192))
@@ -112,10 +112,10 @@ def popcorn() -> Look:
     for v, height in ((0.90, 0.075), (0.625, 0.09)):
         canvas.rect(0.56, v - height, 0.94, v + height, yellow)
         canvas.text("POPCORN", (0.59, v - 0.7 * height, 0.91, v + 0.7 * height), red)
-    return Look(box((0.0315, 0.0212, 0.0097), (0, 0, 0), CELLS), canvas.png(), specular=0.2)
+    return Appearance(box((0.0315, 0.0212, 0.0097), (0, 0, 0), CELLS), canvas.png(), specular=0.2)
 
 
-def macaroni_and_cheese() -> Look:
+def macaroni_and_cheese() -> Appearance:
     """Orange packet that stands, yellow letters, a blue bowl of macaroni."""
     orange, yellow, blue = (232, 104, 22), (255, 220, 70), (28, 74, 150)
     canvas = Canvas(orange, (192, 192))
@@ -128,10 +128,10 @@ def macaroni_and_cheese() -> Look:
     canvas.text("MAC AND CHEESE", (0.555, 0.10, 0.645, 0.90), yellow, turn=90)
     canvas.rect(0.7, 0.8, 1.0, 1.0, (180, 52, 16))
     canvas.text("MACARONI", (0.73, 0.85, 0.97, 0.95), yellow)
-    return Look(box((0.0136, 0.0430, 0.0582), (0, 0, 0), UPRIGHT), canvas.png(), specular=0.2)
+    return Appearance(box((0.0136, 0.0430, 0.0582), (0, 0, 0), UPRIGHT), canvas.png(), specular=0.2)
 
 
-LOOKS = {
+APPEARANCES = {
     "butter": butter,
     "chocolate_pudding": chocolate_pudding,
     "cookies": cookies,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import Cell, Palette, bar, block, in_body
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.surfaces import brushed, edged, panelled, plain, wood
@@ -16,7 +16,7 @@ HANDLES = {"cabinet_top": 0.1839, "cabinet_middle": 0.1104, "cabinet_bottom": 0.
 SHORT_DRAWERS = {"drawer_top": 0.0460, "drawer_middle": 0.0, "drawer_bottom": -0.0473}
 
 
-def wooden_cabinet() -> dict[str, Look]:
+def wooden_cabinet() -> dict[str, Appearance]:
     """Dark walnut, steel bars."""
     board = wood((100, 69, 48), seed=3, depth=0.38)
     tiles = {
@@ -29,7 +29,7 @@ def wooden_cabinet() -> dict[str, Look]:
     return _chest("wooden_cabinet", Palette(tiles), specular=0.15)
 
 
-def white_cabinet() -> dict[str, Look]:
+def white_cabinet() -> dict[str, Appearance]:
     """White paint with sunken panels, dark grey bars."""
     paint = wood((232, 231, 226), seed=8, depth=0.04)
     tiles = {
@@ -42,7 +42,7 @@ def white_cabinet() -> dict[str, Look]:
     return _chest("white_cabinet", Palette(tiles), specular=0.25)
 
 
-def short_cabinet() -> dict[str, Look]:
+def short_cabinet() -> dict[str, Appearance]:
     """Low chest of rosewood with three flat drawers and bent handles."""
     tiles = {
         "outside": wood((112, 66, 46), seed=13, depth=0.42),
@@ -54,10 +54,10 @@ def short_cabinet() -> dict[str, Look]:
     palette = Palette(tiles)
     parts = {"base": _short_base(palette)}
     parts |= {body: _short_drawer(palette, shift) for body, shift in SHORT_DRAWERS.items()}
-    return _looks("short_cabinet", palette, parts, specular=0.2)
+    return _appearances("short_cabinet", palette, parts, specular=0.2)
 
 
-def slide_cabinet() -> dict[str, Look]:
+def slide_cabinet() -> dict[str, Appearance]:
     """Blue-grey cupboard: one half closed, a sliding door with a bar before the other."""
     paint = brushed((122, 138, 164), seed=20, depth=0.008)
     tiles = {
@@ -69,10 +69,10 @@ def slide_cabinet() -> dict[str, Look]:
     }
     palette = Palette(tiles)
     parts = {"main": _slide_base(palette), "slidelink": _slide_door(palette)}
-    return _looks("slide_cabinet", palette, parts, specular=0.25)
+    return _appearances("slide_cabinet", palette, parts, specular=0.25)
 
 
-LOOKS = {
+APPEARANCES = {
     "short_cabinet": short_cabinet,
     "slide_cabinet": slide_cabinet,
     "white_cabinet": white_cabinet,
@@ -80,18 +80,20 @@ LOOKS = {
 }
 
 
-def _looks(category: str, palette: Palette, parts: dict[str, Mesh], *, specular: float) -> dict[str, Look]:
+def _appearances(
+    category: str, palette: Palette, parts: dict[str, Mesh], *, specular: float
+) -> dict[str, Appearance]:
     picture = palette.png()
     return {
-        body: Look(in_body(mesh, category, body), picture, specular=specular, frame="body")
+        body: Appearance(in_body(mesh, category, body), picture, specular=specular, frame="body")
         for body, mesh in parts.items()
     }
 
 
-def _chest(category: str, palette: Palette, *, specular: float) -> dict[str, Look]:
+def _chest(category: str, palette: Palette, *, specular: float) -> dict[str, Appearance]:
     parts = {"base": _chest_base(palette)}
     parts |= {body: _chest_drawer(palette, shift, HANDLES[body]) for body, shift in DRAWERS.items()}
-    return _looks(category, palette, parts, specular=specular)
+    return _appearances(category, palette, parts, specular=specular)
 
 
 def _chest_base(palette: Palette) -> Mesh:

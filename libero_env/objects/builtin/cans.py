@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft
 from libero_env.objects.builtin.paint import Canvas, Color
 
@@ -10,7 +10,7 @@ STEEL, DARK_STEEL, BRIGHT_STEEL = (168, 172, 178), (118, 122, 128), (212, 216, 2
 LABEL = (0.10, 0.80)  # part of the texture's height that the label takes
 
 
-def alphabet_soup() -> Look:
+def alphabet_soup() -> Appearance:
     """Blue label, a bowl of orange soup with letters in it."""
     canvas = _tin((28, 78, 176))
     canvas.band(0.10, 0.22, (247, 190, 40))
@@ -20,10 +20,10 @@ def alphabet_soup() -> Look:
         canvas.disc(u, 0.36, 0.15, 0.13, (250, 250, 245))
         canvas.disc(u, 0.38, 0.125, 0.095, (240, 120, 30))
         canvas.text("SOUP", (u - 0.10, 0.33, u + 0.10, 0.44), (255, 240, 190))
-    return Look(_can(), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(_can(), canvas.png(), specular=0.5, shininess=0.6)
 
 
-def tomato_sauce() -> Look:
+def tomato_sauce() -> Appearance:
     """Red label, a green band with the name, tomatoes on white."""
     canvas = _tin((198, 28, 24))
     canvas.band(0.10, 0.36, (245, 240, 228))
@@ -33,10 +33,10 @@ def tomato_sauce() -> Look:
         canvas.text("TOMATO", (u - 0.16, 0.63, u + 0.16, 0.77), (255, 232, 150))
         for shift in (-0.12, 0.0, 0.12):
             _tomato(canvas, u + shift, 0.22, 0.055, 0.095)
-    return Look(_can(), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(_can(), canvas.png(), specular=0.5, shininess=0.6)
 
 
-def cherries() -> Look:
+def cherries() -> Appearance:
     """Wide pink tin, cherries on a white oval, dark letters."""
     canvas = _tin((244, 176, 194))
     canvas.band(0.10, 0.16, (142, 16, 56))
@@ -52,10 +52,10 @@ def cherries() -> Look:
         canvas.polygon(
             [(u + 0.02, 0.49), (u + 0.06, 0.505), (u + 0.105, 0.46), (u + 0.06, 0.455)], (74, 150, 54)
         )
-    return Look(_can(-0.0402, 0.0400, 0.0325), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(_can(-0.0402, 0.0400, 0.0325), canvas.png(), specular=0.5, shininess=0.6)
 
 
-def corn() -> Look:
+def corn() -> Appearance:
     """Tall green tin, an ear of corn on cream, yellow letters."""
     canvas = _tin((34, 124, 60))
     canvas.band(0.10, 0.14, (250, 206, 40))
@@ -64,10 +64,15 @@ def corn() -> Look:
     for u in (0.0, 0.5, 1.0):
         canvas.text("CORN", (u - 0.15, 0.57, u + 0.15, 0.76), (255, 222, 60))
         _ear(canvas, u, 0.32)
-    return Look(_can(-0.0440, 0.0440, 0.0315), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(_can(-0.0440, 0.0440, 0.0315), canvas.png(), specular=0.5, shininess=0.6)
 
 
-LOOKS = {"alphabet_soup": alphabet_soup, "cherries": cherries, "corn": corn, "tomato_sauce": tomato_sauce}
+APPEARANCES = {
+    "alphabet_soup": alphabet_soup,
+    "cherries": cherries,
+    "corn": corn,
+    "tomato_sauce": tomato_sauce,
+}
 
 
 def _can(bottom: float = -0.0390, top: float = 0.0410, radius: float = 0.0308) -> Mesh:

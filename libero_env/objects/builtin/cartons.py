@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, box, merge, quad
 from libero_env.objects.builtin.paint import Canvas
 
@@ -12,7 +12,7 @@ FRONTS = (0.375, 0.875)
 SIDES = (0.125, 0.625)
 
 
-def milk() -> Look:
+def milk() -> Appearance:
     """Red and white, the word MILK, a cow on green grass."""
     canvas = Canvas((206, 30, 34), (256, 128))
     canvas.band(0.0, 0.40, (196, 226, 246))
@@ -28,10 +28,10 @@ def milk() -> Look:
         for v in (0.18, 0.23, 0.28):
             canvas.rect(u - 0.07, v, u + 0.07, v + 0.02, (120, 140, 170))
         canvas.text("MILK", (u - 0.07, 0.45, u + 0.07, 0.58), (255, 255, 255))
-    return Look(_carton(), canvas.png(), specular=0.2)
+    return Appearance(_carton(), canvas.png(), specular=0.2)
 
 
-def orange_juice() -> Look:
+def orange_juice() -> Appearance:
     """Yellow with a sliced orange and the word JUICE."""
     canvas = Canvas((252, 208, 40), (256, 128))
     canvas.band(0.60, EAVES_V, (240, 120, 20))
@@ -45,10 +45,10 @@ def orange_juice() -> Look:
     for u in SIDES:
         _orange_slice(canvas, u, 0.23, 0.070)
         canvas.text("OJ", (u - 0.05, 0.43, u + 0.05, 0.57), (30, 100, 40))
-    return Look(_carton(), canvas.png(), specular=0.2)
+    return Appearance(_carton(), canvas.png(), specular=0.2)
 
 
-LOOKS = {"milk": milk, "orange_juice": orange_juice}
+APPEARANCES = {"milk": milk, "orange_juice": orange_juice}
 
 
 def _carton() -> Mesh:

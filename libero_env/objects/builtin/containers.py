@@ -1,6 +1,6 @@
 """Things to put things into: the tray of slats, the white storage box, the desk caddy."""
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import Palette, block, prism
 from libero_env.objects.builtin.mesh import merge
 from libero_env.objects.builtin.surfaces import edged, plain, wood
@@ -8,7 +8,7 @@ from libero_env.objects.builtin.surfaces import edged, plain, wood
 BIRCH = (222, 196, 160)
 
 
-def wooden_tray() -> Look:
+def wooden_tray() -> Appearance:
     """Crate of pale boards: a floor of slats, corner posts, a grip at each end (x)."""
     palette = _birch(seed=50)
     side, post, grip = palette["side"], palette["post"], palette["grip"]
@@ -29,10 +29,10 @@ def wooden_tray() -> Look:
             parts.append(block((x0, y0, 0.0017), (x1, y1, 0.0785), post))
     for x0, x1 in ((-0.1402, -0.1262), (0.1390, 0.1534)):
         parts.append(block((x0, -0.0850, 0.0762), (x1, 0.0750, 0.0812), grip, bevel=0.0012))
-    return Look(merge(parts), palette.png(), specular=0.1, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.1, frame="body")
 
 
-def white_storage_box() -> Look:
+def white_storage_box() -> Appearance:
     """White cube with rounded edges along y, open at both ends."""
     palette = Palette({"paint": plain((240, 240, 236))})
     left, right, low, high, wall, cut = -0.0699, 0.0701, 0.0012, 0.1420, 0.0125, 0.0060
@@ -54,10 +54,10 @@ def white_storage_box() -> Look:
         a, b = inner[index], inner[(index + 1) % 4]
         parts.append(prism([one, two, b, a], -0.0588, 0.0590, palette["paint"]))
         parts.append(prism([two, outer[(index + 1) % 4][0], b], -0.0588, 0.0590, palette["paint"]))
-    return Look(merge(parts), palette.png(), specular=0.35, shininess=0.6, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.35, shininess=0.6, frame="body")
 
 
-def desk_caddy() -> Look:
+def desk_caddy() -> Appearance:
     """Pale organiser: a tall cell at -y, two behind each other in the middle, a sloping one at +y; low side at -x."""
     palette = _birch(seed=55)
     side, end = palette["side"], palette["end"]
@@ -72,10 +72,10 @@ def desk_caddy() -> Look:
     ]
     slope = [(-0.0690, 0.0130), (0.0690, 0.0130), (0.0690, 0.1675), (-0.0690, 0.0722)]
     parts += [prism(slope, y0, y1, end) for y0, y1 in ((0.0671, 0.0742), (0.2046, 0.2119))]
-    return Look(merge(parts), palette.png(), specular=0.1, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.1, frame="body")
 
 
-LOOKS = {"desk_caddy": desk_caddy, "white_storage_box": white_storage_box, "wooden_tray": wooden_tray}
+APPEARANCES = {"desk_caddy": desk_caddy, "white_storage_box": white_storage_box, "wooden_tray": wooden_tray}
 
 
 def _birch(seed: int) -> Palette:

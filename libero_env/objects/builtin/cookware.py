@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, Ring, faceted, loft, merge, sweep
 from libero_env.objects.builtin.paint import Canvas
 from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, SPARE, vessel
@@ -14,7 +14,7 @@ BOTTLE_TOP = 0.1586
 BIN_CENTER = (-0.003, -0.0054)
 
 
-def moka_pot() -> Look:
+def moka_pot() -> Appearance:
     """Octagonal steel pot, spout to +y, black handle and knob."""
     canvas = Canvas((196, 199, 204), (128, 256))
     canvas.gradient(0.08, 0.45, (160, 163, 169), (206, 209, 213))
@@ -38,10 +38,10 @@ def moka_pot() -> Look:
         _moka_handle(),
         sweep([(0.0, -0.0310, -0.0215), (0.0, -0.0405, -0.0215)], [(0.0045, 0.0045)] * 2, ACROSS, 8, BRASS),
     ]
-    return Look(merge(parts), canvas.png(), specular=0.9, shininess=0.5)
+    return Appearance(merge(parts), canvas.png(), specular=0.9, shininess=0.5)
 
 
-def chefmate_8_frypan() -> Look:
+def chefmate_8_frypan() -> Appearance:
     """Black pan with a grey floor; its handle points to +y."""
     canvas = Canvas((24, 24, 26), (64, 128))
     canvas.gradient(INNER_V, 0.60, (34, 34, 37), (44, 44, 47))
@@ -83,10 +83,10 @@ def chefmate_8_frypan() -> Look:
         [(0.0, y, z) for y, z, _, _ in handle], [(w, t) for _, _, w, t in handle], ACROSS, 10, SPARE, 2.8
     )
     pan = vessel(outside, inside, segments=24, center=(0.0, 0.0075))
-    return Look(merge([pan, grip]), canvas.png(), specular=0.5, shininess=0.5)
+    return Appearance(merge([pan, grip]), canvas.png(), specular=0.5, shininess=0.5)
 
 
-def wine_bottle() -> Look:
+def wine_bottle() -> Appearance:
     """Dark green bottle with a cork and a pale label on both sides."""
     canvas = Canvas((14, 44, 24), (256, 256))
     canvas.gradient(0.0, 0.40, (10, 32, 18), (16, 54, 30))
@@ -119,10 +119,10 @@ def wine_bottle() -> Look:
         (0.0, BOTTLE_TOP),
     ]
     rings = [Ring(z, r, r, z / BOTTLE_TOP, crease=r in (0.0080, 0.0066)) for r, z in profile]
-    return Look(loft(rings, segments=20), canvas.png(), specular=0.8, shininess=0.8)
+    return Appearance(loft(rings, segments=20), canvas.png(), specular=0.8, shininess=0.8)
 
 
-def bowl_drainer() -> Look:
+def bowl_drainer() -> Appearance:
     """White bin with two compartments and handle slots in its walls."""
     canvas = Canvas((240, 240, 240), (1024, 128))
     canvas.gradient(0.0, 0.44, (206, 207, 210), (244, 244, 244))
@@ -160,12 +160,12 @@ def bowl_drainer() -> Look:
         SPARE,
         12.0,
     )
-    return Look(
+    return Appearance(
         merge([loft(shell, segments=28, center=BIN_CENTER), faceted(divider)]), canvas.png(), specular=0.3
     )
 
 
-LOOKS = {
+APPEARANCES = {
     "bowl_drainer": bowl_drainer,
     "chefmate_8_frypan": chefmate_8_frypan,
     "moka_pot": moka_pot,

@@ -1,6 +1,6 @@
 """Fittings of a house: a sliding window, and two taps."""
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import Palette, bar, block, capsule, in_body, turned
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.surfaces import brushed, chrome, plain, wood
@@ -11,7 +11,7 @@ SASHES = {
 }  # body -> x from, to; y of centre
 
 
-def window() -> dict[str, Look | tuple[Look, ...]]:
+def window() -> dict[str, Appearance | tuple[Appearance, ...]]:
     """Brown wooden frame with a sill, two sashes with crossbars and bluish panes, a white handle."""
     tiles = {
         "frame": wood((142, 92, 70), seed=60, depth=0.25),
@@ -22,17 +22,17 @@ def window() -> dict[str, Look | tuple[Look, ...]]:
     }
     palette, glass = Palette(tiles), Palette({"glass": plain((150, 205, 225))})
     picture = palette.png()
-    looks: dict[str, Look | tuple[Look, ...]] = {
-        "main": Look(_window_frame(palette), picture, specular=0.2, frame="body")
+    appearances: dict[str, Appearance | tuple[Appearance, ...]] = {
+        "main": Appearance(_window_frame(palette), picture, specular=0.2, frame="body")
     }
     for body, ((x0, x1), y) in SASHES.items():
         sash = _sash(palette, x0, x1, y)
         if body == "windowb_a":
             sash = merge([sash, *_window_handle(palette)])
         pane = block((x0 + 0.008, y - 0.0030, -0.066), (x1 - 0.008, y - 0.0020, 0.066), glass["glass"])
-        looks[body] = (
-            Look(in_body(sash, "window", body), picture, specular=0.2, frame="body"),
-            Look(
+        appearances[body] = (
+            Appearance(in_body(sash, "window", body), picture, specular=0.2, frame="body"),
+            Appearance(
                 in_body(pane, "window", body),
                 glass.png(),
                 specular=1.0,
@@ -41,10 +41,10 @@ def window() -> dict[str, Look | tuple[Look, ...]]:
                 frame="body",
             ),
         )
-    return looks
+    return appearances
 
 
-def faucet() -> dict[str, Look]:
+def faucet() -> dict[str, Appearance]:
     """Steel pillar whose red lever turns."""
     palette = Palette(
         {"chrome": chrome((206, 210, 218)), "red": plain((190, 30, 28)), "dark": plain((58, 60, 66))}
@@ -67,14 +67,16 @@ def faucet() -> dict[str, Look]:
         ]
     )
     return {
-        "main": Look(
+        "main": Appearance(
             turned([*pillar, (0.106, 0.0170)], steel, segments=20), picture, specular=0.8, frame="body"
         ),
-        "faucet_link2": Look(in_body(lever, "faucet", "faucet_link2"), picture, specular=0.7, frame="body"),
+        "faucet_link2": Appearance(
+            in_body(lever, "faucet", "faucet_link2"), picture, specular=0.7, frame="body"
+        ),
     }
 
 
-def basin_faucet() -> dict[str, Look]:
+def basin_faucet() -> dict[str, Appearance]:
     """Square mixer tap of polished steel; the lever on its top turns."""
     palette = Palette(
         {
@@ -103,11 +105,12 @@ def basin_faucet() -> dict[str, Look]:
     )
     parts = {"base": stand, "movable": lever}
     return {
-        body: Look(mesh, picture, specular=0.8, shininess=0.7, frame="body") for body, mesh in parts.items()
+        body: Appearance(mesh, picture, specular=0.8, shininess=0.7, frame="body")
+        for body, mesh in parts.items()
     }
 
 
-LOOKS = {"basin_faucet": basin_faucet, "faucet": faucet, "window": window}
+APPEARANCES = {"basin_faucet": basin_faucet, "faucet": faucet, "window": window}
 
 
 def _window_frame(palette: Palette) -> Mesh:

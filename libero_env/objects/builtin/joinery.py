@@ -11,9 +11,9 @@ from itertools import combinations, product
 import mujoco
 import numpy as np
 
-from libero_env.objects.builtin.facts import load_facts
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft, merge
 from libero_env.objects.builtin.paint import png
+from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import ROOT_BODY
 
 TILE = 128  # pixels
@@ -157,7 +157,7 @@ def capsule(
 
 def in_body(mesh: Mesh, category: str, body: str) -> Mesh:
     """The mesh, given in the frame of the root body, in that of the body which is to carry it."""
-    parts, chain = load_facts(category).parts, []
+    parts, chain = load_physics(category).parts, []
     while body != ROOT_BODY:
         chain.append(parts[body])
         body = parts[body].parent

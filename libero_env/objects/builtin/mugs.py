@@ -1,6 +1,6 @@
 """Mugs: turned cups with a handle on one side."""
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, merge, sweep
 from libero_env.objects.builtin.paint import Canvas, Color
 from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, SPARE, Profile, vessel
@@ -8,7 +8,7 @@ from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, SPARE, P
 SEGMENTS = 22
 
 
-def red_coffee_mug() -> Look:
+def red_coffee_mug() -> Appearance:
     """Tall red mug, lighter inside."""
     canvas = _glaze((186, 22, 20), inside=(206, 44, 36), depth=(112, 12, 12))
     outside = [
@@ -43,10 +43,12 @@ def red_coffee_mug() -> Look:
         (-0.0155, 0.0290),
     ]
     body = vessel(outside, inside, segments=SEGMENTS, center=(-0.001, 0.0178))
-    return Look(merge([body, _handle(path, (0.0070, 0.0032))]), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(
+        merge([body, _handle(path, (0.0070, 0.0032))]), canvas.png(), specular=0.5, shininess=0.6
+    )
 
 
-def porcelain_mug() -> Look:
+def porcelain_mug() -> Appearance:
     """White mug with a round belly."""
     canvas = _glaze((243, 242, 240), inside=(240, 239, 236), depth=(186, 184, 180))
     canvas.gradient(0.04, 0.20, (206, 204, 200), (243, 242, 240))
@@ -82,10 +84,12 @@ def porcelain_mug() -> Look:
         (0.0205, 0.0180),
     ]
     body = vessel(outside, inside, segments=SEGMENTS, center=(-0.0016, -0.0162))
-    return Look(merge([body, _handle(path, (0.0080, 0.0042))]), canvas.png(), specular=0.5, shininess=0.7)
+    return Appearance(
+        merge([body, _handle(path, (0.0080, 0.0042))]), canvas.png(), specular=0.5, shininess=0.7
+    )
 
 
-def white_yellow_mug() -> Look:
+def white_yellow_mug() -> Appearance:
     """Mug that is white above and yellow below and inside, with a yellow handle."""
     white, yellow = (244, 242, 236), (240, 184, 36)
     canvas = _glaze(white, inside=yellow, depth=(176, 128, 20))
@@ -125,10 +129,10 @@ def white_yellow_mug() -> Look:
     ]
     body = vessel(outside, inside, segments=SEGMENTS, center=(-0.0008, 0.0180))
     handle = _handle(path, (0.0086, 0.0041), round=3.5)
-    return Look(merge([body, handle]), canvas.png(), specular=0.5, shininess=0.7)
+    return Appearance(merge([body, handle]), canvas.png(), specular=0.5, shininess=0.7)
 
 
-LOOKS = {
+APPEARANCES = {
     "porcelain_mug": porcelain_mug,
     "red_coffee_mug": red_coffee_mug,
     "white_yellow_mug": white_yellow_mug,

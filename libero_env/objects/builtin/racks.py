@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import Palette, block, prism, turned
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.surfaces import edged, plain, wood
@@ -18,7 +18,7 @@ PEGS_X, PEGS_Y = (-0.0438, 0.0311), (-0.1012, -0.0694, -0.0358, 0.0, 0.0309, 0.0
 PEG = [(0.0165, 0.0039), (0.1034, 0.0036)]
 
 
-def wine_rack() -> Look:
+def wine_rack() -> Appearance:
     """Mahogany post on an arched foot; it carries two shelves of oak slats, tilted towards -y."""
     tiles = {
         "foot": wood((96, 38, 22), seed=40, depth=0.45, upright=True),
@@ -32,10 +32,10 @@ def wine_rack() -> Look:
     stretcher = block((-0.0665, -0.0930, 0.0021), (0.0665, 0.0930, 0.0111), palette["post"])
     parts = [_arch(palette), stretcher, _placed(post, (0.00886, 0.17026), -np.arcsin(0.273))]
     parts += [_placed(_slatted(palette), center, slope) for center, slope in SHELVES]
-    return Look(merge(parts), palette.png(), specular=0.25, shininess=0.5, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.25, shininess=0.5, frame="body")
 
 
-def rack() -> Look:
+def rack() -> Appearance:
     """White block with two rows of steel-grey pegs."""
     palette = Palette(
         {"block": edged(plain((232, 232, 228)), width=2, shade=0.9), "peg": plain((196, 200, 206))}
@@ -44,10 +44,10 @@ def rack() -> Look:
     for x in PEGS_X:
         # Their lower ends are inside the block.
         parts += [turned(PEG, palette["peg"], base=(x, y, 0.0), segments=6) for y in PEGS_Y]
-    return Look(merge(parts), palette.png(), specular=0.3, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.3, frame="body")
 
 
-LOOKS = {"rack": rack, "wine_rack": wine_rack}
+APPEARANCES = {"rack": rack, "wine_rack": wine_rack}
 
 
 def _slatted(palette: Palette) -> Mesh:

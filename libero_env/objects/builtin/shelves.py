@@ -1,6 +1,6 @@
 """Shelves of dark oak, open towards -y: one with three compartments, one with two layers."""
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import Palette, block
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.surfaces import edged, wood
@@ -8,7 +8,7 @@ from libero_env.objects.builtin.surfaces import edged, wood
 OAK, OAK_LIGHT = (98, 70, 50), (150, 112, 78)
 
 
-def wooden_shelf() -> Look:
+def wooden_shelf() -> Appearance:
     """Carcase under an overhanging top; two boards make three compartments."""
     palette = _oak(seed=30)
     boards = [
@@ -22,10 +22,10 @@ def wooden_shelf() -> Look:
         _side(palette, (0.1140, -0.0785, 0.0046), (0.1241, 0.1110, 0.2162)),
         block((-0.1081, 0.1072, 0.0084), (0.1159, 0.1112, 0.2162), palette["inside"], faces=_outer(palette)),
     ]
-    return Look(merge(parts), palette.png(), specular=0.15, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.15, frame="body")
 
 
-def wooden_two_layer_shelf() -> Look:
+def wooden_two_layer_shelf() -> Appearance:
     """Wide and without a floor: a board halfway, an overhanging top."""
     palette = _oak(seed=35)
     parts = [
@@ -35,10 +35,10 @@ def wooden_two_layer_shelf() -> Look:
         _side(palette, (0.1562, -0.0785, 0.0002), (0.1701, 0.1110, 0.2058)),
         block((-0.1480, 0.1072, 0.0004), (0.1572, 0.1112, 0.2058), palette["inside"], faces=_outer(palette)),
     ]
-    return Look(merge(parts), palette.png(), specular=0.15, frame="body")
+    return Appearance(merge(parts), palette.png(), specular=0.15, frame="body")
 
 
-LOOKS = {"wooden_shelf": wooden_shelf, "wooden_two_layer_shelf": wooden_two_layer_shelf}
+APPEARANCES = {"wooden_shelf": wooden_shelf, "wooden_two_layer_shelf": wooden_two_layer_shelf}
 
 
 def _oak(seed: int) -> Palette:

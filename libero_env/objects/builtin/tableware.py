@@ -1,6 +1,6 @@
 """Tableware: two bowls, a plate, a ramekin, and a set of cutlery on its cloth."""
 
-from libero_env.objects.builtin.assemble import Look
+from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, box, merge, sweep
 from libero_env.objects.builtin.paint import Canvas
 from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, vessel
@@ -8,7 +8,7 @@ from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, vessel
 FLUTES = 14  # on each side
 
 
-def akita_black_bowl() -> Look:
+def akita_black_bowl() -> Appearance:
     """Black glazed bowl with a worn rim and brush strokes inside."""
     canvas = Canvas((22, 22, 25), (128, 128))
     canvas.gradient(0.15, RIM_V, (16, 16, 18), (46, 46, 51))
@@ -36,10 +36,10 @@ def akita_black_bowl() -> Look:
         (0.0245, 0.0070),
         (0.0, 0.0066),
     ]
-    return Look(vessel(outside, inside), canvas.png(), specular=0.7, shininess=0.7)
+    return Appearance(vessel(outside, inside), canvas.png(), specular=0.7, shininess=0.7)
 
 
-def white_bowl() -> Look:
+def white_bowl() -> Appearance:
     """Small white bowl."""
     canvas = Canvas((240, 239, 234), (64, 128))
     canvas.gradient(INNER_V, FLOOR_V, (240, 239, 234), (206, 204, 198))
@@ -65,10 +65,10 @@ def white_bowl() -> Look:
         (0.0180, 0.0049),
         (0.0, 0.0044),
     ]
-    return Look(vessel(outside, inside), canvas.png(), specular=0.5, shininess=0.6)
+    return Appearance(vessel(outside, inside), canvas.png(), specular=0.5, shininess=0.6)
 
 
-def plate() -> Look:
+def plate() -> Appearance:
     """White dinner plate with a red-brown rim and a fine line inside it."""
     canvas = Canvas((244, 242, 236), (64, 256))
     canvas.gradient(0.0, 0.28, (206, 204, 198), (244, 242, 236))
@@ -95,10 +95,10 @@ def plate() -> Look:
         (0.0320, 0.0045),
         (0.0, 0.0045),
     ]
-    return Look(vessel(outside, inside, segments=32), canvas.png(), specular=0.4, shininess=0.6)
+    return Appearance(vessel(outside, inside, segments=32), canvas.png(), specular=0.4, shininess=0.6)
 
 
-def glazed_rim_porcelain_ramekin() -> Look:
+def glazed_rim_porcelain_ramekin() -> Appearance:
     """White fluted ramekin with a smooth glazed rim."""
     canvas = Canvas((246, 246, 246), (256, 128))
     canvas.gradient(INNER_V + 0.02, FLOOR_V, (236, 237, 240), (206, 208, 214))
@@ -129,10 +129,10 @@ def glazed_rim_porcelain_ramekin() -> Look:
         (0.0320, 0.0080),
         (0.0, 0.0073),
     ]
-    return Look(vessel(outside, inside, segments=28), canvas.png(), specular=0.5, shininess=0.7)
+    return Appearance(vessel(outside, inside, segments=28), canvas.png(), specular=0.5, shininess=0.7)
 
 
-def dining_set_group() -> Look:
+def dining_set_group() -> Appearance:
     """Fork and knife on the right of a place, two spoons on the left, and the linen cloth under it."""
     canvas = Canvas((236, 232, 222), (128, 128))
     for u0, v0, u1, v1 in ((0.03, 0.05, 0.97, 0.08), (0.03, 0.92, 0.97, 0.95)):
@@ -142,10 +142,10 @@ def dining_set_group() -> Look:
     canvas.rect(*STEEL, (150, 153, 158))
     cloth = box((0.14, 0.08, 0.0005), (0.0, 0.0, -0.0175), dict.fromkeys(_FACES, (0.02, 0.03, 0.98, 0.97)))
     pieces = [_fork(0.0865), _knife(0.1122), *_spoons()]
-    return Look(merge([cloth, *pieces]), canvas.png(), specular=0.6, shininess=0.6)
+    return Appearance(merge([cloth, *pieces]), canvas.png(), specular=0.6, shininess=0.6)
 
 
-LOOKS = {
+APPEARANCES = {
     "akita_black_bowl": akita_black_bowl,
     "dining_set_group": dining_set_group,
     "glazed_rim_porcelain_ramekin": glazed_rim_porcelain_ramekin,

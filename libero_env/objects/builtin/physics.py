@@ -1,0 +1,179 @@
+"""Physical parameters of the builtin objects, measured on the original's and stored in `parameters/`."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any
+
+from libero_env.storage import parse_yaml
+
+Vector = tuple[float, ...]
+
+# Contact parameters of the original's objects: as stiff as the timestep allows (refsafe).
+FRICTION: Vector = (0.95, 0.3, 0.1)
+SOLREF: Vector = (0.001, 1.0)
+SOLIMP: Vector = (0.998, 0.998, 0.001)
+
+
+@dataclass(frozen=True)
+class CollisionShape:
+    """Primitive collision geom in the frame of its body; contact parameters that are None are those of the object.
+
+    Attributes:
+        pos: Centre, (3,) [m].
+        size: Size as MuJoCo expects it for `type` (half extents of a box), [m].
+        quat: Orientation, (4,) wxyz.
+        type: MuJoCo geom type in lower case, such as `box`.
+        friction: Sliding, torsional and rolling friction, (3,).
+        solref: MuJoCo's time constant [s] and damping ratio, (2,).
+        solimp: First three of MuJoCo's impedance parameters, (3,).
+    """
+
+    pos: Vector
+    size: Vector
+    quat: Vector = (1.0, 0.0, 0.0, 0.0)
+    type: str = "box"
+    friction: Vector | None = None
+    solref: Vector | None = None
+    solimp: Vector | None = None
+
+
+@dataclass(frozen=True)
+class Site:
+    """Named place on an object.
+
+    Attributes:
+        name: Name that task files use, such as `contain_region`.
+        type: MuJoCo geom type in lower case.
+        pos: Centre in the frame of the body, (3,) [m].
+        size: Size as MuJoCo expects it for `type`, [m].
+        quat: Orientation, (4,) wxyz.
+    """
+
+    name: str
+    type: str
+    pos: Vector
+    size: Vector
+    quat: Vector = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint between a part and its parent.
+
+    Attributes:
+        name: Name within the object.
+        type: `hinge` or `slide`.
+        axis: Axis in the frame of the part, (3,).
+        range: Lower and upper limit, (2,) [rad] or [m].
+        pos: Anchor in the frame of the part, (3,) [m].
+        damping: Damping, [N m s/rad] or [N s/m].
+    """
+
+    name: str
+    type: str
+    axis: Vector
+    range: Vector
+    pos: Vector = (0.0, 0.0, 0.0)
+    damping: float = 0.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """One body: the root, or a descendant of it.
+
+    Attributes:
+        mass: Mass, [kg].
+        com: Centre of mass in the frame of the body, (3,) [m].
+        inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about `com`, [kg m^2]; empty for a body without mass.
+        boxes: Collision shapes.
+        sites: Named places.
+        parent: Name of the parent body; "" for the root.
+        pos: Origin in the frame of the parent, (3,) [m].
+        quat: Orientation in the frame of the parent, (4,) wxyz.
+        joint: Joint to the parent; None where the body is fixed to it.
+    """
+
+    mass: float = 0.0
+    com: Vector = (0.0, 0.0, 0.0)
+    inertia: Vector = ()
+    boxes: tuple[CollisionShape, ...] = ()
+    sites: tuple[Site, ...] = ()
+    parent: str = ""
+    pos: Vector = (0.0, 0.0, 0.0)
+    quat: Vector = (1.0, 0.0, 0.0, 0.0)
+    joint: Joint | None = None
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Physics and placement of one category, SI units; `ObjectModel` documents the fields that are not listed.
+
+    Attributes:
+        root: Root body.
+        parts: Name -> body below the root.
+        friction: Friction of collision shapes that do not set their own, (3,).
+        solref: As `friction`, for MuJoCo's `solref`.
+        solimp: As `friction`, for MuJoCo's `solimp`.
+    """
+
+    root: Part
+    parts: Mapping[str, Part]
+    rotation: Mapping[str, Vector]
+    rotation_axis: str | None
+    bottom_offset: Vector
+    top_offset: Vector
+    horizontal_radius: float
+    articulation: Mapping[str, Vector] = field(default_factory=dict)
+    friction: Vector = FRICTION
+    solref: Vector = SOLREF
+    solimp: Vector = SOLIMP
+    joint_damping: float = 0.0005
+
+    @property
+    def mass(self) -> float:
+        """Total mass of all bodies, [kg]."""
+        return self.root.mass + sum(part.mass for part in self.parts.values())
+
+
+_ROOT_KEYS = ("mass", "com", "inertia", "boxes", "sites")
+
+
+@cache
+def load_physics(category: str) -> Physics:
+    """Return the physics of a builtin category.
+
+    Raises:
+        KeyError: No builtin object has this name.
+    """
+    raw = parse_yaml(_texts()[category])[category]
+    root = _part({key: raw.pop(key) for key in _ROOT_KEYS if key in raw})
+    parts = {name: _part(part) for name, part in raw.pop("parts", {}).items()}
+    for key in ("rotation", "articulation"):
+        raw[key] = MappingProxyType(_tuples(raw.get(key, {})))
+    return Physics(root=root, parts=MappingProxyType(parts), **_tuples(raw))
+
+
+def _part(raw: Mapping[str, Any]) -> Part:
+    values = dict(raw)
+    values["boxes"] = tuple(CollisionShape(**_tuples(box)) for box in values.get("boxes", ()))
+    values["sites"] = tuple(Site(**_tuples(site)) for site in values.get("sites", ()))
+    if "joint" in values:
+        values["joint"] = Joint(**_tuples(values["joint"]))
+    return Part(**_tuples(values))
+
+
+@cache
+def _texts() -> dict[str, str]:
+    """Return category -> its section of the files, not yet parsed: a scene needs a few of many."""
+    folder = files(__package__) / "parameters"
+    texts = [file.read_text(encoding="utf-8") for file in folder.iterdir() if file.name.endswith(".yaml")]
+    parts = [part for text in texts for part in re.split(r"^(?=\w+:\n)", text, flags=re.M)]
+    return {part.split(":", 1)[0]: part for part in parts if not part.startswith("#")}
+
+
+def _tuples(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in mapping.items()}
