@@ -1,33 +1,46 @@
-"""The shape of bodies as points on their collision geoms; what grasping and avoiding need to know."""
+"""Poses, rotations, and the shape of bodies as points on their collision geoms."""
 
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-SPACING = 0.005  # m between points
+SPACING = 0.005  # [m] between neighbouring points
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a frame is in the world."""
+    """Position and orientation of a frame in the world.
 
-    pos: np.ndarray  # (3,), m
-    mat: np.ndarray  # (3, 3), frame to world
+    Attributes:
+        pos: Origin of the frame, (3,), m.
+        mat: Rotation matrix, (3, 3), frame to world.
+    """
+
+    pos: np.ndarray
+    mat: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points of the frame in the world; (N, 3) -> (N, 3)."""
+        """Transform points (N, 3) from the frame to the world."""
         return points @ self.mat.T + self.pos
 
     def invert(self, point_world: np.ndarray) -> np.ndarray:
-        """A point of the world in the frame; (3,) -> (3,)."""
+        """Transform a point (3,) from the world to the frame."""
         return self.mat.T @ (point_world - self.pos)
 
 
 def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -> np.ndarray:
-    """Points on the collision geoms of a body and of what hangs on it, in the body's frame; (N, 3), m.
+    """Return points on the collision geoms of a body and its descendants.
 
-    Bodies below that are moved by joints of their own are taken where the model has them.
+    Descendants with joints are taken at the reference configuration of the model.
+
+    Args:
+        model: Model that has the body.
+        body: Index of the body.
+        spacing: Distance between neighbouring points, m.
+
+    Returns:
+        Points in the body's frame, (N, 3), m.
     """
     clouds = []
     poses = {body: (np.zeros(3), np.eye(3))}
@@ -44,7 +57,7 @@ def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -
 
 
 def body_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -> np.ndarray:
-    """Points on the collision geoms of one body alone, in its frame; (N, 3), m."""
+    """Return points on the collision geoms of one body, without its descendants, in its frame; (N, 3), m."""
     clouds = [np.zeros((0, 3))]
     for g in np.flatnonzero(model.geom_bodyid == body):
         if model.geom_contype[g] or model.geom_conaffinity[g]:
@@ -68,7 +81,7 @@ def _geom_points(model: mujoco.MjModel, geom: int, spacing: float) -> np.ndarray
             return side
         ball = _ball_points(np.full(3, size[0]), spacing)
         return np.concatenate([side, ball + np.sign(ball[:, 2:]) * [0, 0, size[1]]])
-    return np.zeros((0, 3))  # planes and height fields are not things to grasp
+    return np.zeros((0, 3))  # planes and height fields cannot be grasped
 
 
 def _steps(half: float, spacing: float) -> np.ndarray:
@@ -125,21 +138,31 @@ def _mesh_points(model: mujoco.MjModel, mesh: int, spacing: float) -> np.ndarray
 
 def quat_to_mat(quat_wxyz: np.ndarray) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a unit quaternion (4,)."""
-    out = np.empty(9)
-    mujoco.mju_quat2Mat(out, quat_wxyz)
-    return out.reshape(3, 3)
+    mat = np.empty(9)
+    mujoco.mju_quat2Mat(mat, quat_wxyz)
+    return mat.reshape(3, 3)
 
 
-def axis_angle(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3), rad, of unit quaternions (n, 4); angle in [0, 2 pi) as the original writes it."""
+def quat_from_axis_angle(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the quaternion (4,), wxyz, of a rotation by `angle`, rad, about a unit axis (3,)."""
+    quat = np.empty(4)
+    mujoco.mju_axisAngle2Quat(quat, axis, angle)
+    return quat
+
+
+def quat_to_axis_angle(quat_wxyz: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors (N, 3), rad, of unit quaternions (N, 4).
+
+    Angles are in [0, 2 pi), as the original LIBERO writes them.
+    """
     w = np.clip(quat_wxyz[:, :1], -1.0, 1.0)
     sine = np.sqrt(1.0 - w * w)
     scale = np.where(sine < 1e-9, 0.0, 2.0 * np.arccos(w) / np.maximum(sine, 1e-9))
     return quat_wxyz[:, 1:] * scale
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Quaternion products, wxyz (n, 4); the same bits for every n."""
+def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the products of quaternions, (N, 4) each, wxyz; the bits of a row do not depend on N."""
     aw, ax, ay, az = a.T
     bw, bx, by, bz = b.T
     return np.stack(
@@ -153,7 +176,23 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     )
 
 
-def rotated(quat: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (n, 3) turned by unit quaternions (n, 4), wxyz."""
+def quat_rotate(quat_wxyz: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Rotate vectors (N, 3) by unit quaternions (N, 4)."""
     pure = np.concatenate([np.zeros((len(vectors), 1)), vectors], axis=1)
-    return product(product(quat, pure), quat * (1.0, -1.0, -1.0, -1.0))[:, 1:]
+    return quat_multiply(quat_multiply(quat_wxyz, pure), quat_wxyz * (1.0, -1.0, -1.0, -1.0))[:, 1:]
+
+
+def rotation_between(mat: np.ndarray, goal_mat: np.ndarray) -> np.ndarray:
+    """Return the rotation from one orientation to another as a rotation vector.
+
+    Args:
+        mat: Orientation at the start, (3, 3), body to world.
+        goal_mat: Orientation at the end, (3, 3), body to world.
+
+    Returns:
+        Axis times angle in the world frame, (3,), rad.
+    """
+    quat, rotation = np.empty(4), np.empty(3)
+    mujoco.mju_mat2Quat(quat, (goal_mat @ mat.T).ravel())
+    mujoco.mju_quat2Vel(rotation, quat, 1.0)
+    return rotation

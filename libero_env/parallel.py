@@ -3,11 +3,24 @@
 import multiprocessing
 import os
 import threading
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import connection
 
 
+def spawn_pool(workers: int) -> ProcessPoolExecutor:
+    """Return a pool of processes that start with a new interpreter and end when this process ends.
+
+    They are spawned, not forked: an OpenGL context that a fork inherits hangs.
+
+    Args:
+        workers: Number of processes.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=spawn, initializer=end_with_parent)
+
+
 def end_with_parent() -> None:
-    """End this process when its parent is gone: the workers of a killed recording would wait for ever."""
+    """End this process when its parent is gone; the workers of a killed process would otherwise wait forever."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -19,6 +32,6 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def cores() -> int:
-    """Number of processor cores that this process may use."""
+def cpu_count() -> int:
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,25 +1,82 @@
-"""The package's own YAML files."""
+"""Reading and writing of files: YAML, and files that are replaced in one step."""
 
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import yaml
 
+PART_SUFFIX = ".part"  # of files and folders that are not yet complete
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
 
 
 def parse_yaml(text: str) -> Any:
-    """What a YAML text says; nothing in it is executed."""
+    """Return the content of a YAML text; nothing in it is executed."""
     return yaml.load(text, Loader=_LOADER)
 
 
 def read_yaml(path: str) -> Any:
-    """What one of the package's files says; the path is relative to `libero_env`."""
+    """Return the content of one of the package's YAML files; the path is relative to `libero_env`."""
     return parse_yaml(resources.files("libero_env").joinpath(*path.split("/")).read_text(encoding="utf-8"))
 
 
+@contextmanager
+def atomic_path(target: Path, *, fsync: bool = False) -> Iterator[Path]:
+    """Yield a temporary path beside `target`, which replaces `target` when the block ends without an error.
+
+    Readers see the old file or the new one, never a part of it. After an error the temporary file is removed
+    and `target` is as it was. Only a process that is killed leaves one behind: `.<name>.<random>.part`.
+
+    Args:
+        target: File to write; its folder is created.
+        fsync: Whether the content must have reached the disk before the file gets its name, so that it
+            survives a power failure.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
+    try:
+        yield temporary
+        if fsync:
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:
+    """Write a UTF-8 text file in one step; see `atomic_path`."""
+    with atomic_path(target, fsync=fsync) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def atomic_folder(target: Path) -> Iterator[Path]:
+    """Yield an empty temporary folder `.<name>.part` beside `target`, which is renamed to `target` at the end.
+
+    After an error it is removed, and so is one that a killed process left behind. Two processes must not write
+    the same folder at the same time.
+
+    Args:
+        target: Folder to make. It must not exist when the block ends.
+    """
+    temporary = target.with_name(f".{target.name}{PART_SUFFIX}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        os.rename(temporary, target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def show_bytes(count: float) -> str:
-    """`1.5 GB`."""
+    """Return a number of bytes as text, such as `1.5 GB`."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"

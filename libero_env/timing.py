@@ -2,5 +2,5 @@
 
 TIMESTEP = 0.002  # [s] of one physics step
 SUBSTEPS = 25  # physics steps per control step
-CONTROL_PERIOD = SUBSTEPS * TIMESTEP  # [s] 0.05
-CONTROL_HZ = round(1.0 / CONTROL_PERIOD)  # 20
+CONTROL_PERIOD = SUBSTEPS * TIMESTEP  # 0.05 [s]
+CONTROL_HZ = round(1.0 / CONTROL_PERIOD)  # 20 [Hz]

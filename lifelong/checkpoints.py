@@ -5,7 +5,6 @@ executed on load, and a file is either complete or not there at all.
 """
 
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from libero_env.storage import atomic_path
 from lifelong.errors import CheckpointError
 
 _FORMAT = "lifelong-1"
@@ -34,16 +34,12 @@ def save(path: Path, tree: dict[str, Any]) -> None:
     tensors: dict[str, Tensor] = {}
     plain = _encode(tree, "", tensors)
     tensors.setdefault("", torch.zeros(0))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        save_file(tensors, partial, metadata={"format": _FORMAT, "tree": json.dumps(plain)})
-        os.replace(partial, path)
+        with atomic_path(path) as temporary:
+            save_file(tensors, temporary, metadata={"format": _FORMAT, "tree": json.dumps(plain)})
     except (OSError, SafetensorError) as error:
         message = f"cannot write {path}: {error}. Free some space; the older file is intact"
         raise CheckpointError(message) from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from libero_env.demos.generate import make_demos
 from libero_env.demos.record import Recipe
-from libero_env.parallel import cores
+from libero_env.parallel import cpu_count
 from libero_env.tasks import get_suite
 
 
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=2)
     args = parser.parse_args()
-    workers = args.workers or cores()
+    workers = args.workers or cpu_count()
     print(
         f"| suite, {workers} processes | without pictures, demos/h | two {args.size}x{args.size} views | ratio |"
     )

@@ -37,6 +37,7 @@ from libero.lifelong.utils import (
     torch_load_model,
 )
 from libero_env.demos.generate import ensure_demos
+from libero_env.storage import atomic_path
 from lifelong import checkpoints
 from lifelong.errors import ConfigError
 from lifelong.tracking import Tracker
@@ -253,9 +254,8 @@ def _take_up(run: _Run, task: int, summary: dict[str, Any]) -> None:
 
 def _write(folder: Path, summary: Mapping[str, Any]) -> None:
     """`result.pt`, whole or not at all; tensors only, so that torch.load needs to execute nothing."""
-    partial = folder / ".result.pt.part"
-    torch.save(_tensors(dict(summary)), partial)
-    os.replace(partial, folder / "result.pt")
+    with atomic_path(folder / "result.pt") as temporary, open(temporary, "wb") as file:
+        torch.save(_tensors(dict(summary)), file)
 
 
 def _tensors(node: Any) -> Any:

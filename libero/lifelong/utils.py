@@ -2,7 +2,6 @@
 
 import copy
 import json
-import os
 import pickle
 import random
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from libero._adapters.lifelong.config import Config, assign, plain
 from libero_env.paths import cache_dir
+from libero_env.storage import atomic_path
 from lifelong.errors import CheckpointError
 from lifelong.language import embed
 from lifelong.results.metrics import wilson_interval
@@ -70,11 +70,9 @@ def torch_save_model(
     The file is there whole or not at all.
     """
     path = Path(model_path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     stored = {"state_dict": dict(model.state_dict()), "cfg": plain(cfg), "previous_masks": previous_masks}
-    torch.save(stored, partial)
-    os.replace(partial, path)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        torch.save(stored, file)
 
 
 def torch_load_model(

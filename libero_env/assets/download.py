@@ -16,6 +16,7 @@ from typing import Any
 from libero_env.assets.hub import DownloadError, Remote, broken_files, check_room
 from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir
+from libero_env.storage import atomic_write_text
 
 REPO = "lerobot/libero-assets"  # a data set; CC BY 4.0
 REVISION = "0b3ea86be5fe169d0fd036ae63d1070ec09e90f6"
@@ -81,9 +82,7 @@ def _write_manifest(folder: Path, revision: str, remote: Mapping[str, Remote]) -
         "revision": revision,
         "files": {name: asdict(file) for name, file in remote.items()},
     }
-    partial = folder / f"{MANIFEST}.partial"
-    partial.write_text(json.dumps(record, indent=1), encoding="utf-8")
-    partial.replace(folder / MANIFEST)
+    atomic_write_text(folder / MANIFEST, json.dumps(record, indent=1))
 
 
 def _listing(api: Any, revision: str) -> dict[str, Remote]:

@@ -14,8 +14,10 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
+from libero_env.geometry import quat_to_mat
 from libero_env.mujoco_compat import delete
 from libero_env.paths import cache_dir
+from libero_env.storage import atomic_path
 
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
@@ -121,11 +123,9 @@ def _simplified_cached(digest: str, groups: tuple) -> list[tuple[np.ndarray, np.
         with np.load(path) as stored:
             return [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(groups))]
     meshes = [_merge_and_simplify(sources) for sources in groups]
-    path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {k: a for i, (v, f) in enumerate(meshes) for k, a in ((f"v{i}", v), (f"f{i}", f))}
-    partial = path.with_name(f"{path.stem}.{np.random.SeedSequence().entropy:x}.npz")
-    np.savez_compressed(partial, **arrays)
-    partial.replace(path)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
     return meshes
 
 
@@ -137,9 +137,7 @@ def _merge_and_simplify(sources: tuple) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.load(file, force="mesh", process=True, skip_materials=True)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         pose = np.eye(4)
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, np.asarray(quat_wxyz))
-        pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), pos
+        pose[:3, :3], pose[:3, 3] = quat_to_mat(np.asarray(quat_wxyz)), pos
         parts.append(mesh.apply_transform(pose))
     whole = trimesh.util.concatenate(parts)
     if len(whole.faces) > _FACES_PER_GEOM:

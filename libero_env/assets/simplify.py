@@ -8,7 +8,9 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
+from libero_env.geometry import quat_to_mat
 from libero_env.paths import cache_dir
+from libero_env.storage import atomic_path
 
 _CACHE_VERSION = 3
 _CHUNK = 64  # points whose distances to all others are in memory at once
@@ -51,11 +53,9 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
 
 
 def _store(path: Path, arrays: Arrays) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.stem}.{np.random.SeedSequence().entropy:x}.npz")
     vertices, triangles, texcoords, indices = arrays
-    np.savez_compressed(partial, a0=vertices, a1=triangles, a2=texcoords, a3=indices)
-    partial.replace(path)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, a0=vertices, a1=triangles, a2=texcoords, a3=indices)
 
 
 def _load(file: str, scale: tuple[float, ...]) -> Arrays:
@@ -65,9 +65,8 @@ def _load(file: str, scale: tuple[float, ...]) -> Arrays:
     spec.add_mesh(name="mesh", file=file, scale=scale, inertia=shell)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
     model = spec.compile()
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.mesh_quat[0])
-    vertices = model.mesh_vert.astype(np.float64) @ rotation.reshape(3, 3).T + model.mesh_pos[0]
+    rotation = quat_to_mat(model.mesh_quat[0])
+    vertices = model.mesh_vert.astype(np.float64) @ rotation.T + model.mesh_pos[0]
     textured = model.mesh_texcoordadr[0] >= 0
     texcoords = model.mesh_texcoord.astype(np.float64) if textured else np.zeros((0, 2))
     indices = model.mesh_facetexcoord if textured else np.zeros((0, 3))

@@ -114,9 +114,9 @@ def run_certify(args: argparse.Namespace) -> int:
     """Run what is missing, write the results and say which tasks fall short; 1 where one does."""
     from libero_env.design.certify import certify
     from libero_env.design.certify_figure import write_results
-    from libero_env.parallel import cores
+    from libero_env.parallel import cpu_count
 
-    jobs = args.jobs or cores()
+    jobs = args.jobs or cpu_count()
     found = certify(
         find_tasks(args.tasks),
         args.states,

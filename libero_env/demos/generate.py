@@ -4,11 +4,10 @@ Demonstration k of a task depends on the seed and k alone (and on what the file 
 number of workers, on what was recorded before, or on how often the recording was interrupted.
 """
 
-import multiprocessing
 import shutil
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace as changed
 from pathlib import Path
@@ -20,7 +19,7 @@ from libero_env.demos.read import Pairing
 from libero_env.demos.record import BATCH, GENERATOR, Recipe, Tally, record_chunk
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
-from libero_env.parallel import cores, end_with_parent
+from libero_env.parallel import cpu_count, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.tasks import Task, get_suite
 
@@ -171,7 +170,7 @@ def record(
     )
     with bar:
         done = _run(
-            [(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cores()
+            [(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cpu_count()
         )
         for j, tally in done:
             tallies[j].add(tally)
@@ -195,9 +194,7 @@ def _run(
                 failed |= {owner} if tally.error else set()
                 yield owner, tally
         return
-    # spawn: an OpenGL context that a fork inherits hangs.
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=end_with_parent)
+    pool = spawn_pool(workers)
     futures: dict[Future[Tally], int] = {}
     try:
         for owner, chunk in zip(owners, chunks, strict=True):

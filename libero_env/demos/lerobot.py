@@ -7,8 +7,8 @@ action stands beside the observation it was chosen on.
 """
 
 import json
-import shutil
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +32,7 @@ from libero_env.demos.statistics import Histogram, Moments
 from libero_env.demos.video import PIXELS, import_av
 from libero_env.demos.write import Episode
 from libero_env.errors import DemoError
+from libero_env.storage import atomic_folder
 from libero_env.timing import CONTROL_HZ
 
 VERSION = "v3.0"
@@ -65,21 +66,13 @@ def export(
     """
     if root.exists():
         raise DemoError(f"{root} exists; choose another folder or remove it")
-    partial = root.with_name(f".{root.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    dataset = _Dataset(partial, video_mb)
-    try:
+    with atomic_folder(root) as folder, closing(_Dataset(folder, video_mb)) as dataset:
         for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
             language, pairing = _language(file), header_of(file).get("pairing", "libero")
             for name, episode in read_episodes(file):
                 dataset.add(_row(f"{file}: {name}", episode, pairing, labels), language)
         dataset.close()
-        counts = dataset.finish()
-        partial.rename(root)
-    finally:
-        dataset.close()
-        shutil.rmtree(partial, ignore_errors=True)
-    return counts
+        return dataset.finish()
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 
@@ -26,8 +25,9 @@ from libero_env.errors import LiberoError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.init_states.store import scene_digest
-from libero_env.parallel import end_with_parent
+from libero_env.parallel import spawn_pool
 from libero_env.sim.scene import build_scene
+from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
 
 BATCH = 16  # starts simulated together
@@ -187,7 +187,7 @@ def _run(
         for k, states in chunks:
             yield k, attempt(tasks[k], states, pack, disturb)
         return
-    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent)
+    pool = spawn_pool(jobs)
     try:
         futures: dict[Future[list[Outcome]], int] = {
             pool.submit(attempt, tasks[k], states, pack, disturb): k for k, states in chunks
@@ -255,7 +255,4 @@ def _stored(path: Path, empty: Certificate) -> Certificate:
 
 
 def _store(path: Path, certificate: Certificate) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(asdict(certificate), indent=1) + "\n", encoding="utf-8")
-    partial.replace(path)
+    atomic_write_text(path, json.dumps(asdict(certificate), indent=1) + "\n")

@@ -11,7 +11,6 @@ from gymnasium import spaces
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.geometry import axis_angle
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
 from libero_env.sim.controllers import ControllerState, get_controller
@@ -22,8 +21,6 @@ from libero_env.sim.simulation import Simulations, make_simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.problem import And
-
-__all__ = ["DEFAULT_CAMERAS", "DEFAULT_OBSERVATIONS", "World", "axis_angle"]
 
 
 class World:

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from libero_env.errors import LiberoError
+from libero_env.storage import atomic_path
 
 _MAX_BYTES = 1 << 28  # of any one part of a file
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of all parts, so that equal states are equal files
@@ -52,15 +53,12 @@ def read_states(path: str | Path) -> np.ndarray:
 def write_states(path: str | Path, rows: np.ndarray) -> None:
     """Write rows (n, size) in the original's format, which `torch.load` and `read_states` read."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     # Written as the older NumPy named things, which every version reads.
     content = pickle.dumps(np.ascontiguousarray(rows, np.float64), protocol=2)
     content = content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
-    partial = path.with_name(f".{path.name}.{np.random.SeedSequence().entropy:x}")
-    with zipfile.ZipFile(partial, "w") as archive:
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, data in (("data.pkl", content), ("version", b"3\n")):
             archive.writestr(zipfile.ZipInfo(f"{path.stem}/{name}", _EPOCH), data)
-    partial.replace(path)
 
 
 def _read_zip(file: Any) -> object:

@@ -2,10 +2,8 @@
 
 import hashlib
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from importlib import resources
-from multiprocessing import get_context
 from pathlib import Path
 
 import mujoco
@@ -15,9 +13,11 @@ from tqdm import tqdm
 from libero_env.assets.pack import BUILTIN
 from libero_env.errors import LiberoError
 from libero_env.init_states.settle import sample_settled
+from libero_env.parallel import spawn_pool
 from libero_env.paths import cache_dir
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
+from libero_env.storage import atomic_path
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50
@@ -93,7 +93,7 @@ def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
     """
     arrays: dict[str, np.ndarray] = {}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with spawn_pool(jobs) as pool:
         made = zip(tasks, pool.map(_generate, tasks), strict=True)
         for task, (states, digest) in tqdm(made, unit="task", desc="initial states", total=len(tasks)):
             arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
@@ -137,6 +137,5 @@ def _shipped(suite: str) -> dict[str, tuple[str, np.ndarray]]:
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    partial = path.with_suffix(".partial.npz")
-    np.savez_compressed(partial, **arrays)
-    partial.replace(path)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)

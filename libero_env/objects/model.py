@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
+from libero_env.geometry import quat_from_axis_angle
+
 ROOT_BODY = "main"
 GLOW_GROUP = 2  # group of the sites that are seen only while their object is turned on
 
@@ -66,8 +68,7 @@ def rest_quat(
     total = np.array([1.0, 0.0, 0.0, 0.0])
     for axis, (low, high) in rotation.items():
         angle = 0.5 * (low + high) if rng is None else rng.uniform(low, high)
-        turn, product = np.zeros(4), np.zeros(4)
-        mujoco.mju_axisAngle2Quat(turn, np.eye(3)["xyz".index(axis)], angle)
-        mujoco.mju_mulQuat(product, turn, total)
+        product = np.zeros(4)
+        mujoco.mju_mulQuat(product, quat_from_axis_angle(np.eye(3)["xyz".index(axis)], angle), total)
         total = product
     return np.roll(total, -1)  # (w, x, y, z) -> (x, y, z, w), kept in this order on purpose

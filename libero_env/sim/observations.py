@@ -28,7 +28,7 @@ import numpy as np
 from gymnasium import spaces
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.geometry import axis_angle, product, rotated
+from libero_env.geometry import quat_multiply, quat_rotate, quat_to_axis_angle
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.predicates import glowing_sites
 from libero_env.sim.render import Picture, Renderer
@@ -132,7 +132,7 @@ class Observer:
             case "ee_quat":
                 return self._eef_pose()[1].copy()
             case "ee_ori":
-                return axis_angle(self._eef_pose()[1])
+                return quat_to_axis_angle(self._eef_pose()[1])
         raise UnknownNameError("observation of the robot", name, _ROBOT)
 
     def empty_frames(self, num: int | None = None) -> dict[str, np.ndarray]:
@@ -254,8 +254,8 @@ class _Things:
         for name, body in self._bodies.items():
             pos, quat = f["xpos"][:, body].copy(), f["xquat"][:, body].copy()
             found |= {f"{name}_pos": pos, f"{name}_quat": quat}
-            found[f"{name}_to_ee_pos"] = rotated(back, pos - eef_pos)
-            found[f"{name}_to_ee_quat"] = product(back, quat)
+            found[f"{name}_to_ee_pos"] = quat_rotate(back, pos - eef_pos)
+            found[f"{name}_to_ee_quat"] = quat_multiply(back, quat)
             if name in self._joints:
                 found[f"{name}_joints"] = f["qpos"][:, self._joints[name]]
         return found

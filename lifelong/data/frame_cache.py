@@ -27,6 +27,7 @@ from torch import Tensor
 
 from libero_env.demos.read import demo_files
 from libero_env.paths import cache_dir
+from libero_env.storage import atomic_folder
 from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.source import DemoArrays, DemoSource, check_language, last_frames
 from lifelong.errors import DataError
@@ -85,24 +86,19 @@ def _ensure(source: DemoSource) -> Path:
 
 
 def _build(source: DemoSource, folder: Path, made_from: dict[str, Any]) -> None:
-    """Write a folder under another name, and give it its own when it is complete."""
-    part = folder.with_name(f".{folder.name}.part")  # of a process that was killed: the lock is ours now
-    shutil.rmtree(part, ignore_errors=True)
+    """Write the folder of a source in one step."""
     needed, free = source.nbytes(), shutil.disk_usage(folder.parent).free
     try:
         if needed > free:
             raise OSError(f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} are free")
-        part.mkdir()
-        index = {"format": _FORMAT, "shape": _write_arrays(source, part), **made_from}
-        (part / "index.json").write_text(json.dumps(index, indent=1))
-        os.replace(part, folder)
+        with atomic_folder(folder) as part:
+            index = {"format": _FORMAT, "shape": _write_arrays(source, part), **made_from}
+            (part / "index.json").write_text(json.dumps(index, indent=1))
     except OSError as error:
         raise DataError(
             f"{folder}: the frames of {source.path} cannot be written ({error}). Make room there, name another "
             "folder with LIBERO_CACHE, or set data.memory=host"
         ) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _write_arrays(source: DemoSource, folder: Path) -> tuple[int, ...]:

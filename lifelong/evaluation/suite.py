@@ -5,7 +5,6 @@ What is done of a task is on disk when it is done, so a stopped evaluation goes 
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.errors import ConfigError, LifelongError
@@ -308,10 +308,7 @@ def _result(task: Task, done: Rollouts) -> TaskResult:
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    atomic_write_text(path, json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n")
 
 
 def _tuples(value: Any) -> Any:

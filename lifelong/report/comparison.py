@@ -4,7 +4,6 @@ The published ± is the standard error over seeds; the intervals are those of `l
 """
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.storage import atomic_write_text
 from lifelong.report.runs import Group, Run
 from lifelong.results.bootstrap import DRAWS, Member, Resamples, resample
 from lifelong.results.metrics import METRIC_NAMES, Estimate, mean_and_standard_error
@@ -59,11 +59,7 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
 
 def write_comparison(found: Mapping[str, Any], path: Path) -> None:
     """Writes what `compare` found as JSON, in one step; NaN is null."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(
-        json.dumps(plain(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
-    os.replace(part, path)
+    atomic_write_text(path, json.dumps(plain(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def _group(group: Group, runs: Sequence[Run], drawn: Resamples | None) -> dict[str, Any]:

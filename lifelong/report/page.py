@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from libero_env.storage import atomic_write_text
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import compare, write_comparison
 from lifelong.report.figures import (
@@ -68,9 +69,7 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
         out.parent.mkdir(parents=True, exist_ok=True)
         context = _single(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
         page = _template().render(**context, metric_texts=METRIC_TEXTS)
-        part = out.with_name(out.name + ".part")
-        part.write_text(page, encoding="utf-8")
-        os.replace(part, out)
+        atomic_write_text(out, page)
     except OSError as error:
         raise LifelongError(f"{out}: the report cannot be written ({error})") from error
     return out

@@ -15,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from libero_env.storage import PART_SUFFIX, atomic_write_text
 from lifelong import checkpoints
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.log import ResultLog
@@ -58,7 +59,7 @@ class RunDirectory:
             if not resume and self.path.exists():
                 os.rename(self.path, _free_name(self.path))
             self.path.mkdir(exist_ok=True)
-            for part in self.path.rglob("*.part"):  # half written by a process that was killed
+            for part in self.path.rglob(f"*{PART_SUFFIX}"):  # half written by a process that was killed
                 part.unlink()
             self._agree(dict(config))
             yield self
@@ -66,9 +67,7 @@ class RunDirectory:
     def _agree(self, config: dict[str, Any]) -> None:
         file = self.path / "config.yaml"
         if not file.exists():
-            part = file.with_suffix(".part")
-            part.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True), encoding="utf-8")
-            os.replace(part, file)
+            atomic_write_text(file, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
             return
         old = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
         was, now = decisive(old), decisive(config)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from libero_env.storage import atomic_write_text
 from lifelong.errors import ResultsError
 from lifelong.results.metrics import METRIC_NAMES, lifelong_metrics, wilson_interval
 from lifelong.results.records import TaskEndRecord
@@ -31,15 +31,11 @@ def write_summary(path: Path | str, results: Results, config: Mapping[str, Any])
     """
     summary = plain(summarize(results) | {"config": dict(config)})
     path = Path(path)
-    part = path.with_name(path.name + ".part")
     try:
-        with open(part, "w", encoding="utf-8") as file:
-            json.dump(summary, file, indent=1, ensure_ascii=False, allow_nan=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
+        atomic_write_text(
+            path, json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False), fsync=True
+        )
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise ResultsError(
             f"{path}: the summary cannot be written ({error}); results.jsonl is intact"
         ) from error

@@ -9,13 +9,13 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
 from libero_env.expert.arm.gripper import MAX_OPENING, WIDEST
 from libero_env.expert.arm.reach import limit_elbow_extension
-from libero_env.expert.arm.servo import action_toward, downward, rotation_between
+from libero_env.expert.arm.servo import action_toward, downward
 from libero_env.expert.grasping.costs import finger_offset, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, grasps
 from libero_env.expert.planning.pick_plan import Failure, _alike, choose_approach, choose_place
 from libero_env.expert.rollout import run_experts
 from libero_env.expert.skills.transport import Carry, Move
-from libero_env.geometry import surface_points
+from libero_env.geometry import rotation_between, surface_points
 from libero_env.sim.predicates import atoms_of, evaluate
 from libero_env.sim.regions import contains, is_over, region_boxes
 from libero_env.tasks import get_suite, get_task

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.geometry import product, rotated
+from libero_env.geometry import quat_multiply, quat_rotate
 from libero_env.registration import env_ids
 from libero_env.sim.observations import NAMES, PROPRIOCEPTION
 from libero_env.sim.predicates import glowing_sites
@@ -109,9 +109,9 @@ def test_kinds_of_segmentation_agree(kitchen):
 def test_poses_seen_from_the_hand_lead_back_to_the_world(kitchen):
     seen = kitchen.set_state(kitchen.get_state())
     for name in kitchen.world.scene.entities:
-        back = rotated(seen["ee_quat"][None], seen[f"{name}_to_ee_pos"][None])[0] + seen["ee_pos"]
+        back = quat_rotate(seen["ee_quat"][None], seen[f"{name}_to_ee_pos"][None])[0] + seen["ee_pos"]
         np.testing.assert_allclose(back, seen[f"{name}_pos"], atol=1e-9)
-        quat = product(seen["ee_quat"][None], seen[f"{name}_to_ee_quat"][None])[0]
+        quat = quat_multiply(seen["ee_quat"][None], seen[f"{name}_to_ee_quat"][None])[0]
         assert abs(quat @ seen[f"{name}_quat"]) == pytest.approx(1.0)
 
 

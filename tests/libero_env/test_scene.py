@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from libero_env.envs.env import LiberoEnv
-from libero_env.envs.world import axis_angle
 from libero_env.errors import PlacementError, RenderError, UnknownNameError
+from libero_env.geometry import quat_to_axis_angle
 from libero_env.init_states.placement import lowest_point, sample_qpos
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.render import Renderer, open_context
@@ -217,7 +217,7 @@ def test_axis_angle_turns_back_into_the_rotation():
     quats = np.random.default_rng(0).normal(size=(50, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     quats[0] = [1, 0, 0, 0]
-    for quat, vector in zip(quats, axis_angle(quats), strict=True):
+    for quat, vector in zip(quats, quat_to_axis_angle(quats), strict=True):
         angle, back = np.linalg.norm(vector), np.zeros(4)
         mujoco.mju_axisAngle2Quat(back, vector / max(angle, 1e-12), angle)
         assert abs(back @ quat) == pytest.approx(1)

@@ -10,6 +10,7 @@ import numpy as np
 
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.geometry import quat_to_mat
 
 if TYPE_CHECKING:
     from libero._adapters.envs.sim import MjSim
@@ -116,9 +117,9 @@ class Observer:
     def _things(self) -> dict[str, np.ndarray]:
         found: dict[str, np.ndarray] = {}
         grip_pos, grip_quat = self._grip()
-        inverse, rotation = np.empty(4), np.empty(9)
+        inverse = np.empty(4)
         mujoco.mju_negQuat(inverse, grip_quat)
-        mujoco.mju_quat2Mat(rotation, inverse)
+        rotation = quat_to_mat(inverse)
         for name in self.objects:
             pos, quat = (
                 self.sim.data.get_body_xpos(f"{name}_main"),
@@ -127,7 +128,7 @@ class Observer:
             relative = np.empty(4)
             mujoco.mju_mulQuat(relative, inverse, quat)
             found[f"{name}_pos"], found[f"{name}_quat"] = pos.copy(), np.roll(quat, -1)
-            found[f"{name}_to_robot0_eef_pos"] = rotation.reshape(3, 3) @ (pos - grip_pos)
+            found[f"{name}_to_robot0_eef_pos"] = rotation @ (pos - grip_pos)
             found[f"{name}_to_robot0_eef_quat"] = np.roll(relative if relative[0] >= 0 else -relative, -1)
         return found
 

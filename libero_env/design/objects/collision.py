@@ -9,6 +9,7 @@ import numpy as np
 
 from libero_env.design.objects.mesh_file import Notify, is_closed, signed_volume
 from libero_env.errors import LiberoError
+from libero_env.geometry import quat_to_mat
 
 METHODS = ("decompose", "hull", "boxes")
 INSTALL = "pip install 'libero-lifelong[objects]'"
@@ -110,9 +111,8 @@ def _mass(
         model = spec.compile()
     except ValueError as error:
         raise LiberoError(f"the mesh has no inside that could weigh something ({error}); mend it") from error
-    index, turn = model.body("body").id, np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.body_iquat[index])
-    axes = turn.reshape(3, 3)
+    index = model.body("body").id
+    axes = quat_to_mat(model.body_iquat[index])
     inertia = density / scale**5 * axes @ np.diag(model.body_inertia[index]) @ axes.T
     order = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
     return Mass(float(model.body_mass[index] / scale**3), model.body_ipos[index] / scale, inertia[order])

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.robot import REST_QPOS
-from libero_env.expert.arm.servo import rotation_between
+from libero_env.geometry import rotation_between
 from libero_env.sim.osc import POSITION_SCALE
 from libero_env.sim.state import StateView
 

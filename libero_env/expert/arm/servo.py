@@ -1,8 +1,8 @@
 """From where the gripper is to where it should be: one action of the environment."""
 
-import mujoco
 import numpy as np
 
+from libero_env.geometry import rotation_between
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 
 OPEN, CLOSE = -1.0, 1.0
@@ -50,14 +50,6 @@ def action_toward(
     action[3:6] = turn * min(1.0, 0.6 / max(np.linalg.norm(turn), 1e-9))
     action[6] = gripper
     return action
-
-
-def rotation_between(mat: np.ndarray, goal_mat: np.ndarray) -> np.ndarray:
-    """The rotation that takes one orientation to the other, axis times angle in the world frame, (3,), rad."""
-    quat, out = np.zeros(4), np.zeros(3)
-    mujoco.mju_mat2Quat(quat, (goal_mat @ mat.T).ravel())
-    mujoco.mju_quat2Vel(out, quat, 1.0)
-    return out
 
 
 def finger_axis(mat: np.ndarray) -> np.ndarray:

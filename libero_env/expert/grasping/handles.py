@@ -8,7 +8,7 @@ from itertools import product
 import mujoco
 import numpy as np
 
-from libero_env.geometry import Pose, body_points, surface_points
+from libero_env.geometry import Pose, body_points, quat_from_axis_angle, quat_to_mat, surface_points
 from libero_env.sim.state import StateView
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -182,9 +182,7 @@ def _part_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray
 
 
 def _body_pose(view: StateView, body: int) -> Pose:
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, _field(view, "xquat")[body])
-    return Pose(_field(view, "xpos")[body].copy(), mat.reshape(3, 3))
+    return Pose(_field(view, "xpos")[body].copy(), quat_to_mat(_field(view, "xquat")[body]))
 
 
 def _field(view: StateView, name: str) -> np.ndarray:
@@ -193,7 +191,4 @@ def _field(view: StateView, name: str) -> np.ndarray:
 
 def turned(axis: np.ndarray, angle: float) -> np.ndarray:
     """Rotation (3, 3) by an angle, rad, about a unit axis (3,)."""
-    quat, mat = np.zeros(4), np.zeros(9)
-    mujoco.mju_axisAngle2Quat(quat, axis, angle)
-    mujoco.mju_quat2Mat(mat, quat)
-    return mat.reshape(3, 3)
+    return quat_to_mat(quat_from_axis_angle(axis, angle))

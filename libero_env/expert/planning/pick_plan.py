@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from libero_env.expert.arm.servo import finger_axis, rotation_between
+from libero_env.expert.arm.servo import finger_axis
 from libero_env.expert.clearance import Voxels
 from libero_env.expert.grasping.costs import HAND, collision_cost, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, grasps
 from libero_env.expert.planning.place_poses import DOWN, Place, places
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
-from libero_env.geometry import Pose
+from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 

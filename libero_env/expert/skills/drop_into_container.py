@@ -5,12 +5,12 @@ from typing import Literal
 import numpy as np
 
 from libero_env.expert.arm.gripper import TIP_BELOW
-from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward, downward, finger_axis, rotation_between
+from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward, downward, finger_axis
 from libero_env.expert.grasping.grasps import GraspError
 from libero_env.expert.grasping.top_grasps import TopGrasp, choose_top_grasp
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.variation import MotionStyle
-from libero_env.geometry import Pose
+from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom

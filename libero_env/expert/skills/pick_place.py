@@ -6,7 +6,7 @@ import numpy as np
 
 from libero_env.errors import LiberoError
 from libero_env.expert.arm.gripper import MAX_OPENING, TIP_BELOW
-from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward, rotation_between
+from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward
 from libero_env.expert.clearance import lowest, obstacle_height
 from libero_env.expert.grasping.costs import finger_offset
 from libero_env.expert.grasping.grasps import crowding
@@ -14,7 +14,7 @@ from libero_env.expert.planning.pick_plan import Approach, Failure, choose_appro
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.skills.transport import Carry, Move
 from libero_env.expert.variation import MotionStyle
-from libero_env.geometry import Pose
+from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom

@@ -5,12 +5,11 @@ from typing import Literal
 
 import numpy as np
 
-from libero_env.expert.arm.servo import rotation_between
 from libero_env.expert.clearance import lowest, obstacle_height
 from libero_env.expert.planning.pick_plan import ASIDE, Approach
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.variation import MotionStyle
-from libero_env.geometry import Pose
+from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom

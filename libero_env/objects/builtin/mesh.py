@@ -8,8 +8,9 @@ viewer in front (-y), the front (0.5) and the right (+y) to the back again (1).
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
+
+from libero_env.geometry import quat_to_mat
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,7 @@ class Mesh:
 
     def rotated(self, quat: np.ndarray) -> "Mesh":
         """The mesh turned by a quaternion wxyz (4,)."""
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
-        return Mesh(self.vertices @ matrix.reshape(3, 3).T, self.faces, self.texcoords)
+        return Mesh(self.vertices @ quat_to_mat(np.asarray(quat, float)).T, self.faces, self.texcoords)
 
 
 @dataclass(frozen=True)
