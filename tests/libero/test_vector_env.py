@@ -80,7 +80,7 @@ def test_a_hanging_worker_is_given_up():
     env = SubprocVectorEnv([lambda: Slow(60.0)], call_timeout=15.0)
     env.reset()
     env.workers[0]._timeout = 0.3
-    with pytest.raises(WorkerError, match=r"step took more than 0.3 s"):
+    with pytest.raises(WorkerError, match="in step: no answer within 0.3 s"):
         env.step([1])
     env.close()
     assert not env.workers[0].process.is_alive()

@@ -1,139 +1,110 @@
-"""One environment of a vector: what any worker does, and the one that works in this process.
+"""Workers of a vector of environments: one in this process, and one in a process of its own.
 
-A worker answers requests in order: `send` starts one and `recv` waits for its answer, so that several work at once.
+A worker answers requests in order: `send` starts one and `recv` waits for its answer, so several workers run at once.
 """
 
+import sys
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from multiprocessing import shared_memory
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import connection
 from typing import Any
 
-import cloudpickle
 import numpy as np
+from gymnasium.vector import utils
 
+from libero_env.envs.worker import Shared, Worker, shut_down, wait_for
 from libero_env.errors import LiberoError
+
+# Methods of the environment that a worker has, too: each sends the call and waits for the answer.
+METHODS = {"reset", "step", "seed", "render", "check_success", "get_segmentation_of_interest"}
+METHODS |= {"get_sim_state", "set_init_state"}
 
 
 class WorkerError(LiberoError, RuntimeError):
-    """A worker failed, died or took too long; the message says which and why."""
+    """A worker failed, died or took too long; the message states which one and why."""
 
 
-class CloudpickleWrapper:
-    """A factory that survives being sent to another process, a lambda included."""
+class CloudpickleWrapper(utils.CloudpickleWrapper):
+    """Factory that can be sent to another process, also a lambda."""
 
-    def __init__(self, data: Any):
-        self.data = data
-
-    def __getstate__(self) -> bytes:
-        return cloudpickle.dumps(self.data)
-
-    def __setstate__(self, data: bytes) -> None:
-        self.data = cloudpickle.loads(data)
+    @property
+    def data(self) -> Callable[[], Any]:
+        """The factory."""
+        return self.fn
 
 
 class ShArray:
-    """An array in memory that processes share; whoever made it frees it."""
+    """Array in memory that processes share; the process that made it frees it."""
 
     def __init__(self, dtype: Any, shape: Sequence[int]):
-        self.dtype, self.shape = np.dtype(dtype), tuple(shape)
-        size = max(1, self.dtype.itemsize * int(np.prod(self.shape)))
-        self._memory: Any = shared_memory.SharedMemory(create=True, size=size)
-        self._owner = True
+        self._open(np.dtype(dtype), tuple(shape))
+
+    def _open(self, dtype: np.dtype, shape: tuple[int, ...], name: str | None = None) -> None:
+        self.dtype, self.shape = dtype, shape
+        self._shared = Shared({"array": np.empty(shape, dtype)}, name)
 
     def save(self, array: Any) -> None:
-        """Write."""
-        self._view()[...] = array
+        """Write the array."""
+        self._shared.write({"array": array})
 
     def get(self) -> np.ndarray:
-        """A copy."""
-        return self._view().copy()
+        """Return a copy of the array."""
+        return self._shared.views["array"].copy()
 
     def close(self) -> None:
-        """Let go of the memory. Idempotent."""
-        if self._memory is not None:
-            self._memory.close()
-            if self._owner:
-                self._memory.unlink()
-            self._memory = None
-
-    def _view(self) -> np.ndarray:
-        return np.ndarray(self.shape, self.dtype, self._memory.buf)
+        """Release the memory. Idempotent."""
+        self._shared.close()
 
     def __getstate__(self) -> tuple:
-        return self.dtype, self.shape, self._memory.name
+        return self.dtype, self.shape, self._shared.name
 
     def __setstate__(self, state: tuple) -> None:
-        self.dtype, self.shape, name = state
-        self._memory, self._owner = shared_memory.SharedMemory(name), False
+        self._open(*state)
 
 
 class EnvWorker(ABC):
-    """One environment."""
+    """One environment. The methods in `METHODS` call those of the environment and return their results."""
 
     def __init__(self, env_fn: Callable[[], Any]):
         self._env_fn, self.is_closed = env_fn, False
-        self.result: Any = None
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name in METHODS:
+            return partial(self._ask, name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
-    def send(self, method: str, *args: Any, **kwargs: Any) -> None:
-        """Start a call of the environment."""
+    def _send(self, command: str, *args: Any) -> None:
+        """Start a command of `VectorHost`."""
 
     @abstractmethod
     def recv(self) -> Any:
-        """The result of the call that was started.
+        """Return the result of the call that was started.
 
         Raises:
-            WorkerError: it failed.
+            WorkerError: The call failed, the process died, or the time is over.
         """
 
     @abstractmethod
-    def get_env_attr(self, key: str) -> Any:
-        """An attribute of the environment."""
-
-    @abstractmethod
-    def set_env_attr(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment."""
-
-    @abstractmethod
     def close_env(self) -> None:
-        """Close the environment."""
+        """Close the environment, by force where it does not answer."""
 
-    def call(self, method: str, *args: Any, **kwargs: Any) -> Any:
-        """Call a method of the environment."""
-        self.send(method, *args, **kwargs)
+    def send(self, method: str, *args: Any, **kwargs: Any) -> None:
+        """Start a call of a method of the environment."""
+        self._send("call", method, args, kwargs)
+
+    def get_env_attr(self, key: str) -> Any:
+        """Return an attribute of the environment; of one in another process a copy."""
+        self._send("get", key)
         return self.recv()
 
-    def reset(self, **kwargs: Any) -> Any:
-        """Call `reset`."""
-        return self.call("reset", **kwargs)
-
-    def step(self, action: Any) -> Any:
-        """Call `step`."""
-        return self.call("step", action)
-
-    def seed(self, seed: int | None = None) -> Any:
-        """Call `seed`."""
-        return self.call("seed", seed)
-
-    def render(self, **kwargs: Any) -> Any:
-        """Call `render`."""
-        return self.call("render", **kwargs)
-
-    def check_success(self) -> bool:
-        """Call `check_success`."""
-        return self.call("check_success")
-
-    def get_segmentation_of_interest(self, segmentation_image: np.ndarray) -> np.ndarray:
-        """Call `get_segmentation_of_interest`."""
-        return self.call("get_segmentation_of_interest", segmentation_image)
-
-    def get_sim_state(self) -> np.ndarray:
-        """Call `get_sim_state`."""
-        return self.call("get_sim_state")
-
-    def set_init_state(self, init_state: np.ndarray) -> Any:
-        """Call `set_init_state`."""
-        return self.call("set_init_state", init_state)
+    def set_env_attr(self, key: str, value: Any) -> None:
+        """Set an attribute of the environment, or of its inner environment where only that has it."""
+        self._send("set", key, value)
+        self.recv()
 
     def close(self) -> None:
         """Close the environment. Idempotent."""
@@ -143,8 +114,12 @@ class EnvWorker(ABC):
 
     @staticmethod
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
-        """The workers that are ready, `wait_num` of them at least unless the time is over."""
+        """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
         return workers
+
+    def _ask(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        self.send(method, *args, **kwargs)
+        return self.recv()
 
 
 class DummyEnvWorker(EnvWorker):
@@ -152,30 +127,157 @@ class DummyEnvWorker(EnvWorker):
 
     def __init__(self, env_fn: Callable[[], Any]):
         super().__init__(env_fn)
-        self.env = env_fn()
+        self._host = VectorHost(env_fn)
+        self._host.open()
+        self.env, self.result = self._host.env, None
 
-    def send(self, method: str, *args: Any, **kwargs: Any) -> None:
-        """Make the call."""
-        self.result = getattr(self.env, method)(*args, **kwargs)
+    def _send(self, command: str, *args: Any) -> None:
+        self.result = getattr(self._host, command)(*args)
 
     def recv(self) -> Any:
-        """Its result."""
+        """Return the result of the call."""
         return self.result
-
-    def get_env_attr(self, key: str) -> Any:
-        """An attribute of the environment."""
-        return getattr(self.env, key)
-
-    def set_env_attr(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment, or of the one inside where that has it."""
-        set_attribute(self.env, key, value)
 
     def close_env(self) -> None:
         """Close the environment."""
-        self.env.close()
+        self._host.close()
 
 
-def set_attribute(env: Any, key: str, value: Any) -> None:
-    """Set an attribute of an environment, or of the one inside where only that has it."""
-    inner = getattr(env, "env", None)
-    setattr(inner if inner is not None and not hasattr(env, key) else env, key, value)
+class SubprocEnvWorker(EnvWorker):
+    """An environment in a process of its own, which is spawned: no GL context is inherited.
+
+    Args:
+        env_fn: Factory of the environment, called in the process; a lambda is allowed.
+        share_memory: Whether the arrays of observations come back through shared memory.
+        timeout: Seconds that a call may take; None for no limit.
+    """
+
+    def __init__(self, env_fn: Callable[[], Any], share_memory: bool = False, timeout: float | None = None):
+        super().__init__(env_fn)
+        self.share_memory, self._timeout, self._request = share_memory, timeout, ""
+        with _without_main():
+            self._worker = Worker("", env_fn, host=VectorHost)
+        self.process, self.parent_remote = self._worker.process, self._worker.pipe
+
+    def _send(self, command: str, *args: Any) -> None:
+        self._request = args[0]
+        self._worker.send(command, *args)
+
+    def recv(self) -> Any:
+        """Return the result of the call that was started; see `EnvWorker.recv`."""
+        if not self._worker.opened:
+            self._answer("making the environment")
+            self._worker.opened = True
+        result = self._answer(self._request)
+        if self.share_memory and (observation := _observation(result)):
+            self._unshare(observation)
+        return result
+
+    def _answer(self, request: str) -> Any:
+        """Return the answer to a request; a worker that does not answer, or has no environment, is killed."""
+        answers, failures = wait_for({0: self._worker}, self._timeout)
+        if not failures:
+            return answers[0]
+        if failures[0].lost or not self._worker.opened:
+            self.process.kill()
+        raise WorkerError(f"worker {self.process.pid}, in {request}: {failures[0].why}")
+
+    def _unshare(self, observation: dict[str, Any]) -> None:
+        """Fill in the arrays that came through shared memory, which the first observation sets up."""
+        shared = self._worker.shared
+        if shared is not None:
+            absent = [key for key in shared.views if observation.get(key, 0) is None]
+            observation.update({key: shared.views[key].copy() for key in absent})
+        elif arrays := _arrays(observation):
+            self._worker.shared = Shared(arrays)
+            self._worker.send("attach", self._worker.shared.name)
+            self._answer("attach")
+
+    def close_env(self) -> None:
+        """End the process, by force where it does not answer."""
+        shut_down([self._worker])
+
+    @staticmethod
+    def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
+        """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
+        remotes: dict[Any, EnvWorker] = {worker.parent_remote: worker for worker in workers}
+        end = None if timeout is None else time.monotonic() + timeout
+        ready: list[EnvWorker] = []
+        while remotes and len(ready) < wait_num:
+            found = connection.wait(list(remotes), None if end is None else max(0.0, end - time.monotonic()))
+            ready += [remotes.pop(remote) for remote in found]
+            if not found:
+                break
+        return ready
+
+
+class VectorHost:
+    """The commands of a worker, see `libero_env.envs.worker`: calls and attributes of any environment."""
+
+    def __init__(self, make: Callable[[], Any]):
+        self._make = make
+        self.env: Any = None
+        self._shared: Shared | None = None
+        self._layout: dict[str, np.ndarray] = {}
+
+    def open(self) -> None:
+        """Make the environment."""
+        self.env = self._make()
+
+    def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Call a method; None stands for arrays of an observation that are in shared memory."""
+        result = getattr(self.env, method)(*args, **kwargs)
+        observation = _observation(result)
+        if observation is None:
+            return result
+        arrays = _arrays(observation)
+        self._layout = self._layout or arrays
+        for key, view in self._shared.views.items() if self._shared else ():
+            if key in arrays and arrays[key].shape == view.shape:
+                view[...] = arrays[key]
+                observation[key] = None
+        return result
+
+    def get(self, key: str) -> Any:
+        """Return an attribute."""
+        return getattr(self.env, key)
+
+    def set(self, key: str, value: Any) -> None:
+        """Set an attribute, of the inner environment where only that has it."""
+        inner = getattr(self.env, "env", None)
+        setattr(inner if inner is not None and not hasattr(self.env, key) else self.env, key, value)
+
+    def attach(self, name: str) -> None:
+        """Write observations to shared memory, laid out as the first observation was."""
+        self._shared = Shared(self._layout, name)
+
+    def close(self) -> None:
+        """Close the environment and release the shared memory."""
+        if self.env is not None:
+            self.env.close()
+        if self._shared is not None:
+            self._shared.close()
+
+
+def _observation(result: Any) -> dict[str, Any] | None:
+    """Return the observation in the result of `reset` or `step`; None where there is none."""
+    observation = result[0] if isinstance(result, tuple) else result
+    return observation if isinstance(observation, dict) else None
+
+
+def _arrays(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    return {key: value for key, value in observation.items() if isinstance(value, np.ndarray)}
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Keep a spawned process from running the script again: what it needs comes with the factory."""
+    main: Any = sys.modules["__main__"]
+    hidden: dict[str, Any] = {
+        name: main.__dict__.pop(name) for name in ("__file__", "__spec__") if name in main.__dict__
+    }
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        main.__dict__.update(hidden)
