@@ -8,16 +8,3 @@ from libero.libero.envs.env_wrapper import (
     SegmentationRenderEnv,
 )
 from libero.libero.envs.venv import BaseVectorEnv, DummyVectorEnv, SubprocVectorEnv
-
-__all__ = [
-    "TASK_MAPPING",
-    "BDDLBaseDomain",
-    "BaseVectorEnv",
-    "ControlEnv",
-    "DemoRenderEnv",
-    "DummyVectorEnv",
-    "OffScreenRenderEnv",
-    "SegmentationRenderEnv",
-    "SubprocVectorEnv",
-    "register_problem",
-]

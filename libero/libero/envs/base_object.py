@@ -266,9 +266,8 @@ class MujocoXMLObject(BaseObject):
         return model_of(self, self.category_name)
 
 
-def declare(base: type[BaseObject], module: str, names: str) -> list[type]:
-    """Subclasses of `base` for these class names, registered, in order."""
-    return [
-        register_object(type(name, (base,), {"__module__": module, "__doc__": f"`{category_of(name)}`"}))
-        for name in names.split()
-    ]
+def declare(base: type[BaseObject], names: str) -> dict[str, type]:
+    """Register a subclass of `base` for each of the class names, and return them by name."""
+    facts = {"__module__": base.__module__}
+    classes = [type(name, (base,), {**facts, "__doc__": f"`{category_of(name)}`"}) for name in names.split()]
+    return {cls.__name__: register_object(cls) for cls in classes}

@@ -2,5 +2,3 @@
 
 from libero.libero import get_libero_path, get_path_dict
 from libero.libero import set_libero_default_path as set_libero_path
-
-__all__ = ["get_libero_path", "get_path_dict", "set_libero_path"]

@@ -13,20 +13,9 @@ from libero.libero import get_path_dict
 from libero.libero.benchmark import get_benchmark
 from libero_env.assets.http import fetch
 from libero_env.assets.hub import DownloadError
-from libero_env.demos.download import REPO as HF_REPO_ID
+from libero_env.demos.download import REPO as HF_REPO_ID  # noqa: F401 - name of the original
 from libero_env.demos.download import download_demos
 from libero_env.errors import UnknownNameError
-
-__all__ = [
-    "DATASET_LINKS",
-    "HF_REPO_ID",
-    "DownloadProgressBar",
-    "check_libero_dataset",
-    "download_from_huggingface",
-    "download_url",
-    "libero_dataset_download",
-    "url_is_alive",
-]
 
 # Archives of the demonstrations, without published checksums. That of LIBERO-100 holds libero_90 and libero_10.
 DATASET_LINKS = {

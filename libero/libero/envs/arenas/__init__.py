@@ -7,14 +7,3 @@ from libero.libero.envs.arenas.kitchen_arena import KitchenTableArena
 from libero.libero.envs.arenas.living_room_arena import LivingRoomTableArena
 from libero.libero.envs.arenas.study_arena import StudyTableArena
 from libero.libero.envs.arenas.table_arena import TableArena
-
-__all__ = [
-    "Arena",
-    "WorkspaceArena",
-    "TableArena",
-    "KitchenTableArena",
-    "LivingRoomTableArena",
-    "StudyTableArena",
-    "CoffeeTableArena",
-    "EmptyArena",
-]

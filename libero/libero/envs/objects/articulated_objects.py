@@ -1,6 +1,11 @@
 """What opens, closes and turns."""
 
-from libero.libero.envs.base_object import BuiltinObject, declare, register_visual_change_object
+from libero.libero.envs.base_object import (
+    BuiltinObject,
+    declare,
+    get_object_fn,
+    register_visual_change_object,
+)
 
 
 class ArticulatedObject(BuiltinObject):
@@ -10,21 +15,9 @@ class ArticulatedObject(BuiltinObject):
     in_folders = False
 
 
-(
-    BasinFaucet,
-    Faucet,
-    FlatStove,
-    Microwave,
-    ShortCabinet,
-    ShortFridge,
-    SlideCabinet,
-    WhiteCabinet,
-    Window,
-    WoodenCabinet,
-) = declare(
-    ArticulatedObject,
-    __name__,
-    "BasinFaucet Faucet FlatStove Microwave ShortCabinet ShortFridge SlideCabinet WhiteCabinet "
-    "Window WoodenCabinet",
+NAMES = (
+    "BasinFaucet Faucet FlatStove Microwave ShortCabinet ShortFridge SlideCabinet WhiteCabinet Window "
+    "WoodenCabinet"
 )
-register_visual_change_object(FlatStove)
+globals().update(declare(ArticulatedObject, NAMES))
+register_visual_change_object(get_object_fn("flat_stove"))

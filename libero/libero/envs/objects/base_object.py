@@ -1,6 +1,6 @@
 """The registry, under its second path."""
 
-from libero.libero.envs.base_object import (
+from libero.libero.envs.base_object import (  # noqa: F401 - names of the original
     OBJECTS_DICT,
     VISUAL_CHANGE_OBJECTS_DICT,
     get_object_dict,
@@ -8,12 +8,3 @@ from libero.libero.envs.base_object import (
     register_object,
     register_visual_change_object,
 )
-
-__all__ = [
-    "OBJECTS_DICT",
-    "VISUAL_CHANGE_OBJECTS_DICT",
-    "get_object_dict",
-    "get_object_fn",
-    "register_object",
-    "register_visual_change_object",
-]

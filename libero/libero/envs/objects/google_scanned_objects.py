@@ -9,16 +9,5 @@ class GoogleScannedObject(BuiltinObject):
     family = "stable_scanned_objects"
 
 
-(
-    AkitaBlackBowl,
-    Basket,
-    Chefmate8Frypan,
-    GlazedRimPorcelainRamekin,
-    Plate,
-    Rack,
-    WhiteBowl,
-) = declare(
-    GoogleScannedObject,
-    __name__,
-    "AkitaBlackBowl Basket Chefmate8Frypan GlazedRimPorcelainRamekin Plate Rack WhiteBowl",
-)
+NAMES = "AkitaBlackBowl Basket Chefmate8Frypan GlazedRimPorcelainRamekin Plate Rack WhiteBowl"
+globals().update(declare(GoogleScannedObject, NAMES))

@@ -9,27 +9,8 @@ class HopeBaseObject(BuiltinObject):
     family = "stable_hope_objects"
 
 
-(
-    AlphabetSoup,
-    BbqSauce,
-    Butter,
-    Cherries,
-    ChocolatePudding,
-    Cookies,
-    Corn,
-    CreamCheese,
-    Ketchup,
-    MacaroniAndCheese,
-    Mayo,
-    Milk,
-    NewSaladDressing,
-    OrangeJuice,
-    Popcorn,
-    SaladDressing,
-    TomatoSauce,
-) = declare(
-    HopeBaseObject,
-    __name__,
+NAMES = (
     "AlphabetSoup BbqSauce Butter Cherries ChocolatePudding Cookies Corn CreamCheese Ketchup "
-    "MacaroniAndCheese Mayo Milk NewSaladDressing OrangeJuice Popcorn SaladDressing TomatoSauce",
+    "MacaroniAndCheese Mayo Milk NewSaladDressing OrangeJuice Popcorn SaladDressing TomatoSauce"
 )
+globals().update(declare(HopeBaseObject, NAMES))

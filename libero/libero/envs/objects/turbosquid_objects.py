@@ -9,26 +9,8 @@ class TurbosquidObjects(BuiltinObject):
     family = "turbosquid_objects"
 
 
-(
-    BlackBook,
-    BowlDrainer,
-    DeskCaddy,
-    DiningSetGroup,
-    MokaPot,
-    PorcelainMug,
-    RedCoffeeMug,
-    WhiteStorageBox,
-    WhiteYellowMug,
-    WineBottle,
-    WineRack,
-    WoodenShelf,
-    WoodenTray,
-    WoodenTwoLayerShelf,
-    YellowBook,
-) = declare(
-    TurbosquidObjects,
-    __name__,
-    "BlackBook BowlDrainer DeskCaddy DiningSetGroup MokaPot PorcelainMug RedCoffeeMug "
-    "WhiteStorageBox WhiteYellowMug WineBottle WineRack WoodenShelf WoodenTray WoodenTwoLayerShelf "
-    "YellowBook",
+NAMES = (
+    "BlackBook BowlDrainer DeskCaddy DiningSetGroup MokaPot PorcelainMug RedCoffeeMug WhiteStorageBox "
+    "WhiteYellowMug WineBottle WineRack WoodenShelf WoodenTray WoodenTwoLayerShelf YellowBook"
 )
+globals().update(declare(TurbosquidObjects, NAMES))

@@ -25,27 +25,3 @@ from libero.libero.envs.predicates.registry import (
     get_predicate_fn_dict,
     update_predicate_fn_dict,
 )
-
-__all__ = [
-    "VALIDATE_PREDICATE_FN_DICT",
-    "BinaryAtomic",
-    "Close",
-    "Expression",
-    "FalsePredicateFn",
-    "In",
-    "InContactPredicateFn",
-    "MultiarayAtomic",
-    "On",
-    "Open",
-    "PrintJointState",
-    "Stack",
-    "TruePredicateFn",
-    "TurnOff",
-    "TurnOn",
-    "UnaryAtomic",
-    "Up",
-    "eval_predicate_fn",
-    "get_predicate_fn",
-    "get_predicate_fn_dict",
-    "update_predicate_fn_dict",
-]

@@ -10,12 +10,3 @@ from libero.libero.envs.problems.libero_living_room_tabletop_manipulation import
 )
 from libero.libero.envs.problems.libero_study_tabletop_manipulation import Libero_Study_Tabletop_Manipulation
 from libero.libero.envs.problems.libero_tabletop_manipulation import Libero_Tabletop_Manipulation
-
-__all__ = [
-    "Libero_Coffee_Table_Manipulation",
-    "Libero_Floor_Manipulation",
-    "Libero_Kitchen_Tabletop_Manipulation",
-    "Libero_Living_Room_Tabletop_Manipulation",
-    "Libero_Study_Tabletop_Manipulation",
-    "Libero_Tabletop_Manipulation",
-]

@@ -47,20 +47,3 @@ def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
 def update_region_samplers(problem_name: str, region_sampler_name: str, region_sampler: type) -> None:
     """Add a sampler or replace one."""
     REGION_SAMPLERS.setdefault(problem_name, {})[region_sampler_name] = region_sampler
-
-
-__all__ = [
-    "REGION_SAMPLERS",
-    "InSiteRegionRandomSampler",
-    "Libero100TableRegionSampler",
-    "MultiRegionRandomSampler",
-    "ObjectBasedSampler",
-    "ObjectPropertySampler",
-    "OpenCloseSampler",
-    "SiteRegionRandomSampler",
-    "SiteSequentialCompositeSampler",
-    "TableRegionSampler",
-    "TurnOnOffSampler",
-    "get_region_samplers",
-    "update_region_samplers",
-]

@@ -9,5 +9,3 @@ ROBOT_CLASS_MAPPING = {
     "MountedPanda": SingleArm,
     "OnTheGroundPanda": SingleArm,
 }
-
-__all__ = ["ROBOT_CLASS_MAPPING", "MountedPanda", "OnTheGroundPanda", "SingleArm"]
