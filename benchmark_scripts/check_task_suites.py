@@ -1,4 +1,4 @@
-"""Runs libero.scripts.check_task_suites."""
+"""Run `libero.scripts.check_task_suites`."""
 
 from libero.scripts.check_task_suites import main
 

@@ -1,4 +1,4 @@
-"""Runs libero.scripts.download_libero_datasets."""
+"""Run `libero.scripts.download_libero_datasets`."""
 
 from libero.scripts.download_libero_datasets import main
 

@@ -1,4 +1,4 @@
-"""Runs libero.scripts.render_single_task."""
+"""Run `libero.scripts.render_single_task`."""
 
 from libero.scripts.render_single_task import main
 

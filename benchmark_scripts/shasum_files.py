@@ -1,4 +1,4 @@
-"""Runs libero.scripts.shasum_files."""
+"""Run `libero.scripts.shasum_files`."""
 
 from libero.scripts.shasum_files import main
 

@@ -1,4 +1,4 @@
-"""Runs libero.scripts.check_dataset_integrity."""
+"""Run `libero.scripts.check_dataset_integrity`."""
 
 from libero.scripts.check_dataset_integrity import main
 

@@ -1,4 +1,4 @@
-"""Runs libero.scripts.collect_demonstration."""
+"""Run `libero.scripts.collect_demonstration`."""
 
 from libero.scripts.collect_demonstration import main
 

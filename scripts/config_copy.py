@@ -1,4 +1,4 @@
-"""Runs libero.scripts.config_copy."""
+"""Run `libero.scripts.config_copy`."""
 
 from libero.scripts.config_copy import main
 

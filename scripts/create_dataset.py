@@ -1,4 +1,4 @@
-"""Runs libero.scripts.create_dataset."""
+"""Run `libero.scripts.create_dataset`."""
 
 from libero.scripts.create_dataset import main
 

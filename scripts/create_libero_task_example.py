@@ -1,4 +1,4 @@
-"""Runs libero.scripts.create_libero_task_example."""
+"""Run `libero.scripts.create_libero_task_example`."""
 
 from libero.scripts.create_libero_task_example import main
 

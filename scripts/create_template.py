@@ -1,4 +1,4 @@
-"""Runs libero.scripts.create_template."""
+"""Run `libero.scripts.create_template`."""
 
 from libero.scripts.create_template import main
 

@@ -1,4 +1,4 @@
-"""Runs libero.scripts.get_affordance_info."""
+"""Run `libero.scripts.get_affordance_info`."""
 
 from libero.scripts.get_affordance_info import main
 

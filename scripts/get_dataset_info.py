@@ -1,4 +1,4 @@
-"""Runs libero.scripts.get_dataset_info."""
+"""Run `libero.scripts.get_dataset_info`."""
 
 from libero.scripts.get_dataset_info import main
 

@@ -1,4 +1,4 @@
-"""Runs libero.scripts.libero_100_collect_demonstrations."""
+"""Run `libero.scripts.libero_100_collect_demonstrations`."""
 
 from libero.scripts.libero_100_collect_demonstrations import main
 

@@ -1,32 +1,25 @@
-"""Whether demonstration files are whole: every array is read, and shapes, ranges and counts are compared."""
+"""Check that demonstration files are complete: every array is read; shapes, ranges and counts are compared."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from libero.libero.utils.download_utils import datasets_folder
-from libero.scripts.command import run
+from libero.scripts.command import option, script
 from libero_env.demos.curate import examine
 from libero_env.errors import DemoError
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The script."""
-    parser = argparse.ArgumentParser(prog="check_dataset_integrity.py", description=__doc__)
-    parser.add_argument(
-        "paths", nargs="*", type=Path, help="files or folders (default: the data sets' folder)"
-    )
-    parser.add_argument("--num-demos", type=int, default=50, help="expected in each file (default: 50)")
-    return run(parser, check, argv)
-
-
-def check(args: argparse.Namespace) -> int:
-    """One line for each file; 1 where one is broken or incomplete.
+@script(
+    option("paths", nargs="*", type=Path, help="files or folders (default: the folder of the data sets)"),
+    option("--num-demos", type=int, default=50, help="demonstrations expected in each file (default: 50)"),
+)
+def main(args: argparse.Namespace) -> int:
+    """Print one line for each file; return 1 where one is broken or incomplete.
 
     Raises:
-        DemoError: there are no files.
+        DemoError: There are no files.
     """
     roots = args.paths or [datasets_folder()]
     files = [f for root in roots for f in ([root] if root.is_file() else sorted(root.rglob("*.hdf5")))]
@@ -48,9 +41,5 @@ def check(args: argparse.Namespace) -> int:
             tqdm.write(f"FAIL  {file}: {fault}")
         if not faults:
             tqdm.write(f"ok    {file}: {stats}")
-    print(f"{len(files) - bad} of {len(files)} files are whole")
+    print(f"{len(files) - bad} of {len(files)} files are complete")
     return int(bad > 0)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

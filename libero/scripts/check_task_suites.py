@@ -1,28 +1,22 @@
-"""Whether every task of the benchmark has a task file that can be read, and its initial states."""
+"""Check that every task of the benchmark has a task file that can be read, and its initial states."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from tqdm import tqdm
 
 from libero.libero import get_libero_path
 from libero.libero.benchmark import Benchmark, get_benchmark, libero_suites
-from libero.scripts.command import run
+from libero.scripts.command import option, script
 from libero_env.errors import LiberoError
 from libero_env.init_states.pickles import read_states
 from libero_env.tasks import bddl
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The script."""
-    parser = argparse.ArgumentParser(prog="check_task_suites.py", description=__doc__)
-    parser.add_argument("suites", nargs="*", default=libero_suites, help="such as libero_goal (default: all)")
-    return run(parser, check, argv)
-
-
-def check(args: argparse.Namespace) -> int:
-    """One line for each suite and each fault; 1 where there is one."""
+@script(option("suites", nargs="*", default=libero_suites, help="names of suites (default: all)"))
+def main(args: argparse.Namespace) -> int:
+    """Print one line for each suite and each fault; return 1 where there is a fault."""
     bad = 0
     for name in args.suites:
         suite = get_benchmark(name)()
@@ -35,7 +29,7 @@ def check(args: argparse.Namespace) -> int:
 
 
 def faults(suite: Benchmark) -> Iterator[str]:
-    """What is wrong with the files of a suite."""
+    """Yield what is wrong with the files of a suite."""
     states = Path(get_libero_path("init_states"))
     for i, task in enumerate(tqdm(suite.tasks, desc=suite.name, disable=None)):
         try:
@@ -46,7 +40,3 @@ def faults(suite: Benchmark) -> Iterator[str]:
             continue
         if rows.ndim != 2 or len(rows) < 50:
             yield f"{task.init_states_file}: {rows.shape}; expected at least 50 states"
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

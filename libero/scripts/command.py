@@ -1,33 +1,48 @@
-"""What the scripts have in common: errors in one line, and an exit status."""
+"""What the scripts have in common: options, errors in one line, and an exit status."""
 
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from libero_env.errors import LiberoError
 
+Option = Callable[[argparse.ArgumentParser], Any]
+Main = Callable[[Sequence[str] | None], int]
 
-def run(
-    parser: argparse.ArgumentParser,
-    work: Callable[[argparse.Namespace], int | None],
-    argv: Sequence[str] | None,
-) -> int:
-    """Parse the arguments and do the work.
+
+def option(*flags: str, **settings: Any) -> Option:
+    """Return a function that adds an option to a parser; arguments as in `ArgumentParser.add_argument`."""
+    return lambda parser: parser.add_argument(*flags, **settings)
+
+
+def script(*options: Option, prog: str = "") -> Callable[[Callable[[argparse.Namespace], int | None]], Any]:
+    """Decorator: turn a function of parsed arguments into the `main(argv)` of a script.
+
+    It returns the exit status: that of the function (None for 0), or 2 for an error, which is printed in one line.
 
     Args:
-        parser: of the script.
-        work: gets the arguments; returns the exit status, None for 0.
-        argv: those of the process by default.
-
-    Returns:
-        Exit status: 0, 1 where something broken was found, 2 for an error (told in one line).
+        options: Functions that add options to the parser, see `option`.
+        prog: Name of the script in messages; by default that of its file.
     """
-    args = parser.parse_args(argv)
-    try:
-        return work(args) or 0
-    except (LiberoError, OSError) as error:
-        print(f"{parser.prog}: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{parser.prog}: interrupted", file=sys.stderr)
-        return 130
+
+    def decorate(work: Callable[[argparse.Namespace], int | None]) -> Main:
+        name = prog or f"{work.__module__.rpartition('.')[2]}.py"
+
+        def main(argv: Sequence[str] | None = None) -> int:
+            parser = argparse.ArgumentParser(prog=name, description=sys.modules[work.__module__].__doc__)
+            for add in options:
+                add(parser)
+            try:
+                return work(parser.parse_args(argv)) or 0
+            except (LiberoError, OSError) as error:
+                print(f"{name}: error: {error}", file=sys.stderr)
+                return 2
+            except KeyboardInterrupt:
+                print(f"{name}: interrupted", file=sys.stderr)
+                return 130
+
+        main.__doc__ = work.__doc__
+        return main
+
+    return decorate

@@ -1,8 +1,7 @@
-"""Demonstrations that were collected, observed anew, as a data set: pictures and proprioception of each state."""
+"""Make a data set of collected demonstrations: pictures and proprioception of each state."""
 
 import argparse
 import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from libero.libero.utils.dataset_utils import get_dataset_info
-from libero.scripts.command import run
+from libero.scripts.command import option, script
 from libero_env.demos.curate import header_of, read_episodes, task_of
 from libero_env.demos.observe import Filmer, Shots, fixtures_of
 from libero_env.demos.read import LOW_DIM_KEYS
@@ -19,23 +18,18 @@ from libero_env.demos.replay import rerender
 from libero_env.demos.write import DemoWriter
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The script."""
-    parser = argparse.ArgumentParser(prog="create_dataset.py", description=__doc__)
-    add = parser.add_argument
-    add("--demo-file", type=Path, required=True, help="demonstrations with states and actions (demo.hdf5)")
-    add("--use-actions", action="store_true", help="let the actions act instead of replaying the states")
-    add("--use-camera-obs", action="store_true", help="draw the cameras' pictures")
-    add("--dataset-path", type=Path, default=Path("datasets"), help="folder (default: datasets)")
-    add("--dataset-name", default="", help="file below it (default: <suite>/<task>_demo.hdf5)")
-    add("--no-proprio", action="store_true", help="leave out joints, gripper and end effector")
-    add("--use-depth", action="store_true", help="draw depth, too")
-    add("--size", type=int, default=128, help="of the pictures, pixels (default: 128)")
-    return run(parser, create, argv)
-
-
-def create(args: argparse.Namespace) -> None:
-    """Write the data set and say what is in it."""
+@script(
+    option("--demo-file", type=Path, required=True, help="file with states and actions (demo.hdf5)"),
+    option("--use-actions", action="store_true", help="replay the actions instead of the states"),
+    option("--use-camera-obs", action="store_true", help="draw the pictures of the cameras"),
+    option("--dataset-path", type=Path, default=Path("datasets"), help="folder (default: datasets)"),
+    option("--dataset-name", default="", help="file in the folder (default: <suite>/<task>_demo.hdf5)"),
+    option("--no-proprio", action="store_true", help="leave out joints, gripper and end effector"),
+    option("--use-depth", action="store_true", help="draw depth, too"),
+    option("--size", type=int, default=128, help="size of the pictures, pixels (default: 128)"),
+)
+def main(args: argparse.Namespace) -> None:
+    """Write the data set and print what it holds."""
     task = task_of(args.demo_file)
     name = args.dataset_name or f"{task.suite}/{task.name}_demo.hdf5"
     target = args.dataset_path / (name if name.endswith(".hdf5") else f"{name}.hdf5")
@@ -54,10 +48,10 @@ def create(args: argparse.Namespace) -> None:
 
 
 def acted(file: Path, target: Path) -> Path:
-    """A copy of demonstrations with the states that their actions lead to from the first one.
+    """Write a copy of demonstrations with the states that their actions lead to from the first one.
 
     Raises:
-        DemoError: the file is broken or does not fit its task's scene.
+        DemoError: The file is broken or does not fit the scene of its task.
     """
     filmer, writer = Filmer(task_of(file), Shots(())), DemoWriter(target, header_of(file))
     world = filmer.env.world
@@ -77,14 +71,10 @@ def acted(file: Path, target: Path) -> Path:
 
 
 def drop_proprioception(file: Path) -> None:
-    """Leave out everything but pictures and states."""
+    """Remove everything but pictures and states from a file."""
     with h5py.File(file, "r+") as handle:
         for demo in handle["data"].values():
             for key in [key for key in LOW_DIM_KEYS if key in demo["obs"]]:
                 del demo["obs"][key]
             if "robot_states" in demo:
                 del demo["robot_states"]
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,10 +1,9 @@
-"""An example of tasks of one's own: two on a scene of the benchmark, written as task files."""
+"""Write two user-defined tasks on a scene of the benchmark as task files, as an example."""
 
 import argparse
-from collections.abc import Sequence
 
 from libero.libero.utils.task_generation_utils import TaskInfoTuple, generate_bddl_from_task_info
-from libero.scripts.command import run
+from libero.scripts.command import option, script
 
 TASKS = (
     TaskInfoTuple(
@@ -25,18 +24,8 @@ TASKS = (
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The script."""
-    parser = argparse.ArgumentParser(prog="create_libero_task_example.py", description=__doc__)
-    parser.add_argument("--folder", default="custom_pddl", help="for the files (default: custom_pddl)")
-    return run(parser, create, argv)
-
-
-def create(args: argparse.Namespace) -> None:
-    """Write the files and name them."""
+@script(option("--folder", default="custom_pddl", help="folder of the files (default: custom_pddl)"))
+def main(args: argparse.Namespace) -> None:
+    """Write the files and print their paths."""
     for task in TASKS:
         print(generate_bddl_from_task_info(task, output_dir=args.folder))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

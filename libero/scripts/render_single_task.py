@@ -1,4 +1,4 @@
-"""Pictures of a task: of its initial states, or of the first states of demonstrations, side by side."""
+"""Draw the initial states of a task, or the first states of its demonstrations, side by side."""
 
 import argparse
 from collections.abc import Sequence
@@ -10,31 +10,26 @@ from tqdm import tqdm
 
 from libero.libero.benchmark import get_benchmark
 from libero.libero.envs import OffScreenRenderEnv
-from libero.scripts.command import run
+from libero.scripts.command import option, script
 from libero_env.demos.read import read_demos
 from libero_env.errors import LiberoError
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The script."""
-    parser = argparse.ArgumentParser(prog="render_single_task.py", description=__doc__)
-    add = parser.add_argument
-    add("--benchmark_name", help="such as libero_goal")
-    add("--task_id", type=int, help="index of the task in the benchmark")
-    add("--bddl_file", help="task file, instead of a task of a benchmark")
-    add("--demo_file", help="demonstrations, whose first states are drawn")
-    add("--num", type=int, default=5, help="states (default: 5)")
-    add("--size", type=int, default=256, help="of each picture, pixels (default: 256)")
-    add("--seed", type=int, default=0, help="of the starts where none are stored (default: 0)")
-    add("--out", type=Path, default=Path("benchmark_tasks"), help="folder (default: benchmark_tasks)")
-    return run(parser, draw, argv)
-
-
-def draw(args: argparse.Namespace) -> None:
-    """Write the picture and name it.
+@script(
+    option("--benchmark_name", help="such as libero_goal"),
+    option("--task_id", type=int, help="index of the task in the benchmark"),
+    option("--bddl_file", help="task file, instead of a task of a benchmark"),
+    option("--demo_file", help="demonstration file, whose first states are drawn"),
+    option("--num", type=int, default=5, help="number of states (default: 5)"),
+    option("--size", type=int, default=256, help="size of each picture, pixels (default: 256)"),
+    option("--seed", type=int, default=0, help="seed of the states where none are stored (default: 0)"),
+    option("--out", type=Path, default=Path("benchmark_tasks"), help="folder (default: benchmark_tasks)"),
+)
+def main(args: argparse.Namespace) -> None:
+    """Write the picture and print its path.
 
     Raises:
-        LiberoError: no task is named, or there is none of this index.
+        LiberoError: No task is named, or the index does not exist.
     """
     file, states = task_and_states(args)
     env = OffScreenRenderEnv(bddl_file_name=file, camera_heights=args.size, camera_widths=args.size)
@@ -53,7 +48,7 @@ def draw(args: argparse.Namespace) -> None:
 
 
 def task_and_states(args: argparse.Namespace) -> tuple[str, Sequence[np.ndarray] | None]:
-    """The task file, and the states to draw; None for starts to be drawn anew."""
+    """Return the task file and the states to draw; None for states to be sampled."""
     states: Sequence[np.ndarray] | None = None
     if args.bddl_file:
         file = args.bddl_file
@@ -65,12 +60,8 @@ def task_and_states(args: argparse.Namespace) -> tuple[str, Sequence[np.ndarray]
         if not args.demo_file:
             states = list(suite.get_task_init_states(args.task_id)[: args.num])
     else:
-        raise LiberoError("which task? Name --benchmark_name and --task_id, or --bddl_file")
+        raise LiberoError("which task? Pass --benchmark_name and --task_id, or --bddl_file")
     if args.demo_file:
         demos = read_demos(args.demo_file, (), args.num)
         states = [demo.states[0] for demo in demos if demo.states is not None]
     return file, states
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,31 +1,25 @@
-"""SHA-256 of files, as `sha256sum` prints and checks them."""
+"""Print or check the SHA-256 of files, in the format of `sha256sum`."""
 
 import argparse
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from libero.libero.utils.download_utils import datasets_folder
-from libero.scripts.command import run
+from libero.scripts.command import option, script
 from libero_env.errors import LiberoError
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The script."""
-    parser = argparse.ArgumentParser(prog="shasum_files.py", description=__doc__)
-    add = parser.add_argument
-    add("paths", nargs="*", type=Path, help="files or folders (default: the data sets' folder)")
-    add("--check", type=Path, metavar="LIST", help="compare with a list that was printed before")
-    return run(parser, tell, argv)
-
-
-def tell(args: argparse.Namespace) -> int:
-    """Print the sums, or compare them; 1 where one differs.
+@script(
+    option("paths", nargs="*", type=Path, help="files or folders (default: the folder of the data sets)"),
+    option("--check", type=Path, metavar="LIST", help="compare with a list that was printed before"),
+)
+def main(args: argparse.Namespace) -> int:
+    """Print the checksums, or compare them; return 1 where one differs.
 
     Raises:
-        LiberoError: there are no files, or a line of the list is none.
+        LiberoError: There are no files, or a line of the list has no checksum.
     """
     if args.check:
         return compare(args.check)
@@ -41,10 +35,10 @@ def tell(args: argparse.Namespace) -> int:
 
 
 def compare(listing: Path) -> int:
-    """One line for each file of a list; 1 where one is missing or differs."""
+    """Print one line for each file of a list; return 1 where one is missing or differs."""
     lines = [line.partition("  ") for line in listing.read_text(encoding="utf-8").splitlines() if line]
     if bad := [line[0] for line in lines if len(line[0]) != 64 or not line[2]]:
-        raise LiberoError(f"{listing}: {bad[0]!r} is no checksum; expected lines of `<sha256>  <file>`")
+        raise LiberoError(f"{listing}: {bad[0]!r} is not a checksum; expected lines of `<sha256>  <file>`")
     wrong = 0
     for known, _, name in tqdm(lines, unit="file", disable=None):
         found = digest(Path(name)) if Path(name).is_file() else None
@@ -54,10 +48,6 @@ def compare(listing: Path) -> int:
 
 
 def digest(file: Path) -> str:
-    """SHA-256 of a file, in hex."""
+    """Return the SHA-256 of a file, in hex."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -144,13 +144,13 @@ def test_get_dataset_info(collected, tmp_path, capsys):
 @pytest.mark.unit
 def test_check_dataset_integrity(collected, tmp_path, capsys):
     assert check_dataset_integrity.main([str(collected), "--num-demos", "2"]) == 0
-    assert "1 of 1 files are whole" in capsys.readouterr().out
+    assert "1 of 1 files are complete" in capsys.readouterr().out
     (tmp_path / "torn.hdf5").write_bytes(collected.read_bytes()[:1000])
     assert check_dataset_integrity.main([str(collected), str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "2 demonstrations; expected 50" in out
     assert f"FAIL  {tmp_path / 'torn.hdf5'}" in out
-    assert "0 of 2 files are whole" in out
+    assert "0 of 2 files are complete" in out
     assert check_dataset_integrity.main([str(tmp_path / "empty")]) == 2
 
 
@@ -239,7 +239,7 @@ def test_templates_ask(tmp_path, monkeypatch, capsys):
     assert "--template is missing" in capsys.readouterr().err
     monkeypatch.setattr(create_template.sys.stdin, "isatty", lambda: True, raising=False)
     assert create_template.main(["--out", str(tmp_path)]) == 2
-    assert "'my box' is no name for a class" in capsys.readouterr().err
+    assert "'my box' is not a valid class name" in capsys.readouterr().err
     assert create_template.main(["--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"my_box.py", "my_box.xml"}
     assert create_template.main(["-t", "object", "-n", "MyBox", "-o", str(tmp_path)]) == 2
