@@ -1,7 +1,8 @@
-"""From the command line to a run: composing the configuration, errors in one line, reports of sweeps."""
+"""From the command line to a run: the configuration is composed, errors take one line, sweeps get a report."""
 
 import sys
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,47 +20,90 @@ from lifelong.training.distributed import Ranks, joined, rank
 
 
 class CombinedReport(Callback):
-    """After `-m`, one report that compares all runs of the sweep."""
+    """Hydra callback that writes one report for all runs of a sweep (`-m`)."""
 
     def __init__(self) -> None:
         self._runs: list[Path] = []
 
     def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
-        """Note the directory of a run that ended well."""
+        """Note the directory of a run that has succeeded."""
         if isinstance(job_return._return_value, Path):
             self._runs.append(job_return._return_value)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare what ended well; where several processes train together, the first does."""
+        """Compare the runs that have succeeded; of several processes that train together, only the first writes."""
         if len(self._runs) > 1 and rank() == 0:
             page = write_report(self._runs, Path(config.runs_dir) / "sweep" / "report.html")
             print(f"{len(self._runs)} runs compared: {page}")
 
 
-def main(config_dir: str) -> int:
-    """Run what the command line asks for.
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train and evaluate as the command line asks: `libero train` and train.py.
 
     Args:
-        config_dir: Folder of the configuration, absolute or relative to the working directory of the script.
+        argv: Hydra's overrides and options, such as `algo=ewc` and `-m`. None: those of this process.
 
     Returns:
-        Exit status: 0, or 1 where something went wrong (told in one line).
+        The exit status: 0, or 1 after an error, which is printed in one line.
     """
-    path = Path(sys.argv[0]).resolve().parent / config_dir
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
         with joined() as ranks:
-            check_choices(sys.argv[1:], path)
-            return _compose_and_run(str(path), ranks)
+            folder = config_folder()
+            check_choices(words, (folder, *_user_folders(words)))
+            return _compose_and_run(words, folder, ranks)
     except LiberoError as error:
-        _tell(error)
+        _print_error(error)
         return 1
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
+        print("interrupted; the same command resumes the run", file=sys.stderr)
         return 130
 
 
-def _compose_and_run(path: str, ranks: Ranks) -> int:
-    """Exit status of the jobs of the command line, which are several after `-m`."""
+def config_folder() -> Path:
+    """Return the folder of config.yaml: in an installed package lifelong/configs, in a checkout configs."""
+    package = Path(str(resources.files("lifelong")))
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise LiberoError(
+        f"no configuration files: {package / 'configs'} and {package.parent / 'configs'} do not exist; "
+        "install libero-lifelong again"
+    )
+
+
+def check_choices(overrides: Sequence[str], folders: Sequence[Path]) -> None:
+    """Check the overrides that choose a group's file, before Hydra does.
+
+    Args:
+        overrides: The words of the command line.
+        folders: Folders of configuration files, in which a group is a subfolder.
+
+    Raises:
+        UnknownNameError: A group has no such file; the message lists its files.
+    """
+    for override in overrides:
+        group, _, names = override.partition("=")
+        found = [folder / group for folder in folders if group and names and (folder / group).is_dir()]
+        valid = sorted({file.stem for folder in found for file in folder.glob("*.yaml")})
+        for name in names.split(",") if found else ():
+            if name not in valid:
+                raise UnknownNameError(group, name, valid)
+
+
+def _user_folders(words: Sequence[str]) -> list[Path]:
+    """Return the folders that `--config-dir` (`-cd`) adds to Hydra's search path."""
+    folders = []
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word in ("--config-dir", "-cd"):
+            folders.append(Path(following))
+        elif word.startswith("--config-dir="):
+            folders.append(Path(word.partition("=")[2]))
+    return folders
+
+
+def _compose_and_run(words: list[str], folder: Path, ranks: Ranks) -> int:
+    """Run the jobs of the command line, several after `-m`; return the exit status."""
     failed = False
 
     def job(config: DictConfig) -> Path | None:
@@ -68,38 +112,23 @@ def _compose_and_run(path: str, ranks: Ranks) -> int:
             return experiment.run(config, HydraConfig.get().runtime.choices, ranks)
         except (LiberoError, HydraException, OmegaConfBaseException, OSError) as error:
             failed = True
-            _tell(error)
+            _print_error(error)
             if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
                 raise SystemExit(1) from error
             return None
 
-    hydra.main(version_base="1.3", config_path=path, config_name="config")(job)()
+    sys.argv[1:] = words  # where Hydra reads them
+    hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(job)()
     return int(failed)
 
 
-def _tell(error: Exception) -> None:
+def _print_error(error: Exception) -> None:
     who = f"rank {rank()}: " if rank() else ""
     print(f"error: {who}{_one_line(error)}", file=sys.stderr)
 
 
-def check_choices(overrides: Sequence[str], config_dir: Path) -> None:
-    """Look at the overrides that choose a group's file, before Hydra does.
-
-    Raises:
-        UnknownNameError: No such file; the message lists those there are.
-    """
-    for override in overrides:
-        group, _, names = override.partition("=")
-        if not (group and names and (config_dir / group).is_dir()):
-            continue
-        valid = sorted(file.stem for file in (config_dir / group).glob("*.yaml"))
-        for name in names.split(","):
-            if name not in valid:
-                raise UnknownNameError(group, name, valid)
-
-
 def _one_line(error: Exception) -> str:
-    """The message, with the message of what caused it where Hydra wraps one of ours."""
+    """Return the message in one line; where Hydra wraps an error of ours, the message of ours."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LiberoError):
         cause = cause.__cause__

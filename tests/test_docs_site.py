@@ -108,7 +108,7 @@ def check_line(line: str) -> None:
         build_parser().parse_args(words[1:])
     elif words[:2] == ["python", "train.py"]:
         overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
-        check_choices(overrides, CONFIGS)
+        check_choices(overrides, [CONFIGS])
         if "-m" in words:  # Hydra takes lists apart before it composes
             overrides = [re.sub(r"=([^\[,]*),.*", r"=\1", w) for w in overrides]
         composes(*overrides)

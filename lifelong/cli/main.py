@@ -11,18 +11,33 @@ from libero_env.errors import LiberoError
 from lifelong.cli import evaluate
 from lifelong.errors import LifelongError
 
+TRAIN_HELP = """\
+Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
+group (algo=ewc, benchmark=libero_goal, preset=paper) or set a key (train.lr=3e-4). A killed run resumes when the same
+command is given again.
+
+examples:
+  libero train algo=ewc benchmark=libero_object
+  libero train -m algo=sequential,er,ewc seed=1,2     a sweep, with one report that compares the runs
+  libero train --config-dir my_configs algo=my_algo   files of your own beside the package's
+  libero train --cfg job                              print the configuration, run nothing
+  libero train --info searchpath                      where configuration files are
+  torchrun --nproc-per-node 2 --no-python libero train   several processes or GPUs"""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand.
 
     Args:
-        argv: the words after `libero`; those of the process by default.
+        argv: The words after `libero`. None: those of this process.
 
     Returns:
-        Exit status: 0, 1 where the command found something broken, 2 for an error (told in one line).
+        The exit status: 0, 1 where the command found a fault, 2 after an error, which is printed in one line.
     """
-    parser = build_parser()
-    args = parser.parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["train"] and not {"-h", "--help"} & set(words):
+        return run_train(words[1:])  # Hydra reads the rest: options in any place, overrides
+    args = build_parser().parse_args(words)
     try:
         return args.run(args) or 0
     except (LiberoError, LifelongError, OSError) as error:
@@ -34,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser with every subcommand; each stores its function as `run`."""
+    """Return the parser with every subcommand; each stores its function as `run`."""
     parser = argparse.ArgumentParser(prog="libero", description="Lifelong robot learning on LIBERO.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     for register in COMMANDS:
@@ -42,15 +57,43 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def register_train(subparsers: Subparsers) -> None:
+    """Add `libero train`."""
+    parser = subparsers.add_parser(
+        "train",
+        help="learn a sequence of tasks and measure forgetting and transfer",
+        description=TRAIN_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage="libero train [-m] [--config-dir DIR] [--cfg job] [OVERRIDE ...]",
+    )
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="GROUP=FILE or KEY=VALUE")
+    parser.add_argument("-m", "--multirun", action="store_true", help="run every combination of values")
+    parser.add_argument("--config-dir", metavar="DIR", help="a folder of configuration files to be added")
+    parser.add_argument("--cfg", metavar="WHAT", help="print the configuration (job, hydra, all)")
+    parser.set_defaults(run=lambda args: run_train(args.overrides))
+
+
+def run_train(words: Sequence[str]) -> int:
+    """Train as the overrides ask."""
+    try:
+        from lifelong.launch import main as launch
+    except ModuleNotFoundError as error:
+        if error.name not in ("hydra", "jinja2", "matplotlib", "omegaconf", "safetensors", "torch"):
+            raise
+        print(f"error: {error.name} is not installed: pip install 'libero-lifelong[train]'", file=sys.stderr)
+        return 1
+    return launch(words)
+
+
 def register_doctor(subparsers: Subparsers) -> None:
-    """`libero doctor`"""
-    parser = subparsers.add_parser("doctor", help="what this machine has and lacks, and how to mend it")
+    """Add `libero doctor`."""
+    parser = subparsers.add_parser("doctor", help="what this machine has and lacks, and how to fix it")
     parser.add_argument("--gl", action="store_true", help="only draw a frame")
     parser.set_defaults(run=run_doctor)
 
 
 def run_doctor(args: argparse.Namespace) -> int:
-    """Print the findings; 1 where something essential is broken."""
+    """Print the findings; return 1 where something essential is broken."""
     import libero_env.cli.doctor as environment
     import lifelong.cli.doctor as learning
 
@@ -62,7 +105,7 @@ def run_doctor(args: argparse.Namespace) -> int:
 
 
 def register_report(subparsers: Subparsers) -> None:
-    """`libero report RUN_DIR...`"""
+    """Add `libero report RUN_DIR...`."""
     parser = subparsers.add_parser("report", help="a page about one run, or about several side by side")
     parser.add_argument(
         "run_dirs", nargs="+", type=Path, metavar="RUN_DIR", help="such as runs/libero_object/ewc/..."
@@ -76,13 +119,14 @@ def register_report(subparsers: Subparsers) -> None:
 
 
 def run_report(args: argparse.Namespace) -> None:
-    """Write the page and say where it is."""
+    """Write the page and print its path."""
     from lifelong.report.page import write_report
 
     print(write_report(args.run_dirs, args.out))
 
 
 COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
+    register_train,
     register_doctor,
     tasks.register,
     demos.register,

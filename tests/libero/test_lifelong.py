@@ -20,7 +20,7 @@ from libero.lifelong.datasets import (
     get_dataset,
 )
 from libero_env.errors import LiberoError
-from tests.libero.lifelong_data import LANGUAGE, SIZE, tiny, write_demos
+from tests.harness.facade_learning import LANGUAGE, SIZE, tiny, write_demos
 
 pytestmark = pytest.mark.unit
 

@@ -20,7 +20,7 @@ from libero.lifelong.models.modules.rgb_modules import ResnetEncoder
 from libero.lifelong.models.modules.transformer_modules import SinusoidalPositionEncoding, TransformerDecoder
 from libero.lifelong.models.policy_head import GMMHead
 from libero_env.errors import LiberoError
-from tests.libero.lifelong_data import tiny, windows, write_demos
+from tests.harness.facade_learning import tiny, windows, write_demos
 
 pytestmark = pytest.mark.unit
 

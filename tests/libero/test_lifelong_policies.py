@@ -16,7 +16,7 @@ from libero.lifelong.models.modules import language_modules, rgb_modules, transf
 from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
 from libero_env.errors import LiberoError
 from lifelong.types import Observation
-from tests.libero.lifelong_data import TINY, TINY_TRANSFORMER, windows, write_demos
+from tests.harness.facade_learning import TINY, TINY_TRANSFORMER, windows, write_demos
 
 pytestmark = pytest.mark.unit
 

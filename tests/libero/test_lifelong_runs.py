@@ -18,7 +18,7 @@ from libero.lifelong.run import run
 from libero_env.init_states.pickles import write_states
 from libero_env.tasks import get_task
 from lifelong import checkpoints
-from tests.libero.lifelong_data import (
+from tests.harness.facade_learning import (
     LANGUAGE,
     SIZE,
     TINY,

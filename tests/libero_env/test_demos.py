@@ -13,29 +13,9 @@ import numpy as np
 import pytest
 
 from libero_env.demos.read import aligned, read_demos
-from libero_env.demos.write import DemoWriter, Episode, make_header
+from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
-
-
-def header(**more):
-    return make_header(
-        problem_name="LIBERO_Floor_Manipulation",
-        language="pick up the butter and place it in the basket",
-        bddl_name="libero_object/pick_up_the_butter.bddl",
-        bddl_text="(define (problem LIBERO_Floor_Manipulation))",
-        env_kwargs={"robots": ["Panda"]},
-        **({"pairing": "aligned", "seed": 1} | more),
-    )
-
-
-def episode(seed: int, steps: int = 11, size: int = 16) -> Episode:
-    rng = np.random.default_rng(seed)
-    image = lambda: rng.integers(0, 256, (steps, size, size, 3), np.uint8)  # noqa: E731
-    obs = {"agentview_rgb": image(), "eye_in_hand_rgb": image()}
-    obs |= {"joint_states": rng.normal(size=(steps, 7)), "gripper_states": rng.normal(size=(steps, 2))}
-    obs |= {"ee_pos": rng.normal(size=(steps, 3)), "ee_ori": rng.normal(size=(steps, 3))}
-    actions = rng.uniform(-1, 1, (steps, 7))
-    return Episode(actions, rng.normal(size=(steps, 30)), rng.normal(size=(steps, 9)), obs, actions * 0.5)
+from tests.harness.demos import episode, header
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import pytest
 from libero_env.demos.lerobot import export
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
-from tests.libero_env.test_demos import episode
-from tests.libero_env.test_demos_tools import write
+from tests.harness.demos import episode, write
 
 av = pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -19,27 +19,10 @@ from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
 from libero_env.expert.rollout import Attempt
 from libero_env.tasks import get_task
+from tests.harness.demos import STEPS, wander
 
 pytestmark = pytest.mark.sim
-TASK, SIZE, STEPS = "libero_goal/3", (24, 32), 12
-
-
-def wander(stage, experts, noise, max_steps):
-    """Instead of the experts: a random walk of the arm, said to be a success."""
-    rng = np.random.default_rng(5)
-    states, actions = [[] for _ in experts], [[] for _ in experts]
-    for _ in range(STEPS):
-        action = rng.uniform(-1, 1, (stage.num_envs, 7))
-        for i in range(len(experts)):
-            states[i].append(stage.world.physics_state(i))
-            actions[i].append(action[i])
-        stage.step(action)
-    for i, rows in enumerate(states):
-        rows.append(stage.world.physics_state(i))
-    return [
-        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "")
-        for s, a in zip(states, actions, strict=True)
-    ]
+TASK, SIZE = "libero_goal/3", (24, 32)
 
 
 @pytest.fixture(scope="module")

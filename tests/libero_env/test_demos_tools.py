@@ -9,19 +9,11 @@ import pytest
 from libero_env.demos.curate import examine, filter_demos, noops, read_episodes, task_of
 from libero_env.demos.read import read_demos
 from libero_env.demos.statistics import QUANTILES, Histogram, Moments
-from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.tasks import get_task
-from tests.libero_env.test_demos import episode, header
+from tests.harness.demos import episode, write
 
 pytestmark = pytest.mark.unit
-
-
-def write(path, episodes, **more):
-    writer = DemoWriter(path, header(**more))
-    for i, one in enumerate(episodes):
-        writer.write(i, one)
-    return writer.finish()
 
 
 def with_noops(seed):

@@ -19,10 +19,9 @@ from lifelong.streams import SomeWindows, StageWindows
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Observation
-from tests.lifelong import test_sequence as walk
-from tests.lifelong.fakes import DeepPolicy, Windows
-from tests.lifelong.test_algorithms import learn, outputs
-from tests.lifelong.test_algorithms_more import killed_again_and_again
+from tests.harness import sequences as walk
+from tests.harness.algorithms import killed_again_and_again, learn, outputs
+from tests.harness.fakes import DeepPolicy, Windows
 
 ALL = {"lora": lambda: LoRA(rank=2, alpha=4.0), "dmpel": lambda: DMPEL(rank=2, alpha=4.0, pool=2)}
 _CONV = {"image_width": 8, "stage_blocks": [1], "stem_pool": False}

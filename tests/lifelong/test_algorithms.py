@@ -6,32 +6,11 @@ import pytest
 import torch
 
 from lifelong import checkpoints
-from lifelong.algorithms import ER, EWC, Algorithm, PackNet, Sequential
+from lifelong.algorithms import ER, EWC, PackNet, Sequential
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
-from lifelong.training.fit import fit
-from lifelong.training.settings import FitSettings
-from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
-
-SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precision="fp32")
-
-
-def learn(algorithm: Algorithm, policy, task: int) -> None:
-    """A task from its beginning to its end, as the experiment walks through it."""
-    dataset = Windows(task)
-    algorithm.begin_task(task, dataset, policy)
-    for number, phase in enumerate(algorithm.phases()):
-        algorithm.begin_phase(phase, policy)
-        fit(policy, dataset, algorithm, settings=SETTINGS, seed=(task, number))
-        algorithm.end_phase(phase, policy)
-    algorithm.end_task(task, dataset, policy, generator(task))
-
-
-def outputs(algorithm: Algorithm, policy, task: int) -> torch.Tensor:
-    with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
-        acting.eval()
-        return acting(Windows(task).features[:, None])
-
+from tests.harness.algorithms import by_hand, learn, outputs
+from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 # --- ER
 
@@ -64,12 +43,6 @@ def test_ewc_penalty_is_zero_at_the_anchor_and_only_there(fisher):
     with torch.no_grad():
         policy.linear.weight[0, 0] += 0.1
     assert algorithm.penalty(policy).item() > 0
-
-
-def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
-    """Gradient of each window's squared error with respect to the weight: 2 (Wx + b - y) x^T."""
-    error = data.features @ policy.linear.weight.T + policy.linear.bias - data.targets
-    return 2 * error[:, :, None] * data.features[:, None, :]  # (N, A, D)
 
 
 def test_fisher_per_sample_is_the_mean_squared_gradient_of_single_windows():

@@ -15,9 +15,9 @@ from lifelong.seeding import generator
 from lifelong.sequence import TaskSequence
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
-from tests.lifelong import test_sequence as walk
-from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
-from tests.lifelong.test_algorithms import SETTINGS, learn
+from tests.harness import sequences as walk
+from tests.harness.algorithms import SETTINGS, killed_again_and_again, learn
+from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 ALL = {
     "agem": lambda: AGEM(budget=25),
@@ -88,23 +88,6 @@ def walks(monkeypatch):
     """The walk of test_sequence.py with these algorithms."""
     monkeypatch.setattr(walk, "ALGORITHMS", ALL)
     return walk
-
-
-def killed_again_and_again(path, algo, monkeypatch):
-    """Walks through the sequence, killed in the second write of every process; how many were needed."""
-    starts, writes = 0, 1
-    while True:
-        starts += 1
-        assert starts < 100
-        with monkeypatch.context() as patch:
-            p = walk.parts(path, algo)
-            killer = walk.Killer(patch, writes)
-            patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
-            try:
-                TaskSequence(p).run()
-                return starts, p
-            except walk.Killed:
-                writes = 2 + starts % 3
 
 
 @pytest.mark.parametrize("algo", ALL)

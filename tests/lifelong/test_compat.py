@@ -14,11 +14,10 @@ from lifelong.seeding import generator
 from lifelong.sequence import TaskSequence
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
-from tests.lifelong import test_sequence as walk
-from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
-from tests.lifelong.test_algorithms import by_hand, learn, outputs
-from tests.lifelong.test_algorithms_more import killed_again_and_again
-from tests.lifelong.test_configs import FILES, composed
+from tests.harness import sequences as walk
+from tests.harness.algorithms import by_hand, killed_again_and_again, learn, outputs
+from tests.harness.configs import FILES, composed
+from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 WITH_COMPAT = ("er", "agem", "ewc", "packnet")
 

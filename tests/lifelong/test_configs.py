@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
@@ -18,16 +17,9 @@ from lifelong.evaluation.settings import EvalSettings
 from lifelong.experiment import GROUPS
 from lifelong.launch import check_choices
 from lifelong.settings import RunSettings
+from tests.harness.configs import CONFIGS, FILES, composed
 
-ROOT = Path(__file__).parents[2]
-CONFIGS = ROOT / "configs"
-FILES = sorted(f.relative_to(CONFIGS) for f in CONFIGS.glob("*/*.yaml"))
 GIVEN = {"policy": {"spec"}}  # what the experiment adds
-
-
-def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return compose("config", [*overrides])
 
 
 def nodes(config, path=""):
@@ -105,7 +97,7 @@ def test_values_on_the_command_line_win_over_the_preset(preset):
 def test_the_paper_preset_is_the_published_protocol():
     config = composed("preset=paper")
     assert OmegaConf.to_container(config.train) == {
-        "_target_": "lifelong.training.settings.FitSettings",
+        "_target_": "lifelong.training.FitSettings",
         "epochs": 50,
         "batch_size": 32,
         "steps_per_epoch": None,
@@ -131,11 +123,11 @@ def test_an_unknown_choice_lists_the_valid_ones(override):
     group = override.partition("=")[0]
     valid = sorted(f.stem for f in FILES if str(f.parent) == group)
     with pytest.raises(LookupError, match="Valid: " + ", ".join(valid)):
-        check_choices([override, "train.epochs=3"], CONFIGS)
+        check_choices([override, "train.epochs=3"], [CONFIGS])
 
 
 def test_known_choices_and_other_overrides_pass():
-    check_choices(["algo=er,ewc", "seed=1,2", "train.lr=1e-3", "-m", "hydra.verbose=true"], CONFIGS)
+    check_choices(["algo=er,ewc", "seed=1,2", "train.lr=1e-3", "-m", "hydra.verbose=true"], [CONFIGS])
 
 
 @pytest.mark.parametrize(

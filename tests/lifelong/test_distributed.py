@@ -12,7 +12,7 @@ import torch
 from lifelong import checkpoints
 from lifelong.errors import ConfigError
 from lifelong.training.distributed import Ranks, joined
-from tests.lifelong import ranks_worker as worker
+from tests.harness import ranks_worker as worker
 
 ROOT = Path(__file__).parents[2]
 

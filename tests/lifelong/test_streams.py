@@ -30,8 +30,8 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import Parts, TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
 from lifelong.streams import StageData, StageWindows, StreamSettings, stages_of
-from tests.lifelong.fakes import Windows
-from tests.lifelong.test_sequence import Killed, Killer, assert_same, dataset, parts
+from tests.harness.fakes import Windows
+from tests.harness.sequences import Killed, Killer, assert_same, dataset, parts
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[2]

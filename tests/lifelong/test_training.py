@@ -18,8 +18,8 @@ from lifelong.training.fit import fit, learning_rate
 from lifelong.training.precision import check_compiler, compiled, deterministic
 from lifelong.training.settings import FitSettings
 from lifelong.types import Batch, PolicySpec
-from tests.lifelong import ranks_worker as worker
-from tests.lifelong.fakes import DeepPolicy, LinearPolicy, Windows
+from tests.harness import ranks_worker as worker
+from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 SETTINGS = FitSettings(epochs=5, batch_size=8, lr=1e-2, warmup_steps=3, precision="fp32")
 

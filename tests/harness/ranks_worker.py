@@ -21,7 +21,7 @@ from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
 from lifelong.training.distributed import Ranks, joined
 from lifelong.training.settings import FitSettings
-from tests.lifelong import test_sequence as walk
+from tests.harness import sequences as walk
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "algo"
 ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("*.yaml"))

@@ -1,0 +1,53 @@
+"""Learning with an algorithm on small random tasks."""
+
+import torch
+
+from lifelong.algorithms import Algorithm
+from lifelong.seeding import generator
+from lifelong.sequence import TaskSequence
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
+from tests.harness import sequences as walk
+from tests.harness.fakes import LinearPolicy, Windows
+
+SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precision="fp32")
+
+
+def learn(algorithm: Algorithm, policy, task: int) -> None:
+    """A task from its beginning to its end, as the experiment walks through it."""
+    dataset = Windows(task)
+    algorithm.begin_task(task, dataset, policy)
+    for number, phase in enumerate(algorithm.phases()):
+        algorithm.begin_phase(phase, policy)
+        fit(policy, dataset, algorithm, settings=SETTINGS, seed=(task, number))
+        algorithm.end_phase(phase, policy)
+    algorithm.end_task(task, dataset, policy, generator(task))
+
+
+def outputs(algorithm: Algorithm, policy, task: int) -> torch.Tensor:
+    with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
+        acting.eval()
+        return acting(Windows(task).features[:, None])
+
+
+def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
+    """Gradient of each window's squared error with respect to the weight: 2 (Wx + b - y) x^T."""
+    error = data.features @ policy.linear.weight.T + policy.linear.bias - data.targets
+    return 2 * error[:, :, None] * data.features[:, None, :]  # (N, A, D)
+
+
+def killed_again_and_again(path, algo, monkeypatch):
+    """Walks through the sequence, killed in the second write of every process; how many were needed."""
+    starts, writes = 0, 1
+    while True:
+        starts += 1
+        assert starts < 100
+        with monkeypatch.context() as patch:
+            p = walk.parts(path, algo)
+            killer = walk.Killer(patch, writes)
+            patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
+            try:
+                TaskSequence(p).run()
+                return starts, p
+            except walk.Killed:
+                writes = 2 + starts % 3

@@ -1,0 +1,19 @@
+"""The configuration files, and configurations composed from them."""
+
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+ROOT = Path(__file__).parents[2]
+
+
+CONFIGS = ROOT / "configs"
+
+
+FILES = sorted(f.relative_to(CONFIGS) for f in CONFIGS.glob("*/*.yaml"))
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose("config", [*overrides])

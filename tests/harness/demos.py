@@ -1,0 +1,54 @@
+"""Small demonstrations of random numbers, and an expert that fails."""
+
+import numpy as np
+
+from libero_env.demos.write import DemoWriter, Episode, make_header
+from libero_env.expert.rollout import Attempt
+
+STEPS = 12  # of an episode by `wander`
+
+
+def header(**more):
+    return make_header(
+        problem_name="LIBERO_Floor_Manipulation",
+        language="pick up the butter and place it in the basket",
+        bddl_name="libero_object/pick_up_the_butter.bddl",
+        bddl_text="(define (problem LIBERO_Floor_Manipulation))",
+        env_kwargs={"robots": ["Panda"]},
+        **({"pairing": "aligned", "seed": 1} | more),
+    )
+
+
+def episode(seed: int, steps: int = 11, size: int = 16) -> Episode:
+    rng = np.random.default_rng(seed)
+    image = lambda: rng.integers(0, 256, (steps, size, size, 3), np.uint8)  # noqa: E731
+    obs = {"agentview_rgb": image(), "eye_in_hand_rgb": image()}
+    obs |= {"joint_states": rng.normal(size=(steps, 7)), "gripper_states": rng.normal(size=(steps, 2))}
+    obs |= {"ee_pos": rng.normal(size=(steps, 3)), "ee_ori": rng.normal(size=(steps, 3))}
+    actions = rng.uniform(-1, 1, (steps, 7))
+    return Episode(actions, rng.normal(size=(steps, 30)), rng.normal(size=(steps, 9)), obs, actions * 0.5)
+
+
+def write(path, episodes, **more):
+    writer = DemoWriter(path, header(**more))
+    for i, one in enumerate(episodes):
+        writer.write(i, one)
+    return writer.finish()
+
+
+def wander(stage, experts, noise, max_steps):
+    """Instead of the experts: a random walk of the arm, said to be a success."""
+    rng = np.random.default_rng(5)
+    states, actions = [[] for _ in experts], [[] for _ in experts]
+    for _ in range(STEPS):
+        action = rng.uniform(-1, 1, (stage.num_envs, 7))
+        for i in range(len(experts)):
+            states[i].append(stage.world.physics_state(i))
+            actions[i].append(action[i])
+        stage.step(action)
+    for i, rows in enumerate(states):
+        rows.append(stage.world.physics_state(i))
+    return [
+        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "")
+        for s, a in zip(states, actions, strict=True)
+    ]

@@ -1,0 +1,159 @@
+"""A sequence of three tasks with a tiny policy and a fake environment; runs that are killed."""
+
+from dataclasses import asdict
+
+import numpy as np
+import torch
+
+from lifelong import checkpoints
+from lifelong.algorithms import ER, EWC, PackNet, Sequential
+from lifelong.data import SequenceVLDataset
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.settings import EvalSettings
+from lifelong.policies import BCTransformer
+from lifelong.results.records import CostRecord
+from lifelong.results.run_directory import RunDirectory
+from lifelong.seeding import generator, seeded
+from lifelong.sequence import Parts
+from lifelong.tracking import Tracker
+from lifelong.training.settings import FitSettings
+from lifelong.types import PolicySpec
+
+SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)
+
+
+TASKS = 3
+
+
+ALGORITHMS = {"sequential": Sequential, "er": lambda: ER(budget=12), "ewc": EWC, "packnet": PackNet}
+
+
+class FakeEnv:
+    """Succeeds after as many steps as the first action's size says; stands still afterwards."""
+
+    def __init__(self, task: int, num_envs: int):
+        self.num_envs, self.task, self.closed = num_envs, task, False
+
+    def _obs(self):
+        draws = np.random.default_rng(self.steps)
+        return {
+            "agentview_rgb": draws.integers(0, 255, (self.num_envs, 16, 16, 3), np.uint8),
+            "x": self.position,
+        }
+
+    def reset(self, *, seed=None, options=None):
+        self.states = np.asarray(options["init_state"])
+        self.steps, self.position = 0, np.stack([self.states / 50, self.states * 0 + self.task], 1)
+        self.running = np.ones(self.num_envs, bool)
+        return self._obs(), {}
+
+    def step(self, actions):
+        self.steps += 1
+        reached = self.running & (np.abs(actions[:, 0]) * 5 > self.states % 4) & (self.steps > 2)
+        self.position = self.position + 0.1 * actions[:, :2] * self.running[:, None]
+        self.running &= ~reached
+        success = ~self.running
+        return self._obs(), reached * 1.0, reached, np.zeros(self.num_envs, bool), {"success": success}
+
+    def close(self):
+        self.closed = True
+
+
+def dataset(task: int) -> SequenceVLDataset:
+    draws = generator(task)
+    frames = 20
+    return SequenceVLDataset(
+        torch.randint(0, 256, (frames, 1, 16, 16, 3), generator=draws, dtype=torch.uint8),
+        {"x": torch.randn(frames, 2, generator=draws)},
+        torch.rand(frames, 7, generator=draws) * 2 - 1,
+        torch.tensor([9] * 10 + [19] * 10),
+        torch.randn(4, generator=draws),
+        task,
+        SPEC.seq_len,
+    )
+
+
+def parts(path, algo: str) -> Parts:
+    datasets = {task: dataset(task) for task in range(TASKS)}
+    with seeded(7):
+        policy = BCTransformer(
+            spec=SPEC,
+            embed_dim=8,
+            image_width=8,
+            stage_blocks=[1],
+            stem_pool=False,
+            layers=1,
+            heads=2,
+            head_dim=4,
+            mlp_dim=8,
+            head_hidden=8,
+            head_layers=1,
+            modes=2,
+            min_std=0.05,
+        )
+    return Parts(
+        instructions=tuple(f"do {task}" for task in range(TASKS)),
+        languages=torch.stack([d.language for d in datasets.values()]),
+        datasets=datasets,
+        policy=policy,
+        algorithm=ALGORITHMS[algo](),
+        envs=EnvPool(lambda key: FakeEnv(*key), 2),
+        fit=FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32"),
+        eval=EvalSettings(episodes=3, curve_episodes=2, every=1, horizon=6, settle_steps=1, precision="fp32"),
+        augment=None,
+        directory=RunDirectory(path),
+        tracker=Tracker(),
+        seed=1,
+        device=torch.device("cpu"),
+        progress=False,
+    )
+
+
+def outcome(path, log):
+    """All records without their times, and the last weights and algorithm's state."""
+    kept = {}
+    for record in log.read().records:
+        values = {k: v for k, v in asdict(record).items() if k != "seconds"}
+        if isinstance(record, CostRecord):  # what is counted, not what is measured
+            values["costs"] = {
+                k: v for k, v in record.costs.items() if not k.endswith("seconds") and "peak" not in k
+            }
+        key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
+        key += tuple(values.get("costs", ()))
+        assert kept.setdefault(key, values) == values, "a record was made twice, and differs"
+    return kept, checkpoints.load(RunDirectory(path).task_path(TASKS - 1))
+
+
+def assert_same(a, b):
+    assert type(a) is type(b)
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b)
+    else:
+        assert a == b or (a != a and b != b)
+
+
+class Killed(BaseException):
+    """What a killed process leaves, without the process."""
+
+
+class Killer:
+    """Lets so many writes pass, then ends the process in the middle of one."""
+
+    def __init__(self, monkeypatch, writes: int):
+        self.left = writes
+        for owner, name in ((checkpoints, "save"), (RunDirectory, None)):
+            if name:
+                monkeypatch.setattr(owner, name, self.guard(getattr(owner, name)))
+
+    def guard(self, write):
+        def guarded(*args, **kwargs):
+            if self.left == 0:
+                raise Killed
+            self.left -= 1
+            return write(*args, **kwargs)
+
+        return guarded
