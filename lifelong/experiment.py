@@ -79,7 +79,7 @@ def _run(config: DictConfig, names: Mapping[str, str], settings: RunSettings, ra
     directory = RunDirectory(Path(settings.runs_dir) / name)
     plain: Any = OmegaConf.to_container(config, resolve=True)
     with directory.opened(plain, settings.resume) if ranks.first else nullcontext():
-        finished = ranks.share(lambda: directory.log.read().finished)
+        finished = ranks.broadcast(lambda: directory.log.read().finished)
         if finished and ranks.first:
             print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
         if not finished and ranks.first:
@@ -126,7 +126,7 @@ def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built
     fit: FitSettings = build(config.train)
     if fit.compile != "off":
         check_compiler(device)
-    languages = ranks.share(lambda: build(config.language).embed([t.language for t in (*first, *tasks)]))
+    languages = ranks.broadcast(lambda: build(config.language).embed([t.language for t in (*first, *tasks)]))
     spec = data.spec(languages.shape[1])
     with seeded(settings.seed, INIT):
         policy = build(config.policy, spec=spec).to(device)
@@ -184,7 +184,7 @@ def _walk(
     began = time.perf_counter()
     progress = sys.stderr.isatty() if settings.progress is None else settings.progress
     progress = progress and ranks.first
-    paths = ranks.share(_demos, built.tasks, built.counts, built.data, directory, progress)
+    paths = ranks.broadcast(_demos, built.tasks, built.counts, built.data, directory, progress)
     with EnvPool(lambda key: _env(built, key), built.eval.open_environments) as envs:
         parts = Parts(
             instructions=tuple(t.language for t in built.tasks),
@@ -240,21 +240,21 @@ def _demos(
 def _pretrain(built: Built, parts: Parts, directory: RunDirectory, plain: Mapping[str, Any]) -> None:
     """Let the policy learn what comes before the sequence, unless the sequence has begun or nothing does."""
     tasks, ranks, began = built.first_tasks, parts.ranks, time.perf_counter()
-    if not tasks or ranks.share(lambda: directory.started):
+    if not tasks or ranks.broadcast(lambda: directory.started):
         return
     kept = {key: plain[key] for key in PRETRAIN_KEYS}
     digest = hashlib.sha256(json.dumps(decisive(kept), sort_keys=True).encode()).hexdigest()[:12]
     own = RunDirectory(Path(plain["runs_dir"]) / "pretrain" / str(built.pretrain.suite) / digest)
     counts = [built.pretrain.demos or built.data.demos] * len(tasks)
     with own.opened(kept, resume=True) if ranks.first else nullcontext():
-        done = ranks.share(lambda: own.log.read().finished)
+        done = ranks.broadcast(lambda: own.log.read().finished)
         if not done and ranks.first:
             print(
                 f"Before the sequence: {len(tasks)} tasks of {built.pretrain.suite} in {own.path}", flush=True
             )
             names = {"algo": "multitask", "benchmark": str(built.pretrain.suite), "policy": "pretrained"}
             _record_start(own, names, parts.seed, tasks, kept, 1)
-        paths = ranks.share(_demos, tasks, counts, built.data, own, parts.progress)
+        paths = ranks.broadcast(_demos, tasks, counts, built.data, own, parts.progress)
         pretrain(
             parts,
             instructions=tuple(t.language for t in tasks),

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from libero_env.errors import LiberoError, UnknownNameError
 from lifelong import experiment
 from lifelong.report.page import write_report
-from lifelong.training.distributed import Ranks, joined, rank
+from lifelong.training.distributed import Ranks, process_group, rank
 
 
 class CombinedReport(Callback):
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        with joined() as ranks:
+        with process_group() as ranks:
             folder = config_folder()
             check_choices(words, (folder, *_user_folders(words)))
             return _compose_and_run(words, folder, ranks)

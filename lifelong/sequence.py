@@ -92,11 +92,11 @@ class TaskSequence:
         """Learn whatever is not learned yet, and evaluate all tasks so far after each stage."""
         done = self._restore()
         if done and evaluate:
-            self.parts.ranks.share(self._finish, self.stages[done - 1])
+            self.parts.ranks.broadcast(self._finish, self.stages[done - 1])
         for stage in self.stages[done:]:
             self._learn(stage)
             if evaluate:
-                self.parts.ranks.share(self._finish, stage)
+                self.parts.ranks.broadcast(self._finish, stage)
 
     def _restore(self) -> int:
         """Take up the state after the last stage that was learned; how many are."""
@@ -124,7 +124,7 @@ class TaskSequence:
         if len(stage) > 1:
             numbers, what = f"Tasks {stage[0] + 1}-{task + 1}", "together"
         self._say(f"{numbers}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
-        p.ranks.wait()  # all have read what is saved
+        p.ranks.barrier()  # all have read what is saved
         costs.reset_peak(p.device)
         if saved is None:
             p.algorithm.begin_task(task, dataset, p.policy)
@@ -135,8 +135,8 @@ class TaskSequence:
                 continue
             resume = saved["fit"] if saved is not None and stretch.number == saved["phase"] else None
             self._train(stretch, dataset, resume)
-            p.ranks.share(self._save, task, stretch.number + 1)
-        p.ranks.share(self._end_task, task, dataset)
+            p.ranks.broadcast(self._save, task, stretch.number + 1)
+        p.ranks.broadcast(self._end_task, task, dataset)
         if not p.ranks.first:
             self._take_up_task(task)
 
@@ -179,14 +179,14 @@ class TaskSequence:
             seed=(p.seed, FIT, stretch.task, stretch.number),
             device=p.device,
             augment=p.augment,
-            on_epoch=lambda end: p.ranks.share(self._after_epoch, stretch, end),
+            on_epoch=lambda end: p.ranks.broadcast(self._after_epoch, stretch, end),
             resume=resume,
             label=f"task {stretch.task + 1} {stretch.phase.name}",
             progress=p.progress,
             ranks=p.ranks,
         )
         if self._selects(stretch):
-            best = p.ranks.share(self._best_epoch, stretch, stretch.epochs)
+            best = p.ranks.broadcast(self._best_epoch, stretch, stretch.epochs)
             state = checkpoints.load(p.directory.best_path, p.device)
             if (state["task"], state["epoch"]) != (stretch.task, best):
                 raise checkpoints.CheckpointError(

@@ -1,18 +1,17 @@
-"""Several processes that train one policy: which one this is, and what they tell each other.
+"""Data-parallel training of one policy by several processes: their ranks and their communication.
 
     torchrun --nproc-per-node 2 train.py algo=er
 
-All processes ("ranks") walk through the same sequence with the same weights. At each step they draw the same
-batch, with the same replay and augmentation, and each takes its own rows of it; the gradients are then added up.
-So a step is that of one process with the whole batch, up to the order in which floating-point numbers are
-summed. Only what a network draws for itself in training (dropout, the noise of flow matching) is another draw
-on each rank.
+All processes ("ranks") learn the same task sequence with the same weights. At each step they draw the same batch,
+with the same replay and augmentation, and each computes its own rows of it; the gradients are then summed. So a step
+equals that of one process with the whole batch, up to the order in which floating-point numbers are summed. Only
+what a network draws itself in training (dropout, the noise of flow matching) differs between ranks.
 
-The first rank alone writes the run's directory, records demonstrations, evaluates and speaks, while the others
-wait; they read its checkpoints, so on several machines the directory must be one that all of them see.
+The first rank alone writes the run's directory, records demonstrations, evaluates and prints, while the others
+wait. They read its checkpoints, so on several machines the directory must be on a shared file system.
 
-torch's DistributedDataParallel is not used: it adds up gradients inside `backward`, where an algorithm that
-calls `backward` or `autograd.grad` of its own is in its way.
+torch's DistributedDataParallel is not used: it sums gradients inside `backward`, which conflicts with algorithms
+that call `backward` or `autograd.grad` themselves.
 """
 
 import os
@@ -30,18 +29,18 @@ from lifelong.errors import ConfigError, TrainingError
 
 T = TypeVar("T")
 
-_PATIENCE = timedelta(days=30)  # others wait while the first evaluates; torchrun ends them if one fails
-_ADDRESS = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # what torchrun sets
+_TIMEOUT = timedelta(days=30)  # the others wait while the first evaluates; torchrun ends them if one fails
+_TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among those that train together; by default there is no other.
+    """Rank of this process among those that train together; by default it is the only one.
 
     Attributes:
-        rank: Its number; 0 is the first.
-        size: How many there are.
-        local_rank: Its number among those of this machine.
+        rank: Number of this process; 0 is the first.
+        size: Number of processes.
+        local_rank: Number of this process among those on this machine.
     """
 
     rank: int = 0
@@ -50,14 +49,17 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this process writes, evaluates and speaks."""
+        """Whether this process writes files, evaluates and prints."""
         return self.rank == 0
 
     def device(self, name: str) -> torch.device:
-        """The device this process computes on: `auto`, `cpu`, `cuda` (a GPU for each process), `cuda:<number>`.
+        """Return the device this process computes on.
+
+        Args:
+            name: `auto`, `cpu`, `cuda` (a GPU for each process) or `cuda:<number>`.
 
         Raises:
-            ConfigError: No such device, no GPU, or fewer GPUs than processes.
+            ConfigError: The device does not exist, or there are fewer GPUs than processes.
         """
         if name == "auto":
             name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -75,44 +77,44 @@ class Ranks:
         count = torch.cuda.device_count()
         if device.index is not None or self.local_rank >= count:
             raise ConfigError(
-                f"{self.size} processes need a GPU each; device={device} and {count} GPUs here do not give "
-                f"them that. Use device=cuda with --nproc-per-node {count} at most, or device=cpu"
+                f"{self.size} processes need a GPU each, but device={device} and this machine has {count} GPUs. "
+                f"Use device=cuda with --nproc-per-node {count} at most, or device=cpu"
             )
         torch.cuda.set_device(self.local_rank)
         return torch.device("cuda", self.local_rank)
 
-    def rows(self, count: int) -> slice:
-        """This process's rows of a batch of `count`; all ranks' rows are all of them, none twice."""
+    def local_rows(self, count: int) -> slice:
+        """Return this process's rows of a batch of `count`; every row belongs to exactly one rank."""
         return slice(count * self.rank // self.size, count * (self.rank + 1) // self.size)
 
-    def wait(self) -> None:
-        """Until all ranks are here."""
+    def barrier(self) -> None:
+        """Wait until all ranks have reached this call."""
         self.sum(torch.zeros(1))
 
-    def share(self, make: Callable[..., T], *args: Any) -> T:
-        """What `make(*args)` gives on the first rank, given to all; the others do not call it.
+    def broadcast(self, make: Callable[..., T], *args: Any) -> T:
+        """Call `make(*args)` on the first rank only, and return its result on all ranks.
 
-        What is given travels as a pickle, between processes of one run only.
+        The result is pickled, between processes of one run only.
         """
         if self.size == 1:
             return make(*args)
         box: list[Any] = [make(*args) if self.first else None]
-        with _together():
+        with _connection_errors():
             dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
         return box[0]
 
     def sum(self, value: Tensor) -> Tensor:
-        """The sum over all ranks, in place."""
+        """Sum a tensor over all ranks, in place, and return it."""
         if self.size > 1:
-            with _together():
+            with _connection_errors():
                 dist.all_reduce(value)
         return value
 
     @torch.no_grad()
     def sum_gradients(self, params: Sequence[Tensor]) -> None:
-        """Replace each parameter's gradient by the sum over all ranks; one message for all of them.
+        """Replace each parameter's gradient by its sum over all ranks, in one message.
 
-        A parameter without a gradient counts as zero, and is left without one where no rank has one.
+        A missing gradient counts as zero; it stays missing where no rank has one.
         """
         if self.size == 1:
             return
@@ -128,49 +130,51 @@ class Ranks:
                 p.grad.copy_(total.view(p.shape))
 
     @torch.no_grad()
-    def agree(self, tensors: Sequence[Tensor]) -> None:
-        """Give the first rank's values to all, in place.
+    def synchronise(self, tensors: Sequence[Tensor]) -> None:
+        """Overwrite the tensors with those of the first rank, in place.
 
-        They are equal already where equal steps have equal results, which is not so of every GPU kernel.
+        They are equal already where kernels are deterministic, which not all GPU kernels are.
         """
         if self.size == 1:
             return
         for tensor in tensors:
             whole = tensor.detach().contiguous()
-            with _together():
+            with _connection_errors():
                 dist.broadcast(whole, src=0)
             tensor.copy_(whole)
 
 
 @contextmanager
-def joined() -> Iterator[Ranks]:
-    """Within the context, this process is one of those that torchrun started, or the only one.
+def process_group() -> Iterator[Ranks]:
+    """Join the processes that torchrun started, if it did, and yield the ranks; leave the group afterwards.
 
-    GPUs talk through NCCL, everything else through Gloo.
+    GPUs communicate through NCCL, everything else through Gloo.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not all(name in os.environ for name in _ADDRESS):
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not all(
+        name in os.environ for name in _TORCHRUN_VARIABLES
+    ):
         yield Ranks()
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-    with _together():
-        dist.init_process_group(backend, timeout=_PATIENCE)
+    with _connection_errors():
+        dist.init_process_group(backend, timeout=_TIMEOUT)
     yield Ranks(dist.get_rank(), dist.get_world_size(), int(os.environ.get("LOCAL_RANK", "0")))
     dist.destroy_process_group()  # not after an error: it would wait for the others
 
 
 def rank() -> int:
-    """This process's number, where nothing else tells it; 0 if there is no other."""
+    """Return the rank of this process where no `Ranks` is at hand; 0 if it is the only one."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 @contextmanager
-def _together() -> Iterator[None]:
-    """One error for all that a lost connection brings forth."""
+def _connection_errors() -> Iterator[None]:
+    """Turn the errors of a lost connection into one TrainingError."""
     try:
         yield
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[0]
         raise TrainingError(
-            f"another process of this run has ended, see what it said ({reason}). The same command goes on "
-            "from what was saved"
+            f"another process of this run has ended; see its error message ({reason}). Run the same command to "
+            "resume from what was saved"
         ) from error

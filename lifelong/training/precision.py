@@ -1,4 +1,4 @@
-"""How networks are computed: in which precision, with which kernels, compiled or not, in which memory."""
+"""Precision, deterministic kernels, compilation and memory allocation of network computations."""
 
 import ctypes
 import os
@@ -27,7 +27,12 @@ with torch.autocast("cpu", torch.bfloat16):
 
 
 def autocast(device: torch.device, precision: str) -> torch.autocast:
-    """The autocast context of a precision; `auto` takes bf16 where the processor computes in it."""
+    """Return the autocast context of a precision.
+
+    Args:
+        device: Device of the computation.
+        precision: `bf16`, `fp32`, or `auto`: bf16 where the processor supports it.
+    """
     if precision == "auto":
         if device.type == "cuda":
             fast = torch.cuda.is_bf16_supported()
@@ -39,11 +44,11 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
 
 @cache
 def bf16_runs_on_cpu() -> bool:
-    """Whether bfloat16 is fast on this CPU and a bfloat16 product ends well.
+    """Return whether bfloat16 is fast on this CPU and a bfloat16 product does not crash.
 
-    Some virtual machines announce AMX and then kill the process at its first instruction, so the product is
-    tried in another process, which takes a few seconds, once. Where it fails, setting the environment
-    variable ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16 before Python starts makes bfloat16 usable nevertheless.
+    Some virtual machines report AMX and then kill the process at its first instruction, so a product is tried in
+    another process, once, which takes a few seconds. Where it fails, setting the environment variable
+    ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16 before Python starts makes bfloat16 usable nevertheless.
     """
     if not torch.ops.mkldnn._is_mkldnn_bf16_supported():
         return False
@@ -56,13 +61,16 @@ def bf16_runs_on_cpu() -> bool:
 
 @contextmanager
 def deterministic(on: bool) -> Iterator[None]:
-    """Within the context, every kernel gives the same bits each time, or fails; afterwards all is as before.
+    """Use deterministic kernels within the context, and restore the settings afterwards.
 
-    On a CPU that is so anyway. On a GPU it costs speed: sums without atomics, a fixed cuBLAS workspace (which
-    cuBLAS reads when it is first used, so this comes before), attention as plain products.
+    CPU kernels are deterministic anyway. On a GPU it costs speed: sums without atomics, a fixed cuBLAS workspace
+    (which cuBLAS reads at its first use, so enter the context before), attention as plain matrix products.
+
+    Args:
+        on: Whether to change anything.
 
     Raises:
-        TrainingError: An operation has no such kernel on this device; the message names it.
+        TrainingError: An operation has no deterministic kernel on this device; the message names it.
     """
     if not on:
         yield
@@ -94,12 +102,12 @@ def deterministic(on: bool) -> Iterator[None]:
 
 
 def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
-    """A function as `torch.compile` makes it; the module it may be a method of keeps its names and weights.
+    """Return a function compiled by `torch.compile`. A module it is a method of keeps its names and weights.
 
     Args:
-        function: What is compiled, when it is first called with arguments of a kind.
-        mode: `off`: the function as it is; `default`; `reduce-overhead`: on a GPU as CUDA graphs, which spare
-            the launching of kernels. What such a function returns is overwritten by its next call.
+        function: Function to compile, at its first call with arguments of each type and shape.
+        mode: `off`: the function unchanged; `default`; `reduce-overhead`: on a GPU as CUDA graphs, which save
+            kernel launches. The output of such a function is overwritten by its next call.
     """
     if mode == "off":
         return function
@@ -107,13 +115,16 @@ def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
 
 
 def check_compiler(device: torch.device) -> None:
-    """Compile something small, so that a missing compiler is told before anything else is done.
+    """Compile a small function, so that a missing compiler is reported before a run starts.
+
+    Args:
+        device: Device to compile for.
 
     Raises:
-        ConfigError: It does not work here.
+        ConfigError: Compilation does not work on this machine.
     """
     try:
-        torch.compile(_small)(torch.ones(64, device=device))
+        torch.compile(_small_function)(torch.ones(64, device=device))
     except (RuntimeError, ImportError, OSError) as error:
         needed = "Triton and a C compiler" if device.type == "cuda" else "a C++ compiler such as g++"
         reason = next((line for line in reversed(str(error).strip().splitlines()) if line.strip()), "")
@@ -124,14 +135,14 @@ def check_compiler(device: torch.device) -> None:
 
 
 def keep_freed_memory() -> bool:
-    """Have glibc's allocator keep what is freed, for the whole process; elsewhere nothing happens.
+    """Make glibc's allocator keep freed memory, for the whole process; with other allocators do nothing.
 
-    By default it gives large blocks back to the system, which zeroes every page of them again when the next step needs
-    its activations. With the paper's policy on two cores that took more than a quarter of a step
-    (experiments/benchmarks). The settings are mallopt(3)'s.
+    By default it returns large blocks to the system, which zeroes every page again when the next step needs memory
+    for its activations. With the paper's policy on two cores that took more than a quarter of a step
+    (experiments/benchmarks). The settings are those of mallopt(3).
 
     Returns:
-        Whether the allocator took the settings.
+        Whether the allocator accepted the settings.
     """
     trim_threshold, top_pad, mmap_max = -1, -2, -4
     try:
@@ -141,5 +152,5 @@ def keep_freed_memory() -> bool:
     return all(mallopt(*pair) for pair in ((mmap_max, 0), (trim_threshold, 2**31 - 1), (top_pad, 2**28)))
 
 
-def _small(x: torch.Tensor) -> torch.Tensor:
+def _small_function(x: torch.Tensor) -> torch.Tensor:
     return (x.sin() + 1).sum()

@@ -1,4 +1,4 @@
-"""How a task is trained."""
+"""Settings of the training of a task."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,24 +10,24 @@ from lifelong.training.precision import COMPILE_MODES
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a task is trained; the defaults are those of the paper (appendix B) and its code.
+    """Settings of the training of a task; the defaults are those of LIBERO's paper (appendix B) and code.
 
     Attributes:
         epochs: Passes over the task's windows.
-        batch_size: Windows per step.
-        steps_per_epoch: Steps that count as one epoch; None: every window once (the last batch is
-            topped up).
-        lr: Learning rate of AdamW at the start.
-        lr_min: Where the cosine schedule ends, at the last step of the task.
-        warmup_steps: Steps over which the rate rises linearly from zero.
+        batch_size: Number of windows per step.
+        steps_per_epoch: Number of steps that count as one epoch. None: every window once (the last batch is
+            filled up).
+        lr: Learning rate of AdamW after the warm-up.
+        lr_min: Learning rate at the last step of the task, where the cosine schedule ends.
+        warmup_steps: Number of steps over which the learning rate rises linearly from zero.
         betas: AdamW's decay rates.
         weight_decay: AdamW's decoupled weight decay.
-        grad_clip: Largest norm of the gradient; 0 switches clipping off.
-        precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor has it.
-        accumulate: Micro-batches that a batch is cut into, one after the other in memory. The gradient is that
-            of the whole batch, up to rounding and to what the policy draws for itself (dropout).
+        grad_clip: Largest norm of the gradient; 0 disables clipping.
+        precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor supports it.
+        accumulate: Number of micro-batches that a batch is divided into, one after the other in memory. The
+            gradient is that of the whole batch, up to rounding and to what the policy draws itself (dropout).
         compile: `torch.compile` of the policy's loss: `off`, `default`, or `reduce-overhead`, which on a GPU
-            replays CUDA graphs. It changes rounding.
+            replays CUDA graphs. Compilation changes rounding.
     """
 
     epochs: int = 50
@@ -44,7 +44,7 @@ class FitSettings:
     compile: Literal["off", "default", "reduce-overhead"] = "off"
 
     def __post_init__(self) -> None:
-        if self.compile is False:  # what YAML makes of an unquoted off
+        if self.compile is False:  # YAML reads an unquoted off as False
             object.__setattr__(self, "compile", "off")
         for name, valid in (("precision", ("auto", "bf16", "fp32")), ("compile", COMPILE_MODES)):
             if getattr(self, name) not in valid:

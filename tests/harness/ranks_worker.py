@@ -19,7 +19,7 @@ from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
-from lifelong.training.distributed import Ranks, joined
+from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
 
@@ -91,7 +91,7 @@ def learn_all(folder: Path, ranks: Ranks) -> None:
 
 def talk(folder: Path, ranks: Ranks) -> None:
     """What processes tell each other, with nothing to learn."""
-    shared = ranks.share(lambda: {"from": ranks.rank, "path": folder})
+    shared = ranks.broadcast(lambda: {"from": ranks.rank, "path": folder})
     assert shared == {"from": 0, "path": folder}
     a, b, c = (torch.nn.Parameter(torch.zeros(2, 2)) for _ in range(3))
     a.grad = torch.full((2, 2), float(ranks.rank + 1))
@@ -102,7 +102,7 @@ def talk(folder: Path, ranks: Ranks) -> None:
     assert torch.equal(b.grad, torch.arange(4.0).view(2, 2)), "one rank alone has a gradient"
     assert c.grad is None, "no rank has one"
     drifted = torch.full((3,), float(ranks.rank), requires_grad=True)
-    ranks.agree([drifted])
+    ranks.synchronise([drifted])
     assert torch.equal(drifted, torch.zeros(3))
     (folder / f"talked_{ranks.rank}").touch()
 
@@ -111,11 +111,11 @@ def die(folder: Path, ranks: Ranks) -> None:
     """The second process is killed; the first waits for it, for ever if nobody ends it."""
     if not ranks.first:
         os.kill(os.getpid(), signal.SIGKILL)
-    ranks.wait()
+    ranks.barrier()
     (folder / "went_on").touch()
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    with joined() as ranks:
+    with process_group() as ranks:
         {"learn": learn_all, "talk": talk, "die": die}[sys.argv[1]](Path(sys.argv[2]), ranks)

@@ -1,4 +1,4 @@
-"""What algorithms cost: operations against the formulas, and nothing is changed by counting them."""
+"""What algorithms cost: operations against the formulas, and nothing is changed by count_flops them."""
 
 import copy
 from pathlib import Path
@@ -14,7 +14,7 @@ from lifelong.data import SequenceVLDataset
 from lifelong.policies import BCTransformer
 from lifelong.policies.bc_rnn import BCRNN
 from lifelong.seeding import generator, seeded
-from lifelong.training.costs import COSTS, action_costs, counting, peak_costs, step_costs, stored_bytes
+from lifelong.training.costs import COSTS, action_costs, count_flops, peak_costs, step_costs, stored_bytes
 from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit
@@ -54,7 +54,7 @@ def transformer() -> BCTransformer:
 
 
 def counted(work) -> int:
-    with counting() as counter:
+    with count_flops() as counter:
         work()
     return counter.get_total_flops()
 
@@ -103,7 +103,7 @@ def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
     assert 2.5 * forward < costs[Sequential] < 3 * forward  # the images need no gradient
 
 
-def test_counting_changes_neither_policy_nor_algorithm():
+def test_count_flops_changes_neither_policy_nor_algorithm():
     policy, algorithm, windows = transformer(), AGEM(budget=9), dataset(1)
     algorithm.end_task(0, dataset(0), policy, generator(0))
     policy.train()

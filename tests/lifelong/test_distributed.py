@@ -11,7 +11,7 @@ import torch
 
 from lifelong import checkpoints
 from lifelong.errors import ConfigError
-from lifelong.training.distributed import Ranks, joined
+from lifelong.training.distributed import Ranks, process_group
 from tests.harness import ranks_worker as worker
 
 ROOT = Path(__file__).parents[2]
@@ -79,17 +79,17 @@ def test_one_that_dies_ends_all(tmp_path):
 @pytest.mark.parametrize("size", [1, 2, 3, 8])
 @pytest.mark.parametrize("count", [1, 7, 32])
 def test_every_row_is_somebodys_and_shares_are_even(size, count):
-    rows = [range(count)[Ranks(rank, size).rows(count)] for rank in range(size)]
+    rows = [range(count)[Ranks(rank, size).local_rows(count)] for rank in range(size)]
     assert [i for part in rows for i in part] == list(range(count))
     assert max(map(len, rows)) - min(map(len, rows)) <= 1
 
 
 def test_alone_nothing_is_said():
     value, made = torch.ones(3), []
-    with joined() as ranks:
+    with process_group() as ranks:
         assert ranks == Ranks() and ranks.first
-        ranks.wait()
-        assert ranks.share(made.append, 5) is None and made == [5]
+        ranks.barrier()
+        assert ranks.broadcast(made.append, 5) is None and made == [5]
         assert torch.equal(ranks.sum(value), torch.ones(3))
 
 
