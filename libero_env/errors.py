@@ -18,6 +18,23 @@ class UnknownNameError(LiberoError, LookupError):
         super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names)}")
 
 
+class MissingPackageError(LiberoError):
+    """A package that supplies files is not installed.
+
+    Attributes:
+        reason: What is missing.
+        remedy: Command that installs it.
+    """
+
+    def __init__(self, reason: str, remedy: str):
+        super().__init__(f"{reason}; type {remedy}")
+        self.reason, self.remedy = reason, remedy
+
+    def __reduce__(self) -> tuple[type, tuple[str, str]]:
+        """Let worker processes send the error: its arguments are not its message."""
+        return type(self), (self.reason, self.remedy)
+
+
 class BDDLError(LiberoError, ValueError):
     """A task file that cannot be read; the message starts with file:line."""
 

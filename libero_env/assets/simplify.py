@@ -1,8 +1,9 @@
-"""Level of detail: visual meshes with fewer triangles, made once per machine and cached."""
+"""Visual meshes with fewer triangles; each is simplified once per machine and cached."""
 
 import hashlib
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,11 +13,28 @@ from libero_env.geometry import quat_to_mat
 from libero_env.paths import cache_dir
 from libero_env.storage import atomic_path
 
-_CACHE_VERSION = 3
+_CACHE_VERSION = 3  # of `lod-*.npz`
+_MERGE_CACHE_VERSION = 2  # of the files of `merge_and_simplify`
 _CHUNK = 64  # points whose distances to all others are in memory at once
-_PER_SIDE = 40  # samples along the mesh
+_PER_SIDE = 40  # samples along the longest side of the mesh
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+class MeshSource(NamedTuple):
+    """A mesh file and its pose in the frame of a body.
+
+    Attributes:
+        name: Name of the mesh in its model.
+        file: Path of the file.
+        pos: Position, (3,) [m].
+        quat: Orientation, (4,) wxyz.
+    """
+
+    name: str
+    file: str
+    pos: tuple[float, ...]
+    quat: tuple[float, ...]
 
 
 def simplify_visuals(spec: mujoco.MjSpec, faces: int) -> None:
@@ -50,6 +68,57 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
         arrays = whole if len(whole[1]) <= faces else decimate(*whole, faces)
         _store(path, arrays)
     return arrays if len(arrays[1]) else None
+
+
+def merge_and_simplify(
+    stem: str, name: str, groups: tuple[tuple[MeshSource, ...], ...], faces: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Merge the meshes of each group into one with at most about a number of triangles.
+
+    Args:
+        stem: Beginning of the name of the cache file.
+        name: Name of the model; it distinguishes models whose meshes have the same names.
+        groups: Meshes to merge.
+        faces: Largest number of triangles of a merged mesh.
+
+    Returns:
+        Vertices (n, 3) [m] and triangles (f, 3) of each group.
+    """
+    parts = [(source.name, *source.pos, *source.quat) for sources in groups for source in sources]
+    digest = hashlib.sha256(repr((_MERGE_CACHE_VERSION, faces, name, parts)).encode()).hexdigest()[:16]
+    return _merged(cache_dir() / "meshes" / f"{stem}-{digest}.npz", groups, faces)
+
+
+@lru_cache(maxsize=8)
+def _merged(
+    path: Path, groups: tuple[tuple[MeshSource, ...], ...], faces: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    if path.exists():
+        with np.load(path) as stored:
+            return [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(groups))]
+    meshes = [_merge(sources, faces) for sources in groups]
+    arrays = {k: a for i, (v, f) in enumerate(meshes) for k, a in ((f"v{i}", v), (f"f{i}", f))}
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
+    return meshes
+
+
+def _merge(sources: tuple[MeshSource, ...], faces: int) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh  # only needed the first time on a machine
+
+    parts = []
+    for source in sources:
+        mesh = trimesh.load(source.file, force="mesh", process=True, skip_materials=True)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = quat_to_mat(np.asarray(source.quat)), source.pos
+        parts.append(mesh.apply_transform(pose))
+    whole = trimesh.util.concatenate(parts)
+    if len(whole.faces) > faces:
+        whole = whole.simplify_quadric_decimation(face_count=faces)
+    whole.update_faces(whole.nondegenerate_faces())
+    whole.remove_unreferenced_vertices()
+    return np.asarray(whole.vertices, np.float64), np.asarray(whole.faces, np.int32)
 
 
 def _store(path: Path, arrays: Arrays) -> None:

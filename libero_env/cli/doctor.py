@@ -1,7 +1,6 @@
 """What this machine has and lacks: each finding with the way to mend it, and no crash."""
 
 import importlib.metadata
-import importlib.util
 import json
 import os
 import platform
@@ -12,10 +11,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from libero_env.assets.robot import (
+    ROBOSUITE_REMEDY,
+    ROBOSUITE_VERSION,
+    robosuite_assets,
+    robosuite_version,
+)
+from libero_env.errors import MissingPackageError
 from libero_env.paths import cache_dir, demos_dir
 from libero_env.storage import show_bytes
 
-ROBOSUITE = "1.4.1"
 GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
 BACKENDS = ("egl", "osmesa", "glfw")
 PROBE_SECONDS = 60
@@ -89,17 +94,14 @@ def check_package(name: str, remedy: str = "make setup", essential: bool = True)
 
 
 def check_robot_models() -> Finding:
-    """robosuite's MJCF of the arm, found without importing robosuite."""
+    """Return whether robosuite's MJCF files of the arm are found, without importing robosuite."""
     title = "robot models (robosuite)"
-    remedy = f"pip install --no-deps robosuite=={ROBOSUITE}"
-    spec = importlib.util.find_spec("robosuite")
-    if spec is None or spec.origin is None:
-        return Finding(title, "robosuite is not installed", False, remedy)
-    arm = Path(spec.origin).parent / "models" / "assets" / "robots" / "panda" / "robot.xml"
-    if not arm.is_file():
-        return Finding(title, f"{arm} is missing", False, remedy)
-    version = importlib.metadata.version("robosuite")
-    return Finding(title, version, version == ROBOSUITE, remedy, essential=False)
+    try:
+        robosuite_assets()
+        version = robosuite_version()
+    except MissingPackageError as error:
+        return Finding(title, error.reason, False, error.remedy)
+    return Finding(title, version, version == ROBOSUITE_VERSION, ROBOSUITE_REMEDY, essential=False)
 
 
 def check_gl() -> Finding:

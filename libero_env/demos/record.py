@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from libero_env.assets.robot import robosuite_version
 from libero_env.demos.observe import Filmer, Shots, model_file
 from libero_env.demos.read import Pairing
 from libero_env.demos.write import DemoWriter, Episode, make_header
@@ -81,7 +82,11 @@ class Recipe:
     def header(self) -> dict:
         """Attributes of the file."""
         task = self.task
-        versions = {name: metadata.version(name) for name in ("mujoco", "robosuite", "h5py")}
+        versions = {
+            "mujoco": metadata.version("mujoco"),
+            "robosuite": robosuite_version(),
+            "h5py": metadata.version("h5py"),
+        }
         return make_header(
             problem_name=task.problem.name,
             language=task.language,

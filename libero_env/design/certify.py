@@ -21,7 +21,7 @@ from tqdm import tqdm
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.record import GENERATOR
 from libero_env.envs.batch import BatchEnv
-from libero_env.errors import LiberoError, PlacementError
+from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.init_states.store import scene_digest
@@ -232,6 +232,8 @@ def _digest(task: Task, pack: Pack, disturb: bool) -> str:
     """Changes with the task, its scene, the expert's version and MuJoCo's; 16 hex digits."""
     try:
         scene = scene_digest(build_scene(task.problem, pack))
+    except MissingPackageError:
+        raise  # no task can be tried
     except LiberoError as error:
         scene = str(error)
     parts = (task.bddl_text, scene, pack.name, GENERATOR, mujoco.__version__, disturb)
