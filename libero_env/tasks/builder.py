@@ -111,7 +111,7 @@ def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
     goal = bddl.parse_expression(goal, known, where) if isinstance(goal, str) else And(atoms(goal))
     interest = facts.get("obj_of_interest")
     if interest is None:
-        interest = _goal_things(goal, regions, objects, facts["fixtures"])
+        interest = entities_in_goal(goal, regions, objects, facts["fixtures"])
     return Problem(
         name=facts["problem"],
         language=facts["language"],
@@ -132,11 +132,11 @@ def language_from_name(name: str) -> str:
     return " ".join(words[prefix:])
 
 
-def _goal_things(goal: Expression, regions: Iterable[Region], *declared: Iterable[str]) -> list[str]:
-    """The declared names that a goal speaks of, in the order declared."""
+def entities_in_goal(goal: Expression, regions: Iterable[Region], *declared: Iterable[str]) -> list[str]:
+    """Return the declared names that a goal refers to, in the order declared; for a region its target."""
     targets = {region.address: region.target for region in regions}
-    spoken = {targets.get(name, name) for name in _arguments(goal)}
-    return [name for names in declared for name in names if name in spoken]
+    named = {targets.get(name, name) for name in _arguments(goal)}
+    return [name for names in declared for name in names if name in named]
 
 
 def _arguments(node: Expression) -> Iterable[str]:

@@ -1,6 +1,6 @@
-"""Task files from the facts of a scene and a task, the way the original's generators are called.
+"""Task files from descriptions of a scene and a task, with the original's generator functions.
 
-The pieces are values of `libero_env.tasks.problem`; `PDDLDefinition` joins them to the text of a task file.
+The parts are values of `libero_env.tasks.problem`; `PDDLDefinition` joins them to the text of a task file.
 """
 
 import functools
@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from libero.libero.envs.bddl_utils import as_expression
+from libero.libero.utils.object_utils import get_affordance_regions
 from libero_env.assets.arena import load_workspace
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import And, Atom, Expression, Problem, Region
 
-# What a workspace is called -> its category.
+# Name of a workspace -> its category.
 WORKSPACE_CATEGORIES = {
     "main_table": "table",
     **{name: name for name in ("kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")},
@@ -41,10 +42,10 @@ class ObjectDict(dict[str, list[str]]):
 
 
 class RegionWrapper:
-    """Regions in the making: each address once.
+    """Regions by address, each once.
 
     Args:
-        regions: to begin with.
+        regions: First regions.
     """
 
     def __init__(self, regions: Iterable[Region] = ()):
@@ -58,26 +59,25 @@ class RegionWrapper:
 
 
 def LogicalState(predicate: str, *args: Any) -> Expression:
-    """One condition: `LogicalState("On", "plate_1", "stove_1")`; And, Or and Not take conditions."""
+    """Return a condition, `LogicalState("On", "plate_1", "stove_1")`; And, Or and Not take conditions."""
     return as_expression([predicate, *args])
 
 
 class PDDLDefinition:
-    """Decorator of a function that gives the facts of a problem (fields of `Problem`): it then gives its task file.
+    """Decorator of a function that returns the fields of a `Problem`: it then returns the task file.
 
     Args:
-        problem_name: such as `LIBERO_Kitchen_Tabletop_Manipulation`.
-        domain: as the task file names it.
+        problem_name: Problem class, such as `LIBERO_Kitchen_Tabletop_Manipulation`.
+        domain: Domain in the task file.
     """
 
     def __init__(self, problem_name: str, domain: str = "robosuite"):
         self.problem_name, self.domain = problem_name, domain
 
     def __call__(self, facts: Callable[..., Mapping[str, Any]]) -> Callable[..., str]:
-        """The function that writes task files.
+        """Return a function that writes task files.
 
-        Raises (when called):
-            BDDLError: a condition speaks of a name that is not declared.
+        It raises a `BDDLError` where a condition uses a name that is not declared.
         """
 
         @functools.wraps(facts)
@@ -91,12 +91,12 @@ class PDDLDefinition:
 
 
 def object_naming_mapping(object_name: str) -> str:
-    """Category that a name stands for: `main_table` is a `table`, `plate_2` a `plate`."""
+    """Return the category of a name: `table` for `main_table`, `plate` for `plate_2`."""
     return WORKSPACE_CATEGORIES.get(object_name, re.sub(r"_\d+$", "", object_name))
 
 
 def get_object_dict(object_num_info: Mapping[str, int]) -> ObjectDict:
-    """Category -> names, from category -> number; a workspace is called by its own name."""
+    """Return category -> names, from category -> number; a workspace keeps its own name."""
     found = ObjectDict()
     for category, count in object_num_info.items():
         if category in WORKSPACE_CATEGORIES:
@@ -106,18 +106,16 @@ def get_object_dict(object_num_info: Mapping[str, int]) -> ObjectDict:
     return found
 
 
-def get_fixtures(fixture_object_dict: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Name -> category of the fixtures."""
-    return ObjectDict({category: list(names) for category, names in fixture_object_dict.items()}).names
+def get_fixtures(object_dict: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return name -> category, from category -> names."""
+    return ObjectDict({category: list(names) for category, names in object_dict.items()}).names
 
 
-def get_objects(movable_object_dict: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Name -> category of the objects."""
-    return get_fixtures(movable_object_dict)
+get_objects = get_fixtures
 
 
 def get_objects_of_interest(objects_of_interest: Iterable[str]) -> tuple[str, ...]:
-    """Names, each once."""
+    """Return the names, each once."""
     return tuple(dict.fromkeys(objects_of_interest))
 
 
@@ -128,26 +126,26 @@ def get_xy_region(
     region_half_len: float | Pair = 0.02,
     yaw_rotation: Pair = (0.0, 0.0),
 ) -> Region:
-    """A rectangle on a workspace.
+    """Return a rectangle on a workspace.
 
     Args:
-        region_name: such as `plate_init_region`.
-        target_name: the workspace.
-        region_centroid_xy: its middle (x, y), m, in the frame of the workspace; or several, for as many rectangles.
-        region_half_len: half its size, m; one number, or one along x and one along y.
-        yaw_rotation: (low, high) of the rotation about the vertical, rad.
+        region_name: Name of the region, such as `plate_init_region`.
+        target_name: Name of the workspace.
+        region_centroid_xy: Centre (x, y) in the frame of the workspace, m; or several, one for each rectangle.
+        region_half_len: Half size, m: one number, or one along x and one along y.
+        yaw_rotation: Range (low, high) of the rotation about the vertical, rad.
     """
-    middles: Any = (
+    centres: Any = (
         [region_centroid_xy] if isinstance(region_centroid_xy[0], int | float) else region_centroid_xy
     )
     half = (region_half_len,) * 2 if isinstance(region_half_len, int | float) else tuple(region_half_len)
-    ranges = tuple((x - half[0], y - half[1], x + half[0], y + half[1]) for x, y in middles)
+    ranges = tuple((x - half[0], y - half[1], x + half[0], y + half[1]) for x, y in centres)
     low, high = map(float, yaw_rotation)
     return Region(region_name, target_name, ranges, ((low, high),))
 
 
 def get_object_affordance_region(region_name: str, target_name: str) -> Region:
-    """A place that belongs to a thing, such as a drawer: a named site of its model."""
+    """Return a region of an object or fixture, such as a drawer: a named site of its model."""
     return Region(region_name, target_name)
 
 
@@ -155,7 +153,7 @@ def region_module(
     xy_region_kwargs_list: Iterable[Mapping[str, Any]],
     affordance_region_kwargs_list: Iterable[Mapping[str, Any]],
 ) -> tuple[Region, ...]:
-    """All regions: arguments of `get_xy_region`, then those of `get_object_affordance_region`."""
+    """Return all regions, from arguments of `get_xy_region` and of `get_object_affordance_region`."""
     wrapper = RegionWrapper(get_xy_region(**kwargs) for kwargs in xy_region_kwargs_list)
     for kwargs in affordance_region_kwargs_list:
         wrapper.add(get_object_affordance_region(**kwargs))
@@ -163,12 +161,12 @@ def region_module(
 
 
 def get_init_state(init_states: Iterable[Sequence[str]]) -> tuple[Atom, ...]:
-    """Conditions of the start from tuples such as `("On", "plate_1", "kitchen_table_plate_init_region")`."""
+    """Return the initial conditions of tuples such as `("On", "plate_1", "kitchen_table_plate_init_region")`."""
     return tuple(Atom(predicate.capitalize(), tuple(args)) for predicate, *args in init_states)
 
 
 def get_goal_state(goal_states: Sequence[Any]) -> Expression:
-    """What is to be reached: conditions that must all hold, or one such as `("Or", ("Open", "a"), ("Open", "b"))`."""
+    """Return the goal of conditions that must all hold, or of one: `("Or", ("Open", "a"), ("Open", "b"))`."""
     states = [goal_states] if goal_states and isinstance(goal_states[0], str) else goal_states
     parts = tuple(as_expression(list(state)) for state in states)
     return parts[0] if len(parts) == 1 and not isinstance(parts[0], Atom) else And(parts)
@@ -177,18 +175,16 @@ def get_goal_state(goal_states: Sequence[Any]) -> Expression:
 def get_affordance_region_kwargs_list_from_fixture_info(
     fixture_info: Mapping[str, int],
 ) -> list[dict[str, str]]:
-    """Arguments of `get_object_affordance_region` for all places of things, from category -> number."""
-    from libero.libero.utils.object_utils import get_affordance_regions
-
-    things = {
-        c: names
-        for c, names in get_object_dict(fixture_info).items()
-        if c not in WORKSPACE_CATEGORIES.values()
+    """Return arguments of `get_object_affordance_region` for all regions of objects, from category -> number."""
+    objects = {
+        category: names
+        for category, names in get_object_dict(fixture_info).items()
+        if category not in WORKSPACE_CATEGORIES.values()
     }
-    regions = get_affordance_regions(things)
+    regions = get_affordance_regions(objects)
     return [
         {"region_name": region, "target_name": name}
-        for category, names in things.items()
+        for category, names in objects.items()
         for name in names
         for region in regions.get(category, ())
     ]
@@ -197,7 +193,7 @@ def get_affordance_region_kwargs_list_from_fixture_info(
 def get_xy_region_kwargs_list_from_regions_info(
     regions_info: Mapping[str, Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Arguments of `get_xy_region` from name -> facts, as `InitialSceneTemplates.get_region_dict` gives them."""
+    """Return arguments of `get_xy_region`, from those that `InitialSceneTemplates.get_region_dict` returns."""
     return [{"region_name": name, **facts} for name, facts in regions_info.items()]
 
 
@@ -211,7 +207,7 @@ def _facts(
     init_states: Iterable[Sequence[str]] = (),
     goal_states: Sequence[Any] = (),
 ) -> dict[str, Any]:
-    """The facts of a problem from a template's."""
+    """Return the fields of a `Problem`."""
     return {
         "language": Language(language),
         "regions": region_module(xy_region_kwargs_list, affordance_region_kwargs_list),
@@ -223,55 +219,29 @@ def _facts(
     }
 
 
-def _generator(category: str) -> Callable[..., str]:
-    return PDDLDefinition(load_workspace(category).problem)(_facts)
-
-
-def tabletop_task_suites_generator(*args: Any, **kwargs: Any) -> str:
-    """Task file of a task at the plain table; arguments as in `_facts`."""
-    return _generator("table")(*args, **kwargs)
-
-
-def kitchen_table_task_suites_generator(*args: Any, **kwargs: Any) -> str:
-    """Task file of a task at the kitchen table."""
-    return _generator("kitchen_table")(*args, **kwargs)
-
-
-def living_room_table_task_suites_generator(*args: Any, **kwargs: Any) -> str:
-    """Task file of a task at the living room's table."""
-    return _generator("living_room_table")(*args, **kwargs)
-
-
-def study_table_task_suites_generator(*args: Any, **kwargs: Any) -> str:
-    """Task file of a task at the desk."""
-    return _generator("study_table")(*args, **kwargs)
-
-
-def coffee_table_task_suites_generator(*args: Any, **kwargs: Any) -> str:
-    """Task file of a task at the coffee table."""
-    return _generator("coffee_table")(*args, **kwargs)
-
-
-def floor_task_suites_generator(*args: Any, **kwargs: Any) -> str:
-    """Task file of a task on the floor."""
-    return _generator("floor")(*args, **kwargs)
+def _task_file(category: str, *args: Any, **kwargs: Any) -> str:
+    """Write the task file of a task on a workspace; arguments as in `_facts`."""
+    return PDDLDefinition(load_workspace(category).problem)(_facts)(*args, **kwargs)
 
 
 SUITE_GENERATORS: dict[str, Callable[..., str]] = {
-    "main_table": tabletop_task_suites_generator,
-    "kitchen_table": kitchen_table_task_suites_generator,
-    "living_room_table": living_room_table_task_suites_generator,
-    "study_table": study_table_task_suites_generator,
-    "coffee_table": coffee_table_task_suites_generator,
-    "floor": floor_task_suites_generator,
+    name: functools.partial(_task_file, category) for name, category in WORKSPACE_CATEGORIES.items()
 }
+(
+    tabletop_task_suites_generator,
+    kitchen_table_task_suites_generator,
+    living_room_table_task_suites_generator,
+    study_table_task_suites_generator,
+    coffee_table_task_suites_generator,
+    floor_task_suites_generator,
+) = SUITE_GENERATORS.values()
 
 
-def suite_generator(workspace_name: str) -> Callable[..., str]:
-    """The generator for a workspace.
+def get_suite_generator_func(workspace_name: str) -> Callable[..., str]:
+    """Return the function that writes task files for a workspace; its arguments are those of `_facts`.
 
     Raises:
-        UnknownNameError: no such workspace.
+        UnknownNameError: The workspace does not exist.
     """
     if workspace_name not in SUITE_GENERATORS:
         raise UnknownNameError("workspace", workspace_name, SUITE_GENERATORS)
@@ -284,18 +254,25 @@ def print_result(result: str) -> None:
 
 
 def get_result(result: str | Sequence[str]) -> str:
-    """A task file as one text."""
+    """Return a task file, which may be a list of lines, as one text."""
     return result if isinstance(result, str) else "\n".join(result)
 
 
-def save_to_file(result: str, scene_name: str, language: str, folder: str | Path = "") -> str:
-    """Write a task file as the benchmark names them: `KITCHEN_SCENE1_open_the_bottom_drawer_of_the_cabinet.bddl`.
+def save_to_file(
+    result: str, scene_name: str, language: str, folder: str | Path = "", file_name: str = ""
+) -> str:
+    """Write a task file and return its path.
 
-    Returns:
-        Its path.
+    Args:
+        result: Text of the task file.
+        scene_name: Name of the scene.
+        language: Instruction of the task.
+        folder: Folder of the file.
+        file_name: Name of the file without its ending; by default as the benchmark names its files, such as
+            `KITCHEN_SCENE1_open_the_bottom_drawer_of_the_cabinet`.
     """
     words = re.sub(r"[^\w-]+", "_", language.strip().lower()).strip("_")
-    path = Path(folder) / f"{scene_name.upper()}_{words}.bddl"
+    path = Path(folder) / f"{file_name or f'{scene_name.upper()}_{words}'}.bddl"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(get_result(result), encoding="utf-8")
     return str(path)

@@ -1,9 +1,13 @@
-"""Scenes as classes: what stands there, and where. Tasks are defined on them with `task_generation_utils`."""
+"""Scenes as classes: which objects a scene has, and where they are at the start.
 
-import importlib
+Tasks on them are defined with `task_generation_utils`. The scenes of LIBERO-100 are registered here; their content is
+that of `libero_env.tasks`.
+"""
+
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from libero.libero.utils.bddl_generation_utils import (
     WORKSPACE_CATEGORIES,
@@ -12,25 +16,26 @@ from libero.libero.utils.bddl_generation_utils import (
     get_xy_region_kwargs_list_from_regions_info,
 )
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.tasks.builder import build_problem, load_scene
 
-MU_DICT: dict[str, Any] = {}  # classes that are made without arguments
+MU_DICT: dict[str, Any] = {}  # name -> class
 SCENE_DICT: dict[str, list[type["InitialSceneTemplates"]]] = {"kitchen": [], "living_room": [], "study": []}
 
 Template = TypeVar("Template", bound=type["InitialSceneTemplates"])
 
 
 def scene_key(name: str) -> str:
-    """What a scene is registered as: `KitchenScene1` and `KITCHEN_SCENE1` are `kitchen_scene1`."""
+    """Return the name that a scene is registered by: `KitchenScene1` and `KITCHEN_SCENE1` are `kitchen_scene1`."""
     if not name.isupper():
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
     return name.lower()
 
 
 def register_mu(scene_type: str) -> Callable[[Template], Template]:
-    """Class decorator: make a scene known by its name; a later one of the same name takes its place.
+    """Class decorator: register a scene by its name; a scene of the same name is replaced.
 
     Args:
-        scene_type: such as `kitchen`; any name.
+        scene_type: Type of the scene, such as `kitchen`; any name is valid.
     """
 
     def register(target_class: Template) -> Template:
@@ -45,10 +50,10 @@ def register_mu(scene_type: str) -> Callable[[Template], Template]:
 
 
 def get_scene_dict(scene_type: str | None = None) -> Any:
-    """Scene type -> classes; or the classes of one type.
+    """Return the classes by scene type, or the classes of one type.
 
     Raises:
-        UnknownNameError: no scene is of this type.
+        UnknownNameError: The scene type does not exist.
     """
     if scene_type is None:
         return SCENE_DICT
@@ -58,36 +63,33 @@ def get_scene_dict(scene_type: str | None = None) -> Any:
 
 
 def get_scene_class(scene_name: str) -> Callable[[], "InitialSceneTemplates"]:
-    """A scene by the name of its class in any spelling; those of the benchmark are there without being imported.
+    """Return a scene by the name of its class in any spelling.
 
     Raises:
-        UnknownNameError: no such scene.
+        UnknownNameError: The scene does not exist.
     """
-    key = scene_key(scene_name)
-    if key not in MU_DICT:
-        importlib.import_module("libero.libero.benchmark.mu_creation")
-    if key not in MU_DICT:
+    if scene_key(scene_name) not in MU_DICT:
         raise UnknownNameError("scene", scene_name, MU_DICT)
-    return MU_DICT[key]
+    return MU_DICT[scene_key(scene_name)]
 
 
 class InitialSceneTemplates:
-    """What stands in a scene, and where it may stand at the start, which subclasses say.
+    """A scene; subclasses define its regions and initial conditions.
 
     Attributes:
-        workspace_name: such as `kitchen_table`.
-        fixture_object_dict, movable_object_dict: category -> names; `plate` is `plate_1`.
-        regions: name -> facts, as `get_region_dict` gives them; filled by `define_regions`.
-        xy_region_kwargs_list: rectangles on the workspace, from `regions` unless `define_regions` sets it.
-        affordance_region_kwargs_list: places that belong to things, such as drawers.
+        workspace_name: Name of the workspace, such as `kitchen_table`.
+        fixture_object_dict, movable_object_dict: Category -> names; `plate` -> `plate_1`.
+        regions: Name -> arguments of `get_region_dict`; filled by `define_regions`.
+        xy_region_kwargs_list: Rectangles on the workspace, from `regions` unless `define_regions` sets it.
+        affordance_region_kwargs_list: Regions of objects and fixtures, such as drawers.
 
     Args:
-        workspace_name: the table, or `floor`.
-        fixture_num_info: category -> number, of what does not move; the workspace may be among them.
-        object_num_info: category -> number, of what can be moved; the order is that of their joints.
+        workspace_name: A table, or `floor`.
+        fixture_num_info: Category -> number of the fixtures; the workspace may be among them.
+        object_num_info: Category -> number of the movable objects, in the order of their joints.
 
     Raises:
-        UnknownNameError: no such workspace or category.
+        UnknownNameError: The workspace or a category does not exist.
     """
 
     def __init__(
@@ -113,12 +115,12 @@ class InitialSceneTemplates:
 
     def define_regions(self) -> None:
         """Fill `regions`."""
-        raise NotImplementedError(f"{type(self).__name__} must say where things stand: define_regions")
+        raise NotImplementedError(f"{type(self).__name__} must define where its objects are: define_regions")
 
     @property
     def init_states(self) -> Sequence[Sequence[str]]:
-        """Conditions of the start: `("On", "plate_1", "kitchen_table_plate_init_region")`."""
-        raise NotImplementedError(f"{type(self).__name__} must say what holds at the start: init_states")
+        """Initial conditions such as `("On", "plate_1", "kitchen_table_plate_init_region")`."""
+        raise NotImplementedError(f"{type(self).__name__} must define what holds at the start: init_states")
 
     def get_region_dict(
         self,
@@ -128,10 +130,10 @@ class InitialSceneTemplates:
         region_half_len: float | Sequence[float] = 0.02,
         yaw_rotation: Sequence[float] = (0.0, 0.0),
     ) -> dict[str, dict[str, Any]]:
-        """Name -> facts of a rectangle, for `regions.update`; arguments as in `bddl_generation_utils.get_xy_region`.
+        """Return a rectangle for `regions.update`; arguments as in `bddl_generation_utils.get_xy_region`.
 
         Raises:
-            LiberoError: the region is there already.
+            LiberoError: The region exists already.
         """
         if region_name in self.regions:
             raise LiberoError(
@@ -157,6 +159,49 @@ class InitialSceneTemplates:
 
     @property
     def possible_objects_of_interest(self) -> list[str]:
-        """Everything that a task may be about: objects, fixtures, and the places that belong to them."""
-        places = [f"{k['target_name']}_{k['region_name']}" for k in self.affordance_region_kwargs_list]
-        return [*self.movable_objects, *self.fixtures, *places]
+        """Names that a task may refer to: objects, fixtures, and their regions."""
+        regions = [f"{k['target_name']}_{k['region_name']}" for k in self.affordance_region_kwargs_list]
+        return [*self.movable_objects, *self.fixtures, *regions]
+
+
+class BenchmarkScene(InitialSceneTemplates):
+    """A scene of the benchmark; subclasses set its name in `libero_env.tasks`."""
+
+    scene: ClassVar[str]
+
+    def __init__(self) -> None:
+        self.problem = build_problem(load_scene(self.scene), {"name": self.scene, "goal": []})
+        fixtures, objects = self.problem.fixtures, self.problem.objects
+        workspace = next(name for name, category in fixtures.items() if name == category)
+        super().__init__(workspace, Counter(fixtures.values()), Counter(objects.values()))
+
+    def define_regions(self) -> None:
+        """Fill `regions` with the rectangles of the scene, as centre and half size."""
+        for region in self.problem.regions:
+            if region.ranges:
+                ((x0, y0, x1, y1),) = region.ranges
+                centre, half = ((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2)
+                yaw = region.yaw[0] if region.yaw else (0.0, 0.0)
+                self.regions |= self.get_region_dict(centre, region.name, region.target, half, yaw)
+
+    @property
+    def init_states(self) -> list[tuple[str, ...]]:
+        """Initial conditions of the scene."""
+        return [(atom.predicate, *atom.args) for atom in self.problem.init]
+
+
+def _benchmark_scenes(scene_type: str, number: int) -> dict[str, type[BenchmarkScene]]:
+    """Register `KitchenScene1` and so on, and return them by name."""
+    found = {}
+    for i in range(1, number + 1):
+        name, scene = f"{scene_type.title().replace('_', '')}Scene{i}", f"{scene_type}_scene{i}"
+        facts = {"__module__": "libero.libero.benchmark.mu_creation", "__doc__": f"`{scene}`", "scene": scene}
+        found[name] = register_mu(scene_type)(type(name, (BenchmarkScene,), facts))
+    return found
+
+
+BENCHMARK_SCENES = {
+    **_benchmark_scenes("kitchen", 10),
+    **_benchmark_scenes("living_room", 6),
+    **_benchmark_scenes("study", 4),
+}

@@ -1,4 +1,4 @@
-"""Which places things have: the drawers of a cabinet, the inside of a basket."""
+"""Regions of objects: the drawers of a cabinet, the inside of a basket."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -7,28 +7,28 @@ import mujoco
 from libero_env.assets.pack import select_pack
 from libero_env.errors import LiberoError
 
-# Category -> its places, where they shall be others than its model's.
+# Category -> names of its regions, where they differ from those of its model.
 EXCEPTION_DICT: dict[str, list[str]] = {}
 
 
 def update_exception_dict(exceptions: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-    """Say for some categories which places they have; all that was said so far is returned."""
+    """Set the regions of some categories, and return `EXCEPTION_DICT`."""
     EXCEPTION_DICT.update({category: list(regions) for category, regions in exceptions.items()})
     return EXCEPTION_DICT
 
 
 def get_affordance_regions(objects: Iterable[str], verbose: bool = False) -> dict[str, list[str]]:
-    """Places of categories: the box-shaped sites of their models, or what `EXCEPTION_DICT` says.
+    """Return the regions of categories: the box-shaped sites of their models, or those in `EXCEPTION_DICT`.
 
     Args:
-        objects: categories, or a mapping of them such as `get_object_dict()`.
-        verbose: whether they are printed.
+        objects: Categories, or a mapping of them such as `get_object_dict()`.
+        verbose: Whether the regions are printed.
 
     Returns:
-        Category -> names, for the categories that have places; those without a model have none.
+        Category -> names, for the categories that have regions; those without a model have none.
 
     Raises:
-        UnknownNameError: no such category.
+        UnknownNameError: A category does not exist.
     """
     pack, found = select_pack(), {}
     for category in objects:

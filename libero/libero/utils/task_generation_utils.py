@@ -1,7 +1,7 @@
 """Tasks on registered scenes, and their task files."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,8 +9,9 @@ from libero.libero.envs.predicates import get_predicate_fn
 from libero.libero.utils.bddl_generation_utils import (
     get_goal_state,
     get_result,
+    get_suite_generator_func,
+    region_module,
     save_to_file,
-    suite_generator,
 )
 from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
 from libero_env.assets.arena import WORKSPACES
@@ -19,21 +20,22 @@ from libero_env.design.lint.checks import KINDS
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.sim.predicates import atoms_of
 from libero_env.tasks.bddl import parse
+from libero_env.tasks.builder import entities_in_goal
 
-# What may go wrong in a scene or task that somebody else wrote, and is told of that task alone.
+# Errors in user-defined scenes and tasks; each is reported for its task alone.
 _FAULTS = (
     LiberoError,
     ArithmeticError,
     AttributeError,
     LookupError,
-    NotImplementedError,
     TypeError,
     ValueError,
+    NotImplementedError,
 )
 
 
 class TaskInfoTuple(NamedTuple):
-    """A task on a scene. `file_name` is that of its task file without ending, empty for the usual one."""
+    """A task on a scene. `file_name` is the name of its task file without ending; empty for the default."""
 
     scene_name: str
     language: str
@@ -43,7 +45,7 @@ class TaskInfoTuple(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """A task file that could not be made, and why."""
+    """A task file that could not be written, and why."""
 
     scene_name: str
     language: str
@@ -59,36 +61,36 @@ def register_task_info(
     objects_of_interest: Sequence[str] = (),
     goal_states: Sequence[Any] = (),
 ) -> Any:
-    """Define a task on a scene; one of the same scene and instruction takes the place of an earlier one.
+    """Define a task on a scene; a task of the same scene and instruction is replaced.
 
     Args:
-        language: the instruction. Or, as a class decorator, a class without arguments whose instances have
-            `scene_name`, `language_instruction` and `goal`, perhaps `task_name` and `objects_of_interest`.
-        scene_name: of a registered scene, in any spelling.
-        objects_of_interest: names; without any, those that the goal speaks of.
-        goal_states: conditions that must all hold, such as `("On", "plate_1", "flat_stove_1_cook_region")`.
+        language: Instruction of the task. Or, as a class decorator, a class without arguments whose instances have
+            `scene_name`, `language_instruction` and `goal`, and optionally `task_name` and `objects_of_interest`.
+        scene_name: Name of a registered scene, in any spelling.
+        objects_of_interest: Names; by default those in the goal.
+        goal_states: Conditions that must all hold, such as `("On", "plate_1", "flat_stove_1_cook_region")`.
 
     Returns:
         The task; as a decorator, the class.
 
     Raises:
-        LiberoError: scene, instruction or goal are missing.
+        LiberoError: Scene, instruction or goal is missing.
     """
     if isinstance(language, type):
         info = _info_of(language())
     else:
         info = TaskInfoTuple(scene_key(scene_name), language, tuple(objects_of_interest), tuple(goal_states))
-        _check_whole(info)
+        _check_complete(info)
     tasks = TASK_INFO.setdefault(info.scene_name, [])
     tasks[:] = [task for task in tasks if task.language != info.language] + [info]
     return language if isinstance(language, type) else info
 
 
 def get_task_info(scene_name: str | None = None) -> Any:
-    """Scene -> tasks; or the tasks of one scene.
+    """Return the tasks by scene, or the tasks of one scene.
 
     Raises:
-        UnknownNameError: no task is defined on it.
+        UnknownNameError: No task is defined on the scene.
     """
     if scene_name is None:
         return TASK_INFO
@@ -97,29 +99,21 @@ def get_task_info(scene_name: str | None = None) -> Any:
     return TASK_INFO[scene_key(scene_name)]
 
 
-def get_suite_generator_func(workspace_name: str) -> Callable[..., str]:
-    """The function that writes task files for a workspace.
-
-    Raises:
-        UnknownNameError: no such workspace.
-    """
-    return suite_generator(workspace_name)
-
-
 def generate_bddl_from_task_info(
     folder: str | os.PathLike | Any = "", output_dir: str | os.PathLike = ""
 ) -> Any:
-    """Write the task files of all registered tasks; or of one.
+    """Write the task files of all registered tasks, or of one.
 
     Args:
-        folder: for the files. Or one task: an instance of a class given to `register_task_info`, or a `TaskInfoTuple`.
-        output_dir: folder for the file of one task.
+        folder: Folder of the files. Or one task: an instance of a class that `register_task_info` decorates, or a
+            `TaskInfoTuple`.
+        output_dir: Folder for the file of one task.
 
     Returns:
-        (paths, failures): a `Failure` has scene, instruction and cause. For one task its path.
+        (paths, failures); for one task its path.
 
     Raises:
-        LiberoError: the one task that was asked for cannot be written; the cause says why.
+        LiberoError: The one task cannot be written; the message states why.
     """
     if not isinstance(folder, str | os.PathLike):
         return _write(folder if isinstance(folder, TaskInfoTuple) else _info_of(folder), output_dir)
@@ -134,22 +128,24 @@ def generate_bddl_from_task_info(
 
 
 def bddl_text(task: TaskInfoTuple) -> str:
-    """The task file of a task.
+    """Return the task file of a task.
 
     Raises:
-        UnknownNameError: a scene, category or predicate that does not exist.
-        BDDLError: a condition speaks of a name that the scene does not have.
-        LiberoError: a condition has too few or too many names.
+        UnknownNameError: A scene, category or predicate does not exist.
+        BDDLError: A condition uses a name that the scene does not have.
+        LiberoError: A condition has too few or too many names.
     """
     scene: InitialSceneTemplates = get_scene_class(task.scene_name)()
+    goal, regions = get_goal_state(task.goal_states), region_module((), scene.affordance_region_kwargs_list)
+    interest = entities_in_goal(goal, regions, scene.movable_objects, scene.fixtures)
     text = get_result(
-        suite_generator(scene.workspace_name)(
+        get_suite_generator_func(scene.workspace_name)(
             language=task.language,
             xy_region_kwargs_list=scene.xy_region_kwargs_list,
             affordance_region_kwargs_list=scene.affordance_region_kwargs_list,
             fixture_object_dict=scene.fixture_object_dict,
             movable_object_dict=scene.movable_object_dict,
-            objects_of_interest=task.objects_of_interest or _interest(scene, task),
+            objects_of_interest=task.objects_of_interest or interest,
             init_states=scene.init_states,
             goal_states=task.goal_states,
         )
@@ -170,42 +166,25 @@ def bddl_text(task: TaskInfoTuple) -> str:
 
 
 def _write(task: TaskInfoTuple, folder: str | os.PathLike) -> str:
-    text = bddl_text(task)
-    if not task.file_name:
-        return save_to_file(text, task.scene_name, task.language, Path(folder))
-    path = Path(folder) / f"{task.file_name}.bddl"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return str(path)
-
-
-def _interest(scene: InitialSceneTemplates, task: TaskInfoTuple) -> list[str]:
-    """The things that a goal speaks of, a drawer's cabinet for the drawer."""
-    targets = {
-        f"{k['target_name']}_{k['region_name']}": k["target_name"]
-        for k in scene.affordance_region_kwargs_list
-    }
-    goal = get_goal_state(task.goal_states)
-    spoken = {targets.get(name, name) for atom in atoms_of(goal) for name in atom.args}
-    return [name for name in (*scene.movable_objects, *scene.fixtures) if name in spoken]
+    return save_to_file(bddl_text(task), task.scene_name, task.language, Path(folder), task.file_name)
 
 
 def _info_of(task: Any) -> TaskInfoTuple:
-    """What an instance of a task class says."""
+    """Return the task that an instance of a task class describes."""
     goal = next((getattr(task, name) for name in ("goal", "goal_states") if hasattr(task, name)), ())
-    words = ("language_instruction", "language", "task_description")
+    keys = ("language_instruction", "language", "task_description")
     info = TaskInfoTuple(
         scene_name=scene_key(str(getattr(task, "scene_name", ""))),
-        language=str(next((getattr(task, name) for name in words if getattr(task, name, "")), "")),
+        language=str(next((getattr(task, name) for name in keys if getattr(task, name, "")), "")),
         objects_of_interest=tuple(getattr(task, "objects_of_interest", ())),
         goal_states=tuple(goal() if callable(goal) else goal),
         file_name=str(getattr(task, "task_name", "")),
     )
-    _check_whole(info)
+    _check_complete(info)
     return info
 
 
-def _check_whole(task: TaskInfoTuple) -> None:
+def _check_complete(task: TaskInfoTuple) -> None:
     named = {"scene_name": task.scene_name, "language": task.language, "goal_states": task.goal_states}
     if missing := [name for name, value in named.items() if not value]:
         raise LiberoError(
