@@ -71,10 +71,11 @@ def _argument(action: argparse.Action) -> str:
 
 
 def groups() -> dict[str, list[Path]]:
-    """The files of each configuration group, in the order of configs/config.yaml."""
+    """Return the files of each configuration group, in the order of configs/config.yaml; subgroups after theirs."""
     defaults = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))["defaults"]
     names = [next(iter(d)) for d in defaults if isinstance(d, dict)]
-    return {name: sorted((CONFIGS / name).glob("*.yaml")) for name in names if (CONFIGS / name).is_dir()}
+    folders = [f for name in names for f in (CONFIGS / name, *sorted((CONFIGS / name).glob("*/")))]
+    return {f.relative_to(CONFIGS).as_posix(): sorted(f.glob("*.yaml")) for f in folders if f.is_dir()}
 
 
 def configuration_reference() -> str:
@@ -91,41 +92,44 @@ def configuration_reference() -> str:
     text = ["## At the top", "", "| key | default | what |", "|---|---|---|", *rows, ""]
     chosen = {k: v for d in top["defaults"] if isinstance(d, dict) for k, v in d.items()}
     for name, files in groups().items():
-        text += [f"## {name}", "", _group(name, files, chosen[name]), ""]
+        text += [f"## {name}", "", _group(name, files, chosen.get(name)), ""]
     return "\n".join(text)
 
 
-def _group(name: str, files: list[Path], default: str) -> str:
-    told = [f"- `{name}={f.stem}`{' (default)' if f.stem == default else ''}{_about(f)}" for f in files]
-    parts = ["\n".join(told)]
-    values = {file: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
-    if any(_is_nested(v) for v in values.values()):
-        parts += [f"`configs/{name}/{f.name}`\n\n```yaml\n{f.read_text(encoding='utf-8')}```" for f in files]
-        return "\n\n".join(parts)
-    targets: dict[str, list[Path]] = {}
-    for file, value in values.items():
-        targets.setdefault(value["_target_"], []).append(file)
-    return "\n\n".join([*parts, *(_table(name, target, own) for target, own in targets.items())])
+def _group(name: str, files: list[Path], default: str | None) -> str:
+    listed = [f"- `{name}={f.stem}`{' (default)' if f.stem == default else ''}{_about(f)}" for f in files]
+    whole, targets = [], {}
+    for file in files:
+        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if "_target_" not in values or any(isinstance(x, dict) for x in values.get("augmentations", ())):
+            whole.append(f"`configs/{name}/{file.name}`\n\n```yaml\n{file.read_text(encoding='utf-8')}```")
+        else:
+            targets.setdefault(values["_target_"], []).append(file)
+    tables = [_table(name, target, own) for target, own in targets.items()]
+    return "\n\n".join(["\n".join(listed), *tables, *whole])
 
 
-def _is_nested(values: Mapping[str, Any]) -> bool:
-    return "_target_" not in values or any(
-        isinstance(v, dict) or (isinstance(v, list) and any(isinstance(x, dict) for x in v))
-        for v in values.values()
-    )
+def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, Any]]:
+    """Yield dotted key, target, key of the target and value of a node and of the components in it."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{key}.")
+        elif key not in ("_target_", "_partial_", "defaults"):
+            yield f"{prefix}{key}", node["_target_"], key, value
 
 
 def _table(group: str, target: str, files: list[Path]) -> str:
-    """The keys of the files that build one class, with their values in each file."""
-    values = {file.stem: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
-    keys = [k for k in dict.fromkeys(k for v in values.values() for k in v) if k != "_target_"]
+    """Return the keys of the files that build one class, with their values in each file."""
+    found = {f.stem: list(leaves(yaml.safe_load(f.read_text(encoding="utf-8")))) for f in files}
+    values = {stem: {dotted: value for dotted, *_, value in own} for stem, own in found.items()}
+    sources = {dotted: (built, key) for own in found.values() for dotted, built, key, _ in own}
     title = f"`{target}`"
-    if not keys:
+    if not sources:
         return f"{title} has no keys."
     rows = [
-        f"| `{group}.{key}` | {' | '.join(_value(v.get(key)) for v in values.values())} "
-        f"| {_cell(meaning(target, key, files))} |"
-        for key in keys
+        f"| `{group.replace('/', '.')}.{dotted}` | {' | '.join(_value(v.get(dotted)) for v in values.values())} "
+        f"| {_cell(meaning(built, key, files))} |"
+        for dotted, (built, key) in sources.items()
     ]
     head = "| key | " + " | ".join(f"`{stem}`" for stem in values) + " | what |"
     return "\n".join([title, "", head, "|---" * (len(values) + 2) + "|", *rows])

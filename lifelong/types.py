@@ -4,7 +4,7 @@ Shape legend: B batch, T time, V views, H W C image, A action, L language embedd
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from torch import Tensor
@@ -16,14 +16,12 @@ class PolicySpec:
 
     views: tuple[str, ...] = ("agentview_rgb", "eye_in_hand_rgb")
     image_size: tuple[int, int] = (128, 128)
-    proprio: Mapping[str, int] | None = None  # name -> dimension, in order
+    proprio: Mapping[str, int] = field(  # name -> dimension, in order
+        default_factory=lambda: {"joint_states": 7, "gripper_states": 2}
+    )
     action_dim: int = 7
     language_dim: int = 384
     seq_len: int = 10
-
-    def __post_init__(self) -> None:
-        if self.proprio is None:
-            object.__setattr__(self, "proprio", {"joint_states": 7, "gripper_states": 2})
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
+from hydra import compose, initialize_config_dir
 from loader_speed import write_noise
-from omegaconf import OmegaConf
 
 from lifelong.algorithms import Sequential
+from lifelong.build import build
 from lifelong.data import DemoSource, open_windows
 from lifelong.seeding import generator
 from lifelong.training.distributed import Ranks
@@ -38,8 +38,6 @@ from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-POLICY = CONFIGS / "policy" / "bc_transformer.yaml"
-AUGMENTATION = CONFIGS / "augmentation" / "shift_jitter.yaml"
 WORKER = Path(__file__).with_name("original_training.py")
 SPEC = PolicySpec(language_dim=768, proprio={"joint_states": 7, "gripper_states": 2})
 
@@ -62,10 +60,12 @@ def measure_here(path: Path, precision: str, args: argparse.Namespace) -> dict[s
     torch.manual_seed(0)
     dataset = open_windows(DemoSource(path, SPEC), language=torch.zeros(SPEC.language_dim), memory="host")
     draws = torch.Generator().manual_seed(0)
-    policy = instantiate(OmegaConf.load(POLICY), _convert_="all", _partial_=True)(spec=SPEC).train()
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = compose("config", ["policy=bc_transformer", "augmentation=shift_jitter"])
+    policy = build(config.policy, spec=SPEC).train()
     settings = FitSettings(batch_size=args.batch, precision=precision)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=settings.lr)
-    augment = instantiate(OmegaConf.load(AUGMENTATION), _convert_="all")
+    augment = build(config.augmentation)
     plain, whole = (
         Step(policy, Sequential(), optimizer, settings, torch.device("cpu"), augmentation, Ranks())
         for augmentation in (None, augment)

@@ -11,17 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-import yaml
+from hydra import compose, initialize_config_dir
 
+from lifelong.build import build
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.nn import ColorJitter, RandomShift
-from lifelong.policies import BCTransformer
 from lifelong.types import PolicySpec
 
 PAPER = PolicySpec(language_dim=768)
 SMALL = PolicySpec(image_size=(64, 64), seq_len=5)
-CONFIG = Path(__file__).parents[2] / "configs" / "policy" / "bc_transformer_small.yaml"
-SMALL_SIZES = {k: v for k, v in yaml.safe_load(CONFIG.read_text()).items() if k != "_target_"}
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
@@ -59,9 +58,10 @@ def measure_data(repeats: int) -> None:
             show(f"{type(augmentation).__name__} of 32 windows, {name}", 32, timed(work, repeats))
 
 
-def measure_policy(name: str, spec: PolicySpec, sizes: dict, repeats: int) -> None:
-    """A step of acting in ten environments."""
-    policy = BCTransformer(spec=spec, **sizes)
+def measure_policy(name: str, spec: PolicySpec, choice: str, repeats: int) -> None:
+    """Measure a step of acting in ten environments."""
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        policy = build(compose("config", [f"policy={choice}"]).policy, spec=spec)
     count = sum(p.numel() for p in policy.parameters())
     print(f"{name}: {count} parameters")
     observation = fake_batch(spec, 10, torch.Generator().manual_seed(0), steps=1).observation
@@ -84,9 +84,9 @@ def main() -> None:
     if args.only in (None, "data"):
         measure_data(args.steps)
     if args.only in (None, "small"):
-        measure_policy("small, 64x64, T=5", SMALL, SMALL_SIZES, args.steps)
+        measure_policy("small, 64x64, T=5", SMALL, "bc_transformer_small", args.steps)
     if args.only in (None, "paper"):
-        measure_policy("paper, 128x128, T=10", PAPER, {}, args.steps)
+        measure_policy("paper, 128x128, T=10", PAPER, "bc_transformer", args.steps)
 
 
 if __name__ == "__main__":

@@ -21,10 +21,10 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
+from hydra import compose, initialize_config_dir
 
 from lifelong.algorithms import Sequential
+from lifelong.build import build
 from lifelong.data import fake_batch
 from lifelong.policies import Policy
 from lifelong.seeding import generator
@@ -35,7 +35,7 @@ from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "policy"
+CONFIGS = Path(__file__).parents[2] / "configs"
 # Dense bf16 TFLOP/s that the makers state, by a part of the device's name.
 PEAKS = {"H200": 989.0, "H100": 989.0, "A100": 312.0, "L40S": 362.0, "RTX 4090": 165.0, "L4": 121.0}
 VARIANTS: dict[str, dict] = {
@@ -80,13 +80,12 @@ class Windows:
         return self.whole.rows(slice(0, len(indices)))
 
 
-def build(job: Job) -> tuple[Policy, Batch]:
+def prepare(job: Job) -> tuple[Policy, Batch]:
     """The policy and a batch, on their device."""
     spec = PolicySpec(image_size=(job.image, job.image), language_dim=768, seq_len=job.window)
     torch.manual_seed(0)
-    policy = instantiate(OmegaConf.load(CONFIGS / f"{job.policy}.yaml"), _convert_="all", _partial_=True)(
-        spec=spec
-    )
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        policy = build(compose("config", [f"policy={job.policy}"]).policy, spec=spec)
     if not VARIANTS[job.variant].get("channels_last", True):
         policy.to(memory_format=torch.contiguous_format)
     return policy.to(job.device).train(), fake_batch(spec, job.batch, generator(0)).to(job.device)
@@ -157,7 +156,7 @@ def arguments() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--policy", default="bc_transformer", choices=sorted(f.stem for f in CONFIGS.glob("*.yaml"))
+        "--policy", default="bc_transformer", choices=sorted(f.stem for f in CONFIGS.glob("policy/*.yaml"))
     )
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS if cuda else ON_CPU))
     parser.add_argument("--batch", type=int, default=32)

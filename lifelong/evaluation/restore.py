@@ -19,6 +19,7 @@ from lifelong.errors import CheckpointError, LifelongError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
+from lifelong.saved_config import upgrade_config
 from lifelong.settings import BenchmarkSettings
 from lifelong.streams import stages_of
 from lifelong.training.distributed import Ranks
@@ -98,7 +99,7 @@ def restore(source: Path, *, after: int | None = None, device: str = "auto") -> 
         LifelongError: There is no such run or checkpoint, or it does not fit its configuration.
     """
     path, checkpoint, after = _find(source, after)
-    config = OmegaConf.create(_read_config(path / "config.yaml"))
+    config = OmegaConf.create(upgrade_config(_read_config(path / "config.yaml")))
     where = Ranks().device(device)
     benchmark: BenchmarkSettings = build(config.benchmark)
     tasks = benchmark.sequence()

@@ -1,9 +1,10 @@
-"""Network parts that policies are made of: vision, tokens, transformer over time, action heads, augmentation."""
+"""Components of policies: image encoders, tokens, networks over time, action heads, augmentation."""
 
 from lifelong.nn.augmentation import Augmentation, ColorJitter, Compose, RandomShift
 from lifelong.nn.flow import FlowHead
 from lifelong.nn.heads import ActionHead, DeterministicHead, GMMHead
 from lifelong.nn.patches import PatchEncoder, SpatialTransformer
+from lifelong.nn.recurrent import TemporalLSTM
 from lifelong.nn.tokens import LanguageToken, ProprioScaling, ProprioTokens
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import FiLM, ResNetFiLMEncoder, SpatialSoftmax
@@ -25,5 +26,6 @@ __all__ = [
     "ResNetFiLMEncoder",
     "SpatialSoftmax",
     "SpatialTransformer",
+    "TemporalLSTM",
     "TemporalTransformer",
 ]

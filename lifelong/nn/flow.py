@@ -56,8 +56,8 @@ class FlowHead(ActionHead):
         super().__init__()
         if not 1 <= execute <= chunk or steps < 1:
             raise PolicyError(
-                f"a flow head with chunk {chunk}, execute {execute}, flow_steps {steps}; valid: "
-                "1 <= execute <= chunk and flow_steps >= 1"
+                f"a flow head with chunk {chunk}, execute {execute}, steps {steps}; valid: "
+                "1 <= execute <= chunk and steps >= 1"
             )
         self.chunk, self.execute, self.steps, self.action_dim = chunk, execute, steps, action_dim
         self.velocity = VelocityField(

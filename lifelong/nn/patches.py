@@ -43,7 +43,7 @@ class PatchEncoder(nn.Module):
         if any(n % patch for n in cells):
             raise PolicyError(
                 f"images of {tuple(image_size)} give {cells[0]} x {cells[1]} cells after the stem, which patches "
-                f"of {patch} x {patch} do not tile; change policy.patch or policy.stem_stride"
+                f"of {patch} x {patch} do not tile; change policy.encoder.patch or policy.encoder.stem_stride"
             )
         self.patches = (cells[0] // patch) * (cells[1] // patch)
         self.stem = nn.Sequential(

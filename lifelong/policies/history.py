@@ -1,30 +1,34 @@
-"""Policies that look back: features of every frame, something over time, a head.
+"""Policies with a history: features of every frame, a network over time, an action head.
 
 Shape legend: B batch, T time, E latent, A action.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lifelong.errors import PolicyError
-from lifelong.nn.flow import FlowHead
-from lifelong.nn.heads import ActionHead, DeterministicHead, GMMHead
+from lifelong.nn.heads import ActionHead
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Observation, PolicySpec
 
+# A class of `lifelong.nn`, or a `functools.partial` of one; the policy calls it with the sizes that only it knows.
+Component = Callable[..., Any]
+
 
 class HistoryPolicy(Policy):
-    """Features of single frames, mixed over time, become latents, and a head makes them actions.
+    """Policy that acts on the last frames: encode each frame, mix the features over time, apply the head.
 
-    A subclass sets `head` and gives `encode` and `over_time`. When acting, features of the last `memory_steps`
-    frames are kept and go through `over_time` anew at every step, so a step is computed as the last one of a window.
+    A subclass sets `head` and implements `encode` and `over_time`. When acting, the features of the last
+    `memory_steps` frames are kept and go through `over_time` again at every step, so that a step is computed as the
+    last one of a window.
 
     Args:
-        spec: what the policy sees and does; `spec.seq_len` is the longest window.
-        stochastic: draw actions instead of taking the most likely ones; needs generators to act.
+        spec: What the policy observes and does; `spec.seq_len` is the longest window.
+        stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
     """
 
     head: ActionHead
@@ -34,35 +38,51 @@ class HistoryPolicy(Policy):
         self.stochastic = stochastic
         self._history: Tensor | None = None  # (B, <= memory_steps, ...)
         self._num_envs: int | None = None
-        self._planned: list[Tensor] = []  # actions (B, A) still to be carried out
+        self._planned: list[Tensor] = []  # actions (B, A) still to be executed
 
     @abstractmethod
     def encode(self, observation: Observation) -> Tensor:
-        """Features of every frame by itself, (B, T, ...)."""
+        """Return the features of every frame by itself, (B, T, ...)."""
 
     @abstractmethod
     def over_time(self, features: Tensor) -> Tensor:
-        """(B, T, ...) to latents (B, T, E), each from its own frame and earlier ones."""
+        """Map features (B, T, ...) to latents (B, T, E), each computed from its own frame and earlier ones."""
+
+    def build_head(self, head: Component, in_dim: int) -> ActionHead:
+        """Build the head for latents of `in_dim` numbers.
+
+        Raises:
+            PolicyError: `head` is not a component, or its chunks are longer than the windows it learns from.
+        """
+        if not callable(head):
+            raise PolicyError(f"policy.head is {head!r}, not a component: choose one with policy/head={head}")
+        built: ActionHead = head(in_dim=in_dim, action_dim=self.spec.action_dim)
+        if built.chunk > self.spec.seq_len:
+            raise PolicyError(
+                f"a chunk of {built.chunk} actions cannot be learned from windows of {self.spec.seq_len}: "
+                f"set data.seq_len to {built.chunk} or more, or policy.head.chunk to {self.spec.seq_len} or less"
+            )
+        return built
 
     @property
     def memory_steps(self) -> int:
-        """Frames looked at when acting: `seq_len`, less where a head needs what follows in the window to learn."""
+        """Number of frames used to act: `seq_len`, less where a head learns from the steps that follow."""
         return self.spec.seq_len - self.head.chunk + 1
 
     def distribution(self, observation: Observation) -> dict[str, Tensor]:
-        """Parameters of the action distribution at every step of a window; see the head."""
+        """Return the parameters of the action distribution at every step of a window; see the head."""
         return self.head(self.over_time(self.encode(observation)))
 
     def window_losses(self, batch: Batch) -> Tensor:
-        """See `Policy`."""
+        """Return the loss of each window; see `Policy`."""
         return self.head.losses(self.distribution(batch.observation), batch.actions).mean(-1)
 
     def predict(self, batch: Batch) -> Tensor:
-        """See `Policy`."""
+        """Return the mean action at every step; see `Policy`."""
         return self.head.mean(self.distribution(batch.observation))
 
     def reset(self, num_envs: int) -> None:
-        """See `Policy`."""
+        """Forget the history and the planned actions; see `Policy`."""
         self._history, self._num_envs, self._planned = None, num_envs, []
 
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
@@ -78,52 +98,17 @@ class HistoryPolicy(Policy):
         return self._planned.pop(0)
 
     def _step(self, observation: Observation) -> dict[str, Tensor]:
-        """Takes a frame in; the parameters of the distribution of the next action."""
+        """Add a frame to the history; return the parameters of the distribution of the next action."""
         if self._num_envs != len(observation.images):
             raise PolicyError(
-                f"reset announced {self._num_envs} environments, the observation has {len(observation.images)}; "
-                "call reset(num_envs) at the start of an episode"
+                f"reset was called for {self._num_envs} environments, the observation has "
+                f"{len(observation.images)}; call reset(num_envs) at the start of an episode"
             )
-        return self.head(self._recall(self.encode(observation)))
+        return self.head(self._latest_latent(self.encode(observation)))
 
-    def _recall(self, features: Tensor) -> Tensor:
-        """Appends a frame's features (B, 1, ...) to the history; its latent (B, E)."""
+    def _latest_latent(self, features: Tensor) -> Tensor:
+        """Append the features (B, 1, ...) of a frame to the history; return the frame's latent (B, E)."""
         if self._history is not None:
             features = torch.cat([self._history, features], dim=1)
         self._history = features[:, -self.memory_steps :]
         return self.over_time(self._history)[:, -1]
-
-
-def make_head(
-    kind: str,
-    *,
-    spec: PolicySpec,
-    in_dim: int,
-    hidden: int,
-    layers: int,
-    norm: bool,
-    modes: int,
-    min_std: float,
-    low_eval_noise: bool,
-    chunk: int,
-    execute: int,
-    flow_steps: int,
-) -> ActionHead:
-    """The head of a policy: `gmm`, `deterministic` or `flow`, each with the sizes that concern it.
-
-    Raises:
-        PolicyError: another kind, or a chunk longer than the window it must be learned from.
-    """
-    sizes = {"in_dim": in_dim, "action_dim": spec.action_dim, "hidden": hidden, "layers": layers}
-    if kind == "gmm":
-        return GMMHead(**sizes, norm=norm, modes=modes, min_std=min_std, low_eval_noise=low_eval_noise)
-    if kind == "deterministic":
-        return DeterministicHead(**sizes, norm=norm)
-    if kind != "flow":
-        raise PolicyError(f"unknown head {kind!r}. Valid: deterministic, flow, gmm")
-    if chunk > spec.seq_len:
-        raise PolicyError(
-            f"a chunk of {chunk} actions cannot be learned from windows of {spec.seq_len}: "
-            f"set data.seq_len to {chunk} or more, or policy.chunk to {spec.seq_len} or less"
-        )
-    return FlowHead(**sizes, chunk=chunk, execute=execute, steps=flow_steps)

@@ -19,6 +19,7 @@ from libero_env.storage import PART_SUFFIX, atomic_write_text
 from lifelong import checkpoints
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.log import ResultLog
+from lifelong.saved_config import upgrade_config
 
 # What may differ between the start of a run and its resumption: it changes no result.
 VOLATILE = (
@@ -70,7 +71,7 @@ class RunDirectory:
             atomic_write_text(file, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
             return
         old = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        was, now = decisive(old), decisive(config)
+        was, now = decisive(upgrade_config(old)), decisive(config)
         changed = [k for k in {**was, **now} if was.get(k, "absent") != now.get(k, "absent")]
         if changed:
             pairs = [(k, was.get(k, "absent"), now.get(k, "absent")) for k in changed[:4]]

@@ -146,5 +146,5 @@ def refuse_batch_norm(policy: nn.Module) -> None:
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             raise ConfigError(
                 f"{name} takes its statistics over the batch, which several processes or train.accumulate "
-                "divide: use policy.norm=group, or one process and train.accumulate=1"
+                "divide: use policy.encoder.norm=group, or one process and train.accumulate=1"
             )

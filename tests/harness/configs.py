@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
 
 
-FILES = sorted(f.relative_to(CONFIGS) for f in CONFIGS.glob("*/*.yaml"))
+FILES = sorted(f.relative_to(CONFIGS) for f in CONFIGS.rglob("*/*.yaml"))
 
 
 def composed(*overrides: str) -> DictConfig:

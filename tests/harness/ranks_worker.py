@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 from lifelong import checkpoints
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.nn.augmentation import RandomShift
-from lifelong.policies import BCTransformer
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 from lifelong.seeding import seeded
@@ -22,6 +21,7 @@ from lifelong.sequence import TaskSequence
 from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
+from tests.harness.policies import small_transformer
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "algo"
 ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("*.yaml"))
@@ -41,22 +41,7 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
     config = OmegaConf.create({"compat": None, "algo": OmegaConf.load(CONFIGS / f"{algo}.yaml")})
     walk.ALGORITHMS[algo] = lambda: instantiate(config.algo)
     with seeded(7):
-        policy = BCTransformer(
-            spec=walk.SPEC,
-            embed_dim=8,
-            image_width=8,
-            stage_blocks=[1],
-            stem_pool=False,
-            layers=1,
-            heads=2,
-            head_dim=4,
-            mlp_dim=8,
-            head_hidden=8,
-            head_layers=1,
-            modes=2,
-            min_std=0.05,
-            dropout=0.0,
-        )
+        policy = small_transformer(walk.SPEC, dropout=0.0)
     parts = walk.parts(folder / algo, algo)
     parts = replace(
         parts,

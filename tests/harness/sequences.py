@@ -10,7 +10,6 @@ from lifelong.algorithms import ER, EWC, PackNet, Sequential
 from lifelong.data import SequenceVLDataset
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.policies import BCTransformer
 from lifelong.results.records import CostRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator, seeded
@@ -18,6 +17,7 @@ from lifelong.sequence import Parts
 from lifelong.tracking import Tracker
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
+from tests.harness.policies import small_transformer
 
 SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)
 
@@ -76,21 +76,7 @@ def dataset(task: int) -> SequenceVLDataset:
 def parts(path, algo: str) -> Parts:
     datasets = {task: dataset(task) for task in range(TASKS)}
     with seeded(7):
-        policy = BCTransformer(
-            spec=SPEC,
-            embed_dim=8,
-            image_width=8,
-            stage_blocks=[1],
-            stem_pool=False,
-            layers=1,
-            heads=2,
-            head_dim=4,
-            mlp_dim=8,
-            head_hidden=8,
-            head_layers=1,
-            modes=2,
-            min_std=0.05,
-        )
+        policy = small_transformer(SPEC)
     return Parts(
         instructions=tuple(f"do {task}" for task in range(TASKS)),
         languages=torch.stack([d.language for d in datasets.values()]),

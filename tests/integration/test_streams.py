@@ -23,7 +23,7 @@ TINY = (
     "eval.horizon=6",
     "eval.episodes=1",
     "eval.curve_episodes=1",
-    "policy.image_width=4",
+    "policy.encoder.width=4",
 )
 
 

@@ -12,7 +12,6 @@ from lifelong.algorithms import DMPEL, LoRA
 from lifelong.algorithms.dmpel import _padded
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import Router, change
-from lifelong.policies import BCRNN, BCTransformer, BCViLT
 from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
 from lifelong.streams import SomeWindows, StageWindows
@@ -22,33 +21,16 @@ from lifelong.types import Observation
 from tests.harness import sequences as walk
 from tests.harness.algorithms import killed_again_and_again, learn, outputs
 from tests.harness.fakes import DeepPolicy, Windows
+from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
 ALL = {"lora": lambda: LoRA(rank=2, alpha=4.0), "dmpel": lambda: DMPEL(rank=2, alpha=4.0, pool=2)}
-_CONV = {"image_width": 8, "stage_blocks": [1], "stem_pool": False}
-_HEAD = {
-    "head_hidden": 8,
-    "head_layers": 1,
-    "modes": 2,
-    "min_std": 0.05,
-    "chunk": 2,
-    "execute": 1,
-    "flow_steps": 2,
-}
-_TIME = {"embed_dim": 8, "layers": 1, "heads": 2, "head_dim": 4, "mlp_dim": 8}
-_PATCH = {"patch_embed": 8, "patch_width": 8, "stem_kernel": 3, "stem_stride": 1, "patch": 4}
-_SPACE = {"spatial_layers": 1, "spatial_heads": 2, "spatial_head_dim": 4, "spatial_mlp_dim": 8}
-POLICIES = {
-    "bc_transformer": (BCTransformer, _CONV | _TIME),
-    "bc_rnn": (BCRNN, _CONV | {"image_embed": 8, "text_embed": 4, "rnn_hidden": 8}),
-    "bc_vilt": (BCViLT, _PATCH | _SPACE | _TIME),
-}
+POLICIES = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}
 SMALL = FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32")
 
 
 def make_policy(kind: str = "bc_transformer", head: str = "gmm"):
-    cls, sizes = POLICIES[kind]
     with seeded(3):
-        return cls(spec=walk.SPEC, **sizes, **_HEAD, head=head)
+        return POLICIES[kind](walk.SPEC, head)
 
 
 def learn_small(algorithm, policy, task: int, settings=SMALL) -> None:

@@ -20,6 +20,7 @@ from lifelong.settings import RunSettings
 from tests.harness.configs import CONFIGS, FILES, composed
 
 GIVEN = {"policy": {"spec"}}  # what the experiment adds
+COMPLETED = {"in_dim", "dim", "out_dim", "latent_dim", "max_length"}  # what policies add to their components
 
 
 def nodes(config, path=""):
@@ -67,8 +68,13 @@ def test_every_file_binds_to_its_target(file):
     assert set(config) == set(GROUPS) | {f.name for f in dataclasses.fields(RunSettings)}
     for path, node in nodes(config):
         target = get_object(node["_target_"])
-        arguments = {k for k in node if k != "_target_"} | GIVEN.get(path, set())
-        inspect.signature(target).bind(**dict.fromkeys(arguments))
+        arguments = {k for k in node if k not in ("_target_", "_partial_")} | GIVEN.get(path, set())
+        signature = inspect.signature(target)
+        bind = signature.bind_partial if node.get("_partial_") else signature.bind
+        bind(**dict.fromkeys(arguments))
+        optional = {k for k, p in signature.parameters.items() if p.default is not p.empty}
+        left_out = optional - arguments - COMPLETED if node.get("_partial_") else None
+        assert not left_out, f"{path} leaves out {left_out}"
         assert not unread(target), f"{path}: {target.__name__} never reads {unread(target)}"
 
 
@@ -91,7 +97,7 @@ def test_an_algorithm_is_named_like_its_file(file):
 @pytest.mark.parametrize("preset", ["laptop", "smoke", "paper"])
 def test_values_on_the_command_line_win_over_the_preset(preset):
     config = composed(f"preset={preset}", "train.epochs=3", "policy=bc_transformer", "data.demos=7")
-    assert (config.train.epochs, config.data.demos, config.policy.image_width) == (3, 7, 64)
+    assert (config.train.epochs, config.data.demos, config.policy.encoder.width) == (3, 7, 64)
 
 
 def test_the_paper_preset_is_the_published_protocol():

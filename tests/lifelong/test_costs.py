@@ -1,6 +1,7 @@
 """What algorithms cost: operations against the formulas, and nothing is changed by count_flops them."""
 
 import copy
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,12 @@ from lifelong.algorithms import EWC, Algorithm, Sequential
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.er import ER
 from lifelong.data import SequenceVLDataset
+from lifelong.nn import TemporalLSTM
 from lifelong.policies import BCTransformer
-from lifelong.policies.bc_rnn import BCRNN
 from lifelong.seeding import generator, seeded
 from lifelong.training.costs import COSTS, action_costs, count_flops, peak_costs, step_costs, stored_bytes
 from lifelong.types import PolicySpec
+from tests.harness.policies import small_rnn, small_transformer
 
 pytestmark = pytest.mark.unit
 SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)
@@ -36,21 +38,7 @@ def dataset(task: int = 0, frames: int = 20) -> SequenceVLDataset:
 
 def transformer() -> BCTransformer:
     with seeded(7):
-        return BCTransformer(
-            spec=SPEC,
-            embed_dim=8,
-            image_width=8,
-            stage_blocks=[1],
-            stem_pool=False,
-            layers=1,
-            heads=2,
-            head_dim=4,
-            mlp_dim=8,
-            head_hidden=8,
-            head_layers=1,
-            modes=2,
-            min_std=0.05,
-        )
+        return small_transformer(SPEC)
 
 
 def counted(work) -> int:
@@ -128,10 +116,9 @@ def test_parameters_and_those_that_are_trained():
 
 
 def test_an_action_of_a_recurrent_policy_costs_less_if_its_memory_is_carried():
-    sizes = {"image_embed": 8, "image_width": 8, "stage_blocks": [1], "stem_pool": False, "text_embed": 4}
-    sizes |= {"rnn_hidden": 16, "rnn_layers": 1, "head_hidden": 8, "head_layers": 1, "modes": 2}
+    lstm = partial(TemporalLSTM, hidden=16, layers=1)
     with seeded(1):
-        window, carried = (BCRNN(spec=SPEC, **sizes, memory=m) for m in ("window", "reset"))
+        window, carried = (small_rnn(SPEC, temporal=lstm, memory=m) for m in ("window", "reset"))
     read_anew = SPEC.seq_len - 1  # steps of the window that a carried memory has behind it
     step = 2 * sum(w.numel() for w in window.rnn.parameters() if w.dim() == 2)
     costs = [action_costs(p)["flops_per_action"] for p in (window, carried)]

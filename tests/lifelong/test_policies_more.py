@@ -1,34 +1,64 @@
 """Every policy with every head acts as it is trained; chunks are planned, carried out and forgotten."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
-from hydra.utils import get_object
+from hydra import compose, initialize_config_dir
 from torch import nn
 
+from lifelong.build import build
 from lifelong.data import fake_batch
 from lifelong.errors import PolicyError
-from lifelong.nn.flow import FlowHead
-from lifelong.nn.heads import GMMHead
+from lifelong.nn import (
+    DeterministicHead,
+    FlowHead,
+    GMMHead,
+    PatchEncoder,
+    ResNetFiLMEncoder,
+    SpatialTransformer,
+    TemporalLSTM,
+    TemporalTransformer,
+)
 from lifelong.policies import BCRNN, BCTransformer, BCViLT, Policy
 from lifelong.types import Batch, Observation, PolicySpec
 
 pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(32, 32), language_dim=6, seq_len=4)
-HEAD = {"head_hidden": 16, "min_std": 0.02, "chunk": 3, "execute": 2, "flow_steps": 3}
-OVER_TIME = {"embed_dim": 16, "layers": 1, "heads": 2, "head_dim": 8, "mlp_dim": 32}
-IMAGE = {"image_width": 8, "stage_blocks": (1,), "stem_stride": 4, "stem_pool": False}
-PATCHES = {"patch_embed": 16, "patch_width": 8, "stem_stride": 4, "patch": 4, "spatial_layers": 1}
-SPATIAL = {"spatial_heads": 2, "spatial_head_dim": 8, "spatial_mlp_dim": 32}
-SMALL = {
-    "transformer": (BCTransformer, IMAGE | OVER_TIME),
-    "rnn": (BCRNN, IMAGE | {"image_embed": 16, "text_embed": 8, "rnn_hidden": 16}),
-    "rnn-window": (BCRNN, IMAGE | {"image_embed": 16, "rnn_hidden": 16, "memory": "window"}),
-    "vilt": (BCViLT, PATCHES | SPATIAL | OVER_TIME),
+HEADS = {
+    "gmm": partial(GMMHead, hidden=16, min_std=0.02),
+    "deterministic": partial(DeterministicHead, hidden=16),
+    "flow": partial(FlowHead, hidden=16, chunk=3, execute=2, steps=3),
 }
-CONFIGS = sorted((Path(__file__).parents[2] / "configs" / "policy").glob("*.yaml"))
+RESNET = partial(ResNetFiLMEncoder, width=8, stage_blocks=(1,), stem_stride=4, stem_pool=False)
+TRANSFORMER = {"layers": 1, "heads": 2, "head_dim": 8, "mlp_dim": 32}
+LSTM = partial(TemporalLSTM, hidden=16)
+PATCHES = partial(PatchEncoder, width=8, stem_stride=4, patch=4)
+SMALL = {
+    "transformer": (
+        BCTransformer,
+        {"embed_dim": 16, "encoder": RESNET, "temporal": partial(TemporalTransformer, **TRANSFORMER)},
+    ),
+    "rnn": (BCRNN, {"image_embed": 16, "text_embed": 8, "encoder": RESNET, "temporal": LSTM}),
+    "rnn-window": (BCRNN, {"image_embed": 16, "encoder": RESNET, "temporal": LSTM, "memory": "window"}),
+    "vilt": (
+        BCViLT,
+        {
+            "patch_embed": 16,
+            "embed_dim": 16,
+            "encoder": PATCHES,
+            "spatial": partial(SpatialTransformer, **TRANSFORMER),
+            "temporal": partial(TemporalTransformer, **TRANSFORMER),
+        },
+    ),
+}
+CONFIGS = Path(__file__).parents[2] / "configs"
+CHOICES = [
+    f"{group}={file.stem}"
+    for group in ("policy", "policy/head")
+    for file in sorted((CONFIGS / group).glob("*.yaml"))
+]
 every_policy = pytest.mark.parametrize("kind", SMALL)
 every_head = pytest.mark.parametrize("head", ["gmm", "deterministic", "flow"])
 
@@ -37,11 +67,22 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def make_policy(kind: str, spec: PolicySpec = SPEC, **changes) -> Policy:
-    target, sizes = SMALL[kind]
+def make_policy(
+    kind: str,
+    spec: PolicySpec = SPEC,
+    head: str = "gmm",
+    stochastic: bool = False,
+    dropout: float | None = None,
+    **head_sizes,
+) -> Policy:
+    """A small policy; `dropout` is that of all its networks that have one."""
+    target, components = SMALL[kind]
+    parts = dict(components)
+    for name in {"spatial", "temporal"} & set(parts) if dropout is not None else ():
+        parts[name] = partial(parts[name], dropout=dropout)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        policy = target(spec=spec, **(HEAD | sizes | changes))
+        policy = target(spec=spec, head=partial(HEADS[head], **head_sizes), stochastic=stochastic, **parts)
         for module in policy.modules():  # FiLM starts as the identity: let language matter
             if isinstance(module, nn.Linear):
                 nn.init.normal_(module.weight, std=0.2)
@@ -79,14 +120,14 @@ def test_the_published_sizes_give_the_published_number_of_parameters(target: typ
     assert sum(p.numel() for p in policy.parameters()) == count
 
 
-@pytest.mark.parametrize("file", CONFIGS, ids=lambda file: file.stem)
-def test_every_configuration_trains_and_acts(file: Path) -> None:
-    config = yaml.safe_load(file.read_text())
-    target = get_object(config.pop("_target_"))
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_configuration_trains_and_acts(choice: str) -> None:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = compose("config", [choice]).policy
     with torch.device("meta"):
-        target(spec=PolicySpec(image_size=(128, 128), language_dim=768), **config)
+        build(config, spec=PolicySpec(image_size=(128, 128), language_dim=768))
     spec = PolicySpec(image_size=(64, 64), language_dim=8, seq_len=5)
-    policy, batch = target(spec=spec, **config).eval(), fake_batch(spec, 1, generator())
+    policy, batch = build(config, spec=spec).eval(), fake_batch(spec, 1, generator())
     assert policy.window_losses(batch).isfinite().all()
     assert act_through(policy, steps(batch.observation, slice(2)), [0]).shape == (1, 2, 7)
 
@@ -106,7 +147,7 @@ def test_acting_step_by_step_equals_the_training_forward(kind: str, head: str) -
 @pytest.mark.parametrize("kind", ["transformer", "rnn-window", "vilt"])
 @every_head
 def test_only_the_latest_frames_are_remembered(kind: str, head: str) -> None:
-    policy = make_policy(kind, head=head, execute=1).eval()
+    policy = make_policy(kind, head=head, **({"execute": 1} if head == "flow" else {})).eval()
     long = fake_batch(SPEC, 2, generator(), steps=9)
     actions, window = act_through(policy, long.observation), slice(9 - policy.memory_steps, 9)
     alone = act_through(policy, steps(long.observation, window))
@@ -236,8 +277,8 @@ def test_no_step_sees_what_comes_after_it(kind: str) -> None:
 @every_policy
 def test_weights_round_trip_through_the_state_dict(kind: str) -> None:
     one, batch = make_policy(kind, head="flow").eval(), fake_batch(SPEC, 2, generator())
-    target, sizes = SMALL[kind]
-    other = target(spec=SPEC, **(HEAD | sizes | {"head": "flow"})).eval()
+    target, components = SMALL[kind]
+    other = target(spec=SPEC, head=HEADS["flow"], **components).eval()
     other.load_state_dict(one.state_dict())
     assert torch.equal(one.window_losses(batch), other.window_losses(batch))
 
@@ -317,7 +358,7 @@ class TestFlow:
         [
             ({"chunk": 5}, "data.seq_len to 5 or more"),
             ({"execute": 4}, "1 <= execute <= chunk"),
-            ({"flow_steps": 0}, "flow_steps >= 1"),
+            ({"steps": 0}, "steps >= 1"),
         ],
     )
     def test_sizes_that_cannot_work_are_refused(self, changes: dict, message: str) -> None:
@@ -328,9 +369,9 @@ class TestFlow:
 def test_wrong_use_is_refused() -> None:
     batch = fake_batch(SPEC, 2, generator())
     with pytest.raises(PolicyError, match="Valid: reset, window"):
-        make_policy("rnn", memory="carry")
+        BCRNN(spec=SPEC, memory="carry")
     with pytest.raises(PolicyError, match="do not tile"):
-        make_policy("vilt", patch=3)
+        BCViLT(spec=SPEC, encoder=partial(PATCHES, patch=3))
     for kind in SMALL:
         policy = make_policy(kind, stochastic=True).eval()
         with pytest.raises(PolicyError, match="reset"):

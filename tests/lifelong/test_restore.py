@@ -24,7 +24,7 @@ from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit
 CONFIGS = Path(__file__).parents[2] / "configs"
-TINY = ("preset=smoke", "device=cpu", "data.image_size=32", "policy.image_width=8", "policy.head_hidden=16")
+TINY = ("preset=smoke", "device=cpu", "data.image_size=32", "policy.encoder.width=8", "policy.head.hidden=16")
 
 
 def make_windows(task: int, spec: PolicySpec) -> SequenceVLDataset:

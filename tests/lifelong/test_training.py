@@ -11,7 +11,6 @@ from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Sequential
 from lifelong.data import fake_batch
 from lifelong.errors import ConfigError, TrainingError
-from lifelong.policies import BCRNN, BCTransformer, BCViLT
 from lifelong.seeding import generator
 from lifelong.training.distributed import Ranks
 from lifelong.training.fit import fit, learning_rate
@@ -20,6 +19,7 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import Batch, PolicySpec
 from tests.harness import ranks_worker as worker
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
+from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
 SETTINGS = FitSettings(epochs=5, batch_size=8, lr=1e-2, warmup_steps=3, precision="fp32")
 
@@ -210,11 +210,9 @@ def traced(monkeypatch):
 
 SMALL = PolicySpec(image_size=(32, 32), language_dim=8, seq_len=2)
 POLICIES = {
-    "bc_transformer": lambda: BCTransformer(
-        spec=SMALL, embed_dim=8, image_width=8, stage_blocks=[1], layers=1, head_hidden=8, dropout=0.0
-    ),
-    "bc_rnn": lambda: BCRNN(spec=SMALL, image_width=8, rnn_hidden=8, rnn_layers=1, head_hidden=8),
-    "bc_vilt": lambda: BCViLT(spec=SMALL, patch=4, spatial_layers=1, head_hidden=8, dropout=0.0),
+    "bc_transformer": lambda: small_transformer(SMALL, dropout=0.0),
+    "bc_rnn": lambda: small_rnn(SMALL),
+    "bc_vilt": lambda: small_vilt(SMALL, dropout=0.0),
 }
 
 

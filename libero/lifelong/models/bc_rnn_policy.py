@@ -37,7 +37,7 @@ class BCRNNPolicy(NativePolicy):
             "dropout": policy.rnn_dropout,
             **image_sizes(policy),
         }
-        network = BCRNN(spec=self.spec, **{**sizes, **more})
+        network = self._build(BCRNN, {**sizes, **more})
         fuse_all(network, policy)
         network.language.linear = build_language(  # type: ignore[assignment]
             policy, "the RNN", policy.text_embed_size

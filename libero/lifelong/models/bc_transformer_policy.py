@@ -27,7 +27,7 @@ class BCTransformerPolicy(NativePolicy):
             **image_sizes(policy),
             **temporal_sizes(policy, policy.embed_size),
         }
-        network = BCTransformer(spec=self.spec, **{**sizes, **more})
+        network = self._build(BCTransformer, {**sizes, **more})
         fuse_all(network, policy)
         encode_positions(network, policy)
         network.language.linear = build_language(policy, "a token", policy.embed_size)  # type: ignore[assignment]

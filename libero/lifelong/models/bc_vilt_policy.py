@@ -37,7 +37,7 @@ class BCViLTPolicy(NativePolicy):
             "embed_dim": token,
             **temporal_sizes(policy, token),
         }
-        network = BCViLT(spec=self.spec, **{**sizes, **more})
+        network = self._build(BCViLT, {**sizes, **more})
         encode_positions(network, policy)
         network.language.linear = build_language(policy, "a token", token)  # type: ignore[assignment]
         network.spatial_language.linear = build_language(  # type: ignore[assignment]

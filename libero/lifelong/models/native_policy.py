@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from libero._adapters.lifelong.config import named, plain
@@ -17,17 +18,19 @@ from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS
 from libero.lifelong.models.modules.rgb_modules import fuse, resnet_sizes
 from libero.lifelong.models.policy_head import HEADS, GMMHead, check_activation, head_over
+from lifelong.build import build
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import sinusoidal_positions
 from lifelong.policies.history import HistoryPolicy
+from lifelong.saved_config import upgrade_policy
 from lifelong.types import Observation
 
 
 class NativePolicy(BasePolicy, registered=False):
     """A `HistoryPolicy`, held as `network`; its checkpoints and this one's weights are interchangeable.
 
-    `cfg.policy.native` holds further arguments of the network. With `norm: batch`, `normalise_proprio: false` and
-    `standardise_language: false` it is the original's to the letter.
+    `cfg.policy.native` holds further arguments of the network, as flat keys (see `upgrade_policy`). With `norm: batch`,
+    `normalise_proprio: false` and `standardise_language: false` it is the original's to the letter.
 
     Raises:
         PolicyError: a configuration that these networks cannot follow.
@@ -49,6 +52,11 @@ class NativePolicy(BasePolicy, registered=False):
     @abstractmethod
     def _network(self, policy: Any, more: dict[str, Any]) -> HistoryPolicy:
         """The network, from `cfg.policy` and what stands in every policy's configuration."""
+
+    def _build(self, kind: type[HistoryPolicy], arguments: Mapping[str, Any]) -> Any:
+        """Return a network of this class, its components given by flat arguments such as `head_hidden`."""
+        node = upgrade_policy({"_target_": f"{kind.__module__}.{kind.__name__}", **arguments})
+        return build(OmegaConf.create(node), spec=self.spec)
 
     def spatial_encode(self, data: Mapping[str, Any]) -> Tensor:
         """What each frame shows, by itself: (B, T, M, E), or (B, T, E) for the RNN."""

@@ -1,0 +1,95 @@
+"""Configurations of runs made by earlier versions, brought to the keys of today."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+Node = dict[str, Any]
+
+# Earlier flat key -> key of the component. Keys that are not listed belong to the policy itself.
+_RESNET = {
+    "image_width": "width",
+    "stage_blocks": "stage_blocks",
+    "stem_kernel": "stem_kernel",
+    "stem_stride": "stem_stride",
+    "stem_pool": "stem_pool",
+    "keypoints": "keypoints",
+    "keypoint_temperature": "temperature",
+    "readout": "readout",
+    "norm": "norm",
+}
+_PATCHES = {
+    "patch_width": "width",
+    "stem_kernel": "stem_kernel",
+    "stem_stride": "stem_stride",
+    "patch": "patch",
+    "norm": "norm",
+}
+_SPATIAL = {
+    "spatial_layers": "layers",
+    "spatial_heads": "heads",
+    "spatial_head_dim": "head_dim",
+    "spatial_mlp_dim": "mlp_dim",
+    "dropout": "dropout",
+}
+_TRANSFORMER = {key: key for key in ("layers", "heads", "head_dim", "mlp_dim", "dropout")}
+_LSTM = {"rnn_hidden": "hidden", "rnn_layers": "layers", "dropout": "dropout"}
+_TRUNK = {"head_hidden": "hidden", "head_layers": "layers"}
+_HEADS = {
+    "deterministic": ("DeterministicHead", {**_TRUNK, "head_norm": "norm"}),
+    "gmm": (
+        "GMMHead",
+        {
+            **_TRUNK,
+            "head_norm": "norm",
+            "modes": "modes",
+            "min_std": "min_std",
+            "low_eval_noise": "low_eval_noise",
+        },
+    ),
+    "flow": ("FlowHead", {**_TRUNK, "chunk": "chunk", "execute": "execute", "flow_steps": "steps"}),
+}
+_POLICIES = {
+    "lifelong.policies.bc_transformer.BCTransformer": {
+        "encoder": ("ResNetFiLMEncoder", _RESNET),
+        "temporal": ("TemporalTransformer", _TRANSFORMER),
+    },
+    "lifelong.policies.bc_rnn.BCRNN": {
+        "encoder": ("ResNetFiLMEncoder", _RESNET),
+        "temporal": ("TemporalLSTM", _LSTM),
+    },
+    "lifelong.policies.bc_vilt.BCViLT": {
+        "encoder": ("PatchEncoder", _PATCHES),
+        "spatial": ("SpatialTransformer", _SPATIAL),
+        "temporal": ("TemporalTransformer", _TRANSFORMER),
+    },
+}
+
+
+def upgrade_config(config: Mapping[str, Any]) -> Node:
+    """Return the resolved configuration of a saved run with the keys of today.
+
+    A configuration of today comes back unchanged, so that callers need not know who wrote it.
+
+    Args:
+        config: A run's config.yaml, or the part of it that a pretraining keeps, as plain data; it is not modified.
+    """
+    upgrades: dict[str, Callable[[Mapping[str, Any]], Node]] = {"policy": upgrade_policy}
+    return {key: upgrades[key](node) if key in upgrades else node for key, node in config.items()}
+
+
+def upgrade_policy(node: Mapping[str, Any]) -> Node:
+    """Return the node of a policy with components in place of flat keys such as `image_width` and `head_hidden`.
+
+    Args:
+        node: The `policy` node, all of its keys or some; nodes of other policies and of today come back unchanged.
+    """
+    components = dict(_POLICIES.get(node.get("_target_", ""), {}))
+    if not components or isinstance(node.get("head", "gmm"), Mapping):
+        return dict(node)
+    components["head"] = _HEADS[node.get("head", "gmm")]
+    flat = {"head", *(key for _, keys in (*components.values(), *_HEADS.values()) for key in keys)}
+    upgraded = {key: value for key, value in node.items() if key not in flat}
+    for name, (target, keys) in components.items():
+        values = {new: node[old] for old, new in keys.items() if old in node}
+        upgraded[name] = {"_target_": f"lifelong.nn.{target}", "_partial_": True, **values}
+    return upgraded
