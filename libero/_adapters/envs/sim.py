@@ -1,9 +1,11 @@
 """One simulation behind the interface of robosuite's `MjSim`: `sim.model`, `sim.data`, `sim.render`.
 
-The model is the environment's own copy, so clients may write to it; where a fixture's root body is put in
-`model.body_pos` and `body_quat` counts from the next `forward` on.
+The model is the environment's own copy, so clients may write to it; a new pose of a fixture in `model.body_pos` and
+`body_quat` takes effect with the next `forward`.
 """
 
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,7 +15,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.sim.render import Picture, Renderer
 from libero_env.sim.simulation import LoopSimulations
 
-# Kind of element, as robosuite calls it -> MuJoCo's number of its kind.
+# Kind of element in robosuite -> kind in MuJoCo.
 KINDS = {
     "body": mujoco.mjtObj.mjOBJ_BODY,
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
@@ -42,7 +44,7 @@ class MjSimState(NamedTuple):
 
     @classmethod
     def from_flattened(cls, array: np.ndarray, sim: "MjSim") -> "MjSimState":
-        """The inverse of `flatten`; what follows the velocities is left out."""
+        """Return a state from `[time, qpos, qvel, ...]`; numbers after the velocities are left out."""
         nq, nv = sim.model.nq, sim.model.nv
         array = np.asarray(array, np.float64)
         if array.ndim != 1 or array.size < 1 + nq + nv:
@@ -52,12 +54,15 @@ class MjSimState(NamedTuple):
         return cls(float(array[0]), array[1 : 1 + nq], array[1 + nq : 1 + nq + nv])
 
     def flatten(self) -> np.ndarray:
-        """[time, qpos, qvel]."""
+        """Return [time, qpos, qvel]."""
         return np.concatenate([[self.time], self.qpos, self.qvel])
 
 
 class MjModel:
-    """A MuJoCo model with names: `body_name2id`, `site_id2name`, `joint_names`, ...; all else is the model's own."""
+    """A MuJoCo model with names: `body_name2id`, `site_id2name`, `joint_names`, ...
+
+    Other attributes are those of `mujoco.MjModel`.
+    """
 
     def __init__(self, model: mujoco.MjModel, xml: Any = None):
         self.__dict__.update(_model=model, _xml=xml)
@@ -65,9 +70,9 @@ class MjModel:
     def __getattr__(self, name: str) -> Any:
         for kind in KINDS:
             if name == f"{kind}_name2id":
-                return lambda element, kind=kind: self._id(kind, element)
+                return partial(self._id, kind)
             if name == f"{kind}_id2name":
-                return lambda index, kind=kind: mujoco.mj_id2name(self._model, KINDS[kind], index)
+                return partial(mujoco.mj_id2name, self._model, KINDS[kind])
             if name == f"{kind}_names":
                 return tuple(self._names(kind))
         return getattr(self.__dict__["_model"], name)
@@ -76,15 +81,15 @@ class MjModel:
         setattr(self._model, name, value)
 
     def get_xml(self) -> str:
-        """The scene as MJCF."""
+        """Return the scene as MJCF."""
         return self._xml()
 
     def get_joint_qpos_addr(self, name: str) -> int | tuple[int, int]:
-        """Index of a joint in qpos, or (start, end) of a free one."""
+        """Return the index of a joint in qpos, or (start, end) of a free joint."""
         return self._address(name, self._model.jnt_qposadr, 7)
 
     def get_joint_qvel_addr(self, name: str) -> int | tuple[int, int]:
-        """Index of a joint in qvel, or (start, end) of a free one."""
+        """Return the index of a joint in qvel, or (start, end) of a free joint."""
         return self._address(name, self._model.jnt_dofadr, 6)
 
     def _address(self, name: str, addresses: np.ndarray, length: int) -> int | tuple[int, int]:
@@ -104,7 +109,12 @@ class MjModel:
 
 
 class MjData:
-    """A MuJoCo state with names: `get_site_xpos`, `set_joint_qpos`, ...; all else is the data's own."""
+    """A MuJoCo state with names; other attributes are those of `mujoco.MjData`.
+
+    `get_body_xpos(name)` and its like read `xpos`, `xquat`, `xmat`, `xvelp`, `xvelr`, `jacp` and `jacr` of bodies,
+    geoms, sites, cameras and lights. `get_joint_qpos(name)` and `set_joint_qpos(name, value)` do so with `qpos` and
+    `qvel` of joints, and `pos` and `quat` of mocap bodies; call `sim.forward` after a change.
+    """
 
     def __init__(self, model: MjModel, data: mujoco.MjData):
         self.__dict__.update(model=model, _data=data)
@@ -114,57 +124,39 @@ class MjData:
             return getattr(self._data, name.removeprefix("body_"))
         verb, _, rest = name.partition("_")
         kind, _, field = rest.partition("_")
+        if kind in ("joint", "mocap") and verb in ("get", "set"):
+            return partial(self._get if verb == "get" else self._set, kind, field)
         if verb == "get" and kind in ("body", "geom", "site", "camera", "light"):
-            return lambda element: self._read(kind, field, element)
+            return partial(self._read, kind, field)
         return getattr(self.__dict__["_data"], name)
 
     def __setattr__(self, name: str, value: Any) -> None:
         setattr(self._data, name, value)
 
     def get_sensor(self, name: str) -> float:
-        """First number of a sensor."""
+        """Return the first number of a sensor."""
         return float(self._data.sensordata[self._data.model.sensor(name).adr[0]])
 
-    def get_joint_qpos(self, name: str) -> Any:
-        """Position of a joint: a number, or (7,) of a free one."""
-        return self._data.qpos[_slice(self.model.get_joint_qpos_addr(name))]
+    def _get(self, kind: str, field: str, name: str) -> Any:
+        rows, index = self._address(kind, field, name)
+        return rows[index]
 
-    def set_joint_qpos(self, name: str, value: Any) -> None:
-        """Put a joint somewhere; call `sim.forward` afterwards."""
-        self._data.qpos[_slice(self.model.get_joint_qpos_addr(name))] = value
+    def _set(self, kind: str, field: str, name: str, value: Any) -> None:
+        rows, index = self._address(kind, field, name)
+        rows[index] = value
 
-    def get_joint_qvel(self, name: str) -> Any:
-        """Velocity of a joint: a number, or (6,) of a free one."""
-        return self._data.qvel[_slice(self.model.get_joint_qvel_addr(name))]
-
-    def set_joint_qvel(self, name: str, value: Any) -> None:
-        """Set the velocity of a joint; call `sim.forward` afterwards."""
-        self._data.qvel[_slice(self.model.get_joint_qvel_addr(name))] = value
-
-    def get_mocap_pos(self, name: str) -> np.ndarray:
-        """Position of a mocap body, (3,)."""
-        return self._data.mocap_pos[self._mocap(name)]
-
-    def set_mocap_pos(self, name: str, value: np.ndarray) -> None:
-        """Move a mocap body."""
-        self._data.mocap_pos[self._mocap(name)] = value
-
-    def get_mocap_quat(self, name: str) -> np.ndarray:
-        """Orientation of a mocap body, wxyz (4,)."""
-        return self._data.mocap_quat[self._mocap(name)]
-
-    def set_mocap_quat(self, name: str, value: np.ndarray) -> None:
-        """Turn a mocap body."""
-        self._data.mocap_quat[self._mocap(name)] = value
-
-    def _mocap(self, name: str) -> int:
+    def _address(self, kind: str, field: str, name: str) -> tuple[np.ndarray, int | slice]:
+        """Return the array and the index of `qpos` or `qvel` of a joint, or `pos` or `quat` of a mocap body."""
+        if kind == "joint":
+            address = getattr(self.model, f"get_joint_{field}_addr")(name)
+            return getattr(self._data, field), slice(*address) if isinstance(address, tuple) else address
         index = int(self.model.body_mocapid[self.model.body_name2id(name)])
         if index < 0:
-            raise LiberoError(f"body {name!r} is no mocap body")
-        return index
+            raise LiberoError(f"body {name!r} is not a mocap body")
+        return getattr(self._data, f"mocap_{field}"), index
 
     def _read(self, kind: str, field: str, name: str) -> np.ndarray:
-        """A field of a named element in the world frame; velocities are those of its origin."""
+        """Return a field of a named element in the world frame; velocities are those of its origin."""
         index, model = self.model._id(kind, name), self.model._model
         if field in ("jacp", "jacr"):
             jacobians = np.zeros((2, 3, model.nv))
@@ -177,42 +169,56 @@ class MjData:
         return value.reshape(3, 3) if field == "xmat" else value
 
 
-def _slice(address: int | tuple[int, int]) -> int | slice:
-    return slice(*address) if isinstance(address, tuple) else address
+class ClientSimulations(LoopSimulations):
+    """A simulation in whose model clients may move fixtures."""
+
+    def read_fixtures(self) -> None:
+        """Read the poses of the fixtures from the model."""
+        bodies = self.fixture_bodies
+        self.fixtures[0] = np.concatenate([self.model.body_pos[bodies], self.model.body_quat[bodies]], axis=1)
 
 
 class MjSim:
-    """The simulation of an environment: `simulations` holds one."""
+    """The simulation of an environment.
 
-    def __init__(self, simulations: LoopSimulations, xml: Any = None):
+    Attributes:
+        model, data: Model and state with names.
+        glowing: Function that returns the sites to be drawn, of objects that are turned on.
+
+    Args:
+        simulations: One simulation.
+        xml: Function that returns the scene as MJCF.
+    """
+
+    def __init__(self, simulations: LoopSimulations, xml: Callable[[], str] | None = None):
         self._simulations = simulations
         self.model = MjModel(simulations.model, xml)
         self.data = MjData(self.model, simulations.data(0))
-        self.glowing: Any = lambda: ()  # which sites are to be seen
+        self.glowing: Callable[[], Iterable[int]] = tuple
         self._renderers: dict[tuple[int, int], Renderer] = {}
 
     def reset(self) -> None:
-        """Everything as the model says."""
+        """Set the state to the initial state of the model."""
         mujoco.mj_resetData(self.model._model, self.data._data)
 
     def forward(self) -> None:
-        """Compute all that follows from positions and velocities."""
+        """Compute everything that follows from positions and velocities."""
         mujoco.mj_forward(self.model._model, self.data._data)
 
     def step(self, with_udd: bool = True) -> None:
-        """One physics step of 2 ms with the controls as they are."""
+        """Take one physics step of 2 ms with the present controls."""
         mujoco.mj_step(self.model._model, self.data._data)
 
     def step1(self) -> None:
-        """First half of `step`, up to the velocities."""
+        """Take the first half of `step`, up to the velocities."""
         mujoco.mj_step1(self.model._model, self.data._data)
 
     def step2(self) -> None:
-        """Second half of `step`."""
+        """Take the second half of `step`."""
         mujoco.mj_step2(self.model._model, self.data._data)
 
     def get_state(self) -> MjSimState:
-        """A copy of time, positions and velocities."""
+        """Return a copy of time, positions and velocities."""
         data = self.data._data
         return MjSimState(data.time, data.qpos.copy(), data.qvel.copy())
 
@@ -236,11 +242,11 @@ class MjSim:
         device_id: int = -1,
         segmentation: bool = False,
     ) -> Any:
-        """One picture in OpenGL's order, lowest row first.
+        """Draw one picture in OpenGL's order, lowest row first.
 
         Returns:
-            (H, W, 3) uint8; with `segmentation` (H, W, 2) int32 of kind and index, -1 where nothing is; with `depth` a
-            pair of it and (H, W) float32 in [0, 1], the normalised depth buffer.
+            (H, W, 3) uint8; with `segmentation` (H, W, 2) int32 of kind and index, -1 for the background; with `depth`
+            a pair of it and (H, W) float32 in [0, 1], the normalised depth buffer.
         """
         height, width = height or 480, width or 640
         renderer = self._renderer(height, width)
@@ -256,14 +262,14 @@ class MjSim:
         return image[::-1], self._normalised(distance)[::-1]
 
     def _elements(self, numbers: np.ndarray) -> np.ndarray:
-        """(H, W) numbers of elements -> (H, W, 2) kind and index."""
+        """Return kind and index (H, W, 2) of the elements whose numbers (H, W) were drawn."""
         ngeom = self.model.ngeom
         kind = np.where(numbers > ngeom, int(KINDS["site"]), np.where(numbers > 0, int(KINDS["geom"]), -1))
         index = np.where(numbers > ngeom, numbers - 1 - ngeom, numbers - 1)
         return np.stack([kind, index], axis=-1).astype(np.int32)
 
     def _normalised(self, distance: np.ndarray) -> np.ndarray:
-        """Metres -> OpenGL's depth buffer, 0 at the near plane and 1 at the far plane."""
+        """Return OpenGL's depth buffer of distances in metres: 0 at the near plane and 1 at the far plane."""
         map_, extent = self.model.vis.map, self.model.stat.extent
         near, far = map_.znear * extent, map_.zfar * extent
         return ((1.0 - near / distance.astype(np.float64)) / (1.0 - near / far)).astype(np.float32)

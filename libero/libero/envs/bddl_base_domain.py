@@ -1,4 +1,4 @@
-"""The environment behind the wrappers: one simulation of a task file, stepped as robosuite would step it."""
+"""The environment behind the wrappers: one simulation of a task file, stepped as robosuite steps it."""
 
 import os
 from collections import OrderedDict
@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 
 from libero._adapters.envs.observations import Observer, cameras
-from libero._adapters.envs.sim import MjSim
-from libero._adapters.envs.stepping import ObservedSimulations
+from libero._adapters.envs.sim import ClientSimulations, MjSim
 from libero._adapters.envs.stored_model import fixtures_of, write_model
 from libero._adapters.envs.window import Window
 from libero.libero.envs import bddl_utils as BDDLUtils
@@ -32,37 +31,20 @@ from libero_env.sim.state import StateView
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz
-# What robosuite or the original take, and what follows from the task file or means nothing without a window here.
-WITHOUT_EFFECT = (
-    "arena_type",
-    "custom_material",
-    "env_name",
-    "hard_reset",
-    "mount_types",
-    "render_collision_mesh",
-    "render_gpu_device_id",
-    "render_visual_mesh",
-    "renderer",
-    "renderer_config",
-    "robot_configs",
-    "scene_properties",
-    "scene_xml",
-    "table_friction",
-    "table_full_size",
-    "table_offset",
-    "visualization_sites_list",
-    "workspace_name",
-    "workspace_offset",
-    "z_offset",
-)
+# Arguments of robosuite or the original that have no effect: the task file decides, or they are about a window.
+WITHOUT_EFFECT = """
+    arena_type custom_material env_name hard_reset mount_types render_collision_mesh render_gpu_device_id
+    render_visual_mesh renderer renderer_config robot_configs scene_properties scene_xml table_friction table_full_size
+    table_offset visualization_sites_list workspace_name workspace_offset z_offset
+""".split()  # noqa: SIM905
 
 
 class EpisodeOverError(LiberoError, ValueError):
-    """A step after the horizon."""
+    """`step` was called after the horizon."""
 
 
 def register_problem(target_class: type["BDDLBaseDomain"]) -> type["BDDLBaseDomain"]:
-    """Make a problem class known by its name; task files name it after `define (problem`, in whatever case."""
+    """Register a problem class by its name, which task files give after `define (problem`; case does not matter."""
     TASK_MAPPING[target_class.__name__.lower()] = target_class
     return target_class
 
@@ -71,27 +53,28 @@ class BDDLBaseDomain:
     """One simulation of a task file.
 
     Attributes:
-        sim: the simulation, like robosuite's.
-        scene, view: the compiled task and the state that predicates see, of `libero_env`.
-        parsed_problem: the task file as dictionaries.
-        objects_dict, fixtures_dict, object_sites_dict, object_states_dict: by name.
-        robots: the arm, one.
-        done: whether the horizon is reached.
+        sim: Simulation with robosuite's interface.
+        scene, view: Compiled task and the state that predicates see, both of `libero_env`.
+        parsed_problem: Task file as dictionaries.
+        objects_dict, fixtures_dict, object_sites_dict, object_states_dict: Objects, fixtures, regions and states by
+            name.
+        robots: List of the one arm.
+        done: Whether the horizon is reached.
 
     Args:
-        bddl_file_name: task file.
-        controller_configs: `{"type": "OSC_POSE"}`, `control_delta` or `use_delta` for absolute actions.
-        initialization_noise: None for none; else the arm starts near its rest pose.
-        reward_scale: what success is worth.
-        has_renderer, render_camera: whether `render` shows a window, and from where.
-        horizon: control steps after which `step` raises, unless `ignore_done`.
-        placement_initializer: an object whose `sample()` gives name -> (pos, quat wxyz, object); by default regions are
-            sampled as the task file says.
-        kwargs: what else the original's classes take (`WITHOUT_EFFECT`) is accepted, of no effect.
+        bddl_file_name: Task file.
+        controller_configs: Controller, `{"type": "OSC_POSE"}`; `control_delta` or `use_delta` for absolute actions.
+        initialization_noise: None for none; otherwise the arm starts near its rest pose.
+        reward_scale: Reward of success.
+        has_renderer, render_camera: Whether `render` shows a window, and the camera it shows.
+        horizon: Control steps after which `step` raises, unless `ignore_done`.
+        placement_initializer: Object whose `sample()` returns name -> (pos, quat wxyz, object); by default the regions
+            of the task file are sampled.
+        kwargs: Arguments of the original's classes in `WITHOUT_EFFECT` are accepted and have no effect.
 
     Raises:
-        BDDLError: it is no task file.
-        UnknownNameError: no such argument, controller or camera.
+        BDDLError: The file is not a task file.
+        UnknownNameError: An argument, controller or camera does not exist.
     """
 
     def __init__(
@@ -127,7 +110,9 @@ class BDDLBaseDomain:
                 "argument", unknown[0], [*signature(BDDLBaseDomain).parameters, *WITHOUT_EFFECT]
             )
         if control_freq != CONTROL_FREQ:
-            raise LiberoError(f"control_freq={control_freq}: the benchmark is defined at {CONTROL_FREQ} Hz")
+            raise LiberoError(
+                f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz; leave it out"
+            )
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
         self.problem = BDDLUtils.read_problem(bddl_file_name)
         self.parsed_problem = BDDLUtils.robosuite_parse_problem(bddl_file_name)
@@ -149,7 +134,7 @@ class BDDLBaseDomain:
         self._setup_references(controller_configs, robots)
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
 
-    # What subclasses may change about the scene ---------------------------------------------------------------------
+    # Hooks of subclasses ------------------------------------------------------------------------------------
 
     def _load_fixtures_in_arena(self, mujoco_arena: Any) -> None:
         """Hook: called with the scene before it is compiled, its fixtures in place."""
@@ -178,7 +163,7 @@ class BDDLBaseDomain:
             for hook in hooks:
                 getattr(self, hook)(arena)
             model = arena.spec.compile()
-        self.simulations = ObservedSimulations(model, 1, self.scene.fixture_bodies.tolist())
+        self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
         self.sim = MjSim(self.simulations, self.get_xml)
         self.view = StateView(self.scene, self.simulations, 0)
         self.sim.glowing = lambda: glowing_sites(self.view)
@@ -209,17 +194,17 @@ class BDDLBaseDomain:
         )
         self._add_placement_initializer()
 
-    # Episodes -------------------------------------------------------------------------------------------------------
+    # Episodes -----------------------------------------------------------------------------------------------
 
     def seed(self, seed: int) -> None:
-        """Placements from now on follow from this number."""
+        """Seed the placements from now on."""
         self.rng = np.random.default_rng(seed)
 
     def reset(self) -> "OrderedDict[str, np.ndarray]":
-        """Place everything anew and observe.
+        """Sample an initial state and observe it.
 
         Raises:
-            PlacementError: nothing fits.
+            PlacementError: The objects do not fit.
         """
         start = self._sample()
         qpos = start.qpos.copy()
@@ -234,7 +219,7 @@ class BDDLBaseDomain:
         return self._get_observations(force_update=True)
 
     def _sample(self) -> Start:
-        """A start, settled with the arm holding its pose whatever the controller."""
+        """Return a settled initial state; the arm holds its pose, whatever the controller."""
         own, self.simulations.controller = self.simulations.controller, ControllerState(1)
         try:
             return sample_settled(self.scene, self.simulations, 0, self.rng)
@@ -242,18 +227,18 @@ class BDDLBaseDomain:
             self.simulations.controller = own
 
     def restart(self, state: np.ndarray) -> None:
-        """Start afresh from [time, qpos, qvel], poses of the fixtures behind it or not; the arm holds its pose.
+        """Start from [time, qpos, qvel], with or without the poses of the fixtures after it; the arm holds its pose.
 
         Raises:
-            LiberoError: a state of another length.
+            LiberoError: The state has another length.
         """
         nq, nv = self.scene.model.nq, self.scene.model.nv
         state, short = np.asarray(state, np.float64).ravel(), 1 + nq + nv
         whole = short + 7 * len(self.scene.fixtures)
         if state.size not in (short, whole) or not np.isfinite(state).all():
             raise LiberoError(
-                f"{self.bddl_file_name}: a state is {short} finite numbers, or {whole} with the fixtures' poses; "
-                f"got {state.size}. Is it of another task?"
+                f"{self.bddl_file_name}: a state is {short} finite numbers, or {whole} with the poses of the fixtures; "
+                f"got {state.size}. Is it a state of another task?"
             )
         self.simulations.read_fixtures()
         fixtures = state[short:].reshape(1, -1, 7) if state.size == whole else None
@@ -262,48 +247,48 @@ class BDDLBaseDomain:
         )
 
     def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
-        """Act for 50 ms: observation, reward, success, and a dictionary that says under `success` the same.
+        """Act for 50 ms; return observation, reward, success, and a dictionary with `success`.
 
-        The observation is of 2 ms before the end, as the original's.
+        The observation is of 2 ms before the end, as in the original.
 
         Raises:
-            EpisodeOverError: the horizon is reached.
-            ActionError: wrong shape or not finite; nothing has moved.
+            EpisodeOverError: The horizon is reached.
+            ActionError: The action has the wrong shape or is not finite; nothing has moved.
         """
         if self.done:
             raise EpisodeOverError(
-                f"{self.horizon} steps are over: call reset(), or set horizon or ignore_done"
+                f"the horizon of {self.horizon} steps is reached: call reset(), or set horizon or ignore_done"
             )
         command = self.robots[0].command(action)
         self.timestep += 1
         mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
-        self.simulations.step([0], command[None], tap=self._tap)
+        self.simulations.step([0], command[None], tap=self._observe)
         self.cur_time += 1.0 / self.control_freq
         reward, self.done, info = self._post_action(action)
         success = self._check_success()
         return self._get_observations(), reward, success, {"success": success, **info}
 
-    def _tap(self, _: mujoco.MjData) -> None:
+    def _observe(self, _: mujoco.MjData) -> None:
         self._observations = self.observer.observe()
 
     def _post_action(self, action: Any) -> tuple[float, bool, dict[str, Any]]:
         return self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
 
     def _post_process(self) -> None:
-        """Nothing to do: what a state looks like follows from the state."""
+        """Update the states of objects that can be turned on; their appearance follows from the simulation."""
         for state in self.tracking_object_states_changes:
             state.update_state()
 
     def reward(self, action: Any = None) -> float:
-        """`reward_scale` on success, else 0."""
+        """Return `reward_scale` on success, otherwise 0."""
         return float(self._check_success()) * (1.0 if self.reward_scale is None else self.reward_scale)
 
     def _check_success(self) -> bool:
-        """Whether the goal holds."""
+        """Return whether the goal holds."""
         return all(map(self._eval_predicate, self.parsed_problem["goal_state"]))
 
     def _eval_predicate(self, state: Sequence[Any]) -> bool:
-        """Truth of an atom such as `["on", "a_1", "b_1"]`, or of a nested goal; case does not count."""
+        """Return the truth of an atom, `["on", "a_1", "b_1"]`, or of a nested goal; case does not matter."""
         if state[0].lower() in ("and", "or", "not", "forall"):
             return evaluate(BDDLUtils.as_expression(list(state)), self.view)
         return bool(eval_predicate_fn(state[0], *(self._state(name) for name in state[1:])))
@@ -313,53 +298,53 @@ class BDDLBaseDomain:
             raise UnknownNameError("object, fixture or region", name, self.object_states_dict)
         return self.object_states_dict[name]
 
-    # Observations ---------------------------------------------------------------------------------------------------
+    # Observations -------------------------------------------------------------------------------------------
 
     def _update_observables(self, force: bool = False) -> None:
         """Observe the present state."""
         self._observations = self.observer.observe()
 
     def _get_observations(self, force_update: bool = False) -> "OrderedDict[str, np.ndarray]":
-        """What was observed last."""
+        """Return the last observation."""
         if force_update:
             self._update_observables(force=True)
         return OrderedDict(self._observations)
 
     def get_robot_state_vector(self, obs: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Fingers, grip position and hand orientation of an observation, (9,)."""
+        """Return fingers, grip position and hand orientation of an observation, (9,)."""
         return np.concatenate([obs[f"robot0_{key}"] for key in ("gripper_qpos", "eef_pos", "eef_quat")])
 
     def visualize(self, vis_settings: Mapping[str, bool]) -> None:
-        """Nothing to do: helper sites are never shown."""
+        """Do nothing: helper sites are never shown."""
 
     def set_visualization(self) -> None:
-        """Nothing to do: sites glow while their object is on."""
+        """Do nothing: sites glow while their object is on."""
 
-    # Small things ---------------------------------------------------------------------------------------------------
+    # Properties and helpers ---------------------------------------------------------------------------------
 
     def is_fixture(self, object_name: str) -> bool:
-        """Whether a name is that of a fixture."""
+        """Return whether a fixture has this name."""
         return object_name in self.fixtures_dict
 
     def get_object(self, object_name: str) -> Any:
-        """The object, fixture or region of this name.
+        """Return the object, fixture or region of this name.
 
         Raises:
-            UnknownNameError: there is none.
+            UnknownNameError: The name does not exist.
         """
-        every = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
-        if object_name not in every:
-            raise UnknownNameError("object, fixture or region", object_name, every)
-        return every[object_name]
+        known = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
+        if object_name not in known:
+            raise UnknownNameError("object, fixture or region", object_name, known)
+        return known[object_name]
 
     @property
     def language_instruction(self) -> str:
-        """What the task file says."""
+        """Instruction in the task file."""
         return self.problem.language
 
     @property
     def action_spec(self) -> tuple[np.ndarray, np.ndarray]:
-        """Low and high of an action."""
+        """Lowest and highest action."""
         return self.robots[0].action_limits
 
     @property
@@ -372,11 +357,11 @@ class BDDLBaseDomain:
         return {"env", "robots", "grippers"}
 
     def get_xml(self) -> str:
-        """The scene as MJCF without textures, fixtures where they stand now."""
+        """Return the scene as MJCF without textures, with the present poses of the fixtures."""
         return write_model(self.scene, self.sim.model._model)
 
     def reset_from_xml_string(self, xml_string: str) -> None:
-        """Put the fixtures where a stored model of this task has them, everything else at its origin."""
+        """Set the poses of the fixtures from a stored model of this task, and everything else to its initial state."""
         for name, (pos, quat) in fixtures_of(self.scene, xml_string).items():
             self.sim.model.body_pos[self.obj_body_id[name]] = pos
             self.sim.model.body_quat[self.obj_body_id[name]] = quat
@@ -391,7 +376,7 @@ class BDDLBaseDomain:
         self.sim.free()
 
     def render(self) -> None:
-        """Show the present state in a window, if `has_renderer` asked for one and there is a screen."""
+        """Show the present state in a window, with `has_renderer` and a screen."""
         if self.window is not None:
             self.window.show(self.sim.model._model, self.sim.data._data)
 

@@ -1,4 +1,4 @@
-"""What is the same of the arm wherever it stands."""
+"""The arm: properties that do not depend on its mount."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -9,11 +9,11 @@ from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_Q
 
 
 class Panda:
-    """Figures of the arm.
+    """Properties of the arm.
 
     Attributes:
-        default_mount: what it stands on, None for the ground.
-        base_xpos_offset: workspace -> where its base goes, (3,) m; for a table as a function of its length.
+        default_mount: Name of the mount; None for the ground.
+        base_xpos_offset: Workspace -> position of the base, (3,) m; for a table a function of its length.
     """
 
     default_mount: ClassVar[str | None] = None
@@ -47,10 +47,10 @@ class Panda:
 
     @property
     def horizontal_radius(self) -> float:
-        """Radius that the arm keeps to itself, m."""
+        """Radius that is kept free around the arm, m."""
         return 0.5
 
 
 def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, float, float]]:
-    """Where the base goes behind a table of a given length."""
+    """Return the position of the base behind a table as a function of the length of the table."""
     return lambda table_length: (x - table_length / 2, 0.0, height)

@@ -1,10 +1,11 @@
 """The arm of an environment, under robosuite's names: `env.robots[0].controller`, `.gripper`, ..."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from libero._adapters.envs.domain import Domain
 from libero.libero.envs.robots.mounted_panda import MountedPanda
 from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
 from libero_env.envs.checks import checked_actions
@@ -12,17 +13,14 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.sim.controllers import CONTROLLERS as KINDS
 from libero_env.sim.controllers import ControllerState, get_controller
 
-if TYPE_CHECKING:
-    from libero.libero.envs.bddl_base_domain import BDDLBaseDomain
-
 CONTROLLERS = tuple(name.upper() for name in KINDS)
 
 
 def controller_of(configs: Any) -> dict[str, Any]:
-    """The controller's configuration: one, a list with one, a name, or None for the default.
+    """Return the configuration of the controller, from a configuration, a list of one, a name, or None (default).
 
     Raises:
-        UnknownNameError: no such controller.
+        UnknownNameError: The controller does not exist.
     """
     if isinstance(configs, Sequence) and not isinstance(configs, str):
         configs = configs[0] if configs else None
@@ -37,10 +35,10 @@ class Controller:
     """Goals of the arm.
 
     Attributes:
-        name: such as `OSC_POSE`.
+        name: Name of the controller, such as `OSC_POSE`.
     """
 
-    def __init__(self, env: "BDDLBaseDomain", config: Mapping[str, Any]):
+    def __init__(self, env: Domain, config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
         delta = bool(config.get("control_delta", config.get("use_delta", True)))
         env.simulations.controller = ControllerState(1, get_controller(self.name.lower(), delta))
@@ -51,7 +49,7 @@ class Controller:
 
     @property
     def use_delta(self) -> bool:
-        """Whether actions count from the present pose; may be set at any time."""
+        """Whether actions are relative to the present pose; may be set at any time."""
         return self._state.kind.control_delta
 
     @use_delta.setter
@@ -75,27 +73,27 @@ class Controller:
 
     @property
     def joint_pos(self) -> np.ndarray:
-        """(7,) rad."""
+        """Joint positions, (7,) rad."""
         return self._env.sim.data.qpos[:7].copy()
 
     @property
     def goal_pos(self) -> np.ndarray:
-        """Where an OSC takes the grip site, (3,) m."""
+        """Goal position of the grip site under operational space control, (3,) m."""
         return self._state.goal[0]
 
     @property
     def goal_ori(self) -> np.ndarray:
-        """Orientation that an OSC gives the grip site, (3, 3)."""
+        """Goal orientation of the grip site under operational space control, (3, 3)."""
         return self._state.memory[0].reshape(3, 3)
 
     def update(self, force: bool = False) -> None:
-        """Nothing to do: kinematics are read when they are needed."""
+        """Do nothing: kinematics are read when they are needed."""
 
     def update_base_pose(self, base_pos: Any = None, base_ori: Any = None) -> None:
-        """Nothing to do: goals are in the world frame."""
+        """Do nothing: goals are in the world frame."""
 
     def reset_goal(self) -> None:
-        """Hold the present pose; the gripper's command stays."""
+        """Set the goal to the present pose; the command of the gripper stays."""
         gripper = self._state.gripper[0].copy()
         self._state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
         self._state.gripper[0] = gripper
@@ -106,7 +104,7 @@ class Gripper:
 
     dof = 1
 
-    def __init__(self, env: "BDDLBaseDomain"):
+    def __init__(self, env: Domain):
         self._env = env
 
     @property
@@ -122,10 +120,10 @@ class Gripper:
 class SingleArm:
     """The arm with controller and gripper."""
 
-    def __init__(self, env: "BDDLBaseDomain", config: Mapping[str, Any], robots: Any = ("Panda",)):
+    def __init__(self, env: Domain, config: Mapping[str, Any], robots: Any = ("Panda",)):
         names = [robots] if isinstance(robots, str) else list(robots)
         if len(names) != 1 or not str(names[0]).endswith("Panda"):
-            raise LiberoError(f"robots={names}: the benchmark has one arm, ['Panda']")
+            raise LiberoError(f"robots={names}: the benchmark has one arm; pass ['Panda']")
         self._env, self.sim = env, env.sim
         self.robot_model = (OnTheGroundPanda if env.scene.workspace.mount is None else MountedPanda)()
         self.controller, self.gripper = Controller(env, config), Gripper(env)
@@ -143,7 +141,7 @@ class SingleArm:
 
     @property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Low and high of an action."""
+        """Lowest and highest action."""
         kind = self._env.simulations.controller.kind
         return kind.low.copy(), kind.high.copy()
 
@@ -169,19 +167,19 @@ class SingleArm:
 
     @property
     def base_pos(self) -> np.ndarray:
-        """Where the arm stands, (3,) m."""
+        """Position of the base, (3,) m."""
         return self.sim.data.get_body_xpos("robot0_base").copy()
 
     def set_robot_joint_positions(self, jpos: Any) -> None:
-        """Put the arm into a pose, (7,) rad."""
+        """Set the joint positions, (7,) rad."""
         self.sim.data.qpos[:7] = jpos
         self.sim.forward()
 
     def command(self, action: Any) -> np.ndarray:
-        """An action as the controller takes it; of seven numbers for `OSC_POSITION` the rotation is left out.
+        """Return an action as the controller takes it: of seven numbers for `OSC_POSITION` the rotation is left out.
 
         Raises:
-            ActionError: wrong shape or not finite.
+            ActionError: The action has the wrong shape or is not finite.
         """
         action = np.asarray(action)
         if self.action_dim == 4 and action.shape == (7,):
