@@ -1,0 +1,161 @@
+"""Measure the shape of the code: entries, levels and circles of imports, lines, long functions, exemptions.
+
+    python experiments/structure/measure.py [CHECKOUT ...]
+
+Imports are those of grimp (the library behind import-linter), inside functions and under TYPE_CHECKING included.
+"""
+
+import argparse
+import ast
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGES = ("libero_env", "lifelong", "libero")
+LONG = 40  # lines of a function
+
+_GRAPH = """
+import json, sys
+import grimp
+sys.path.insert(0, sys.argv[1])
+graph = grimp.build_graph(*sys.argv[2:], cache_dir=None)
+print(json.dumps({m: sorted(graph.find_modules_directly_imported_by(m)) for m in graph.modules}))
+"""
+
+
+def import_graph(checkout: Path) -> dict[str, list[str]]:
+    """Return module -> modules it imports, read in a process of its own from this checkout."""
+    import json
+
+    command = [sys.executable, "-P", "-c", _GRAPH, str(checkout), *PACKAGES]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True, cwd="/").stdout)
+
+
+def circles(graph: dict[str, list[str]]) -> list[set[str]]:
+    """Return the sets of nodes that reach each other (Tarjan's strongly connected components of two or more)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[set[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in graph.get(node, ()):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            at = stack.index(node)
+            if len(stack) - at > 1:
+                found.append(set(stack[at:]))
+            del stack[at:]
+
+    for node in sorted(graph):
+        if node not in index:
+            visit(node)
+    return found
+
+
+def entries(graph: dict[str, list[str]], package: str) -> dict[str, list[str]]:
+    """Return the import graph between what lies directly in a package."""
+    depth = package.count(".") + 1
+
+    def entry(module: str) -> str | None:
+        inside = module.startswith(f"{package}.")
+        return module.split(".")[depth] if inside else None
+
+    found: dict[str, set[str]] = {}
+    for module, imported in graph.items():
+        if (own := entry(module)) is not None:
+            others = {entry(other) for other in imported} - {None, own}
+            found.setdefault(own, set()).update(others)  # type: ignore[arg-type]
+    return {own: sorted(others) for own, others in found.items()}
+
+
+def levels(graph: dict[str, list[str]]) -> int:
+    """Return the length of the longest chain of imports, in which a circle counts once for each member."""
+    member = {node: i for i, circle in enumerate(circles(graph)) for node in circle}
+    group = {node: f"circle {member[node]}" if node in member else node for node in graph}
+    size: dict[str, int] = {}
+    below: dict[str, set[str]] = {}
+    for node, others in graph.items():
+        size[group[node]] = size.get(group[node], 0) + 1
+        below.setdefault(group[node], set()).update(group[other] for other in others)
+    height: dict[str, int] = {}
+
+    def measure(node: str) -> int:
+        if node not in height:
+            height[node] = size[node] + max((measure(o) for o in below[node] - {node}), default=0)
+        return height[node]
+
+    return max(map(measure, below), default=0)
+
+
+def sources(checkout: Path, package: str) -> Iterator[tuple[str, ast.Module]]:
+    """Yield text and syntax tree of the files of a package."""
+    for file in sorted((checkout / package).rglob("*.py")):
+        text = file.read_text(encoding="utf-8")
+        yield text, ast.parse(text)
+
+
+def long_functions(tree: ast.Module) -> int:
+    """Return how many functions are longer than `LONG` lines, docstrings included."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    return sum(
+        isinstance(n, kinds) and (n.end_lineno or n.lineno) - n.lineno + 1 > LONG for n in ast.walk(tree)
+    )
+
+
+def exempt_modules(checkout: Path) -> int:
+    """Return how many modules mypy leaves out."""
+    overrides = tomllib.loads((checkout / "pyproject.toml").read_text())["tool"]["mypy"]["overrides"]
+    return sum(len(o["module"]) for o in overrides if o.get("ignore_errors"))
+
+
+def measure(checkout: Path) -> dict[str, str]:
+    """Return the figures of a checkout."""
+    graph, figures = import_graph(checkout), {}
+    for package in (*PACKAGES, "libero_env.expert"):
+        own = entries(graph, package)
+        inside = sum(
+            len({*others} & circle) for circle in circles(own) for n, others in own.items() if n in circle
+        )
+        figures[package] = (
+            f"{len(own)} entries, {levels(own)} levels, {sum(map(len, own.values()))} imports between them, "
+            f"{inside} of them in circles"
+        )
+    figures["circles of modules"] = str(len(circles(graph)))
+    read = {package: list(sources(checkout, package)) for package in PACKAGES}
+    lines = {package: sum(text.count("\n") for text, _ in files) for package, files in read.items()}
+    figures["lines"] = f"{sum(lines.values())}: " + ", ".join(f"{k} {v}" for k, v in lines.items())
+    trees = [tree for files in read.values() for _, tree in files]
+    figures[f"functions over {LONG} lines"] = str(sum(map(long_functions, trees)))
+    figures["modules exempt from mypy"] = str(exempt_modules(checkout))
+    skipped = sum(
+        file.read_text(encoding="utf-8").count("# fmt: " + "skip")
+        for folder in (*PACKAGES, "tests", "experiments")
+        for file in (checkout / folder).rglob("*.py")
+    )
+    figures["lines that the formatter skips"] = str(skipped)
+    return figures
+
+
+def main() -> None:
+    """Print the figures of one checkout, or of several side by side."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("checkouts", nargs="*", type=Path, default=[Path(__file__).parents[2]])
+    for checkout in parser.parse_args().checkouts:
+        print(checkout)
+        for name, value in measure(checkout.resolve()).items():
+            print(f"  {name:32} {value}")
+
+
+if __name__ == "__main__":
+    main()

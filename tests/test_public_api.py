@@ -1,0 +1,79 @@
+"""The names that packages offer: what users import, loaded when it is first used."""
+
+import importlib
+import json
+import pkgutil
+import subprocess
+import sys
+
+import pytest
+
+import libero_env
+import lifelong
+
+pytestmark = pytest.mark.unit
+
+OFFERED = {
+    "libero_env": {
+        *(
+            "BatchEnv",
+            "Expert",
+            "LiberoEnv",
+            "LiberoError",
+            "SubprocEnv",
+            "Suite",
+            "Task",
+            "UnknownNameError",
+        ),
+        *("ensure_demos", "get_suite", "get_task", "make_task", "read_demos", "read_task"),
+        *("register_object", "register_predicate"),
+    },
+    "lifelong": {
+        *("Algorithm", "Batch", "EvalSettings", "FitSettings", "LifelongError", "Policy", "PolicySpec"),
+        *("fit", "lifelong_metrics", "rollout", "write_report"),
+    },
+}
+PACKAGES = sorted(
+    module.name
+    for root in (libero_env, lifelong)
+    for module in [
+        pkgutil.ModuleInfo(None, root.__name__, True),  # type: ignore[arg-type]
+        *pkgutil.walk_packages(root.__path__, f"{root.__name__}."),
+    ]
+    if module.ispkg
+)
+
+
+@pytest.mark.parametrize("package", OFFERED)
+def test_packages_offer_what_the_documentation_uses(package):
+    module = importlib.import_module(package)
+    assert set(module.__all__) == OFFERED[package]
+    assert dir(module) == sorted(module.__all__)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_offered_name_exists(package):
+    module = importlib.import_module(package)
+    for name in getattr(module, "__all__", ()):
+        assert getattr(module, name) is not None
+        assert not isinstance(getattr(module, name), type(sys)), f"{package}.{name} is a module"
+
+
+@pytest.mark.parametrize(
+    ("package", "heavy"),
+    [
+        ("libero_env", {"mujoco", "torch", "numpy", "h5py"}),
+        ("lifelong", {"mujoco", "torch", "numpy", "hydra"}),
+    ],
+)
+def test_importing_a_package_loads_nothing_heavy(package, heavy):
+    code = f"import json, sys, {package}; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not heavy & set(json.loads(done.stdout))
+
+
+def test_a_name_that_does_not_exist_is_refused():
+    with pytest.raises(ImportError, match="LiberoEvn"):
+        from libero_env import LiberoEvn  # noqa: F401
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = lifelong.nothing  # type: ignore[attr-defined]
