@@ -94,7 +94,7 @@ def test_broken_demonstrations_are_told_apart(demo_file, tmp_path, capsys):
     cut.write_bytes(demo_file.read_bytes()[:2000])
     assert cli.main(["demos", "check", str(tmp_path)]) == 1
     out = capsys.readouterr().out
-    assert f"ok    {demo_file}" in out and f"FAIL  {cut}: not a whole HDF5 file" in out
+    assert f"ok    {demo_file}" in out and f"FAIL  {cut}: not a complete HDF5 file" in out
 
 
 @pytest.mark.parametrize("command", ["info", "check"])

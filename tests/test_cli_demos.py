@@ -8,7 +8,7 @@ import pytest
 
 from libero_env.cli import demos as cli_demos
 from libero_env.demos.read import read_demos
-from libero_env.demos.record import Tally
+from libero_env.demos.record import RecordingReport
 from lifelong.cli import main as cli
 from tests.harness.demos import wander
 
@@ -72,19 +72,19 @@ def test_every_tool_runs(file, tmp_path, capsys):
 
 
 def test_failures_are_counted_by_kind():
-    tally = Tally(recorded=2, attempts=8)
-    tally.reasons.update(
+    report = RecordingReport(recorded=2, attempts=8)
+    report.failure_reasons.update(
         {"in phase reach after 250 steps": 2, "in phase reach after 91 steps": 3, "mug_1 tipped": 1}
     )
-    lines = cli_demos.report(tally)
+    lines = cli_demos.report_lines(report)
     assert lines == [
         "2 of 8 attempts successful (25 %)",
         "5 x in phase reach after N steps",
         "1 x mug_1 tipped",
     ]
-    tally.error = "it gave up"
-    assert cli_demos.report(tally)[-1] == "ERROR it gave up"
-    assert cli_demos.summary({Path("a"): Tally(3), Path("b"): tally}, 3) == (
+    report.error = "it gave up"
+    assert cli_demos.report_lines(report)[-1] == "ERROR it gave up"
+    assert cli_demos.summary({Path("a"): RecordingReport(3), Path("b"): report}, 3) == (
         "1 of 2 tasks complete, 25.0 % of 8 attempts successful"
     )
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from libero_env.demos.record import Recipe, Studio
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.record import DemoRecorder
 from libero_env.tasks import get_suite
 
 MOMENTS = (0.0, 0.2, 0.4, 0.55, 0.8, 1.0)
@@ -14,10 +15,10 @@ MOMENTS = (0.0, 0.2, 0.4, 0.55, 0.8, 1.0)
 def main() -> None:
     columns = []
     for task in get_suite("libero_object").tasks:
-        studio = Studio(Recipe(task.id, (96, 96)))
-        attempts = [attempt for _, attempt in studio.attempt([(0, 0)])]
-        obs = studio.film(attempts[0], {}).obs
-        studio.close()
+        recorder = DemoRecorder(DemoConfig(task.id, (96, 96)))
+        attempts = [attempt for _, attempt in recorder.attempt([(0, 0)])]
+        obs = recorder.episode(attempts[0]).obs
+        recorder.close()
         moments = [round(m * (len(attempts[0]) - 1)) for m in MOMENTS]
         views = [np.concatenate([obs[k][t] for k in ("agentview_rgb", "eye_in_hand_rgb")]) for t in moments]
         columns.append(np.concatenate(views))

@@ -11,8 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from libero_env.demos.config import DemoConfig, RecordingJob
 from libero_env.demos.generate import make_demos
-from libero_env.demos.record import Recipe
 from libero_env.parallel import cpu_count
 from libero_env.tasks import get_suite
 
@@ -20,15 +20,15 @@ from libero_env.tasks import get_suite
 def seconds(suite: str, n: int, size: int, workers: int, images: bool) -> float:
     """Wall time of recording n demonstrations of each task."""
     with tempfile.TemporaryDirectory() as folder:
-        shots = {} if images else {"cameras": (), "pictures": ()}
-        recipes = [Recipe(task, (size, size), **shots) for task in get_suite(suite).tasks]
-        jobs = [(recipe, Path(folder) / f"{recipe.task.name}_demo.hdf5") for recipe in recipes]
+        rendered = {} if images else {"cameras": (), "modalities": ()}
+        configs = [DemoConfig(task, (size, size), **rendered) for task in get_suite(suite).tasks]
+        jobs = [RecordingJob(config, Path(folder) / f"{config.task.name}_demo.hdf5") for config in configs]
         started = time.perf_counter()
-        tallies = make_demos(jobs, n, workers=workers)
+        reports = make_demos(jobs, n, workers=workers)
         took = time.perf_counter() - started
-    for path, tally in tallies.items():
-        if tally.error:
-            raise SystemExit(f"{path.name}: {tally.error}")
+    for path, report in reports.items():
+        if report.error:
+            raise SystemExit(f"{path.name}: {report.error}")
     return took
 
 

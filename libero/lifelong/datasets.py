@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
 from libero._adapters.lifelong.observations import picture
-from libero_env.demos.read import demo_files, demo_names, opened, read_demos
+from libero_env.demos.read import demo_files, demo_names, open_demo_file, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import SequenceVLDataset as Windows
 from lifelong.types import PolicySpec
@@ -163,7 +163,7 @@ def _keys(obs_modality: Mapping[str, Sequence[str]] | Sequence[str], kind: str) 
 def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
     """Shapes of one frame's observations."""
     file = next(iter(demo_files(path)), path)
-    with opened(file) as handle:
+    with open_demo_file(file) as handle:
         names = demo_names(handle, file)
         obs = handle["data"][names[0]]["obs"] if names else {}
         missing = [key for key in keys if key not in obs]
@@ -178,7 +178,7 @@ def _read(path: Path, spec: PolicySpec, filter_key: str | None, pairing: str, la
     language = torch.zeros(1)
     if filter_key is None:
         return Windows.from_file(path, spec=spec, language=language, pairing=pairing, labels=labels)
-    with opened(path) as handle:
+    with open_demo_file(path) as handle:
         if filter_key not in handle.get("mask", {}):
             known = ", ".join(handle.get("mask", {})) or "none"
             raise DemoError(f"{path}: no subset {filter_key!r}; there is {known}")

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from libero.scripts.command import option, script
-from libero_env.cli.teleop import add_device, run_teleop
+from libero_env.cli.teleop import add_device_options, run_teleop
 from libero_env.errors import LiberoError
 from libero_env.tasks import read_task
 
@@ -20,7 +20,7 @@ OPTIONS = (
     option("--size", type=int, default=128, help="size of the recorded pictures, pixels (default: 128)"),
     option("--seed", type=int, default=0, help="seed of the initial states (default: 0)"),
     option("--screen", default="auto", choices=("auto", "window", "terminal"), help="where it is shown"),
-    add_device,
+    add_device_options,
 )
 
 

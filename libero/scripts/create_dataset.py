@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from libero.libero.utils.dataset_utils import get_dataset_info
 from libero.scripts.command import option, script
-from libero_env.demos.curate import header_of, read_episodes, task_of
-from libero_env.demos.observe import Filmer, Shots, fixtures_of
+from libero_env.demos.curate import read_episodes, read_header, recorded_task
+from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import LOW_DIM_KEYS
 from libero_env.demos.replay import rerender
 from libero_env.demos.write import DemoWriter
@@ -30,17 +30,17 @@ from libero_env.demos.write import DemoWriter
 )
 def main(args: argparse.Namespace) -> None:
     """Write the data set and print what it holds."""
-    task = task_of(args.demo_file)
+    task = recorded_task(args.demo_file)
     name = args.dataset_name or f"{task.suite}/{task.name}_demo.hdf5"
     target = args.dataset_path / (name if name.endswith(".hdf5") else f"{name}.hdf5")
-    pictures = ("rgb", "depth") if args.use_depth else ("rgb",)
-    cameras = Shots().cameras if args.use_camera_obs else ()
-    shots = Shots(cameras, (args.size, args.size), pictures)
+    modalities = ("rgb", "depth") if args.use_depth else ("rgb",)
+    cameras = RenderConfig().cameras if args.use_camera_obs else ()
+    config = RenderConfig(cameras, (args.size, args.size), modalities)
     if args.use_actions:
         with tempfile.TemporaryDirectory() as folder:
-            rerender(acted(args.demo_file, Path(folder) / "acted.hdf5"), target, shots)
+            rerender(acted(args.demo_file, Path(folder) / "acted.hdf5"), target, config)
     else:
-        rerender(args.demo_file, target, shots)
+        rerender(args.demo_file, target, config)
     if args.no_proprio:
         drop_proprioception(target)
     print(target)
@@ -53,12 +53,13 @@ def acted(file: Path, target: Path) -> Path:
     Raises:
         DemoError: The file is broken or does not fit the scene of its task.
     """
-    filmer, writer = Filmer(task_of(file), Shots(())), DemoWriter(target, header_of(file))
-    world = filmer.env.world
+    renderer = StateRenderer(recorded_task(file), RenderConfig(()))
+    writer = DemoWriter(target, read_header(file))
+    world = renderer.env.world
     try:
         for name, episode in tqdm(read_episodes(file), desc="acting", unit="demo", disable=None):
-            filmer.pose_fixtures(fixtures_of(episode.attrs, filmer.scene, f"{file}: {name}"))
-            filmer.env.set_state(episode.states[0])
+            renderer.place_fixtures(fixture_poses(episode, renderer.scene, f"{file}: {name}"))
+            renderer.env.set_state(episode.states[0])
             states = []
             for action in episode.actions:
                 states.append(world.physics_state(0))
@@ -66,7 +67,7 @@ def acted(file: Path, target: Path) -> Path:
             success = bool(world.judge(0)[0])
             writer.write(int(name[5:]), replace(episode, states=np.array(states), success=success))
     finally:
-        filmer.close()
+        renderer.close()
     return writer.finish()
 
 

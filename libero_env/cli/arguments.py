@@ -6,7 +6,7 @@ Subparsers = argparse._SubParsersAction  # argparse has no public name for it
 
 
 def positive(text: str) -> int:
-    """An integer of at least 1, for argparse."""
+    """Return an integer of at least 1, for argparse."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not at least 1")
@@ -14,15 +14,15 @@ def positive(text: str) -> int:
 
 
 def size(text: str) -> tuple[int, int]:
-    """`128` or `120x160`: (height, width), for argparse."""
+    """Return (height, width) from `128` or `120x160`, for argparse."""
     numbers = [positive(part) for part in text.split("x")]
     if len(numbers) > 2:
         raise argparse.ArgumentTypeError(f"{text} is neither N nor HEIGHTxWIDTH")
     return numbers[0], numbers[-1]
 
 
-def pictures(args: argparse.Namespace) -> tuple[str, ...]:
-    """Kinds of picture that the options ask for."""
+def modalities(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the kinds of image that the options ask for, as `RenderConfig` names them."""
     if getattr(args, "no_images", False):
         return ()
     depth = ("depth",) if args.depth else ()

@@ -1,4 +1,4 @@
-"""`libero demos`: record demonstrations, say what there is, check files."""
+"""`libero demos`: record demonstrations, describe and check files."""
 
 import argparse
 import re
@@ -7,88 +7,90 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.cli import demos_edit as cli_demos_tools
-from libero_env.cli.arguments import pictures, positive, size
-from libero_env.demos.curate import describe, find_files
+from libero_env.cli import demos_edit
+from libero_env.cli.arguments import Subparsers, modalities, positive, size
+from libero_env.demos.curate import describe, find_demo_files
 
 if TYPE_CHECKING:
-    from libero_env.demos.record import Recipe, Tally, Variation
+    from libero_env.demos.config import DemoConfig, Variation
+    from libero_env.demos.record import RecordingReport
 
 VARIATIONS = ("style", "noise", "pushes")
 CAMERAS = ("agentview", "robot0_eye_in_hand")
-SHOWN_REASONS = 3  # of failed attempts at a task
+SHOWN_REASONS = 3  # most frequent reasons of failure that are listed for a task
 
 
-def register(subparsers: "argparse._SubParsersAction") -> None:
-    """`libero demos generate|download|info|check|replay|rerender|filter|export`"""
+def register(subparsers: Subparsers) -> None:
+    """Add `libero demos generate|download|info|check|replay|rerender|filter|export`."""
     parser = subparsers.add_parser("demos", help="record demonstrations, look at them, convert them")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _register_generate(commands)
     _register_download(commands)
-    places = "files or folders (default: where demonstrations are kept)"
-    info = commands.add_parser("info", help="the demonstration files in a folder")
-    info.add_argument("paths", nargs="*", type=Path, help=places)
+    paths = "files or folders (default: where demonstrations are kept)"
+    info = commands.add_parser("info", help="list the demonstration files in a folder")
+    info.add_argument("paths", nargs="*", type=Path, help=paths)
     info.set_defaults(run=run_info)
-    check = commands.add_parser("check", help="read demonstrations whole and say what is in them or broken")
-    check.add_argument("paths", nargs="*", type=Path, help=places)
+    check = commands.add_parser("check", help="read files completely and report what is in them or broken")
+    check.add_argument("paths", nargs="*", type=Path, help=paths)
     check.set_defaults(run=run_check)
-    cli_demos_tools.register(commands)
+    demos_edit.register(commands)
 
 
-def _register_generate(commands: "argparse._SubParsersAction") -> None:
+def _register_generate(commands: Subparsers) -> None:
     generate = commands.add_parser(
-        "generate", help="record with the scripted expert; goes on where it was stopped"
+        "generate", help="record with the scripted expert; an interrupted recording can be resumed"
     )
-    what = generate.add_mutually_exclusive_group(required=True)
-    what.add_argument("--benchmark", "--suite", help="all tasks of a suite, such as libero_object")
-    what.add_argument("--task", help="one task, such as libero_goal/3")
-    what.add_argument("--bddl", type=Path, help="a task file of your own")
+    tasks = generate.add_mutually_exclusive_group(required=True)
+    tasks.add_argument("--benchmark", "--suite", help="all tasks of a suite, such as libero_object")
+    tasks.add_argument("--task", help="one task, such as libero_goal/3")
+    tasks.add_argument("--bddl", type=Path, help="a user-defined task file")
     add = generate.add_argument
     add("--n", type=positive, default=50, help="demonstrations of each task (default: 50)")
-    add("--size", type=size, default=(128, 128), help="of the pictures, 128 or 120x160 (default: 128)")
-    add("--cameras", nargs="+", default=CAMERAS, help=f"what is drawn (default: {' '.join(CAMERAS)})")
+    add("--size", type=size, default=(128, 128), help="size of the images, 128 or 120x160 (default: 128)")
+    add("--cameras", nargs="+", default=CAMERAS, help=f"cameras to render (default: {' '.join(CAMERAS)})")
     add(
         "--no-images",
         action="store_true",
-        help="states, proprioception and actions alone; rerender draws later",
+        help="record states, proprioception and actions only; `rerender` can add images later",
     )
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
-    add("--seed", type=int, default=0, help="of starts and manners (default: 0)")
+    add("--seed", type=int, default=0, help="seed of starts, motion styles and action noise (default: 0)")
     add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
     add(
         "--variation",
         nargs="+",
         choices=(*VARIATIONS, "none"),
         default=VARIATIONS,
-        help="of the manner and of the executed actions (default: all)",
+        help="what varies: the motion style, noise on the executed actions, pushes (default: all)",
     )
     add("--noise", type=float, help="standard deviation of the noise on actions (default: 0.12)")
     add(
         "--pairing",
         choices=("aligned", "libero"),
         default="aligned",
-        help="observations before their action, or after it as in the original (default: aligned)",
+        help="store the observation before an action, or the one after it as the original does (default: aligned)",
     )
-    add("--workers", type=int, default=0, help="processes (default: one for each core)")
-    add("--folder", type=Path, help="where to keep them (default: LIBERO_DEMOS, or in the cache)")
+    add("--workers", type=int, default=0, help="number of processes (default: one per core)")
+    add("--folder", type=Path, help="where to keep the files (default: LIBERO_DEMOS, or in the cache)")
     generate.set_defaults(run=run_generate)
 
 
-def _register_download(commands: "argparse._SubParsersAction") -> None:
+def _register_download(commands: Subparsers) -> None:
     download = commands.add_parser(
-        "download", help="fetch those that people recorded for the original; goes on where it was stopped"
+        "download",
+        help="download the original's human demonstrations; an interrupted download can be resumed",
     )
     add = download.add_argument
     add("names", nargs="+", help="suites such as libero_object, or tasks such as libero_object/3")
-    add("--dest", type=Path, help="the folder (default: where demonstrations are kept)")
+    add("--dest", type=Path, help="folder to write (default: where demonstrations are kept)")
     add("--revision", help="commit, tag or branch of the data set (default: a pinned commit)")
-    add("--overwrite", action="store_true", help="replace files that are there and are others")
+    add("--overwrite", action="store_true", help="replace existing files of other contents")
     download.set_defaults(run=run_download)
 
 
 def run_download(args: argparse.Namespace) -> None:
-    """Fetch, then name the files."""
+    """Download, then list the files."""
     from libero_env.demos.download import REVISION, download_demos
 
     for path in download_demos(
@@ -98,90 +100,97 @@ def run_download(args: argparse.Namespace) -> None:
 
 
 def run_generate(args: argparse.Namespace) -> int:
-    """Record what is missing, then list the files and what failed; 1 where a task is not complete."""
+    """Record what is missing, then list the files and the failures; return 1 if a task is not complete."""
+    from libero_env.demos.config import RecordingJob
     from libero_env.demos.generate import demo_path, make_demos
     from libero_env.paths import demos_dir
 
     root = args.folder or demos_dir()
-    jobs = [(recipe, demo_path(root, recipe)) for recipe in recipes(args)]
-    tallies = make_demos(jobs, args.n, workers=args.workers, replace=True)
-    for path, tally in tallies.items():
+    jobs = [RecordingJob(config, demo_path(root, config)) for config in demo_configs(args)]
+    reports = make_demos(jobs, args.n, workers=args.workers, replace=True)
+    for path, report in reports.items():
         print(describe(path) if path.is_file() else f"{path}: not complete")
-        for line in report(tally):
+        for line in report_lines(report):
             print(f"    {line}")
-    if len(tallies) > 1:
-        print(summary(tallies, args.n))
-    return int(any(tally.error for tally in tallies.values()))
+    if len(reports) > 1:
+        print(summary(reports, args.n))
+    return int(any(report.error for report in reports.values()))
 
 
-def recipes(args: argparse.Namespace) -> "list[Recipe]":
-    """What the options of `generate` ask for."""
-    from libero_env.demos.record import Recipe
+def demo_configs(args: argparse.Namespace) -> "list[DemoConfig]":
+    """Return the configurations of the demonstrations that the options of `generate` ask for, one per task."""
+    from libero_env.demos.config import DemoConfig
     from libero_env.tasks import get_suite, get_task, read_task
 
     if args.benchmark:
         tasks = get_suite(args.benchmark).tasks
     else:
         tasks = (read_task(args.bddl) if args.bddl else get_task(args.task),)
-    disturb, varied = bool({"noise", "pushes"} & set(args.variation)), variation(args)
-    cameras = () if args.no_images else tuple(args.cameras)
     return [
-        Recipe(task, args.size, args.seed, args.pairing, disturb, varied, cameras, pictures(args))
+        DemoConfig(
+            task,
+            args.size,
+            args.seed,
+            args.pairing,
+            disturb=bool({"noise", "pushes"} & set(args.variation)),
+            variation=variation(args),
+            cameras=() if args.no_images else tuple(args.cameras),
+            modalities=modalities(args),
+        )
         for task in tasks
     ]
 
 
 def variation(args: argparse.Namespace) -> "Variation":
-    """How demonstrations differ from each other."""
-    from libero_env.demos.record import Variation
+    """Return how the demonstrations differ from each other, by the options of `generate`."""
+    from libero_env.demos.config import Variation
 
-    usual = Variation()
-    noise = usual.noise if args.noise is None else args.noise
+    default = Variation()
+    noise = default.noise if args.noise is None else args.noise
     return Variation(
         style="style" in args.variation,
         noise=noise if "noise" in args.variation else 0.0,
-        push_rate=usual.push_rate if "pushes" in args.variation else 0.0,
+        push_rate=default.push_rate if "pushes" in args.variation else 0.0,
         reserved=args.reserved,
     )
 
 
-def report(tally: "Tally") -> list[str]:
-    """What came of one task: the share of attempts that succeeded, and why others failed."""
-    if not tally.attempts:
-        return [tally.error] if tally.error else []
-    failed = tally.reasons.total()
-    share = f"{tally.attempts - failed} of {tally.attempts} attempts successful"
-    lines = [f"{share} ({100 * (1 - failed / tally.attempts):.0f} %)"]
-    # reasons that differ in numbers alone are the same
-    alike: Counter[str] = Counter()
-    for reason, count in tally.reasons.items():
-        alike[re.sub(r"(?<!\w)\d+(\.\d+)?", "N", reason)] += count
-    lines += [f"{count} x {reason}" for reason, count in alike.most_common(SHOWN_REASONS)]
-    return lines + ([f"ERROR {tally.error}"] if tally.error else [])
+def report_lines(report: "RecordingReport") -> list[str]:
+    """Return the outcome of one task: the share of attempts that succeeded, and why others failed."""
+    if not report.attempts:
+        return [report.error] if report.error else []
+    failed = report.failure_reasons.total()
+    share = f"{report.attempts - failed} of {report.attempts} attempts successful"
+    lines = [f"{share} ({100 * (1 - failed / report.attempts):.0f} %)"]
+    reasons: Counter[str] = Counter()
+    for reason, count in report.failure_reasons.items():
+        reasons[re.sub(r"(?<!\w)\d+(\.\d+)?", "N", reason)] += count  # reasons may differ in numbers only
+    lines += [f"{count} x {reason}" for reason, count in reasons.most_common(SHOWN_REASONS)]
+    return lines + ([f"ERROR {report.error}"] if report.error else [])
 
 
-def summary(tallies: "Mapping[Path, Tally]", n: int) -> str:
-    """One line about all tasks."""
-    done = sum(not tally.error and tally.recorded >= n for tally in tallies.values())
-    attempts = sum(tally.attempts for tally in tallies.values())
-    failed = sum(tally.reasons.total() for tally in tallies.values())
+def summary(reports: "Mapping[Path, RecordingReport]", n: int) -> str:
+    """Return one line about all tasks."""
+    done = sum(not report.error and report.recorded >= n for report in reports.values())
+    attempts = sum(report.attempts for report in reports.values())
+    failed = sum(report.failure_reasons.total() for report in reports.values())
     share = f", {100 * (1 - failed / attempts):.1f} % of {attempts} attempts successful" if attempts else ""
-    return f"{done} of {len(tallies)} tasks complete{share}"
+    return f"{done} of {len(reports)} tasks complete{share}"
 
 
 def run_info(args: argparse.Namespace) -> None:
-    """One line for each file."""
-    for path in find_files(args.paths):
+    """Print one line about each file."""
+    for path in find_demo_files(args.paths):
         print(describe(path))
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Read every file whole; 1 where one is broken."""
+    """Read every file completely; return 1 if one is broken."""
     from libero_env.demos.curate import examine
     from libero_env.errors import DemoError
 
     broken = 0
-    for path in find_files(args.paths):
+    for path in find_demo_files(args.paths):
         try:
             stats = examine(path)
         except DemoError as error:

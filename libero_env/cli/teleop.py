@@ -1,48 +1,48 @@
-"""`libero teleop`: record demonstrations by hand."""
+"""`libero teleop`: record demonstrations with a keyboard or a 3D mouse."""
 
 import argparse
 from pathlib import Path
 
-from libero_env.cli.arguments import positive, size
+from libero_env.cli.arguments import Subparsers, positive, size
 
 
-def register(subparsers: "argparse._SubParsersAction") -> None:
-    """`libero teleop TASK`"""
+def register(subparsers: Subparsers) -> None:
+    """Add `libero teleop TASK`."""
     parser = subparsers.add_parser("teleop", help="record demonstrations by hand: keyboard or 3D mouse")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("task", nargs="?", help="such as libero_goal/3")
-    what.add_argument("--bddl", type=Path, help="a task file of your own")
+    task = parser.add_mutually_exclusive_group(required=True)
+    task.add_argument("task", nargs="?", help="such as libero_goal/3")
+    task.add_argument("--bddl", type=Path, help="a user-defined task file")
     add = parser.add_argument
     add(
         "--out",
         type=Path,
-        help="demonstration file (default: <task>_demo.hdf5 here); goes on where it was stopped",
+        help="demonstration file (default: <task>_demo.hdf5 here); demonstrations that it has are kept",
     )
-    add("--n", type=positive, default=1, help="demonstrations that it shall have (default: 1)")
-    add("--size", type=size, default=(128, 128), help="of the pictures, 128 or 120x160 (default: 128)")
-    add("--seed", type=int, default=0, help="of the starts (default: 0)")
-    add("--camera", default="agentview", help="what is shown while recording (default: agentview)")
+    add("--n", type=positive, default=1, help="demonstrations that the file shall have (default: 1)")
+    add("--size", type=size, default=(128, 128), help="size of the images, 128 or 120x160 (default: 128)")
+    add("--seed", type=int, default=0, help="seed of the starts (default: 0)")
+    add("--camera", default="agentview", help="camera shown while recording (default: agentview)")
     add("--screen", default="auto", choices=("auto", "window", "terminal"), help="where it is shown")
-    add_device(parser)
+    add_device_options(parser)
     parser.set_defaults(run=run_teleop)
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
-    """Options about what the user acts through."""
+def add_device_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the input device."""
     add = parser.add_argument
-    add("--device", default="keyboard", choices=("keyboard", "spacemouse"), help="what you act through")
-    add("--pos-sensitivity", type=float, default=1.0, help="factor on motions (default: 1)")
-    add("--rot-sensitivity", type=float, default=1.0, help="factor on turns (default: 1)")
-    add("--vendor-id", type=int, default=9583, help="of the 3D mouse")
-    add("--product-id", type=int, default=50741, help="of the 3D mouse")
+    add("--device", default="keyboard", choices=("keyboard", "spacemouse"), help="input device")
+    add("--pos-sensitivity", type=float, default=1.0, help="factor on translations (default: 1)")
+    add("--rot-sensitivity", type=float, default=1.0, help="factor on rotations (default: 1)")
+    add("--vendor-id", type=int, default=9583, help="USB vendor of the 3D mouse (default: 9583)")
+    add("--product-id", type=int, default=50741, help="USB product of the 3D mouse (default: 50741)")
 
 
 def run_teleop(args: argparse.Namespace) -> int:
-    """Record; 1 where the user stopped before all were done."""
+    """Record demonstrations; return 1 if the user stopped before all were recorded."""
     from libero_env.tasks import get_task, read_task
     from libero_env.teleop.devices import HELP, Keyboard, SpaceMouse
     from libero_env.teleop.screens import MouseReader, open_screen
-    from libero_env.teleop.session import Teleop, record_by_hand
+    from libero_env.teleop.session import Teleop, record_session
 
     task = read_task(args.bddl) if args.bddl else get_task(args.task)
     out = args.out or Path(f"{task.name}_demo.hdf5")
@@ -59,10 +59,10 @@ def run_teleop(args: argparse.Namespace) -> int:
     try:
         teleop = Teleop(task, device, screen, seed=args.seed)
         try:
-            done = record_by_hand(teleop, out, args.n, size=args.size, tell=print)
+            recorded = record_session(teleop, out, args.n, size=args.size, report=print)
         finally:
             teleop.close()
     finally:
         screen.close()
-    print(f"{out}: {done} of {args.n} demonstrations")
-    return int(done < args.n)
+    print(f"{out}: {recorded} of {args.n} demonstrations")
+    return int(recorded < args.n)

@@ -1,15 +1,24 @@
-from .generate import ensure_demos
+from .config import DemoConfig, RecordingJob, Variation
+from .generate import ensure_demos, make_demos
+from .lerobot import export_lerobot
+from .observe import RenderConfig
 from .read import Demo, demo_lengths, iter_demos, read_demos
 from .replay import rerender
 from .write import DemoWriter, Episode
 
 __all__ = [
     "Demo",
+    "DemoConfig",
     "DemoWriter",
     "Episode",
+    "RecordingJob",
+    "RenderConfig",
+    "Variation",
     "demo_lengths",
     "ensure_demos",
+    "export_lerobot",
     "iter_demos",
+    "make_demos",
     "read_demos",
     "rerender",
 ]

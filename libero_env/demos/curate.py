@@ -1,4 +1,4 @@
-"""Demonstration files as a whole: whose they are, what is in them, and parts of them in a file of their own."""
+"""Demonstration files as a whole: which task they are of, what is in them, and files made of parts of them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -8,7 +8,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from libero_env.demos.read import LOW_DIM_KEYS, BrokenDemoError, check_demo, demo_names, is_picture, opened
+from libero_env.demos.read import (
+    LOW_DIM_KEYS,
+    BrokenDemoError,
+    check_demo,
+    demo_names,
+    is_image,
+    open_demo_file,
+)
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.paths import demos_dir
@@ -17,20 +24,25 @@ from libero_env.tasks import Task, bddl, get_suite
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.problem import same_meaning
 
-NOOP = 1e-3  # largest entry of an action's motion that counts as none
-_COUNTED = ("num_demos", "total", "num_failed_attempts")  # attributes that follow from the demonstrations
-_OWN = ("num_samples", "init_state", "success")  # likewise, of one demonstration
+NOOP_THRESHOLD = 1e-3  # [action units] largest motion that counts as none
+_COUNTS = ("num_demos", "total", "num_failed_attempts")  # attributes that follow from the demonstrations
+_DERIVED = (
+    "num_samples",
+    "init_state",
+    "success",
+    "fixtures",
+)  # attributes that follow from the episode's fields
 
 
 @dataclass(frozen=True)
 class DemoStats:
-    """What is in a file.
+    """Contents of a file.
 
     Attributes:
-        lengths: steps of each demonstration.
-        successes: how many reached the goal.
-        noops: steps in which nothing was wanted of the arm.
-        faults: what is wrong although it can be read.
+        lengths: Number of steps of each demonstration.
+        successes: Number of demonstrations that reached the goal.
+        noops: Number of no-op steps, see `noop_steps`.
+        faults: What is wrong although it can be read.
     """
 
     lengths: tuple[int, ...]
@@ -44,25 +56,28 @@ class DemoStats:
         return f"{length}, {self.successes} of {n} successful, {100 * self.noops / steps:.1f} % no-ops"
 
 
-def header_of(file: Path) -> dict[str, Any]:
-    """Attributes of a file's group `data`, those aside that count its demonstrations.
+def read_header(file: Path) -> dict[str, Any]:
+    """Return the attributes of a file's group `data`, without those that count its demonstrations.
 
     Raises:
-        DemoError: it is not a demonstration file.
+        DemoError: It is not a demonstration file.
     """
-    with opened(file) as handle:
+    with open_demo_file(file) as handle:
         demo_names(handle, file)
-        return {key: value for key, value in handle["data"].attrs.items() if key not in _COUNTED}
+        return {key: value for key, value in handle["data"].attrs.items() if key not in _COUNTS}
 
 
-def task_of(file: Path) -> Task:
-    """The task that was recorded: one of ours where the file names it and means the same, else what its text says.
+def recorded_task(file: Path) -> Task:
+    """Return the task that was recorded.
+
+    It is the benchmark's task that the file names, if the file's task text means the same, and else the task that the
+    text describes.
 
     Raises:
-        DemoError: the file names no task.
-        BDDLError: its task text cannot be read.
+        DemoError: The file names no task.
+        BDDLError: Its task text cannot be read.
     """
-    header = header_of(file)
+    header = read_header(file)
     name, text = Path(str(header.get("bddl_file_name", ""))), str(header.get("bddl_file_content", ""))
     try:
         known = next((t for t in get_suite(name.parent.name).tasks if t.name == name.stem), None)
@@ -71,7 +86,7 @@ def task_of(file: Path) -> Task:
     if not text.strip():
         if known is None:
             raise DemoError(
-                f"{file}: neither bddl_file_content nor bddl_file_name says which task was recorded"
+                f"{file}: neither bddl_file_content nor bddl_file_name states which task was recorded"
             )
         return known
     problem = bddl.parse(text, f"{file} bddl_file_content")
@@ -81,12 +96,12 @@ def task_of(file: Path) -> Task:
 
 
 def read_episodes(file: Path) -> Iterator[tuple[str, Episode]]:
-    """(name, all that is recorded) of each demonstration in turn; pictures are upright.
+    """Yield the name of each demonstration with all that is recorded of it; images are upright.
 
     Raises:
-        DemoError: at the first demonstration that is broken, or has no states.
+        DemoError: A demonstration is broken, or has no states; those before it have been returned.
     """
-    with opened(file) as handle:
+    with open_demo_file(file) as handle:
         for name in demo_names(handle, file):
             group = handle["data"][name]
             check_demo(group, file, name, group.get("obs", ()) if isinstance(group, h5py.Group) else ())
@@ -98,64 +113,84 @@ def read_episodes(file: Path) -> Iterator[tuple[str, Episode]]:
 def _read_episode(group: h5py.Group, file: Path, name: str) -> Episode:
     try:
         obs = {
-            key: np.ascontiguousarray(values[()][:, ::-1]) if is_picture(key) else values[()]
+            key: np.ascontiguousarray(values[()][:, ::-1]) if is_image(key) else values[()]
             for key, values in group.get("obs", {}).items()
-            if is_picture(key) or key in LOW_DIM_KEYS
+            if is_image(key) or key in LOW_DIM_KEYS
         }
-        arrays = {
-            k: group[k][()] if k in group else None for k in ("robot_states", "expert_actions", "rewards")
+        optional = {
+            key: group[key][()] if key in group else None
+            for key in ("robot_states", "expert_actions", "rewards")
         }
         actions, states = group["actions"][()], group["states"][()]
     except OSError as error:
         raise BrokenDemoError(f"{file}: {name} cannot be read ({error}); the file is damaged") from error
-    rewards, attrs = arrays.pop("rewards"), dict(group.attrs)
-    success = bool(attrs.get("success", rewards is None or rewards[-1] > 0))
-    own = {key: value for key, value in attrs.items() if key not in _OWN}
-    return Episode(actions, states, obs=obs, success=success, attrs=own, **arrays)
+    rewards, attrs = optional.pop("rewards"), dict(group.attrs)
+    return Episode(
+        actions,
+        states,
+        obs=obs,
+        success=bool(attrs.get("success", rewards is None or rewards[-1] > 0)),
+        fixtures=np.asarray(attrs["fixtures"], np.float64) if "fixtures" in attrs else None,
+        attrs={key: value for key, value in attrs.items() if key not in _DERIVED},
+        **optional,
+    )
 
 
-def noops(actions: np.ndarray, threshold: float = NOOP) -> np.ndarray:
-    """Which of the actions (T, 7) want nothing: no motion, and the gripper as before; (T,) bool."""
+def noop_steps(actions: np.ndarray, threshold: float = NOOP_THRESHOLD) -> np.ndarray:
+    """Return which actions do nothing: no motion, and the gripper command as before.
+
+    Args:
+        actions: (T, 7).
+        threshold: Largest entry of a motion that counts as none.
+
+    Returns:
+        (T,) bool.
+    """
     still = (np.abs(actions[:, :6]) <= threshold).all(axis=1)
-    same = np.concatenate([[True], actions[1:, 6] == actions[:-1, 6]])
-    return still & same
+    same_gripper = np.concatenate([[True], actions[1:, 6] == actions[:-1, 6]])
+    return still & same_gripper
 
 
-def examine(file: Path, *, threshold: float = NOOP) -> DemoStats:
-    """Read a file whole and say what is in it.
+def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
+    """Read a file completely and return what is in it.
+
+    Args:
+        file: Demonstration file.
+        threshold: As for `noop_steps`.
 
     Raises:
-        DemoError: it is broken; the message names file, demonstration, key and what was expected.
+        DemoError: The file is broken; the message names file, demonstration, key and what was expected.
     """
-    lengths, successes, still, faults = [], 0, 0, []
+    lengths, successes, noops, faults = [], 0, 0, []
     shapes: dict[str, tuple[int, ...]] = {}
     for name, episode in read_episodes(file):
-        lengths.append(len(episode.actions))
+        lengths.append(len(episode))
         successes += episode.success
-        still += int(noops(_labels(episode), threshold).sum())
-        arrays = {"actions": episode.actions, "states": episode.states}
-        arrays |= {f"obs/{key}": values for key, values in episode.obs.items()}
-        for key, values in arrays.items():
-            if values.dtype.kind == "f" and not np.isfinite(values).all():
-                faults.append(f"{name}/{key} has values that are not finite")
-            if shapes.setdefault(key, values.shape[1:]) != values.shape[1:]:
-                faults.append(
-                    f"{name}/{key} holds {values.shape[1:]}; expected {shapes[key]} as in the others"
-                )
-        if missing := sorted(shapes.keys() - arrays.keys()):
-            faults.append(f"{name} has no {', '.join(missing)}; expected them as in the others")
-        if np.abs(episode.actions).max() > 1.0 + 1e-6:
-            faults.append(
-                f"{name}/actions reach {np.abs(episode.actions).max():.2f}; expected numbers in [-1, 1]"
-            )
+        noops += int(noop_steps(episode.labels, threshold).sum())
+        faults += [f"{name}{fault}" for fault in _faults(episode, shapes)]
     if not lengths:
         raise DemoError(f"{file}: no demonstrations; expected at least data/demo_0. Record them again")
-    with opened(file) as handle:
+    with open_demo_file(file) as handle:
         counted = {key: handle["data"].attrs.get(key) for key in ("num_demos", "total")}
     for key, value in zip(counted, (len(lengths), sum(lengths)), strict=True):
         if counted[key] is not None and int(counted[key]) != value:
             faults.append(f"attribute {key} is {counted[key]}; expected {value}")
-    return DemoStats(tuple(lengths), successes, still, tuple(faults))
+    return DemoStats(tuple(lengths), successes, noops, tuple(faults))
+
+
+def _faults(episode: Episode, shapes: dict[str, tuple[int, ...]]) -> Iterator[str]:
+    """Yield what is wrong with an episode; `shapes` are those of the first ones, and new keys are added to them."""
+    arrays = {"actions": episode.actions, "states": episode.states}
+    arrays |= {f"obs/{key}": values for key, values in episode.obs.items()}
+    for key, values in arrays.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            yield f"/{key} has values that are not finite"
+        if shapes.setdefault(key, values.shape[1:]) != values.shape[1:]:
+            yield f"/{key} holds {values.shape[1:]}; expected {shapes[key]} as in the others"
+    if missing := sorted(shapes.keys() - arrays.keys()):
+        yield f" has no {', '.join(missing)}; expected them as in the others"
+    if (largest := np.abs(episode.actions).max()) > 1.0 + 1e-6:
+        yield f"/actions reach {largest:.2f}; expected numbers in [-1, 1]"
 
 
 def filter_demos(
@@ -164,70 +199,71 @@ def filter_demos(
     *,
     success_only: bool = False,
     without_noops: bool = False,
-    threshold: float = NOOP,
+    threshold: float = NOOP_THRESHOLD,
 ) -> DemoStats:
-    """Write what is wanted of a file into another one, demonstrations numbered anew; says what is there then.
+    """Write some of the demonstrations or steps of a file into another one; demonstrations are numbered from 0.
 
-    Without its no-ops a demonstration no longer replays by its actions; by its states it does. The last step stays.
+    Without its no-ops a demonstration can be replayed by its states, no longer by its actions. Its last step is always
+    kept.
 
     Args:
-        file: to read.
-        target: to write; must not be there.
-        success_only: leave out demonstrations that did not reach the goal.
-        without_noops: leave out steps of `noops`.
-        threshold: of `noops`.
+        file: File to read.
+        target: File to write; it must not exist.
+        success_only: Whether to leave out demonstrations that did not reach the goal.
+        without_noops: Whether to leave out the steps of `noop_steps`.
+        threshold: As for `noop_steps`.
+
+    Returns:
+        Contents of the new file.
 
     Raises:
-        DemoError: the file is broken, nothing of it is wanted, or the target exists.
+        DemoError: The file is broken, nothing of it is left, or the target exists.
     """
     if target.exists():
         raise DemoError(f"{target} exists; choose another name or remove it")
     dropped = [key for key, on in (("failures", success_only), ("no-ops", without_noops)) if on]
     writer = DemoWriter(
-        target, {**header_of(file), "filter": f"without {' and '.join(dropped) or 'nothing'}"}
+        target, {**read_header(file), "filter": f"without {' and '.join(dropped) or 'nothing'}"}
     )
     count = 0
     for name, episode in read_episodes(file):
         if success_only and not episode.success:
             continue
-        keep = ~noops(_labels(episode), threshold) if without_noops else np.ones(len(episode.actions), bool)
+        keep = ~noop_steps(episode.labels, threshold) if without_noops else np.ones(len(episode), bool)
         keep[-1] = True
-        writer.write(count, replace(select(episode, keep), attrs={**episode.attrs, "source_demo": name}))
+        kept = select_steps(episode, keep)
+        writer.write(count, replace(kept, attrs={**episode.attrs, "source_demo": name}))
         count += 1
     if not count:
         raise DemoError(f"{file}: no demonstration is successful; nothing to write")
     return examine(writer.finish())
 
 
-def select(episode: Episode, keep: np.ndarray) -> Episode:
-    """Some of the steps of a demonstration, by a mask (T,)."""
+def select_steps(episode: Episode, keep: np.ndarray) -> Episode:
+    """Return the episode with the steps of a mask (T,) only."""
 
-    def cut(values: np.ndarray | None) -> np.ndarray | None:
+    def select(values: np.ndarray | None) -> np.ndarray | None:
         return None if values is None else values[keep]
 
     return replace(
         episode,
         actions=episode.actions[keep],
         states=episode.states[keep],
-        robot_states=cut(episode.robot_states),
-        expert_actions=cut(episode.expert_actions),
+        robot_states=select(episode.robot_states),
+        expert_actions=select(episode.expert_actions),
         obs={key: values[keep] for key, values in episode.obs.items()},
     )
 
 
-def _labels(episode: Episode) -> np.ndarray:
-    """What the expert wanted, which is what there is to learn."""
-    return episode.actions if episode.expert_actions is None else episode.expert_actions
+def find_demo_files(paths: list[Path]) -> list[Path]:
+    """Return the demonstration files among the given paths and in the given folders.
 
-
-def find_files(paths: list[Path]) -> list[Path]:
-    """The demonstration files that the paths name or hold.
+    Args:
+        paths: Files and folders; none for the folder where demonstrations are kept.
 
     Raises:
-        DemoError: there is none.
+        DemoError: There are none.
     """
-    from libero_env.errors import DemoError
-
     paths = paths or [demos_dir()]
     found = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
     files = [file for group in found for file in group]
@@ -239,25 +275,22 @@ def find_files(paths: list[Path]) -> list[Path]:
     return files
 
 
-def describe(path: Path) -> str:
-    """How many demonstrations a file holds, their steps and pictures, and how many attempts failed.
+def describe(file: Path) -> str:
+    """Return one line about a file: demonstrations, steps, image size, failed attempts, pairing, bytes.
 
     Raises:
-        DemoError: it is not a demonstration file.
+        DemoError: It is not a demonstration file.
     """
-    from libero_env.demos.read import demo_names, opened
-    from libero_env.errors import DemoError
-
-    if not path.is_file():
-        raise DemoError(f"{path}: no such file")
-    with opened(path) as handle:
-        names = demo_names(handle, path)
+    if not file.is_file():
+        raise DemoError(f"{file}: no such file")
+    with open_demo_file(file) as handle:
+        names = demo_names(handle, file)
         data = handle["data"]
         steps = [len(data[name]["actions"]) if "actions" in data[name] else 0 for name in names]
         obs = data[names[0]].get("obs", {}) if names else {}
         colours = [key for key in obs if key.endswith("_rgb")]
-        seen = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no pictures"
+        images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no pictures"
         failed = data.attrs.get("num_failed_attempts", "unknown")
         pairing = data.attrs.get("pairing", "libero")
-    parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", seen, f"failed attempts: {failed}")
-    return f"{path}: {', '.join(parts)}, pairing: {pairing}, {show_bytes(path.stat().st_size)}"
+    parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", images, f"failed attempts: {failed}")
+    return f"{file}: {', '.join(parts)}, pairing: {pairing}, {show_bytes(file.stat().st_size)}"

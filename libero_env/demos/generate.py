@@ -1,27 +1,36 @@
-"""Making demonstrations: the scripted expert in batched simulations, on all cores, resumable.
+"""Demonstrations in any number: the scripted expert in batched simulations, on all cores, resumable.
 
-Demonstration k of a task depends on the seed and k alone (and on what the file says it was made with): not on the
-number of workers, on what was recorded before, or on how often the recording was interrupted.
+Demonstration k of a task depends on its configuration and on k alone: not on the number of workers, on what was
+recorded before, or on how often the recording was interrupted.
 """
 
 import shutil
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace as changed
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
+from libero_env.demos.config import GENERATOR, DemoConfig, RecordingJob
 from libero_env.demos.read import Pairing
-from libero_env.demos.record import BATCH, GENERATOR, Recipe, Tally, record_chunk
-from libero_env.demos.write import DemoWriter
+from libero_env.demos.record import (
+    BATCH,
+    RecorderCache,
+    RecordingReport,
+    initialize_worker,
+    record_chunk,
+    record_chunk_in_worker,
+)
 from libero_env.errors import DemoError
 from libero_env.parallel import cpu_count, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.tasks import Task, get_suite
+
+_Chunk = tuple[int, list[int]]  # position of a job, and the demonstrations of it to record together
+_Reports = Generator[tuple[int, RecordingReport]]  # position of a job, and the report on a chunk of it
 
 
 def generate(
@@ -36,27 +45,28 @@ def generate(
     disturb: bool = True,
     progress: bool | None = None,
 ) -> Path:
-    """Record the first `n` demonstrations of a task into one file; those that are there already stay.
+    """Record the first `n` demonstrations of a task into one file; those that exist already are kept.
 
-    `make_demos` takes a whole `Recipe`: other cameras, depth, variation.
+    For other cameras, depth, or another variation, give `make_demos` a whole `DemoConfig`.
 
     Args:
-        task: a `Task`, what `get_task` takes, or a BDDL file.
-        n: number of successful demonstrations; failed attempts are left out and counted in the file.
-        path: the file. An interrupted recording leaves `<path>.parts`, and goes on when called again.
-        seed: of placements, manners and disturbances. The 50 stored initial states are never used.
-        camera_size: (height, width), pixels.
-        workers: processes; 0 is one for each core, 1 records in this process.
-        pairing: see `libero_env.demos.read`.
-        disturb: disturb the executed actions; the file then also holds what the expert wanted.
-        progress: show a bar; None where stderr is a terminal.
+        task: A `Task`, what `get_task` takes, or the path of a BDDL file.
+        n: Number of successful demonstrations. Failed attempts are left out and counted in the file.
+        path: File to write. An interrupted recording leaves `<path>.parts`, from which the next call resumes.
+        seed: Seed of the starts, motion styles and action noise. The 50 stored initial states are never used.
+        camera_size: (height, width) of the images, pixels.
+        workers: Number of processes. 0 means one per core; 1 records in this process.
+        pairing: Which observation is stored with an action, see `libero_env.demos.read`.
+        disturb: Whether noise is added to the executed actions; the file then also holds the expert's own actions.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Raises:
-        DemoError: the file there was made otherwise, cannot be written, or the expert cannot do the task.
+        DemoError: The existing file was recorded with another configuration, the file cannot be written, or the
+            expert cannot do the task.
     """
-    recipe = Recipe(Recipe(task).task, (camera_size[0], camera_size[1]), seed, pairing, disturb)
+    config = DemoConfig(task, (camera_size[0], camera_size[1]), seed, pairing, disturb)
     path = Path(path)
-    _refuse_failures(make_demos([(recipe, path)], n, workers=workers, progress=progress))
+    _raise_errors(make_demos([RecordingJob(config, path)], n, workers=workers, progress=progress))
     return path
 
 
@@ -70,91 +80,99 @@ def ensure_demos(
     workers: int = 0,
     progress: bool | None = None,
 ) -> list[Path]:
-    """Demonstration files with at least `n` demonstrations for each task: found where they are, else recorded.
+    """Return demonstration files with at least `n` demonstrations of each task; what is missing is recorded.
 
-    Files are named by all that matters (suite, camera size, seed, generator), so that each is made once; one that was
-    recorded with another version of the scene is recorded anew. Several processes may call this at once.
+    The path of a file contains all that its demonstrations depend on (suite, camera size, seed, generator), so each
+    is recorded once. A file that was recorded with another version of the scene is recorded again. Several processes
+    may call this at the same time.
 
     Args:
-        tasks: name of a suite, or tasks.
-        n: demonstrations of each; the first `n` are the same however many there are.
-        camera_size, seed, workers, progress: as for `generate`.
-        root: folder of demonstrations; `libero_env.paths.demos_dir()` by default.
+        tasks: Name of a suite, or tasks.
+        n: Demonstrations of each task. The first `n` are the same however many there are.
+        camera_size: As for `generate`.
+        seed: As for `generate`.
+        root: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
+        workers: As for `generate`.
+        progress: As for `generate`.
 
     Returns:
-        One path for each task, in order.
+        One path per task, in order.
+
+    Raises:
+        DemoError: A file cannot be written, or the expert cannot do a task.
     """
     tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
     root = demos_dir() if root is None else Path(root)
-    jobs = [
-        (r, demo_path(root, r)) for r in (Recipe(t, (camera_size[0], camera_size[1]), seed) for t in tasks)
-    ]
-    _refuse_failures(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
-    return [path for _, path in jobs]
+    configs = [DemoConfig(task, (camera_size[0], camera_size[1]), seed) for task in tasks]
+    jobs = [RecordingJob(config, demo_path(root, config)) for config in configs]
+    _raise_errors(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
+    return [job.path for job in jobs]
 
 
 def make_demos(
-    jobs: Sequence[tuple[Recipe, Path]],
+    jobs: Sequence[RecordingJob],
     n: int,
     *,
     workers: int = 0,
     progress: bool | None = None,
     replace: bool = False,
-) -> dict[Path, Tally]:
-    """Record what is missing of the first `n` demonstrations of each job, all jobs on one pool of processes.
+) -> dict[Path, RecordingReport]:
+    """Record what is missing of the first `n` demonstrations of each job, all jobs in one pool of processes.
 
-    A task that the expert cannot do stops nothing else; its tally says why.
+    A task that the expert cannot do does not stop the others; its report states why.
 
     Args:
-        jobs: what to record, and into which file.
-        n: demonstrations of each.
-        workers, progress: as for `generate`.
-        replace: record again what was made otherwise; only for files that this package named itself.
+        jobs: What to record, and into which files.
+        n: Demonstrations of each job.
+        workers: As for `generate`.
+        progress: As for `generate`.
+        replace: Whether to record again what was recorded with another configuration. Only for files whose path
+            this package chose.
 
     Returns:
-        File -> what came of it, in the order of the jobs; no attempts where all was there.
+        File to report, in the order of the jobs. A file that was complete has no attempts.
 
     Raises:
-        DemoError: a file there was made otherwise, or one cannot be written.
+        DemoError: An existing file was recorded with another configuration, or a file cannot be written.
     """
-    tallies = {path: Tally(n) for _, path in jobs}
-    missing = [job for job in jobs if not _complete(*job, n)]
-    folders = sorted({path.parent for _, path in missing})
+    reports = {job.path: RecordingReport(n) for job in jobs}
+    missing = [job for job in jobs if not _is_complete(job, n)]
     with ExitStack() as locks:
-        for folder in folders:
-            locks.enter_context(_locked(folder))
-        missing = [job for job in missing if not _complete(*job, n)]
-        for recipe, path in missing if replace else ():
-            _make_way(DemoWriter(path, recipe.header()))
+        for folder in sorted({job.path.parent for job in missing}):
+            locks.enter_context(_recording_lock(folder))
+        missing = [
+            job for job in missing if not _is_complete(job, n)
+        ]  # other processes may have recorded some
+        for job in missing if replace else ():
+            _remove_outdated(job)
         if missing:
-            tallies |= record(missing, n, workers=workers, progress=progress)
-    return tallies
+            reports |= _record(missing, n, workers=workers, progress=progress)
+    return reports
 
 
-def _refuse_failures(tallies: dict[Path, Tally]) -> None:
-    failed = {path: tally for path, tally in tallies.items() if tally.error}
+def demo_path(root: Path, config: DemoConfig) -> Path:
+    """Return where `ensure_demos` keeps the demonstrations of a configuration; the path contains all that matters."""
+    (height, width), task = config.camera_size, config.task
+    plain = config == DemoConfig(config.source, config.camera_size, config.seed)
+    suffix = "" if plain else f"-{zlib.crc32(config.key().encode()):08x}"
+    folder = f"{height}x{width}-seed{config.seed}-{GENERATOR}{suffix}"
+    return root / task.suite / folder / f"{task.name}_demo.hdf5"
+
+
+def _raise_errors(reports: dict[Path, RecordingReport]) -> None:
+    failed = {path: report for path, report in reports.items() if report.error}
     if failed:
-        each = "; ".join(f"{path.name}: {tally.error}" for path, tally in failed.items())
-        raise DemoError(f"{len(failed)} of {len(tallies)} files are not complete. {each}")
+        each = "; ".join(f"{path.name}: {report.error}" for path, report in failed.items())
+        raise DemoError(f"{len(failed)} of {len(reports)} files are not complete. {each}")
 
 
-def demo_path(root: Path, recipe: Recipe) -> Path:
-    """Where `ensure_demos` keeps the demonstrations of a recipe: named by all that matters."""
-    (height, width), task = recipe.camera_size, recipe.task
-    usual = Recipe(recipe.source, recipe.camera_size, recipe.seed)
-    more = "" if recipe == usual else f"-{zlib.crc32(repr(changed(recipe, source='')).encode()):08x}"
-    return (
-        root / task.suite / f"{height}x{width}-seed{recipe.seed}-{GENERATOR}{more}" / f"{task.name}_demo.hdf5"
-    )
-
-
-def record(
-    jobs: Sequence[tuple[Recipe, Path]], n: int, *, workers: int = 0, progress: bool | None = None
-) -> dict[Path, Tally]:
-    """As `make_demos`, without a look at what other processes do."""
-    writers = [DemoWriter(path, recipe.header()) for recipe, path in jobs]
+def _record(
+    jobs: Sequence[RecordingJob], n: int, *, workers: int, progress: bool | None
+) -> dict[Path, RecordingReport]:
+    """Record as `make_demos` does, while no other process records in the same folders."""
+    writers = [job.writer() for job in jobs]
     missing = [sorted(set(range(n)) - writer.recorded()) for writer in writers]
-    tallies = [Tally(n - len(numbers)) for numbers in missing]
+    reports = [RecordingReport(n - len(numbers)) for numbers in missing]
     chunks = [
         (j, numbers[i : i + BATCH])
         for j, numbers in enumerate(missing)
@@ -162,78 +180,81 @@ def record(
     ]
     bar = tqdm(
         total=n * len(jobs),
-        initial=sum(tally.recorded for tally in tallies),
+        initial=sum(report.recorded for report in reports),
         desc="demonstrations",
         unit="demo",
         smoothing=0.1,
         disable=None if progress is None else not progress,
     )
-    with bar:
-        done = _run(
-            [(*jobs[j], numbers) for j, numbers in chunks], [j for j, _ in chunks], workers or cpu_count()
-        )
-        for j, tally in done:
-            tallies[j].add(tally)
-            bar.update(tally.recorded)
-            bar.set_postfix(failed=sum(t.reasons.total() for t in tallies), refresh=False)
-            if tallies[j].recorded == n:
+    workers = min(workers or cpu_count(), len(chunks))
+    for writer, numbers in zip(writers, missing, strict=True):
+        if not numbers:  # a process was killed after the last part
+            writer.finish()
+    with bar, closing(_in_processes(jobs, chunks, workers) if workers > 1 else _here(jobs, chunks)) as done:
+        for j, report in done:
+            reports[j].add(report)
+            bar.update(report.recorded)
+            bar.set_postfix(failed=sum(r.failure_reasons.total() for r in reports), refresh=False)
+            if reports[j].recorded == n:
                 writers[j].finish()
-    return {path: tally for (_, path), tally in zip(jobs, tallies, strict=True)}
+    return {job.path: report for job, report in zip(jobs, reports, strict=True)}
 
 
-def _run(
-    chunks: list[tuple[Recipe, Path, list[int]]], owners: list[int], workers: int
-) -> Iterator[tuple[int, Tally]]:
-    """Record chunks in processes; yields (owner, tally) as each is done. Chunks of an owner that has failed are left
-    out, as far as they have not begun."""
-    workers, failed = min(workers, len(chunks)), set()
-    if workers <= 1:
-        for owner, chunk in zip(owners, chunks, strict=True):
-            if owner not in failed:
-                tally = record_chunk(*chunk)
-                failed |= {owner} if tally.error else set()
-                yield owner, tally
-        return
-    pool = spawn_pool(workers)
-    futures: dict[Future[Tally], int] = {}
+def _here(jobs: Sequence[RecordingJob], chunks: list[_Chunk]) -> _Reports:
+    """Record in this process and yield the report on each chunk. A job ends at its first error."""
+    failed: set[int] = set()
+    with closing(RecorderCache()) as recorders:
+        for j, numbers in chunks:
+            if j not in failed:
+                report = record_chunk(jobs[j], numbers, recorders)
+                if report.error:
+                    failed.add(j)
+                yield j, report
+
+
+def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: int) -> _Reports:
+    """Record as `_here` does, in a pool of processes; chunks that have begun are finished after an error."""
+    pool = spawn_pool(workers, initializer=initialize_worker)
     try:
-        for owner, chunk in zip(owners, chunks, strict=True):
-            futures[pool.submit(record_chunk, *chunk)] = owner
-        for future in as_completed(futures):
+        owners: dict[Future[RecordingReport], int] = {
+            pool.submit(record_chunk_in_worker, jobs[j], numbers): j for j, numbers in chunks
+        }
+        for future in as_completed(owners):
             if future.cancelled():
                 continue
-            tally, owner = future.result(), futures[future]
-            if tally.error:
-                for other in [other for other, whose in futures.items() if whose == owner]:
-                    other.cancel()
-            yield owner, tally
+            report, j = future.result(), owners[future]
+            if report.error:
+                for other, owner in owners.items():
+                    if owner == j:
+                        other.cancel()
+            yield j, report
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _complete(recipe: Recipe, path: Path, n: int) -> bool:
-    """Whether the file has the first `n` demonstrations of the recipe."""
-    writer = DemoWriter(path, recipe.header())
+def _is_complete(job: RecordingJob, n: int) -> bool:
+    """Return whether the file has the first `n` demonstrations of the job."""
+    writer = job.writer()
     try:
-        return path.is_file() and not writer.parts.exists() and set(range(n)) <= writer.recorded()
+        return job.path.is_file() and not writer.parts.exists() and set(range(n)) <= writer.recorded()
     except DemoError:
         return False
 
 
-def _make_way(writer: DemoWriter) -> None:
-    """Remove what an older version of the scene or the expert left under the name of the file to be, or a broken one.
-    Only for files that this package named itself."""
+def _remove_outdated(job: RecordingJob) -> None:
+    """Remove a file or parts that are broken, or were recorded with an older version of the scene or the expert."""
+    writer = job.writer()
     try:
         writer.recorded()
     except DemoError as error:
         tqdm.write(f"recording again: {error}")
-        writer.path.unlink(missing_ok=True)
+        job.path.unlink(missing_ok=True)
         shutil.rmtree(writer.parts, ignore_errors=True)
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """One recording at a time in a folder; the lock of a process that was killed is free."""
+def _recording_lock(folder: Path) -> Iterator[None]:
+    """Let one process at a time record in a folder; the lock of a process that was killed is free."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / ".recording.lock")
     try:

@@ -1,9 +1,9 @@
-"""Demonstrations as a LeRobotDataset v3.0: low-dimensional data in Parquet, pictures in MP4, many episodes to a file.
+"""Demonstrations as a LeRobotDataset v3.0: low-dimensional data in Parquet, images in MP4, many episodes to a file.
 
 Needs the extra `export` (PyArrow and PyAV). Names are those of LeRobot's own LIBERO environment: `observation.state`
 (8: grip site position, hand axis-angle, fingers), `action` (7), `observation.images.image` for agentview,
-`observation.images.image2` for the hand, `observation.images.<camera>` for others. Pictures are upright, and each
-action stands beside the observation it was chosen on.
+`observation.images.image2` for the hand, `observation.images.<camera>` for others. Images are upright, and each
+action is paired with the observation on which it was chosen.
 """
 
 import json
@@ -16,20 +16,20 @@ from typing import Any, Literal
 import numpy as np
 from tqdm import tqdm
 
-from libero_env.demos.curate import header_of, read_episodes, task_of
+from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.lerobot_files import (
     DATA,
     DATA_MB,
     FILES_PER_CHUNK,
     VIDEO,
     VIDEO_MB,
-    Table,
-    Video,
+    CameraVideo,
+    ParquetTable,
     import_arrow,
 )
 from libero_env.demos.read import BrokenDemoError
 from libero_env.demos.statistics import Histogram, Moments
-from libero_env.demos.video import PIXELS, import_av
+from libero_env.demos.video import PIXEL_FORMAT, import_av
 from libero_env.demos.write import Episode
 from libero_env.errors import DemoError
 from libero_env.storage import atomic_folder
@@ -43,7 +43,7 @@ _CAMERAS = {"agentview": "image", "eye_in_hand": "image2"}
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 
-def export(
+def export_lerobot(
     files: Sequence[Path],
     root: Path,
     *,
@@ -51,74 +51,83 @@ def export(
     video_mb: float = VIDEO_MB,
     progress: bool | None = None,
 ) -> tuple[int, int]:
-    """Write demonstration files as one data set; returns (episodes, frames).
+    """Write demonstration files as one data set.
 
     Args:
-        files: read in this order; all have the same cameras and picture size.
-        root: a folder that is not there yet.
-        labels: as in `read_demos`.
-        video_mb: size from which a video goes on in another file, MB.
-        progress: show a bar; None where stderr is a terminal.
+        files: Files to read, in this order; all have the same cameras and image size.
+        root: Folder to write; it must not exist.
+        labels: As for `read_demos`.
+        video_mb: Size from which a video is continued in another file, [MiB].
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
+
+    Returns:
+        Number of episodes and number of frames.
 
     Raises:
-        DemoError: a file is broken or has other pictures than the first, or the folder exists.
+        DemoError: A file is broken or has other images than the first, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
     if root.exists():
         raise DemoError(f"{root} exists; choose another folder or remove it")
-    with atomic_folder(root) as folder, closing(_Dataset(folder, video_mb)) as dataset:
+    with atomic_folder(root) as folder, closing(_DatasetWriter(folder, video_mb)) as dataset:
         for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
-            language, pairing = _language(file), header_of(file).get("pairing", "libero")
+            language, pairing = _language(file), read_header(file).get("pairing", "libero")
             for name, episode in read_episodes(file):
-                dataset.add(_row(f"{file}: {name}", episode, pairing, labels), language)
+                dataset.add(_exported(f"{file}: {name}", episode, pairing, labels), language)
         dataset.close()
         return dataset.finish()
 
 
 @dataclass(frozen=True)
-class _Row:
-    """One episode as it is exported."""
+class _ExportedEpisode:
+    """One episode as it is exported.
 
-    state: np.ndarray  # (T, 8) float32
-    action: np.ndarray  # (T, 7) float32
+    Attributes:
+        state: (T, 8) float32.
+        action: (T, 7) float32.
+        success: Whether the goal was reached.
+        images: Feature to (T, H, W, 3) uint8.
+        where: File and demonstration, for error messages.
+    """
+
+    state: np.ndarray
+    action: np.ndarray
     success: bool
-    pictures: dict[str, np.ndarray]  # feature -> (T, H, W, 3) uint8
+    images: dict[str, np.ndarray]
     where: str
 
 
 def _language(file: Path) -> str:
-    header = header_of(file)
+    header = read_header(file)
     try:
         return json.loads(header["problem_info"])["language_instruction"]
     except (KeyError, ValueError):
-        return task_of(file).language
+        return recorded_task(file).language
 
 
-def _row(where: str, episode: Episode, pairing: str, labels: str) -> _Row:
-    wanted = episode.actions
-    if labels == "expert" and episode.expert_actions is not None:
-        wanted = episode.expert_actions
+def _exported(where: str, episode: Episode, pairing: str, labels: str) -> _ExportedEpisode:
+    actions = episode.labels if labels == "expert" else episode.actions
     obs = episode.obs
     for key in ("ee_pos", "ee_ori", "gripper_states"):
         if key not in obs:
             raise BrokenDemoError(f"{where}/obs/{key} is missing; expected it beside {', '.join(obs)}")
     if pairing == "libero":  # the observation before action t + 1 is the one after action t
-        obs, wanted = {key: values[:-1] for key, values in obs.items()}, wanted[1:]
-    if not len(wanted):
+        obs, actions = {key: values[:-1] for key, values in obs.items()}, actions[1:]
+    if not len(actions):
         raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
     state = np.concatenate([obs["ee_pos"], obs["ee_ori"], obs["gripper_states"]], axis=1).astype(np.float32)
-    pictures = {feature_of(key): values for key, values in obs.items() if key.endswith("_rgb")}
-    return _Row(state, wanted.astype(np.float32), episode.success, pictures, where)
+    images = {feature_of(key): values for key, values in obs.items() if key.endswith("_rgb")}
+    return _ExportedEpisode(state, actions.astype(np.float32), episode.success, images, where)
 
 
 def feature_of(key: str) -> str:
-    """The data set's name of a camera's pictures: `eye_in_hand_rgb` -> `observation.images.image2`."""
+    """Return the data set's name of a camera's images: `eye_in_hand_rgb` -> `observation.images.image2`."""
     camera = key.removesuffix("_rgb")
     return f"observation.images.{_CAMERAS.get(camera, camera)}"
 
 
-class _Dataset:
-    """A data set that grows by episodes."""
+class _DatasetWriter:
+    """Writes a data set episode by episode."""
 
     def __init__(self, root: Path, video_mb: float):
         self._pa, self._pq = import_arrow()
@@ -127,57 +136,51 @@ class _Dataset:
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
         self._shapes: dict[str, tuple[int, ...]] = {}
-        self._videos: dict[str, Video] = {}
+        self._videos: dict[str, CameraVideo] = {}
         self._video_mb = video_mb
-        self._data = Table(root)
+        self._data = ParquetTable(root)
         self._stats: dict[str, Any] = {}  # Moments or Histogram
 
-    def add(self, row: _Row, language: str) -> None:
+    def add(self, episode: _ExportedEpisode, language: str) -> None:
         """Append an episode."""
-        shapes = {key: frames.shape[1:] for key, frames in row.pictures.items()}
+        shapes = {key: frames.shape[1:] for key, frames in episode.images.items()}
         self._shapes = self._shapes or shapes
         if shapes != self._shapes:
-            raise DemoError(f"{row.where} has pictures {shapes}; expected {self._shapes} as in the first")
-        number, steps = len(self._episodes), len(row.action)
+            raise DemoError(f"{episode.where} has images {shapes}; expected {self._shapes} as in the first")
+        number, steps = len(self._episodes), len(episode.action)
         task = self._tasks.setdefault(language, len(self._tasks))
         first = self._frames
         columns = {
-            "observation.state": row.state,
-            "action": row.action,
+            "observation.state": episode.state,
+            "action": episode.action,
             "timestamp": (np.arange(steps) / CONTROL_HZ).astype(np.float32),
-            "next.reward": np.append(np.zeros(steps - 1), float(row.success)).astype(np.float32),
+            "next.reward": np.append(np.zeros(steps - 1), float(episode.success)).astype(np.float32),
             "next.done": np.append(np.zeros(steps - 1, bool), True),
-            **dict(
-                zip(
-                    _INDICES,
-                    (
-                        np.arange(steps),
-                        np.full(steps, number),
-                        first + np.arange(steps),
-                        np.full(steps, task),
-                    ),
-                    strict=True,
-                )
-            ),
+            "frame_index": np.arange(steps),
+            "episode_index": np.full(steps, number),
+            "index": first + np.arange(steps),
+            "task_index": np.full(steps, task),
         }
-        found = {"episode_index": number, "tasks": [language], "length": steps}
-        found |= self._data.add(columns)
-        found |= {"dataset_from_index": first, "dataset_to_index": first + steps}
-        for key, frames in row.pictures.items():
+        entry: dict[str, Any] = {"episode_index": number, "tasks": [language], "length": steps}
+        entry |= self._data.add(columns)
+        entry |= {"dataset_from_index": first, "dataset_to_index": first + steps}
+        for key, frames in episode.images.items():
             if key not in self._videos:
-                self._videos[key] = Video(self.root, key, self._video_mb)
-            found |= self._videos[key].add(frames)
-        found |= self._measure(columns, row.pictures)
-        self._episodes.append({**found, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
+                self._videos[key] = CameraVideo(self.root, key, self._video_mb)
+            entry |= self._videos[key].add(frames)
+        entry |= self._add_statistics(columns, episode.images)
+        self._episodes.append({**entry, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
         self._frames += steps
 
-    def _measure(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> dict[str, Any]:
-        """Statistics of an episode, which are counted into those of all."""
-        own: dict[str, Any] = {key: Moments.of(values) for key, values in columns.items()}
-        own |= {key: Histogram.of(frames) for key, frames in pictures.items()}
+    def _add_statistics(
+        self, columns: dict[str, np.ndarray], images: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
+        """Return the statistics of an episode, and add them to those of the data set."""
+        own: dict[str, Any] = {key: Moments.from_values(values) for key, values in columns.items()}
+        own |= {key: Histogram.from_frames(frames) for key, frames in images.items()}
         for key, stats in own.items():
             self._stats[key] = stats if key not in self._stats else self._stats[key] + stats
-        return {f"stats/{key}/{name}": v for key, stats in own.items() for name, v in stats.values().items()}
+        return {f"stats/{key}/{name}": v for key, stats in own.items() for name, v in stats.summary().items()}
 
     def close(self) -> None:
         """Close all files."""
@@ -186,35 +189,35 @@ class _Dataset:
             video.close()
 
     def finish(self) -> tuple[int, int]:
-        """Write what there is to say about the whole; returns (episodes, frames)."""
+        """Write the metadata of the data set; return the number of episodes and the number of frames."""
         if not self._episodes:
             raise DemoError("no demonstrations to export")
         pa, meta = self._pa, self.root / "meta"
         (self.root / _EPISODES).parent.mkdir(parents=True)
         self._pq.write_table(pa.Table.from_pylist(self._episodes), self.root / _EPISODES)
         self._pq.write_table(self._task_table(), meta / "tasks.parquet")
-        _write_json(meta / "stats.json", {key: stats.values() for key, stats in self._stats.items()})
+        _write_json(meta / "stats.json", {key: stats.summary() for key, stats in self._stats.items()})
         _write_json(meta / "info.json", self._info())
         return len(self._episodes), self._frames
 
     def _task_table(self) -> Any:
-        """Task -> index; the tasks are the index of the table when pandas reads it."""
-        pa, kind = self._pa, {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+        """Return the table of task indices; its pandas index are the instructions, as LeRobot expects."""
+        pa, integer = self._pa, {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
         table = pa.table(
             {"task_index": pa.array(self._tasks.values(), pa.int64()), "task": list(self._tasks)}
         )
         text = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-        said = {
+        pandas = {
             "index_columns": ["task"],
             "column_indexes": [{"name": None, "field_name": None, **text}],
             "columns": [
-                {"name": "task_index", "field_name": "task_index", **kind},
+                {"name": "task_index", "field_name": "task_index", **integer},
                 {"name": "task", "field_name": "task", **text},
             ],
             "creator": {"library": "pyarrow", "version": pa.__version__},
             "pandas_version": "2.0.0",
         }
-        return table.replace_schema_metadata({"pandas": json.dumps(said)})
+        return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
     def _info(self) -> dict[str, Any]:
         number = {"shape": [1], "names": None}
@@ -250,7 +253,7 @@ def _video_feature(height: int, width: int, channels: int) -> dict[str, Any]:
         "video.width": width,
         "video.channels": channels,
         "video.codec": "h264",
-        "video.pix_fmt": PIXELS,
+        "video.pix_fmt": PIXEL_FORMAT,
         "video.fps": CONTROL_HZ,
         "video.is_depth_map": False,
         "has_audio": False,

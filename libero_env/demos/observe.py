@@ -1,17 +1,16 @@
-"""Observations of states that were recorded: what filming, replaying and rendering anew have in common."""
+"""Observations of recorded states: for new recordings, for replaying, and for rendering files again."""
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
+from libero_env.demos.write import Episode
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.mujoco_compat import delete
@@ -22,42 +21,44 @@ from libero_env.tasks import Task
 
 
 @dataclass(frozen=True)
-class Shots:
-    """What is drawn of each state.
+class RenderConfig:
+    """What is rendered of each state.
 
     Attributes:
-        cameras: names in the model.
-        size: (height, width), pixels.
-        pictures: `rgb`, `depth`, and at most one of `segmentation_instance`, `_class` and `_element`.
+        cameras: Names of the cameras in the model.
+        size: (height, width) of the images, pixels.
+        modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
+            and `segmentation_element`.
     """
 
     cameras: tuple[str, ...] = DEFAULT_CAMERAS
     size: tuple[int, int] = (128, 128)
-    pictures: tuple[str, ...] = ("rgb",)
+    modalities: tuple[str, ...] = ("rgb",)
 
-    def header(self) -> dict:
-        """Attributes of a file; those of the ordinary cameras go without saying."""
-        extra = {"cameras": list(self.cameras), "pictures": list(self.pictures)}
-        usual = {"cameras": list(DEFAULT_CAMERAS), "pictures": ["rgb"]}
-        return {"camera_size": list(self.size)} | {k: v for k, v in extra.items() if v != usual[k]}
+    def header(self) -> dict[str, list]:
+        """Return the attributes of a file; the default cameras and modalities are left out."""
+        values = {"cameras": list(self.cameras), "pictures": list(self.modalities)}
+        defaults = {"cameras": list(DEFAULT_CAMERAS), "pictures": ["rgb"]}
+        return {"camera_size": list(self.size)} | {k: v for k, v in values.items() if v != defaults[k]}
 
 
-class Filmer:
-    """Puts one simulation into recorded states and says what is seen there.
+class StateRenderer:
+    """Puts one simulation into recorded states and observes it there.
 
     Args:
-        task: whose scene.
-        shots: what is drawn.
-        assets: as in `LiberoEnv`.
+        task: Task whose scene is simulated.
+        config: What is rendered.
+        assets: Where models come from, as for `LiberoEnv`.
     """
 
-    def __init__(self, task: Task, shots: Shots, assets: Pack | str | Path | None = None):
+    def __init__(self, task: Task, config: RenderConfig, assets: Pack | str | Path | None = None):
+        self.task = task
         self.env = LiberoEnv(
             task,
-            cameras=shots.cameras,
-            camera_size=shots.size,
+            cameras=config.cameras,
+            camera_size=config.size,
             assets=assets,
-            observations=(*shots.pictures, "proprioception", "ee_quat"),
+            observations=(*config.modalities, "proprioception", "ee_quat"),
         )
 
     @property
@@ -65,73 +66,83 @@ class Filmer:
         """The compiled scene."""
         return self.env.world.scene
 
-    def pose_fixtures(self, fixtures: np.ndarray) -> None:
-        """Let fixtures stand at (nfixtures, 7) pos, quat wxyz from the next state on."""
+    def place_fixtures(self, fixtures: np.ndarray) -> None:
+        """Put the fixtures at the given poses, (nfixtures, 7) pos and quat wxyz, from the next state on."""
         self.env.world.simulations.fixtures[0] = fixtures
 
-    def film(self, states: np.ndarray, fixtures: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Observations name -> (T, ...) and robot states (T, 9) of states (T, 1 + nq + nv)."""
-        self.pose_fixtures(fixtures)
-        seen = [self.env.set_state(state) for state in states]
-        obs = {key: np.stack([frame[key] for frame in seen]) for key in seen[0]}
+    def render_states(
+        self, states: np.ndarray, fixtures: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Return what is observed in the given states.
+
+        Args:
+            states: (T, 1 + nq + nv) time, qpos, qvel.
+            fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
+
+        Returns:
+            Observations, name to (T, ...), and robot states, (T, 9).
+        """
+        self.place_fixtures(fixtures)
+        frames = [self.env.set_state(state) for state in states]
+        obs = {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}
         quat_xyzw = obs.pop("ee_quat")[:, [1, 2, 3, 0]]
         return obs, np.concatenate([obs["gripper_states"], obs["ee_pos"], quat_xyzw], axis=1)
 
+    def model_xml(self, fixtures: np.ndarray) -> str:
+        """Return the scene as MJCF, complete but for its textures; the robot's meshes are named by their path.
+
+        Args:
+            fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
+        """
+        spec = self._spec_without_textures
+        for name, pose in zip(self.scene.fixtures, fixtures, strict=True):
+            body = spec.body(f"{name}_{ROOT_BODY}")
+            body.pos, body.quat = pose[:3], pose[3:]
+        return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', spec.to_xml())
+
+    @cached_property
+    def _spec_without_textures(self) -> mujoco.MjSpec:
+        spec = scene_spec(self.task.problem)
+        for material in spec.materials:
+            material.textures = [""] * len(list(material.textures))
+        for texture in list(spec.textures):
+            delete(spec, texture)
+        spec.compile()
+        return spec
+
     def close(self) -> None:
-        """Free simulation and GL context."""
+        """Free the simulation and the OpenGL context."""
         self.env.close()
 
 
-@lru_cache(maxsize=4)
-def _bare_spec(task: Task) -> mujoco.MjSpec:
-    """The scene without its textures, which are made in memory."""
-    spec = scene_spec(task.problem)
-    for material in spec.materials:
-        material.textures = [""] * len(list(material.textures))
-    for texture in list(spec.textures):
-        delete(spec, texture)
-    spec.compile()
-    return spec
+def fixture_poses(episode: Episode, scene: Scene, where: str) -> np.ndarray:
+    """Return the poses of the fixtures in an episode, (nfixtures, 7) pos and quat wxyz.
 
-
-def model_file(task: Task, names: Sequence[str], fixtures: np.ndarray) -> str:
-    """The scene as MJCF, whole but for its textures; the robot's meshes by their path.
+    Files of this package store them exactly. All files have them, rounded, in the attribute `model_file`; without
+    it, they are those of the scene.
 
     Args:
-        task: whose scene.
-        names: of the fixtures.
-        fixtures: where they stand, (nfixtures, 7) pos, quat wxyz.
-    """
-    spec = _bare_spec(task)
-    for name, pose in zip(names, fixtures, strict=True):
-        body = spec.body(f"{name}_{ROOT_BODY}")
-        body.pos, body.quat = pose[:3], pose[3:]
-    return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', spec.to_xml())
-
-
-def fixtures_of(attrs: Mapping[str, Any], scene: Scene, where: str) -> np.ndarray:
-    """Where the fixtures of a demonstration stand, (nfixtures, 7) pos, quat wxyz.
-
-    They are in the attribute `fixtures` of our files, rounded in the `model_file` of all, and else where the scene has
-    them.
+        episode: What was recorded.
+        scene: Scene of the same task.
+        where: File and demonstration, for error messages.
 
     Raises:
-        DemoError: an attribute that does not fit the scene; the message starts with `where`.
+        DemoError: The poses do not fit the scene.
     """
     poses = scene.fixture_poses.copy()
-    if "fixtures" in attrs:
-        if np.shape(attrs["fixtures"]) != poses.shape:
+    if episode.fixtures is not None:
+        if episode.fixtures.shape != poses.shape:
             raise DemoError(
-                f"{where}: attribute fixtures is {np.shape(attrs['fixtures'])}; expected {poses.shape}"
+                f"{where}: attribute fixtures is {episode.fixtures.shape}; expected {poses.shape}"
             )
-        return np.asarray(attrs["fixtures"], np.float64)
-    if "model_file" not in attrs or not scene.fixtures:
+        return episode.fixtures
+    if "model_file" not in episode.attrs or not scene.fixtures:
         return poses
-    xml = attrs["model_file"]
     try:
-        bodies = {body.get("name"): body for body in ElementTree.fromstring(xml).iter("body")}
+        root = ElementTree.fromstring(episode.attrs["model_file"])
     except ElementTree.ParseError as error:
         raise DemoError(f"{where}/model_file is no XML ({error}); expected the scene as MJCF") from error
+    bodies = {body.get("name"): body for body in root.iter("body")}
     for pose, name in zip(poses, scene.fixtures, strict=True):
         body = bodies.get(f"{name}_{ROOT_BODY}")
         if body is None:

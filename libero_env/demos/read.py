@@ -1,17 +1,19 @@
-"""Demonstrations on disk: HDF5 in the original LIBERO's layout, read whole or not at all.
+"""Demonstrations on disk: HDF5 in the original LIBERO's layout, read completely or not at all.
 
 A file holds `data/demo_i` with `actions` (T, 7), `states` (T, 1 + nq + nv), `robot_states` (T, 9: fingers, gripper
 position, gripper quaternion xyzw), `rewards` and `dones` (T,) uint8, and `obs/` with `agentview_rgb`,
 `eye_in_hand_rgb` (T, H, W, 3) uint8 stored upside down (OpenGL rows), `gripper_states` (T, 2), `joint_states` (T, 7),
 `ee_states` (T, 6), `ee_pos` (T, 3), `ee_ori` (T, 3 axis-angle, rad). States are always those before the action. Other
-cameras and kinds of picture are named the same way: `<camera>_rgb`, `<camera>_depth` (T, H, W) float metres,
-`<camera>_segmentation` (T, H, W) int32. The attribute `model_file` is the scene as MJCF, fixtures where they stood.
+cameras and modalities are named the same way: `<camera>_rgb`, `<camera>_depth` (T, H, W) float metres,
+`<camera>_segmentation` (T, H, W) int32. The attribute `model_file` is the scene as MJCF, with the fixtures at their
+poses.
 
-Pairing. The original stores with each action the observation *after* it. Files of this package say in the attribute
-`pairing` which they hold: "aligned" (the observation the action was chosen on, the default) or "libero".
+Pairing: the original stores with each action the observation *after* it. In files of this package the attribute
+`pairing` states which one they hold: "aligned" (the observation on which the action was chosen, the default) or
+"libero".
 
-Labels. Some demonstrations are made with disturbed actions. `actions` is what was executed, so that replaying works;
-`expert_actions`, where present, is what the expert wanted at that moment, which is what there is to learn.
+Labels: some demonstrations are recorded with noise on the actions. `actions` are the executed ones, so that they can be
+replayed; `expert_actions`, where present, are those that the expert chose, which are the ones to learn.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,23 +30,34 @@ Pairing = Literal["aligned", "libero"]
 
 LOW_DIM_KEYS = {"gripper_states": 2, "joint_states": 7, "ee_states": 6, "ee_pos": 3, "ee_ori": 3}
 IMAGE_KEYS = ("agentview_rgb", "eye_in_hand_rgb")
-PICTURES = {"_rgb": "u", "_depth": "f", "_segmentation": "iu"}  # end of a key -> kinds of number
+IMAGE_KINDS = {"_rgb": "u", "_depth": "f", "_segmentation": "iu"}  # end of a key -> kinds of NumPy dtype
 
 
 class BrokenDemoError(DemoError):
-    """What is in the file is not a demonstration, or not a whole one."""
+    """A file or group that is not a demonstration, or not a complete one."""
 
 
 @dataclass(frozen=True)
 class Demo:
-    """One demonstration. Images are upright; `states`, `rewards` and `dones` are None where the file has none."""
+    """One demonstration, as it is learned from.
+
+    Attributes:
+        name: Its group in the file, such as `demo_3`.
+        actions: (T, 7) float64 in [-1, 1].
+        obs: Observations, name to (T, ...); images are upright.
+        states: (T, 1 + nq + nv), or None where the file has none.
+        rewards: (T,) uint8, or None where the file has none.
+        dones: (T,) uint8, or None where the file has none.
+        success: Whether the goal was reached.
+        pairing: Which observation stands with an action.
+    """
 
     name: str
-    actions: np.ndarray  # (T, 7) float64 in [-1, 1]
-    obs: Mapping[str, np.ndarray] = field(repr=False)  # name -> (T, ...)
-    states: np.ndarray | None = field(default=None, repr=False)  # (T, 1 + nq + nv)
-    rewards: np.ndarray | None = field(default=None, repr=False)  # (T,) uint8
-    dones: np.ndarray | None = field(default=None, repr=False)  # (T,) uint8
+    actions: np.ndarray
+    obs: Mapping[str, np.ndarray] = field(repr=False)
+    states: np.ndarray | None = field(default=None, repr=False)
+    rewards: np.ndarray | None = field(default=None, repr=False)
+    dones: np.ndarray | None = field(default=None, repr=False)
     success: bool = True
     pairing: Pairing = "aligned"
 
@@ -60,18 +73,19 @@ def read_demos(
     labels: Literal["expert", "executed"] = "expert",
     pairing: Literal["stored", "aligned"] = "stored",
 ) -> list[Demo]:
-    """Read demonstrations, after all of those wanted have been checked.
+    """Read demonstrations, after all requested ones have been checked.
 
     Args:
-        path: a demonstration file, ours or the original's, or the folder of parts that an interrupted recording left.
-        obs_keys: observations to load; None for all known ones that the file has.
-        limit: the first so many demonstrations only.
+        path: A demonstration file, of this package or the original, or the folder of parts that an interrupted
+            recording left.
+        obs_keys: Observations to load; None for all known ones that the file has.
+        limit: Largest number of demonstrations to read; None for all.
         labels: "expert" puts `expert_actions` into `Demo.actions` where the file has them, "executed" never does.
-        pairing: "aligned" shifts demonstrations of "libero" pairing by one step, at the cost of their first one.
+        pairing: "aligned" shifts demonstrations of "libero" pairing by one step; they lose their first action.
 
     Raises:
-        DemoError: a file that is absent, truncated or empty, a key that is missing or of the wrong shape or type; the
-            message names file, demonstration, key and what was expected. Nothing is returned then.
+        DemoError: A file is absent, truncated or empty, or a key is missing or has the wrong shape or type. The
+            message names file, demonstration, key and what was expected.
     """
     return list(iter_demos(path, obs_keys, limit, labels=labels, pairing=pairing))
 
@@ -84,43 +98,43 @@ def iter_demos(
     labels: Literal["expert", "executed"] = "expert",
     pairing: Literal["stored", "aligned"] = "stored",
 ) -> Iterator[Demo]:
-    """Read demonstrations one after the other, for files that do not fit in memory; see `read_demos`.
+    """Read demonstrations one at a time, for files that do not fit into memory; see `read_demos`.
 
     Raises:
-        DemoError: as for `read_demos`, before the first one is given; only damage that shows when an array is read
-            comes later.
+        DemoError: As for `read_demos`, before the first demonstration is returned; only damage that shows when an
+            array is read is found later.
     """
-    wanted: list[tuple[Path, list[str], list[str]]] = []
+    requested: list[tuple[Path, list[str], list[str]]] = []
     count, shapes = 0, None
     for file in demo_files(path):
-        with opened(file) as handle:
+        with open_demo_file(file) as handle:
             names = demo_names(handle, file)[: None if limit is None else max(limit - count, 0)]
-            keys = _wanted_keys(handle, file, names, obs_keys)
+            keys = _requested_keys(handle, file, names, obs_keys)
             for name in names:
                 check_demo(handle["data"][name], file, name, keys)
-                shapes = _same_shapes(handle["data"][name], keys, path, name, shapes)
-        wanted.append((file, names, keys))
+                shapes = _check_same_shapes(handle["data"][name], keys, path, name, shapes)
+        requested.append((file, names, keys))
         count += len(names)
     if not count:
         raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0. Record them again")
-    for file, names, keys in wanted:
-        with opened(file) as handle:
+    for file, names, keys in requested:
+        with open_demo_file(file) as handle:
             for name in names:
                 demo = _load(handle["data"], file, name, keys, labels)
-                yield aligned(demo) if pairing == "aligned" else demo
+                yield align(demo) if pairing == "aligned" else demo
 
 
 def demo_lengths(
     path: str | Path, limit: int | None = None, *, pairing: Literal["stored", "aligned"] = "stored"
 ) -> list[int]:
-    """Steps of each demonstration that `iter_demos` gives, without reading any.
+    """Return the number of steps of each demonstration that `iter_demos` returns, without reading any.
 
     Raises:
-        DemoError: there is no whole file, or a demonstration without actions.
+        DemoError: A file is absent or truncated, or a demonstration has no actions.
     """
     lengths: list[int] = []
     for file in demo_files(path):
-        with opened(file) as handle:
+        with open_demo_file(file) as handle:
             names = demo_names(handle, file)[: None if limit is None else max(limit - len(lengths), 0)]
             shifted = pairing == "aligned" and _pairing(handle["data"]) == "libero"
             lengths += [
@@ -129,10 +143,10 @@ def demo_lengths(
     return lengths
 
 
-def _same_shapes(
+def _check_same_shapes(
     group: h5py.Group, keys: list[str], path: str | Path, name: str, first: tuple[str, dict] | None
 ) -> tuple[str, dict]:
-    """The first demonstration's name and shapes of an observation; raises DemoError where this one differs."""
+    """Return the name and the observations' shapes of the first demonstration; raise DemoError if this one differs."""
     found = {key: group[f"obs/{key}"].shape[1:] for key in keys}
     if first is None:
         return name, found
@@ -144,8 +158,11 @@ def _same_shapes(
     return first
 
 
-def aligned(demo: Demo) -> Demo:
-    """The demonstration with each action beside the observation before it; a "libero" one loses its first action."""
+def align(demo: Demo) -> Demo:
+    """Return the demonstration with each action paired with the observation before it.
+
+    A demonstration of "libero" pairing loses its first action and its last observation.
+    """
     if demo.pairing == "aligned":
         return demo
     states, rewards, dones = (None if x is None else x[1:] for x in (demo.states, demo.rewards, demo.dones))
@@ -154,24 +171,24 @@ def aligned(demo: Demo) -> Demo:
 
 
 def demo_files(path: str | Path) -> list[Path]:
-    """The file itself, or the finished parts in a folder of them.
+    """Return the file itself, or the complete parts in a folder of them.
 
     Raises:
-        DemoError: there is nothing at the path.
+        DemoError: There is nothing at the path.
     """
     path = Path(path)
     if path.is_dir():
         return sorted(path.glob("demo_*.hdf5"))
     if not path.is_file():
-        raise DemoError(f"{path}: no such file; make it with `libero demos generate`")
+        raise DemoError(f"{path}: no such file; record it with `libero demos generate`")
     return [path]
 
 
 def demo_names(handle: h5py.File, file: Path) -> list[str]:
-    """Names of the demonstrations in numerical order.
+    """Return the names of the demonstrations in numerical order.
 
     Raises:
-        DemoError: no group `data`.
+        BrokenDemoError: The file has no group `data`.
     """
     if not isinstance(handle.get("data"), h5py.Group):
         raise BrokenDemoError(
@@ -182,10 +199,16 @@ def demo_names(handle: h5py.File, file: Path) -> list[str]:
 
 
 def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]) -> None:
-    """Check one demonstration's keys, shapes and types without reading its images.
+    """Check the keys, shapes and types of one demonstration without reading its images.
+
+    Args:
+        group: The demonstration.
+        file: Its file, for error messages.
+        name: Its name, for error messages.
+        obs_keys: Observations to check.
 
     Raises:
-        BrokenDemoError: naming file, demonstration, key, and what was expected.
+        BrokenDemoError: The message names file, demonstration, key, and what was expected.
     """
     if not isinstance(group, h5py.Group):
         raise BrokenDemoError(f"{file}: {name} is not a group; expected actions, states, obs/ in it")
@@ -205,45 +228,44 @@ def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]
             _check_shape(_dataset(group, key, file, name), key, file, name, shape, kind)
     for key in obs_keys:
         dataset = _dataset(group, f"obs/{key}", file, name)
-        if is_picture(key):
-            _check_shape(
-                dataset, f"obs/{key}", file, name, _picture_shape(key, steps, dataset.ndim), _kinds(key)
-            )
+        if is_image(key):
+            shape, kinds = _image_shape(key, steps, dataset.ndim), _image_kinds(key)
+            _check_shape(dataset, f"obs/{key}", file, name, shape, kinds)
         else:
             _check_shape(dataset, f"obs/{key}", file, name, (steps, LOW_DIM_KEYS.get(key)), "f")
 
 
-def is_picture(key: str) -> bool:
-    """Whether an observation is a picture, stored upside down; `obs/agentview_rgb` is, `obs/ee_pos` is not."""
-    return key.endswith(tuple(PICTURES))
+def is_image(key: str) -> bool:
+    """Return whether an observation is an image, which is stored upside down: `agentview_rgb` is, `ee_pos` is not."""
+    return key.endswith(tuple(IMAGE_KINDS))
 
 
-def _kinds(key: str) -> str:
-    return next(kinds for end, kinds in PICTURES.items() if key.endswith(end))
+def _image_kinds(key: str) -> str:
+    return next(kinds for end, kinds in IMAGE_KINDS.items() if key.endswith(end))
 
 
-def _picture_shape(key: str, steps: int, ndim: int) -> tuple[int | None, ...]:
-    """(T, H, W, 3) of colours; (T, H, W) of others, where the original has one more axis of length 1."""
+def _image_shape(key: str, steps: int, ndim: int) -> tuple[int | None, ...]:
+    """Return (T, H, W, 3) for colours and (T, H, W) for others, where the original has one more axis of length 1."""
     if key.endswith("_rgb"):
         return steps, None, None, 3
     return (steps, None, None, 1) if ndim == 4 else (steps, None, None)
 
 
-def opened(file: Path) -> h5py.File:
-    """The file, open for reading.
+def open_demo_file(file: Path) -> h5py.File:
+    """Open a demonstration file for reading.
 
     Raises:
-        BrokenDemoError: it was cut short, or is no HDF5 file.
+        BrokenDemoError: The file is truncated, or is no HDF5 file.
     """
     try:
         return h5py.File(file, "r")
     except OSError as error:
         raise BrokenDemoError(
-            f"{file}: not a whole HDF5 file ({error}); it was cut short or is something else"
+            f"{file}: not a complete HDF5 file ({error}); it is truncated, or of another format"
         ) from error
 
 
-def _wanted_keys(
+def _requested_keys(
     handle: h5py.File, file: Path, names: list[str], obs_keys: Sequence[str] | None
 ) -> list[str]:
     if obs_keys is not None:
@@ -254,7 +276,7 @@ def _wanted_keys(
             raise BrokenDemoError(
                 f"{file}: {name}/obs is missing; expected a group with {', '.join(IMAGE_KEYS)}, ..."
             )
-        known = dict.fromkeys((*IMAGE_KEYS, *filter(is_picture, sorted(obs)), *LOW_DIM_KEYS))
+        known = dict.fromkeys((*IMAGE_KEYS, *filter(is_image, sorted(obs)), *LOW_DIM_KEYS))
         return [key for key in known if key in obs]
     return []
 
@@ -297,13 +319,13 @@ def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str)
 
     obs = {key: read(f"obs/{key}") for key in keys}
     for key in obs:
-        if is_picture(key):
+        if is_image(key):
             obs[key] = np.ascontiguousarray(obs[key][:, ::-1])  # the file has OpenGL rows
-    wanted = "expert_actions" if labels == "expert" and "expert_actions" in group else "actions"
-    actions = read(wanted).astype(np.float64)
+    label_key = "expert_actions" if labels == "expert" and "expert_actions" in group else "actions"
+    actions = read(label_key).astype(np.float64)
     if not np.isfinite(actions).all():
         raise BrokenDemoError(
-            f"{file}: {name}/{wanted} has values that are not finite; expected numbers in [-1, 1]"
+            f"{file}: {name}/{label_key} has values that are not finite; expected numbers in [-1, 1]"
         )
     states, rewards, dones = (read(key) if key in group else None for key in ("states", "rewards", "dones"))
     ends = [x[-1] for x in (rewards, dones) if x is not None]
@@ -312,5 +334,4 @@ def _load(data: h5py.Group, file: Path, name: str, keys: list[str], labels: str)
 
 
 def _pairing(data: h5py.Group) -> Pairing:
-    """The original's files do not say it."""
-    return data.attrs.get("pairing", "libero")
+    return data.attrs.get("pairing", "libero")  # the original's files do not state it

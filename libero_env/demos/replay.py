@@ -1,4 +1,4 @@
-"""Going through recorded demonstrations again: by their states or by their actions, and with other cameras."""
+"""Replaying recorded demonstrations by their states or by their actions, and rendering them again."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,29 +9,29 @@ import numpy as np
 from tqdm import tqdm
 
 from libero_env.assets.pack import Pack
-from libero_env.demos.curate import header_of, read_episodes, task_of
-from libero_env.demos.observe import Filmer, Shots, fixtures_of
+from libero_env.demos.curate import read_episodes, read_header, recorded_task
+from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import BrokenDemoError
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
 from libero_env.sim.observations import entry
 from libero_env.sim.scene import Scene
 
-BY = ("state", "action")
+REPLAY_MODES = ("state", "action")
 
 
 @dataclass(frozen=True)
-class Replay:
-    """What came of going through a demonstration.
+class ReplayResult:
+    """Outcome of the replay of one demonstration.
 
     Attributes:
-        name: `demo_3`.
-        recorded: whether the file says that it reached the goal.
-        success: whether it did now.
-        steps: that it took.
-        drift: largest distance of an object from where it was recorded, m, (T,); 0 where states are replayed.
-        arm_drift: likewise of the arm's joints, rad, (T,).
-        frames: pictures side by side, (T, H, W, 3) uint8.
+        name: Name of the demonstration, such as `demo_3`.
+        recorded: Whether the file states that it reached the goal.
+        success: Whether the replay reached the goal.
+        steps: Number of steps that were replayed.
+        drift: Largest distance of an object from where it was recorded, [m], (T,); 0 where states are replayed.
+        arm_drift: Largest difference of a joint angle of the arm from the recorded one, [rad], (T,).
+        frames: Images of all cameras side by side, (T, H, W, 3) uint8; None without cameras.
     """
 
     name: str
@@ -51,122 +51,124 @@ def replay(
     cameras: Sequence[str] = (),
     size: tuple[int, int] = (256, 256),
     assets: Pack | str | Path | None = None,
-) -> Iterator[Replay]:
-    """Go through demonstrations from their first state, with their fixtures where they stood.
+) -> Iterator[ReplayResult]:
+    """Replay demonstrations from their first state, with the fixtures at their recorded poses.
 
     Args:
-        file: whose demonstrations.
-        by: `action` lets the recorded actions act; `state` puts the simulation into each recorded state, and lets
-            only the last action act.
-        demos: names of those wanted; None for all.
-        cameras: to be filmed; none by default.
-        size: (height, width) of the film, pixels.
-        assets: where models come from, as in `LiberoEnv`.
+        file: Demonstration file.
+        by: `action` executes the recorded actions; `state` puts the simulation into each recorded state, and executes
+            the last action only.
+        demos: Names of the demonstrations to replay; None for all.
+        cameras: Cameras to render; none by default.
+        size: (height, width) of the images, pixels.
+        assets: Where models come from, as for `LiberoEnv`.
 
     Raises:
-        DemoError: the file is broken, does not fit its task's scene, or has no such demonstration.
+        DemoError: The file is broken, does not fit its task's scene, or has no such demonstration.
     """
-    if by not in BY:
-        raise DemoError(f"replay by {by!r}; valid: {', '.join(BY)}")
-    filmer = Filmer(task_of(file), Shots(tuple(cameras), size), assets)
+    if by not in REPLAY_MODES:
+        raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
+    renderer = StateRenderer(recorded_task(file), RenderConfig(tuple(cameras), size), assets)
+    keys = [entry(camera, "rgb") for camera in cameras]
     found = set()
     try:
         for name, episode in read_episodes(file):
             if demos is None or name in demos:
                 found.add(name)
-                fixtures = _fitting(file, name, episode, filmer.scene)
-                yield _replayed(
-                    filmer, name, episode, fixtures, by, [entry(camera, "rgb") for camera in cameras]
-                )
+                renderer.place_fixtures(_checked_fixtures(file, name, episode, renderer.scene))
+                yield _replay_episode(renderer, name, episode, by, keys)
     finally:
-        filmer.close()
+        renderer.close()
     if absent := set(demos or ()) - found:
         raise DemoError(f"{file}: no demonstration {', '.join(sorted(absent))}")
 
 
-def _replayed(
-    filmer: Filmer, name: str, episode: Episode, fixtures: np.ndarray, by: str, keys: list[str]
-) -> Replay:
-    env, states, scene = filmer.env, episode.states, filmer.scene
-    objects = _object_positions(scene)
-    filmer.pose_fixtures(fixtures)
+def _replay_episode(
+    renderer: StateRenderer, name: str, episode: Episode, by: str, keys: list[str]
+) -> ReplayResult:
+    env, states, nq = renderer.env, episode.states, renderer.scene.model.nq
+    objects = _object_positions(renderer.scene)
     obs = env.set_state(states[0])
     drift, arm_drift, frames, terminated = [], [], [], False
     for t, action in enumerate(episode.actions):
         if by == "state" and t:
             obs = env.set_state(states[t])
-        qpos, then = env.world.simulations.fields["qpos"][0], states[t, 1 : 1 + scene.model.nq]
-        away = qpos[objects] - then[objects]  # (n, 3)
-        drift.append(np.linalg.norm(away, axis=1).max(initial=0.0))
-        arm_drift.append(np.abs(qpos[:7] - then[:7]).max())
+        qpos, recorded_qpos = env.world.simulations.fields["qpos"][0], states[t, 1 : 1 + nq]
+        offsets = qpos[objects] - recorded_qpos[objects]  # (n, 3)
+        drift.append(np.linalg.norm(offsets, axis=1).max(initial=0.0))
+        arm_drift.append(np.abs(qpos[:7] - recorded_qpos[:7]).max())
         frames += [np.concatenate([obs[key] for key in keys], axis=1)] if keys else []
         if by == "action" or t == len(states) - 1:
             obs, _, terminated, _, _ = env.step(action)
             if terminated:
                 break
-    return Replay(
-        name,
-        episode.success,
-        bool(terminated),
-        t + 1,
-        np.array(drift),
-        np.array(arm_drift),
-        np.stack(frames) if frames else None,
+    return ReplayResult(
+        name=name,
+        recorded=episode.success,
+        success=bool(terminated),
+        steps=len(drift),
+        drift=np.array(drift),
+        arm_drift=np.array(arm_drift),
+        frames=np.stack(frames) if frames else None,
     )
 
 
 def rerender(
     file: Path,
     target: Path,
-    shots: Shots,
+    config: RenderConfig,
     *,
     assets: Pack | str | Path | None = None,
     progress: bool | None = None,
 ) -> Path:
-    """Write a file's demonstrations again, observed anew: other cameras, resolution, depth or segmentation.
+    """Write the demonstrations of a file with other observations: cameras, resolution, depth or segmentation.
 
-    The observations are those of the recorded states, so the new file has "aligned" pairing whatever the old one had.
-    It goes on where it was stopped.
+    The observations are those of the recorded states, so the new file has "aligned" pairing, whatever the old one had.
+    An interrupted call can be repeated: it resumes where it stopped.
 
     Args:
-        file: to read.
-        target: to write.
-        shots: what is drawn.
-        assets: where models come from, as in `LiberoEnv`.
-        progress: show a bar; None where stderr is a terminal.
+        file: File to read.
+        target: File to write.
+        config: What is rendered.
+        assets: Where models come from, as for `LiberoEnv`.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
+
+    Returns:
+        The new file.
 
     Raises:
-        DemoError: the file is broken or does not fit its task's scene; the target was made otherwise.
+        DemoError: The file is broken or does not fit its task's scene, or the target was recorded with another
+            configuration.
     """
     if target.exists() and target.samefile(file):
         raise DemoError(f"{target} is the file to read; choose another name")
-    header = {k: v for k, v in header_of(file).items() if k not in ("cameras", "pictures")}
-    writer = DemoWriter(target, {**header, **shots.header(), "pairing": "aligned"})
-    done = writer.recorded()
-    filmer = Filmer(task_of(file), shots, assets)
+    header = {k: v for k, v in read_header(file).items() if k not in ("cameras", "pictures")}
+    writer = DemoWriter(target, {**header, **config.header(), "pairing": "aligned"})
+    recorded = writer.recorded()
+    renderer = StateRenderer(recorded_task(file), config, assets)
     try:
-        shown = tqdm(read_episodes(file), unit="demo", disable=None if progress is None else not progress)
-        for name, episode in shown:
-            if (index := int(name[5:])) not in done:
-                fixtures = _fitting(file, name, episode, filmer.scene)
-                obs, robot = filmer.film(episode.states, fixtures)
-                writer.write(index, replace(episode, obs=obs, robot_states=robot))
+        disable = None if progress is None else not progress
+        for name, episode in tqdm(read_episodes(file), unit="demo", disable=disable):
+            if (index := int(name[5:])) not in recorded:
+                fixtures = _checked_fixtures(file, name, episode, renderer.scene)
+                obs, robot_states = renderer.render_states(episode.states, fixtures)
+                writer.write(index, replace(episode, obs=obs, robot_states=robot_states))
     finally:
-        filmer.close()
+        renderer.close()
     return writer.finish()
 
 
-def _fitting(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:
-    """The demonstration's fixtures, after a look whether its states fit the scene."""
+def _checked_fixtures(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:
+    """Return the poses of the fixtures, after a check that the states fit the scene."""
     length = 1 + scene.model.nq + scene.model.nv
     if episode.states.shape[1] != length:
         raise BrokenDemoError(
             f"{file}: {name}/states is {episode.states.shape}; expected (T, {length}) for {scene.problem.language!r}"
         )
-    return fixtures_of(episode.attrs, scene, f"{file}: {name}")
+    return fixture_poses(episode, scene, f"{file}: {name}")
 
 
 def _object_positions(scene: Scene) -> np.ndarray:
-    """Addresses in qpos of the positions of free bodies, (n, 3)."""
+    """Return the addresses in qpos of the positions of free bodies, (n, 3)."""
     free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     return scene.model.jnt_qposadr[free][:, None] + np.arange(3)

@@ -1,4 +1,4 @@
-"""Statistics that add up over episodes: of numbers, and of the colours of pictures."""
+"""Statistics that can be added over episodes: of numbers, and of the colours of images."""
 
 from dataclasses import dataclass
 
@@ -15,15 +15,15 @@ class Moments:
     samples: tuple[np.ndarray, ...]  # each (N, D) float64
 
     @classmethod
-    def of(cls, values: np.ndarray) -> "Moments":
-        """Of values (N,) or (N, D)."""
+    def from_values(cls, values: np.ndarray) -> "Moments":
+        """Return the statistics of values (N,) or (N, D)."""
         return cls((values.reshape(len(values), -1).astype(np.float64),))
 
     def __add__(self, other: "Moments") -> "Moments":
         return Moments(self.samples + other.samples)
 
-    def values(self) -> dict[str, list]:
-        """Name -> D numbers; `count` is one."""
+    def summary(self) -> dict[str, list]:
+        """Return each statistic as D numbers, by name; `count` is one number."""
         x = np.concatenate(self.samples)
         found = {"min": x.min(axis=0), "max": x.max(axis=0), "mean": x.mean(axis=0), "std": x.std(axis=0)}
         found |= dict(zip(_NAMES, np.quantile(x, QUANTILES, axis=0), strict=True))
@@ -32,22 +32,22 @@ class Moments:
 
 @dataclass(frozen=True)
 class Histogram:
-    """How often each channel of pictures has each of the 256 values, which says all there is to say, exactly."""
+    """Histogram of each colour channel over the 256 values, from which all statistics follow exactly."""
 
     counts: np.ndarray  # (3, 256) int64
     frames: int
 
     @classmethod
-    def of(cls, frames: np.ndarray) -> "Histogram":
-        """Of frames (T, H, W, 3) uint8."""
+    def from_frames(cls, frames: np.ndarray) -> "Histogram":
+        """Return the histogram of frames (T, H, W, 3) uint8."""
         counts = [np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)]
         return cls(np.array(counts, np.int64), len(frames))
 
     def __add__(self, other: "Histogram") -> "Histogram":
         return Histogram(self.counts + other.counts, self.frames + other.frames)
 
-    def values(self) -> dict[str, list]:
-        """Name -> (3, 1, 1) nested, colours in [0, 1]; `count` is the number of frames."""
+    def summary(self) -> dict[str, list]:
+        """Return each statistic as nested lists (3, 1, 1) in [0, 1], by name; `count` is the number of frames."""
         levels, total = np.arange(256) / 255.0, self.counts.sum(axis=1)
         below = np.cumsum(self.counts, axis=1)
         mean = self.counts @ levels / total

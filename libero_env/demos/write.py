@@ -1,12 +1,11 @@
-"""Recording demonstrations so that a killed process or a full disk costs at most the one being written.
+"""Writing demonstrations so that a killed process or a full disk costs at most the one being written.
 
-Each demonstration is first a file of its own, written under another name, flushed to the disk and then renamed, in
-the folder `<file>.parts` beside the file to be. `DemoWriter.finish` joins the parts into the one file and removes
-them. A part is a demonstration file like any other: `read_demos` reads it, or the whole folder.
+Each demonstration is first a file of its own in the folder `<file>.parts`, which appears when it is complete and on
+the disk. `DemoWriter.finish` joins the parts into the one file and removes them. A part is a demonstration file like
+any other: `read_demos` reads it, or the whole folder.
 """
 
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -23,15 +22,16 @@ from libero_env.demos.read import (
     check_demo,
     demo_files,
     demo_names,
-    is_picture,
-    opened,
+    is_image,
+    open_demo_file,
 )
 from libero_env.errors import DemoError
+from libero_env.storage import atomic_path
 
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
-# What demonstrations of one file have in common.
-_MADE_WITH = (
+# Attributes in which all demonstrations of a file agree.
+_CONFIG_KEYS = (
     "bddl_file_name",
     "bddl_file_content",
     "seed",
@@ -49,23 +49,43 @@ _MADE_WITH = (
 
 @dataclass(frozen=True)
 class Episode:
-    """What is recorded of one attempt. Images are upright; `libero_env.demos.read` explains the arrays."""
+    """What happened in one episode, as it is recorded; `libero_env.demos.read` explains the arrays.
 
-    actions: np.ndarray  # (T, 7)
-    states: np.ndarray  # (T, 1 + nq + nv), before each action
-    robot_states: np.ndarray | None  # (T, 9)
-    obs: Mapping[str, np.ndarray] = field(repr=False)  # agentview_rgb, ..., joint_states, ee_pos, ee_ori, ...
-    expert_actions: np.ndarray | None = None  # (T, 7) where the executed ones were disturbed
+    Attributes:
+        actions: Executed actions, (T, 7).
+        states: State before each action, (T, 1 + nq + nv) time, qpos, qvel.
+        robot_states: (T, 9).
+        obs: Observations, name to (T, ...); images are upright. Empty until the states are rendered.
+        expert_actions: Actions that the expert chose, (T, 7), where noise was added to the executed ones.
+        success: Whether the goal was reached.
+        fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
+        attrs: Further attributes of the demonstration.
+    """
+
+    actions: np.ndarray
+    states: np.ndarray
+    robot_states: np.ndarray | None = None
+    obs: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    expert_actions: np.ndarray | None = None
     success: bool = True
-    attrs: Mapping[str, Any] = field(default_factory=dict)  # more attributes of the demonstration's group
+    fixtures: np.ndarray | None = None
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    @property
+    def labels(self) -> np.ndarray:
+        """Actions to learn, (T, 7): those of the expert where they differ from the executed ones."""
+        return self.actions if self.expert_actions is None else self.expert_actions
 
 
 class DemoWriter:
     """Writes one demonstration file.
 
     Args:
-        path: the file to be.
-        header: attributes of the group `data`; `make_header` makes those of the original.
+        path: File to write.
+        header: Attributes of the group `data`; `make_header` makes those of the original.
         compression: "gzip" (level 1 with the shuffle filter; every HDF5 reader has it), "lzf" or None.
     """
 
@@ -76,68 +96,62 @@ class DemoWriter:
         self.compression = compression
 
     def recorded(self) -> set[int]:
-        """Numbers of the demonstrations that are on disk whole, in the file or among the parts.
+        """Return the numbers of the demonstrations that are complete on disk, in the file or among the parts.
 
         Raises:
-            DemoError: what is there was made otherwise (another task, seed, camera size, ...).
+            DemoError: They were recorded with another configuration (task, seed, camera size, ...).
         """
         return {int(name[5:]) for _, name in self._sources()}
 
     def write(self, index: int, episode: Episode) -> Path:
-        """Record demonstration number `index`; it is on disk, whole, when this returns.
+        """Write demonstration number `index`; it is complete on the disk when this returns.
 
         Raises:
-            DemoError: it cannot be written (disk full, no permission); nothing that was there before is harmed.
+            DemoError: It cannot be written (disk full, no permission); earlier demonstrations are intact.
         """
         target = self.parts / f"demo_{index:05d}.hdf5"
-        partial = target.with_name(f".{target.name}.{os.getpid()}")
         try:
-            self.parts.mkdir(parents=True, exist_ok=True)
-            with h5py.File(partial, "w") as handle:
+            with atomic_path(target, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
                 data = handle.create_group("data")
                 data.attrs.update(self.header)
                 self._write_demo(data.create_group(f"demo_{index}"), episode)
-                _count(data)
-            _sync(partial)
-            partial.replace(target)
+                _write_counts(data)
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise DemoError(
-                f"{target}: demonstration {index} cannot be written ({error}); what was recorded before stays "
-                f"readable in {self.parts}. Make room and start again, it goes on from there"
+                f"{target}: demonstration {index} cannot be written ({error}); earlier ones stay readable in "
+                f"{self.parts}. Free some space and start again: recording resumes from there"
             ) from error
         return target
 
     def finish(self) -> Path:
-        """Join everything recorded into the one file and remove the parts.
+        """Join all recorded demonstrations into the one file and remove the parts.
 
         Raises:
-            DemoError: nothing was recorded, or the file cannot be written.
+            DemoError: Nothing was recorded, or the file cannot be written.
         """
         sources = list(self._sources())
         if not sources:
             raise DemoError(f"{self.path}: no demonstrations were recorded; nothing to write")
-        partial = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
-            with h5py.File(partial, "w") as handle:
+            with atomic_path(self.path, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
                 data = handle.create_group("data")
                 data.attrs.update(self.header)
                 for file, name in sorted(sources, key=lambda source: int(source[1][5:])):
                     with h5py.File(file, "r") as part:
                         part.copy(f"data/{name}", data)  # copies compressed bytes as they are
-                _count(data)
-            _sync(partial)
-            partial.replace(self.path)
+                _write_counts(data)
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise DemoError(
-                f"{self.path}: cannot be written ({error}); all is still in {self.parts}"
+                f"{self.path}: cannot be written ({error}); all demonstrations are still in {self.parts}"
             ) from error
         shutil.rmtree(self.parts, ignore_errors=True)
         return self.path
 
     def _sources(self) -> Iterator[tuple[Path, str]]:
-        """(file, name) of each whole demonstration; a broken part is left out, a broken or foreign file refused."""
+        """Yield (file, name) of each complete demonstration.
+
+        A broken part is removed, to be recorded again; a broken file or one of another configuration is refused.
+        """
         seen: set[str] = set()
         if self.path.is_file():
             yield from self._demos_in(self.path, seen)
@@ -145,10 +159,10 @@ class DemoWriter:
             try:
                 yield from self._demos_in(part, seen)
             except BrokenDemoError:
-                part.unlink(missing_ok=True)  # to be recorded again
+                part.unlink(missing_ok=True)
 
     def _demos_in(self, file: Path, seen: set[str]) -> Iterator[tuple[Path, str]]:
-        with opened(file) as handle:
+        with open_demo_file(file) as handle:
             names = demo_names(handle, file)
             for name in names:
                 check_demo(handle["data"][name], file, name, handle["data"][name].get("obs", ()))
@@ -159,16 +173,16 @@ class DemoWriter:
                 yield file, name
 
     def _check_header(self, file: Path, found: Mapping[str, Any]) -> None:
-        for key in _MADE_WITH if self.header else ():
-            here, wanted = (_plain(values.get(key)) for values in (found, self.header))
-            if here != wanted:
+        for key in _CONFIG_KEYS if self.header else ():
+            here, expected = (_plain(values.get(key)) for values in (found, self.header))
+            if here != expected:
                 raise DemoError(
-                    f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not {shorten(repr(wanted), 80)}; "
-                    f"choose another file or remove this one"
+                    f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not "
+                    f"{shorten(repr(expected), 80)}; choose another file or remove this one"
                 )
 
     def _write_demo(self, group: h5py.Group, episode: Episode) -> None:
-        steps = len(episode.actions)
+        steps = len(episode)
         ends = np.zeros(steps, np.uint8)
         ends[-1] = episode.success
         put = group.create_dataset
@@ -180,10 +194,18 @@ class DemoWriter:
             put("robot_states", data=np.asarray(episode.robot_states, np.float64))
         put("rewards", data=ends)
         put("dones", data=ends)
-        obs = group.create_group("obs")
-        for key, values in _with_ee_states(episode.obs).items():
-            if is_picture(key):
-                obs.create_dataset(
+        self._write_observations(group.create_group("obs"), episode.obs, steps)
+        group.attrs["num_samples"] = steps
+        group.attrs["init_state"] = np.asarray(episode.states[0], np.float64)
+        group.attrs["success"] = bool(episode.success)
+        group.attrs.update(episode.attrs)
+        if episode.fixtures is not None:
+            group.attrs["fixtures"] = episode.fixtures
+
+    def _write_observations(self, group: h5py.Group, obs: Mapping[str, np.ndarray], steps: int) -> None:
+        for key, values in _with_ee_states(obs).items():
+            if is_image(key):
+                group.create_dataset(
                     key,
                     data=values[:, ::-1],
                     chunks=(min(FRAMES_PER_CHUNK, steps), *values.shape[1:]),
@@ -192,11 +214,7 @@ class DemoWriter:
                     shuffle=self.compression is not None and values.dtype != np.uint8,
                 )
             elif key in LOW_DIM_KEYS:
-                obs.create_dataset(key, data=np.asarray(values, np.float64))
-        group.attrs["num_samples"] = steps
-        group.attrs["init_state"] = np.asarray(episode.states[0], np.float64)
-        group.attrs["success"] = bool(episode.success)
-        group.attrs.update(episode.attrs)
+                group.create_dataset(key, data=np.asarray(values, np.float64))
 
 
 def make_header(
@@ -206,16 +224,17 @@ def make_header(
     bddl_name: str,
     bddl_text: str,
     env_kwargs: Mapping[str, Any],
-    **more: Any,
+    **extra: Any,
 ) -> dict[str, Any]:
-    """Attributes of the group `data` as the original has them, and `more` of one's own.
+    """Return the attributes of the group `data` as the original has them, and `extra` ones.
 
     Args:
-        problem_name: as in the task file, e.g. `LIBERO_Floor_Manipulation`.
-        language: the instruction.
-        bddl_name: `libero_object/pick_up_..._basket.bddl`.
-        bddl_text: the task file.
-        env_kwargs: robots, controller, cameras, control frequency.
+        problem_name: Name of the problem in the task file, such as `LIBERO_Floor_Manipulation`.
+        language: The instruction.
+        bddl_name: Path of the task file below `bddl_files`, such as `libero_object/pick_up_..._basket.bddl`.
+        bddl_text: Text of the task file.
+        env_kwargs: Arguments of the original's environment: robots, controller, cameras, control frequency.
+        extra: Further attributes.
     """
     words = problem_name.split("_")
     env_name = "_".join([words[0].capitalize(), *words[1:]])
@@ -234,11 +253,11 @@ def make_header(
         "bddl_file_content": bddl_text,
         "env_args": json.dumps({**args, "env_kwargs": dict(env_kwargs)}),
         "tag": TAG,
-        **more,
+        **extra,
     }
 
 
-def _count(data: h5py.Group) -> None:
+def _write_counts(data: h5py.Group) -> None:
     demos = [group for name, group in data.items() if name.startswith("demo_")]
     data.attrs["num_demos"] = len(demos)
     data.attrs["total"] = int(sum(group.attrs["num_samples"] for group in demos))
@@ -253,9 +272,3 @@ def _with_ee_states(obs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-
-
-def _sync(path: Path) -> None:
-    """Make sure that the file is on the disk before it gets its name."""
-    with open(path, "rb+") as handle:
-        os.fsync(handle.fileno())

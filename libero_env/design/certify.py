@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.record import GENERATOR
+from libero_env.demos.config import GENERATOR
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes

@@ -1,7 +1,7 @@
 """Experts beside a batch of simulations: one attempt in each, recorded as it goes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class Attempt:
     expert_actions: np.ndarray  # (T, 7) wanted
     retries: int
     reason: str  # why it did not succeed, or ""
+    fixtures: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))  # (nfixtures, 7) pos, quat wxyz
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -73,6 +74,7 @@ def run_experts(
             np.array(wanted[i]),
             expert.retries,
             "" if success[i] else _reason(expert, len(executed[i])),
+            world.simulations.fixtures[i].copy(),
         )
         for i, expert in enumerate(experts)
     ]

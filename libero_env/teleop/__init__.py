@@ -1,1 +1,1 @@
-"""Recording demonstrations by hand: input devices, the recording session, screens."""
+"""Teleoperation: demonstrations that a user records with a keyboard or a 3D mouse."""

@@ -1,4 +1,4 @@
-"""Input devices for teleoperation: what keys and a SpaceMouse mean as actions."""
+"""Input devices of teleoperation: how keys and a 3D mouse become actions."""
 
 import math
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-# Key -> (entry of the action, direction): position in the robot's frame, then rotation vector.
+# Key -> (index in the action, sign): translation in the robot's frame, then rotation vector.
 MOTIONS: Mapping[str, tuple[int, float]] = {
     "w": (0, -1.0),
     "s": (0, 1.0),
@@ -21,66 +21,61 @@ MOTIONS: Mapping[str, tuple[int, float]] = {
     "c": (5, -1.0),
     "v": (5, 1.0),
 }
-
-
 GRIPPER, RESET, QUIT = " ", "q", "escape"
-
-
 HELP = (
     "w s: back, forth   a d: left, right   r f: up, down   z x, t g, c v: turn about x, y, z\n"
-    "space: open or close the gripper   q: start again   escape: stop"
+    "space: open or close the gripper   q: restart the episode   escape: stop"
 )
 
-
-_KEY_POSITION, _KEY_ROTATION = 3.75, 0.15  # of an action per key, before it is cut at 1
-
-
-_MOUSE_POSITION, _MOUSE_ROTATION = 0.625, 0.25  # likewise at full deflection
-
-
-_MOUSE_RANGE = 350.0  # of a raw reading
-
-
-_TAP_STEPS = 2  # that a key acts for which nobody reports the release of
+_KEY_TRANSLATION, _KEY_ROTATION = 3.75, 0.15  # [action units] of one key, before clipping to 1
+_MOUSE_TRANSLATION, _MOUSE_ROTATION = 0.625, 0.25  # [action units] at full deflection
+_MOUSE_RANGE = 350.0  # [raw units] reading at full deflection
+_TAP_STEPS = 2  # [control steps] during which a key acts whose release is not reported
 
 
 class Device(Protocol):
-    """What the user acts through."""
+    """Input device of the user.
 
-    command: str | None  # RESET or QUIT since it was last set to None
+    Attributes:
+        command: `RESET` or `QUIT` if the user gave that command since it was last set to None.
+    """
+
+    command: str | None
 
     def action(self) -> np.ndarray:
-        """What is wanted for the next control step, (7,)."""
+        """Return the action for the next control step, (7,)."""
         ...
 
     def restart(self) -> None:
-        """A new episode: nothing is pressed, the gripper is open."""
+        """Prepare for a new episode: no key is pressed, the gripper is open."""
         ...
 
 
 class Keyboard:
-    """Key events to actions.
+    """Turns key events into actions; the keys and their effect are those of robosuite's keyboard device.
 
     Args:
-        pos_sensitivity, rot_sensitivity: factors on motions and turns.
+        pos_sensitivity: Factor on translations.
+        rot_sensitivity: Factor on rotations.
     """
 
     def __init__(self, pos_sensitivity: float = 1.0, rot_sensitivity: float = 1.0):
-        self.gains = np.repeat([_KEY_POSITION * pos_sensitivity, _KEY_ROTATION * rot_sensitivity], 3)
+        self.gains = np.repeat([_KEY_TRANSLATION * pos_sensitivity, _KEY_ROTATION * rot_sensitivity], 3)
         self.command: str | None = None
         self.restart()
 
     def restart(self) -> None:
         """See `Device`."""
-        self.steps: dict[str, float] = {}  # key -> control steps that it still acts
+        self.steps: dict[str, float] = {}  # pressed key -> control steps during which it still acts
         self.closed = False
 
     def press(self, key: str, *, held: bool = False) -> None:
-        """A key goes down.
+        """Handle the press of a key.
 
         Args:
-            key: one of `MOTIONS`, `GRIPPER`, `RESET`, `QUIT`; others do nothing.
-            held: its release will be told too; else it acts for 0.1 s, and again when it repeats.
+            key: One of `MOTIONS`, `GRIPPER`, `RESET`, `QUIT`; others have no effect.
+            held: Whether the release of the key will be reported. If not, the key acts for 0.1 s, and again when it
+                repeats.
         """
         key = key.lower()
         if key in MOTIONS:
@@ -91,7 +86,7 @@ class Keyboard:
             self.command = key
 
     def release(self, key: str) -> None:
-        """A key goes up. One that was pressed since the last step acts in the next step all the same."""
+        """Handle the release of a key. A key pressed since the last step still acts in the next one."""
         if self.steps.get(key.lower()) == math.inf:
             self.steps[key.lower()] = 1
 
@@ -99,20 +94,26 @@ class Keyboard:
         """See `Device`."""
         motion = np.zeros(6)
         for key in self.steps:
-            entry, direction = MOTIONS[key]
-            motion[entry] += direction * self.gains[entry]
+            index, sign = MOTIONS[key]
+            motion[index] += sign * self.gains[index]
         self.steps = {key: left - 1 for key, left in self.steps.items() if left > 1}
         return np.append(np.clip(motion, -1.0, 1.0), 1.0 if self.closed else -1.0)
 
 
 class SpaceMouse(Keyboard):
-    """Reports of a 3Dconnexion mouse to actions: six axes; the left button closes the gripper while it is down, the
-    right one starts again. Keys act, too.
+    """Turns the reports of a 3Dconnexion mouse into actions; keys act as well.
+
+    Its six axes move the gripper. The left button closes the gripper while it is pressed, the right button restarts
+    the episode.
+
+    Args:
+        pos_sensitivity: Factor on translations.
+        rot_sensitivity: Factor on rotations.
     """
 
     def __init__(self, pos_sensitivity: float = 1.0, rot_sensitivity: float = 1.0):
         super().__init__(pos_sensitivity, rot_sensitivity)
-        gains = (_MOUSE_POSITION * pos_sensitivity, _MOUSE_ROTATION * rot_sensitivity)
+        gains = (_MOUSE_TRANSLATION * pos_sensitivity, _MOUSE_ROTATION * rot_sensitivity)
         self.mouse_gains = np.repeat(gains, 3)
 
     def restart(self) -> None:
@@ -121,19 +122,24 @@ class SpaceMouse(Keyboard):
         self.deflection, self.button = np.zeros(6), False
 
     def report(self, data: bytes) -> None:
-        """A report as the device sends it: number 1 moves (and turns), 2 turns on older ones, 3 are the buttons."""
+        """Handle a report of the device.
+
+        Args:
+            data: Its bytes. The first is the kind: 1 is translation, with rotation on newer devices, 2 is rotation on
+                older ones, 3 is the buttons.
+        """
         if len(data) < 2:
             return
-        number, values = data[0], np.frombuffer(data[1 : 1 + (len(data) - 1) // 2 * 2], "<i2")
-        if number == 3:
+        kind, values = data[0], np.frombuffer(data[1 : 1 + (len(data) - 1) // 2 * 2], "<i2")
+        if kind == 3:
             self.button = data[1] == 1
             self.command = RESET if data[1] == 2 else self.command
             return
         scaled = np.clip(values / _MOUSE_RANGE, -1.0, 1.0)
-        if number == 1 and len(scaled) >= 3:
+        if kind == 1 and len(scaled) >= 3:
             self.deflection[:3] = scaled[1], scaled[0], -scaled[2]
             scaled = scaled[3:]
-        if number in (1, 2) and len(scaled) >= 3:
+        if kind in (1, 2) and len(scaled) >= 3:
             self.deflection[3:] = scaled[1], scaled[0], -scaled[2]
 
     def action(self) -> np.ndarray:

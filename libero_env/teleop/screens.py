@@ -1,4 +1,4 @@
-"""Windows and terminals of a teleoperation session: events go to the device, pictures to the user."""
+"""Windows and terminals of a teleoperation session: input goes to the device, images go to the user."""
 
 import importlib
 import os
@@ -20,8 +20,10 @@ from libero_env.teleop.devices import GRIPPER, HELP, MOTIONS, QUIT, RESET, Keybo
 from libero_env.teleop.session import Status
 from libero_env.timing import CONTROL_HZ
 
-KINDS = ("auto", "window", "terminal")
+SCREENS = ("auto", "window", "terminal")
 _ESCAPE = "\x1b"
+_ESCAPE_KEY = 256  # number of the key in GLFW
+_STEPS_PER_IMAGE = 4  # [control steps] between two images in a terminal
 
 
 class OpenScreen(Protocol):
@@ -36,23 +38,23 @@ class OpenScreen(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back what it holds."""
+        """Close the screen and restore what it changed."""
         ...
 
 
 def open_screen(
     kind: str, keyboard: Keyboard, camera: str = "agentview", reader: "MouseReader | None" = None
 ) -> OpenScreen:
-    """A window, or a terminal where there is none.
+    """Open a window, or use the terminal if no window can be opened.
 
     Args:
-        kind: `window`, `terminal`, or `auto` for the first that works.
-        keyboard: gets the keys.
-        camera: what is shown.
-        reader: of a 3D mouse, to be read beside the keys.
+        kind: `window`, `terminal`, or `auto` for the first of them that works.
+        keyboard: Device that receives the keys.
+        camera: Camera whose image is shown.
+        reader: Reader of a 3D mouse that is used beside the keys.
 
     Raises:
-        RenderError: neither works here; the message says why.
+        RenderError: No screen of this kind works here; the message states why.
     """
     problems = []
     if kind in ("auto", "window"):
@@ -65,18 +67,19 @@ def open_screen(
             return Terminal(keyboard, camera, reader)
         except RenderError as error:
             problems.append(str(error))
-    raise RenderError("; ".join(problems) or f"screen {kind!r}; valid: {', '.join(KINDS)}")
+    raise RenderError("; ".join(problems) or f"screen {kind!r}; valid: {', '.join(SCREENS)}")
 
 
 class MouseReader:
     """Reads a 3D mouse through the package hidapi.
 
     Args:
-        mouse: gets the reports.
-        vendor_id, product_id: of the device.
+        mouse: Device that receives the reports.
+        vendor_id: USB vendor of the mouse.
+        product_id: USB product of the mouse.
 
     Raises:
-        LiberoError: hidapi or the device is missing.
+        LiberoError: hidapi is not installed, or the mouse cannot be opened.
     """
 
     def __init__(self, mouse: SpaceMouse, vendor_id: int = 9583, product_id: int = 50741):
@@ -90,19 +93,19 @@ class MouseReader:
             self.device.open(vendor_id, product_id)
         except OSError as error:
             raise LiberoError(
-                f"no 3D mouse {vendor_id}:{product_id} can be opened ({error}); name yours with --vendor-id and "
-                "--product-id, and see that you may read it"
+                f"the 3D mouse {vendor_id}:{product_id} cannot be opened ({error}); choose another with --vendor-id "
+                "and --product-id, and check that you have permission to read it"
             ) from error
         self.device.set_nonblocking(True)
 
     def poll(self) -> None:
-        """Hand on all reports that are waiting."""
+        """Pass all pending reports to the mouse."""
         while data := self.device.read(13):
             self.mouse.report(bytes(data))
 
 
 class _Clock:
-    """Lets a control step last as long as it does on the robot."""
+    """Makes a control step last as long as it does on the robot."""
 
     def __init__(self) -> None:
         self.next = time.monotonic()
@@ -113,10 +116,16 @@ class _Clock:
 
 
 class Window:
-    """A window of GLFW that MuJoCo draws into.
+    """A GLFW window into which MuJoCo renders.
+
+    Args:
+        keyboard: Device that receives the keys.
+        camera: Camera whose image is shown.
+        reader: Reader of a 3D mouse that is used beside the keys.
+        size: Width and height of the window, pixels.
 
     Raises:
-        RenderError: no window opens here.
+        RenderError: No window can be opened here.
     """
 
     def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None, size: int = 640):
@@ -129,11 +138,11 @@ class Window:
         except ImportError as error:
             raise RenderError(f"no window: {error}; pip install glfw") from error
         if not self.glfw.init():
-            raise RenderError("no window: GLFW finds no screen")
+            raise RenderError("no window: GLFW found no screen")
         self.window = self.glfw.create_window(size, size, "libero teleop", None, None)
         if not self.window:
             self.glfw.terminate()
-            raise RenderError("no window: GLFW cannot open one with OpenGL")
+            raise RenderError("no window: GLFW cannot open a window with OpenGL")
         self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
         self.glfw.set_key_callback(self.window, self._on_key)
         self.context: mujoco.MjrContext | None = None
@@ -155,10 +164,8 @@ class Window:
             self.scene, self.option = mujoco.MjvScene(model, 2000), mujoco.MjvOption()
             self.option.geomgroup[0] = 0  # collision shapes
             self.view = mujoco.MjvCamera()
-            self.view.type, self.view.fixedcamid = (
-                mujoco.mjtCamera.mjCAMERA_FIXED,
-                model.camera(self.camera).id,
-            )
+            self.view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self.view.fixedcamid = model.camera(self.camera).id
         area = mujoco.MjrRect(0, 0, *self.glfw.get_framebuffer_size(self.window))
         mujoco.mj_camlight(model, data)
         self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(world.views[0]))  # a stove that is on
@@ -174,7 +181,7 @@ class Window:
         self.clock.wait()
 
     def close(self) -> None:
-        """Give the window back."""
+        """Close the window."""
         if self.context is not None:
             self.glfw.make_context_current(self.window)
             self.context.free()
@@ -191,18 +198,23 @@ class Window:
 
 
 def key_name(code: int) -> str | None:
-    """GLFW's number of a key as `Keyboard` calls it; None for those without a meaning."""
-    if code == 256:
+    """Return the name of a key in `Keyboard` from its number in GLFW; None for a key without a function."""
+    if code == _ESCAPE_KEY:
         return QUIT
     name = chr(code).lower() if 0 <= code < 128 else ""
     return name if name in MOTIONS or name in (GRIPPER, RESET) else None
 
 
 class Terminal:
-    """Keys from a terminal and pictures as coloured characters: for machines without a screen.
+    """Reads keys from a terminal and shows images as coloured characters, for machines without a screen.
+
+    Args:
+        keyboard: Device that receives the keys.
+        camera: Camera whose image is shown.
+        reader: Reader of a 3D mouse that is used beside the keys.
 
     Raises:
-        RenderError: standard input is no terminal.
+        RenderError: Standard input is not a terminal.
     """
 
     def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None):
@@ -213,7 +225,7 @@ class Terminal:
             tty: Any = importlib.import_module("tty")
         except ImportError as error:
             raise RenderError(f"no terminal: {error}") from error
-        self.before = self.termios.tcgetattr(sys.stdin)
+        self.settings = self.termios.tcgetattr(sys.stdin)
         tty.setcbreak(sys.stdin)
         self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
         print(f"\x1b[2J{HELP}")
@@ -226,21 +238,24 @@ class Terminal:
             self.reader.poll()
 
     def show(self, world: World, status: Status) -> None:
-        """See `Screen`; every fourth state is drawn."""
-        if status.step % 4 == 1:
+        """See `Screen`; every fourth state is shown."""
+        if status.step % _STEPS_PER_IMAGE == 1:
             columns, lines = shutil.get_terminal_size()
             edge = max(min(columns, 2 * (lines - 6)) // 2 * 2, 8)
-            picture = Image.fromarray(world.frame(0, self.camera)).resize((edge, edge))
-            print(f"\x1b[4;1H{as_text(np.asarray(picture))}\n\x1b[K{status}", flush=True)
+            image = Image.fromarray(world.frame(0, self.camera)).resize((edge, edge))
+            print(f"\x1b[4;1H{as_text(np.asarray(image))}\n\x1b[K{status}", flush=True)
         self.clock.wait()
 
     def close(self) -> None:
-        """Give the terminal back."""
-        self.termios.tcsetattr(sys.stdin, self.termios.TCSADRAIN, self.before)
+        """Restore the settings of the terminal."""
+        self.termios.tcsetattr(sys.stdin, self.termios.TCSADRAIN, self.settings)
 
 
 def press_typed(keyboard: Keyboard, typed: str) -> None:
-    """Hand on characters as a terminal sends them; escape alone stops, the sequences of arrow keys mean nothing."""
+    """Press the keys that a terminal has sent as characters.
+
+    The escape key alone stops the session; escape sequences, such as those of arrow keys, have no effect.
+    """
     if typed == _ESCAPE:
         keyboard.press(QUIT)
     elif not typed.startswith(_ESCAPE):
@@ -248,10 +263,10 @@ def press_typed(keyboard: Keyboard, typed: str) -> None:
             keyboard.press(key)
 
 
-def as_text(picture: np.ndarray) -> str:
-    """A picture (H, W, 3), H even, as lines of half blocks in 24-bit colour."""
+def as_text(image: np.ndarray) -> str:
+    """Return an image (H, W, 3), H even, as lines of half blocks in 24-bit colour."""
     lines = []
-    for upper, lower in zip(picture[::2].tolist(), picture[1::2].tolist(), strict=True):
+    for upper, lower in zip(image[::2].tolist(), image[1::2].tolist(), strict=True):
         pairs = zip(upper, lower, strict=True)
         cells = ["\x1b[38;2;{};{};{}m\x1b[48;2;{};{};{}m▀".format(*above, *below) for above, below in pairs]
         lines.append("".join(cells) + "\x1b[0m")

@@ -1,48 +1,56 @@
-"""Demonstrations by hand: from key events or a 3D mouse to actions, episodes and a demonstration file.
+"""Teleoperated demonstrations: from the actions of an input device to episodes and a demonstration file.
 
-Nothing here knows of windows: a `Screen` feeds the device with what the user did and shows where things stand
-(`libero_env.teleop.screens`). Keys and their effect are those of robosuite's keyboard device.
+Nothing here depends on windows: a `Screen` passes the user's input to the device and shows the state of the episode
+(`libero_env.teleop.screens`).
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from libero_env.demos.observe import Filmer, Shots, model_file
-from libero_env.demos.record import Recipe
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.observe import StateRenderer
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.envs.world import World
 from libero_env.tasks import Task
 from libero_env.teleop.devices import QUIT, Device
 
-HOLD_STEPS = 10  # control steps that the goal must hold, as in the original
+HOLD_STEPS = 10  # [control steps] during which the goal must hold, as in the original
 GENERATOR = "teleoperation"
-VIEW = (480, 480)  # pixels of the pictures that screens ask the world for
+VIEW_SIZE = (480, 480)  # [pixels] height and width of the images that screens render
 
 
 @dataclass(frozen=True)
 class Status:
-    """What a screen shows beside the picture."""
+    """State of the session, which a screen shows beside the image.
+
+    Attributes:
+        language: The instruction.
+        progress: Whether each atom of the goal is true.
+        step: Number of control steps in the episode.
+        recorded: Number of demonstrations that are recorded.
+        target: Number of demonstrations to record.
+    """
 
     language: str
     progress: Mapping[str, bool]
     step: int
     recorded: int
-    wanted: int
+    target: int
 
     def __str__(self) -> str:
         atoms = "  ".join(f"{atom} {'yes' if truth else 'no'}" for atom, truth in self.progress.items())
-        return f"{self.language} | {atoms} | step {self.step} | {self.recorded} of {self.wanted} recorded"
+        return f"{self.language} | {atoms} | step {self.step} | {self.recorded} of {self.target} recorded"
 
 
 class Screen(Protocol):
-    """What the user looks at and acts on."""
+    """What the user looks at and types into."""
 
     def poll(self, world: World) -> None:
-        """Hand on to the device what the user did; once for each control step."""
+        """Pass the user's input to the device; called once per control step."""
         ...
 
     def show(self, world: World, status: Status) -> None:
@@ -50,56 +58,50 @@ class Screen(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Recording:
-    """An episode that reached the goal: actions (T, 7), states before them (T, 1 + nq + nv), fixtures (n, 7)."""
-
-    actions: np.ndarray = field(repr=False)
-    states: np.ndarray = field(repr=False)
-    fixtures: np.ndarray = field(repr=False)
-
-
 class Teleop:
-    """Episodes of a task under a user's hands.
+    """Episodes of a task that a user drives.
 
     Args:
-        task: the task.
-        device: what the user acts through.
-        screen: what the user looks at.
-        seed: of the starts.
-        hold_steps: control steps that the goal must hold before an episode counts.
+        task: The task.
+        device: Input device of the user.
+        screen: What the user looks at.
+        seed: Seed of the starts.
+        hold_steps: Number of control steps during which the goal must hold before the episode ends.
     """
 
     def __init__(
         self, task: Task, device: Device, screen: Screen, *, seed: int = 0, hold_steps: int = HOLD_STEPS
     ):
-        self.task, self.device, self.screen, self.seed, self.hold_steps = (
-            task,
-            device,
-            screen,
-            seed,
-            hold_steps,
-        )
-        self.world = World(task, 1, cameras=(), camera_size=VIEW)
+        self.task, self.device, self.screen = task, device, screen
+        self.seed, self.hold_steps = seed, hold_steps
+        self.world = World(task, 1, cameras=(), camera_size=VIEW_SIZE)
         self.rng = np.random.default_rng(seed)
 
-    def episode(self, recorded: int = 0, wanted: int = 1) -> Recording | None:
-        """One episode, until the goal has held for long enough; None where the user stops.
+    def episode(self, recorded: int = 0, target: int = 1) -> Episode | None:
+        """Run an episode until the goal has held for long enough.
 
-        When the user starts again, what was done so far is forgotten and things stand anew.
+        When the user restarts it, what was done so far is dropped and a new start is sampled.
+
+        Args:
+            recorded: Number of demonstrations that are recorded, for the screen.
+            target: Number of demonstrations to record, for the screen.
+
+        Returns:
+            The episode, without observations; None if the user stops.
 
         Raises:
-            PlacementError: things find no place.
+            PlacementError: No placement of the objects was found.
         """
         while self.device.command != QUIT:
             self.device.command = None
             self.device.restart()
             self.world.reset_random([0], [self.rng])
-            if (found := self._attempt(recorded, wanted)) is not None:
-                return found
+            if (episode := self._attempt(recorded, target)) is not None:
+                return episode
         return None
 
-    def _attempt(self, recorded: int, wanted: int) -> Recording | None:
+    def _attempt(self, recorded: int, target: int) -> Episode | None:
+        """Run an episode; return None when the user gives a command."""
         world, actions, states, held = self.world, [], [], 0
         fixtures = world.simulations.fixtures[0].copy()
         while held < self.hold_steps:
@@ -112,55 +114,57 @@ class Teleop:
             world.step([0], action[None])
             success, progress = world.judge(0)
             held = held + 1 if success else 0
-            self.screen.show(world, Status(self.task.language, progress, len(actions), recorded, wanted))
-        return Recording(np.array(actions), np.array(states), fixtures)
+            self.screen.show(world, Status(self.task.language, progress, len(actions), recorded, target))
+        return Episode(np.array(actions), np.array(states), fixtures=fixtures)
 
     def close(self) -> None:
         """Free the simulation."""
         self.world.close()
 
 
-def record_by_hand(
+def record_session(
     teleop: Teleop,
     path: Path,
     n: int,
     *,
     size: tuple[int, int] = (128, 128),
-    tell: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Record demonstrations into a file, each on disk before the next begins; goes on where it was stopped.
+    """Record teleoperated demonstrations into a file; each is on the disk before the next one begins.
 
     Args:
-        teleop: the task, device and screen.
-        path: demonstration file to write.
-        n: demonstrations that the file shall have.
-        size: (height, width) of the pictures, pixels.
-        tell: hears what was recorded.
+        teleop: The task, device and screen.
+        path: Demonstration file to write. Demonstrations that it has already are kept.
+        n: Number of demonstrations that the file shall have.
+        size: (height, width) of the images, pixels.
+        report: Called with a line of text about each demonstration.
 
     Returns:
-        How many there are now; fewer than `n` where the user stopped.
+        Number of demonstrations in the file; fewer than `n` if the user stopped.
 
     Raises:
-        DemoError: the file cannot be written, or was made otherwise.
+        DemoError: The file cannot be written, or was recorded with another configuration.
     """
-    task = teleop.task
-    shots = Shots(size=size)
-    header = Recipe(task, size, teleop.seed, disturb=False).header() | {"generator": GENERATOR}
-    writer = DemoWriter(path, header)
-    done = writer.recorded()
-    teleop.rng = np.random.default_rng([teleop.seed, len(done)])
-    filmer = Filmer(task, shots)
+    config = DemoConfig(teleop.task, size, teleop.seed, disturb=False)
+    writer = DemoWriter(path, config.header() | {"generator": GENERATOR})
+    recorded = writer.recorded()
+    teleop.rng = np.random.default_rng([teleop.seed, len(recorded)])
+    renderer = StateRenderer(teleop.task, config.render)
     try:
-        while len(done) < n and (found := teleop.episode(len(done), n)) is not None:
-            number = max(done, default=-1) + 1
-            obs, robot = filmer.film(found.states, found.fixtures)
-            xml = model_file(task, tuple(filmer.scene.fixtures), found.fixtures)
-            attrs = {"model_file": xml, "fixtures": found.fixtures}
-            writer.write(number, Episode(found.actions, found.states, robot, obs, attrs=attrs))
-            done.add(number)
-            tell(f"demonstration {number}: {len(found.actions)} steps")
+        while len(recorded) < n and (episode := teleop.episode(len(recorded), n)) is not None:
+            number = max(recorded, default=-1) + 1
+            writer.write(number, _with_observations(episode, renderer))
+            recorded.add(number)
+            report(f"demonstration {number}: {len(episode)} steps")
     finally:
-        filmer.close()
-    if done:
+        renderer.close()
+    if recorded:
         writer.finish()
-    return len(done)
+    return len(recorded)
+
+
+def _with_observations(episode: Episode, renderer: StateRenderer) -> Episode:
+    assert episode.fixtures is not None  # `Teleop` records them
+    obs, robot_states = renderer.render_states(episode.states, episode.fixtures)
+    attrs = {"model_file": renderer.model_xml(episode.fixtures)}
+    return replace(episode, obs=obs, robot_states=robot_states, attrs=attrs)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from libero_env.demos.read import demo_files, demo_names, opened
+from libero_env.demos.read import demo_files, demo_names, open_demo_file
 from lifelong.data.source import DemoSource, check_language
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation
@@ -63,7 +63,7 @@ class RobomimicWindows:
         files = demo_files(self.source.path)
         if files != [self.source.path]:
             raise DataError(f"{self.source.path}: robomimic reads single files; use data.backend=native")
-        with opened(files[0]) as file:
+        with open_demo_file(files[0]) as file:
             names = demo_names(file, files[0])[: self.source.limit]
             labelled = {"expert_actions" in file["data"][name] for name in names}
             if self.source.labels == "expert" and len(labelled) > 1:

@@ -36,19 +36,19 @@ def write(path, episodes, **more):
     return writer.finish()
 
 
-def wander(stage, experts, noise, max_steps):
-    """Instead of the experts: a random walk of the arm, said to be a success."""
+def wander(env, experts, noise, max_steps):
+    """Replace `run_experts` by a random walk of the arm that is reported as a success."""
     rng = np.random.default_rng(5)
     states, actions = [[] for _ in experts], [[] for _ in experts]
     for _ in range(STEPS):
-        action = rng.uniform(-1, 1, (stage.num_envs, 7))
+        action = rng.uniform(-1, 1, (env.num_envs, 7))
         for i in range(len(experts)):
-            states[i].append(stage.world.physics_state(i))
+            states[i].append(env.world.physics_state(i))
             actions[i].append(action[i])
-        stage.step(action)
+        env.step(action)
     for i, rows in enumerate(states):
-        rows.append(stage.world.physics_state(i))
+        rows.append(env.world.physics_state(i))
     return [
-        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "")
-        for s, a in zip(states, actions, strict=True)
+        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "", env.world.simulations.fixtures[i].copy())
+        for i, (s, a) in enumerate(zip(states, actions, strict=True))
     ]

@@ -14,7 +14,7 @@ from libero.libero.utils import download_utils
 from libero_env.assets.http import fetch
 from libero_env.assets.hub import DownloadError
 from libero_env.demos import download as demos_download
-from libero_env.demos.download import REPO, REVISION, demo_files, download_demos
+from libero_env.demos.download import REPO, REVISION, download_demos, remote_files
 from libero_env.errors import UnknownNameError
 from lifelong.cli.main import main
 
@@ -152,7 +152,7 @@ def test_other_files_are_not_replaced_unasked(server, tmp_path):
     server.offer(FILE, CONTENT)
     (tmp_path / FILE).parent.mkdir()
     (tmp_path / FILE).write_bytes(b"recorded here")
-    with pytest.raises(DownloadError, match="is there and is another file"):
+    with pytest.raises(DownloadError, match="exists with other contents"):
         download_demos(["libero_object/0"], tmp_path)
     assert (tmp_path / FILE).read_bytes() == b"recorded here"
     download_demos(["libero_object/0"], tmp_path, overwrite=True)
@@ -179,13 +179,13 @@ def test_servers_that_list_files_elsewhere_are_not_trusted(server, tmp_path):
 
 
 def test_every_task_has_a_file():
-    assert len(demo_files(["libero_100"])) == 100
-    assert demo_files(["libero_10", "libero_10/3"]) == demo_files(["libero_10"])
-    assert all(file.endswith("_demo.hdf5") for file in demo_files(["libero_spatial"]))
+    assert len(remote_files(["libero_100"])) == 100
+    assert remote_files(["libero_10", "libero_10/3"]) == remote_files(["libero_10"])
+    assert all(file.endswith("_demo.hdf5") for file in remote_files(["libero_spatial"]))
 
 
 def test_the_facade_fetches_from_the_hub(server, tmp_path, capsys):
-    for file in demo_files(["libero_goal"]):
+    for file in remote_files(["libero_goal"]):
         server.offer(file, file.encode())
     download_utils.libero_dataset_download("libero_goal", tmp_path, use_huggingface=True)
     assert len(list((tmp_path / "libero_goal").glob("*_demo.hdf5"))) == 10
@@ -202,7 +202,7 @@ def test_the_facade_fetches_from_the_hub(server, tmp_path, capsys):
 def _archive(suites):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for file in demo_files(suites):
+        for file in remote_files(suites):
             archive.writestr(file, b"demonstrations")
     return buffer.getvalue()
 

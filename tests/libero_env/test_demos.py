@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.read import aligned, read_demos
+from libero_env.demos.read import align, read_demos
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from tests.harness.demos import episode, header
@@ -92,7 +92,7 @@ def test_files_of_the_original_are_read(tmp_path):
     demos = read_demos(path)
     assert [demo.name for demo in demos] == ["demo_2", "demo_10"] and demos[0].states is None
     assert demos[0].pairing == "libero"
-    shifted = aligned(demos[0])
+    shifted = align(demos[0])
     np.testing.assert_array_equal(shifted.obs["ee_pos"], demos[0].obs["ee_pos"][:-1])
     np.testing.assert_array_equal(shifted.actions, demos[0].actions[1:])
     assert read_demos(path, pairing="aligned")[0].pairing == "aligned"

@@ -12,9 +12,11 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.demos.config import DemoConfig, RecordingJob, Variation
+from libero_env.demos.curate import read_episodes
 from libero_env.demos.generate import demo_path, ensure_demos, generate
 from libero_env.demos.read import read_demos
-from libero_env.demos.record import Recipe, Studio
+from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
@@ -83,11 +85,11 @@ def test_demonstrations_differ_and_are_disturbed(whole):
 
 
 def test_the_libero_pairing_shows_what_came_after():
-    """The same attempt filmed both ways differs by one step."""
-    studio = Studio(Recipe(TASK, SIZE, pairing="libero"))
-    ((_, attempt),) = studio.attempt([(0, 0)])
-    after = studio.film(attempt, {})
-    studio.close()
+    """The same attempt rendered both ways differs by one step."""
+    recorder = DemoRecorder(DemoConfig(TASK, SIZE, pairing="libero"))
+    ((_, attempt),) = recorder.attempt([(0, 0)])
+    after = recorder.episode(attempt)
+    recorder.close()
     np.testing.assert_array_equal(after.states, attempt.states[:-1])
     arm = slice(1, 8)
     np.testing.assert_allclose(after.obs["joint_states"], attempt.states[1:, arm], atol=1e-12)
@@ -125,20 +127,55 @@ def test_a_file_made_otherwise_is_refused(whole):
 
 
 def test_files_are_made_once_and_found_again(whole, tmp_path):
-    recipe = Recipe(TASK, SIZE)
-    kept = demo_path(tmp_path, recipe)
+    kept = demo_path(tmp_path, DemoConfig(TASK, SIZE))
     kept.parent.mkdir(parents=True)
     os.link(whole, kept)
     before = kept.stat().st_mtime_ns
     assert ensure_demos([get_task(TASK)], 2, root=tmp_path, workers=1, **KINDS) == [kept]
     assert kept.stat().st_mtime_ns == before
-    assert (
-        demo_path(tmp_path, Recipe(TASK, SIZE, seed=1)) != kept != demo_path(tmp_path, Recipe(TASK, (32, 32)))
+    others = (
+        DemoConfig(TASK, SIZE, seed=1),
+        DemoConfig(TASK, (32, 32)),
+        DemoConfig(TASK, SIZE, disturb=False),
     )
+    assert kept not in [demo_path(tmp_path, other) for other in others]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("config", "folder"),
+    [
+        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-8"),
+        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-8-d9a2a37b"),
+        (
+            DemoConfig(
+                "libero_goal/3",
+                (128, 128),
+                variation=Variation(style=False, noise=0.2, reserved=True),
+                cameras=("agentview",),
+                modalities=("rgb", "depth"),
+            ),
+            "128x128-seed0-scripted-expert-8-800fa04f",
+        ),
+        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-8-bf1e44b3"),
+    ],
+)
+def test_folders_of_earlier_versions_are_found(config, folder, tmp_path):
+    path = demo_path(tmp_path, config)
+    assert path == tmp_path / config.task.suite / folder / f"{config.task.name}_demo.hdf5"
+
+
+def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_path):
+    path = tmp_path / "unjoined.hdf5"
+    writer = RecordingJob(DemoConfig(get_task(TASK), SIZE), path).writer()
+    for name, episode in read_episodes(whole):
+        writer.write(int(name[5:]), episode)
+    assert not path.exists()
+    same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
 
 def test_what_an_older_scene_left_is_recorded_anew(whole, tmp_path):
-    kept = demo_path(tmp_path, Recipe(TASK, SIZE))
+    kept = demo_path(tmp_path, DemoConfig(TASK, SIZE))
     kept.parent.mkdir(parents=True)
     kept.write_bytes(whole.read_bytes())
     with h5py.File(kept, "r+") as handle:

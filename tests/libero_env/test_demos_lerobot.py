@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from libero_env.demos.lerobot import export
+from libero_env.demos.lerobot import export_lerobot
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
 from tests.harness.demos import episode, write
@@ -37,7 +37,7 @@ def files(tmp_path_factory):
 @pytest.fixture(scope="module")
 def root(files, tmp_path_factory):
     out = tmp_path_factory.mktemp("lerobot") / "set"
-    assert export(files, out, progress=False) == (3, sum(STEPS))
+    assert export_lerobot(files, out, progress=False) == (3, sum(STEPS))
     return out
 
 
@@ -106,7 +106,7 @@ def test_frames_are_found_where_the_episodes_say(root, info, episodes, files):
 
 
 def test_a_full_video_goes_on_in_the_next_file(files, tmp_path):
-    export(files, tmp_path / "set", video_mb=0.0, progress=False)
+    export_lerobot(files, tmp_path / "set", video_mb=0.0, progress=False)
     videos = sorted(p.name for p in (tmp_path / "set/videos/observation.images.image/chunk-000").iterdir())
     rows = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     indices = [row["videos/observation.images.image/file_index"] for row in rows]
@@ -141,7 +141,7 @@ def test_pandas_sees_tasks_as_the_index(root):
 
 def test_the_original_pairing_is_shifted(tmp_path):
     file = write(tmp_path / "c.hdf5", [smooth(0, 9)], pairing="libero")
-    assert export([file], tmp_path / "set", labels="executed", progress=False) == (1, 8)
+    assert export_lerobot([file], tmp_path / "set", labels="executed", progress=False) == (1, 8)
     table = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     one = episode(0, 9, SIZE)
     np.testing.assert_allclose(table["action"].to_pylist(), one.actions[1:], atol=1e-6)
@@ -152,12 +152,12 @@ def test_the_original_pairing_is_shifted(tmp_path):
 
 def test_what_does_not_fit_leaves_nothing(files, tmp_path):
     other = write(tmp_path / "other.hdf5", [smooth(0, 5, 16)])
-    with pytest.raises(DemoError, match=r"other.hdf5: demo_0 has pictures .*16"):
-        export([files[0], other], tmp_path / "set", progress=False)
+    with pytest.raises(DemoError, match=r"other.hdf5: demo_0 has images .*16"):
+        export_lerobot([files[0], other], tmp_path / "set", progress=False)
     assert not (tmp_path / "set").exists()
     odd = write(tmp_path / "odd.hdf5", [smooth(0, 5, 15)])
     with pytest.raises(LiberoError, match="15x15"):
-        export([odd], tmp_path / "set", progress=False)
+        export_lerobot([odd], tmp_path / "set", progress=False)
     (tmp_path / "set").mkdir()
     with pytest.raises(DemoError, match="exists"):
-        export(files, tmp_path / "set", progress=False)
+        export_lerobot(files, tmp_path / "set", progress=False)

@@ -1,17 +1,18 @@
-"""Going through recordings again: fixtures stand where they stood, and states lead to the same pictures."""
+"""Replaying and rendering again: fixtures are at their recorded poses, and states lead to the same images."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.curate import examine, read_episodes, task_of
+from libero_env.demos.config import DemoConfig, RecordingJob, Variation
+from libero_env.demos.curate import examine, read_episodes, recorded_task
 from libero_env.demos.generate import generate, make_demos
-from libero_env.demos.lerobot import export
-from libero_env.demos.observe import Filmer, Shots, fixtures_of
+from libero_env.demos.lerobot import export_lerobot
+from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import read_demos
-from libero_env.demos.record import Recipe, Variation
 from libero_env.demos.replay import replay, rerender
 from libero_env.demos.write import Episode
 from libero_env.envs.env import LiberoEnv
@@ -37,16 +38,22 @@ def path(tmp_path_factory):
 def test_fixtures_are_recorded_where_they_stood(path):
     scene = LiberoEnv(TASK, cameras=()).world.scene
     episodes = [episode for _, episode in read_episodes(path)]
-    poses = [episode.attrs["fixtures"] for episode in episodes]
+    poses = [episode.fixtures for episode in episodes]
     assert not np.allclose(poses[0], poses[1], atol=1e-6)  # they differ from start to start
     for episode, pose in zip(episodes, poses, strict=True):
-        rounded = {"model_file": episode.attrs["model_file"]}
-        np.testing.assert_allclose(fixtures_of(rounded, scene, ""), pose, atol=1e-5)
-    np.testing.assert_array_equal(fixtures_of({}, scene, ""), scene.fixture_poses)
+        np.testing.assert_array_equal(fixture_poses(episode, scene, ""), pose)
+        rounded = replace(
+            episode, fixtures=None
+        )  # only in the attribute model_file, as in the original's files
+        np.testing.assert_allclose(fixture_poses(rounded, scene, ""), pose, atol=1e-5)
+    bare = replace(episodes[0], fixtures=None, attrs={})
+    np.testing.assert_array_equal(fixture_poses(bare, scene, ""), scene.fixture_poses)
     with pytest.raises(DemoError, match="no XML"):
-        fixtures_of({"model_file": "<mujoco"}, scene, "x")
+        fixture_poses(replace(bare, attrs={"model_file": "<mujoco"}), scene, "x")
     with pytest.raises(DemoError, match="no body"):
-        fixtures_of({"model_file": "<mujoco/>"}, scene, "x")
+        fixture_poses(replace(bare, attrs={"model_file": "<mujoco/>"}), scene, "x")
+    with pytest.raises(DemoError, match=r"attribute fixtures is \(1, 7\)"):
+        fixture_poses(replace(bare, fixtures=np.zeros((1, 7))), scene, "x")
 
 
 def test_actions_replay_to_the_same_states(path):
@@ -58,11 +65,11 @@ def test_actions_replay_to_the_same_states(path):
 
 def test_with_fixtures_elsewhere_it_would_not_be_the_same_scene(path, tmp_path):
     """Pictures depend on where fixtures stand, so that it is seen when they are forgotten."""
-    filmer = Filmer(get_task(TASK), Shots(("agentview",), SIZE))
+    renderer = StateRenderer(get_task(TASK), RenderConfig(("agentview",), SIZE))
     _, episode = next(read_episodes(path))
-    seen, _ = filmer.film(episode.states[:1], episode.attrs["fixtures"])
-    moved, _ = filmer.film(episode.states[:1], episode.attrs["fixtures"] + [0.1, 0, 0, 0, 0, 0, 0])
-    filmer.close()
+    seen, _ = renderer.render_states(episode.states[:1], episode.fixtures)
+    moved, _ = renderer.render_states(episode.states[:1], episode.fixtures + [0.1, 0, 0, 0, 0, 0, 0])
+    renderer.close()
     np.testing.assert_array_equal(seen["agentview_rgb"][0], episode.obs["agentview_rgb"][0])
     assert np.abs(seen["agentview_rgb"].astype(int) - moved["agentview_rgb"]).mean() > 1.0
 
@@ -80,7 +87,7 @@ def test_states_replay_with_a_film(path):
 
 
 def test_rendering_anew_gives_the_same_where_nothing_is_changed(path, tmp_path):
-    out = rerender(path, tmp_path / "same.hdf5", Shots(size=SIZE), progress=False)
+    out = rerender(path, tmp_path / "same.hdf5", RenderConfig(size=SIZE), progress=False)
     for a, b in zip(read_demos(path), read_demos(out), strict=True):
         assert a.name == b.name and a.obs.keys() == b.obs.keys()
         for key in a.obs:
@@ -88,8 +95,8 @@ def test_rendering_anew_gives_the_same_where_nothing_is_changed(path, tmp_path):
 
 
 def test_rendering_anew_with_other_cameras_depth_and_segmentation(path, tmp_path):
-    shots = Shots(("agentview", "frontview"), (16, 20), ("rgb", "depth", "segmentation_instance"))
-    out = rerender(path, tmp_path / "other.hdf5", shots, progress=False)
+    config = RenderConfig(("agentview", "frontview"), (16, 20), ("rgb", "depth", "segmentation_instance"))
+    out = rerender(path, tmp_path / "other.hdf5", config, progress=False)
     demo = read_demos(out)[0]
     assert {"frontview_rgb", "frontview_depth", "agentview_segmentation"} <= demo.obs.keys()
     assert (
@@ -97,16 +104,16 @@ def test_rendering_anew_with_other_cameras_depth_and_segmentation(path, tmp_path
         and demo.obs["frontview_depth"].dtype == np.float32
     )
     assert len(np.unique(demo.obs["agentview_segmentation"])) > 3
-    frame = Filmer(get_task(TASK), shots)
+    renderer = StateRenderer(get_task(TASK), config)
     _, episode = next(read_episodes(path))
-    seen, _ = frame.film(episode.states[:1], episode.attrs["fixtures"])
-    frame.close()
+    seen, _ = renderer.render_states(episode.states[:1], episode.fixtures)
+    renderer.close()
     for key in ("frontview_depth", "agentview_segmentation"):
         np.testing.assert_array_equal(demo.obs[key][0], seen[key][0])  # upright again when it is read
     with pytest.raises(DemoError, match="was recorded with camera_size"):
-        rerender(path, out, Shots(size=(8, 8)), progress=False)
+        rerender(path, out, RenderConfig(size=(8, 8)), progress=False)
     with pytest.raises(DemoError, match="choose another name"):
-        rerender(path, path, Shots(), progress=False)
+        rerender(path, path, RenderConfig(), progress=False)
 
 
 def test_states_of_another_scene_are_refused(path, tmp_path):
@@ -123,7 +130,7 @@ def test_states_of_another_scene_are_refused(path, tmp_path):
 def original(source, out):
     """A file as the original writes it, from recorded states: observations after their action, a path of its own."""
     task = get_task(TASK)
-    filmer = Filmer(task, Shots(size=SIZE))
+    renderer = StateRenderer(task, RenderConfig(size=SIZE))
     with h5py.File(out, "w") as handle:
         data = handle.create_group("data")
         data.attrs["env_name"] = "Libero_Tabletop_Manipulation"
@@ -133,8 +140,8 @@ def original(source, out):
         data.attrs["macros_image_convention"], data.attrs["tag"] = "opengl", "libero-v1"
         data.attrs["num_demos"], data.attrs["total"] = 1, STEPS - 1
         episode: Episode = next(read_episodes(source))[1]
-        model, fixtures = filmer.scene.model, episode.attrs["fixtures"]
-        obs, robot = filmer.film(episode.states[1:], fixtures)
+        model, fixtures = renderer.scene.model, episode.fixtures
+        obs, robot = renderer.render_states(episode.states[1:], fixtures)
         demo = data.create_group("demo_0")
         demo["actions"], demo["states"] = episode.actions[:-1], episode.states[:-1]
         demo["robot_states"] = robot
@@ -145,16 +152,16 @@ def original(source, out):
         bodies = [
             f'<body name="{model.body(body).name}" pos="{" ".join(map(str, pose[:3]))}" '
             f'quat="{" ".join(map(str, pose[3:]))}"/>'
-            for body, pose in zip(filmer.scene.fixture_bodies, fixtures, strict=True)
+            for body, pose in zip(renderer.scene.fixture_bodies, fixtures, strict=True)
         ]
         demo.attrs["model_file"] = f"<mujoco><worldbody>{''.join(bodies)}</worldbody></mujoco>"
-    filmer.close()
+    renderer.close()
     return out
 
 
 def test_files_of_the_original_work_with_every_tool(path, tmp_path):
     file = original(path, tmp_path / "human_demo.hdf5")
-    assert task_of(file) is get_task(TASK) and examine(file).lengths == (STEPS - 1,)
+    assert recorded_task(file) is get_task(TASK) and examine(file).lengths == (STEPS - 1,)
     (result,) = replay(file, by="action")
     assert result.drift.max() < 1e-9 and result.arm_drift.max() < 1e-9
     (ours,) = read_demos(path, limit=1)
@@ -162,13 +169,13 @@ def test_files_of_the_original_work_with_every_tool(path, tmp_path):
     np.testing.assert_array_equal(
         theirs.obs["agentview_rgb"], ours.obs["agentview_rgb"][1:]
     )  # upright, one later
-    again = rerender(file, tmp_path / "aligned.hdf5", Shots(size=SIZE), progress=False)
+    again = rerender(file, tmp_path / "aligned.hdf5", RenderConfig(size=SIZE), progress=False)
     (anew,) = read_demos(again)
     assert anew.pairing == "aligned"
     np.testing.assert_array_equal(anew.obs["agentview_rgb"], ours.obs["agentview_rgb"][:-1])
     pytest.importorskip("av")
     pytest.importorskip("pyarrow")
-    assert export([file], tmp_path / "set", progress=False) == (1, STEPS - 2)
+    assert export_lerobot([file], tmp_path / "set", progress=False) == (1, STEPS - 2)
 
 
 def test_recorded_models_have_the_joints_of_the_states(path):
@@ -186,12 +193,13 @@ def test_a_task_beyond_the_expert_stops_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr("libero_env.demos.record.Expert", Choosy)
     monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     jobs = [
-        (Recipe(t, (8, 8)), tmp_path / f"{t[-6:].replace('/', '')}.hdf5") for t in (TASK, "libero_goal/4")
+        RecordingJob(DemoConfig(t, (8, 8)), tmp_path / f"{t[-6:].replace('/', '')}.hdf5")
+        for t in (TASK, "libero_goal/4")
     ]
-    tallies = list(make_demos(jobs, 2, workers=1, progress=False).values())
-    assert "no skill for that" in tallies[0].error and tallies[0].recorded == 0 and not jobs[0][1].exists()
-    assert not tallies[1].error and tallies[1].recorded == tallies[1].attempts == 2
-    assert len(read_demos(jobs[1][1])) == 2
+    reports = list(make_demos(jobs, 2, workers=1, progress=False).values())
+    assert "no skill for that" in reports[0].error and reports[0].recorded == 0 and not jobs[0].path.exists()
+    assert not reports[1].error and reports[1].recorded == reports[1].attempts == 2
+    assert len(read_demos(jobs[1].path)) == 2
     with pytest.raises(DemoError, match=r"1 of 1 files are not complete.*no skill for that"):
         generate(TASK, 1, path=tmp_path / "again.hdf5", camera_size=(8, 8), workers=1, progress=False)
 
@@ -203,22 +211,21 @@ def test_an_expert_that_always_fails_is_given_up(tmp_path, monkeypatch):
         ]
 
     monkeypatch.setattr("libero_env.demos.record.run_experts", idle)
-    jobs = [(Recipe(TASK, (8, 8), variation=Variation(reserved=True)), tmp_path / "a.hdf5")]
-    (tally,) = make_demos(jobs, 2, workers=1, progress=False).values()
-    assert (
-        tally.attempts == 20 and tally.reasons == {"it did nothing": 20} and "failed 10 times" in tally.error
-    )
+    config = DemoConfig(TASK, (8, 8), variation=Variation(reserved=True))
+    (report,) = make_demos([RecordingJob(config, tmp_path / "a.hdf5")], 2, workers=1, progress=False).values()
+    assert report.attempts == 20 and report.failure_reasons == {"it did nothing": 20}
+    assert "failed 10 times on demonstration" in report.error and "it did nothing" in report.error
 
 
 def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
     monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
-    recipe = Recipe(TASK, (8, 8), variation=Variation(reserved=True))
-    make_demos([(recipe, tmp_path / "a.hdf5")], 2, workers=1, progress=False)
+    config = DemoConfig(TASK, (8, 8), variation=Variation(reserved=True))
+    make_demos([RecordingJob(config, tmp_path / "a.hdf5")], 2, workers=1, progress=False)
     env = LiberoEnv(TASK, cameras=())
     for i, (_, episode) in enumerate(read_episodes(tmp_path / "a.hdf5")):
         env.reset(options={"init_state": i})
         np.testing.assert_array_equal(episode.states[0], env.world.physics_state(0))
-        np.testing.assert_array_equal(episode.attrs["fixtures"], env.world.simulations.fixtures[0])
+        np.testing.assert_array_equal(episode.fixtures, env.world.simulations.fixtures[0])
 
 
 def test_a_task_file_of_ones_own_is_recorded(tmp_path, monkeypatch):
@@ -226,7 +233,7 @@ def test_a_task_file_of_ones_own_is_recorded(tmp_path, monkeypatch):
     file = tmp_path / "my_task.bddl"
     file.write_text(get_task("libero_object/9").bddl_text)
     path = generate(str(file), 1, path=tmp_path / "a.hdf5", camera_size=(8, 8), workers=1, progress=False)
-    task = task_of(path)
+    task = recorded_task(path)
     assert task.name == "my_task" and task.id == "file/0" and examine(path).lengths == (STEPS,)
     changed = file.read_text().replace("(:language ", "(:language Kindly ")
     file.write_text(changed)

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.curate import examine, filter_demos, noops, read_episodes, task_of
+from libero_env.demos.curate import examine, filter_demos, noop_steps, read_episodes, recorded_task
 from libero_env.demos.read import read_demos
 from libero_env.demos.statistics import QUANTILES, Histogram, Moments
 from libero_env.errors import DemoError
@@ -32,8 +32,8 @@ def path(tmp_path):
 
 def test_a_no_op_neither_moves_nor_grips():
     actions = with_noops(0).expert_actions
-    assert np.flatnonzero(noops(actions)).tolist() == [3, 4]
-    assert noops(actions, threshold=2.0).sum() == len(actions) - 1  # the one that grips is left
+    assert np.flatnonzero(noop_steps(actions)).tolist() == [3, 4]
+    assert noop_steps(actions, threshold=2.0).sum() == len(actions) - 1  # the one that grips is left
 
 
 def test_files_are_counted(path):
@@ -105,26 +105,26 @@ def test_the_task_is_found_by_name_and_by_text(tmp_path):
     task = get_task("libero_goal/3")
     names = {"bddl_file_name": f"somewhere/bddl_files/libero_goal/{task.name}.bddl"}
     known = write(tmp_path / "known.hdf5", [episode(0)], **names, bddl_file_content=task.bddl_text)
-    assert task_of(known) is task
+    assert recorded_task(known) is task
     bare = write(tmp_path / "bare.hdf5", [episode(0)], **names, bddl_file_content="")
-    assert task_of(bare) is task
+    assert recorded_task(bare) is task
     other = task.bddl_text.replace("(:language ", "(:language Please ")
-    own = task_of(write(tmp_path / "own.hdf5", [episode(0)], **names, bddl_file_content=other))
+    own = recorded_task(write(tmp_path / "own.hdf5", [episode(0)], **names, bddl_file_content=other))
     assert own.id == "file/0" and own.name == task.name and own.problem.objects == task.problem.objects
     nameless = write(tmp_path / "no.hdf5", [episode(0)], bddl_file_name="x.bddl", bddl_file_content="")
     with pytest.raises(DemoError, match="bddl_file_name"):
-        task_of(nameless)
+        recorded_task(nameless)
 
 
 def test_statistics_add_up():
     """Those of parts together are those of the whole, and those of a histogram those of the pixels."""
     rng = np.random.default_rng(0)
     values = rng.normal(size=(90, 3))
-    whole = (Moments.of(values[:40]) + Moments.of(values[40:])).values()
+    whole = (Moments.from_values(values[:40]) + Moments.from_values(values[40:])).summary()
     np.testing.assert_allclose(whole["std"], values.std(axis=0))
     np.testing.assert_allclose(whole["q10"], np.quantile(values, 0.1, axis=0))
     frames = np.clip(rng.normal(100, 60, (20, 8, 8, 3)), 0, 255).astype(np.uint8)
-    found = (Histogram.of(frames[:7]) + Histogram.of(frames[7:])).values()
+    found = (Histogram.from_frames(frames[:7]) + Histogram.from_frames(frames[7:])).summary()
     pixels = frames.reshape(-1, 3) / 255.0
     quantiles = np.quantile(pixels, QUANTILES, axis=0, method="inverted_cdf")
     for name, wanted in {

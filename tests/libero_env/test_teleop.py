@@ -16,7 +16,7 @@ from libero_env.tasks import get_task
 from libero_env.teleop import screens as teleop_screens
 from libero_env.teleop.devices import GRIPPER, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
 from libero_env.teleop.screens import MouseReader, as_text, key_name, open_screen, press_typed
-from libero_env.teleop.session import Status, Teleop, record_by_hand
+from libero_env.teleop.session import Status, Teleop, record_session
 from lifelong.cli import main as cli
 
 TASK = "libero_90/0"  # KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet
@@ -208,10 +208,10 @@ def test_starting_again_forgets_and_stopping_ends(session):
 @pytest.mark.sim
 def test_what_is_recorded_is_a_demonstration(session, tmp_path):
     choose_backend()
-    file, told = tmp_path / "by_hand.hdf5", []
-    assert record_by_hand(session(), file, 1, size=(16, 16), tell=told.append) == 1
-    assert record_by_hand(session(), file, 2, size=(16, 16), tell=told.append) == 2
-    assert [line.partition(":")[0] for line in told] == ["demonstration 0", "demonstration 1"]
+    file, lines = tmp_path / "by_hand.hdf5", []
+    assert record_session(session(), file, 1, size=(16, 16), report=lines.append) == 1
+    assert record_session(session(), file, 2, size=(16, 16), report=lines.append) == 2
+    assert [line.partition(":")[0] for line in lines] == ["demonstration 0", "demonstration 1"]
     first, second = read_demos(file)
     assert first.success
     assert first.obs["agentview_rgb"].shape == (len(first), 16, 16, 3)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.demos.read import demo_names, opened
+from libero_env.demos.read import demo_names, open_demo_file
 from libero_env.errors import DemoError
 
 
@@ -26,7 +26,7 @@ def get_dataset_info(
         DemoError: it is no file of demonstrations, or has no such subset.
     """
     path = Path(dataset_path)
-    with opened(path) as file:
+    with open_demo_file(path) as file:
         names, data = demo_names(file, path), file["data"]
         if filter_key is not None:
             if (masks := file.get("mask")) is None or filter_key not in masks:
