@@ -1,6 +1,6 @@
-"""Demonstrations as the original's datasets: windows as dictionaries of tensors.
+"""The original's datasets of demonstrations: windows as dictionaries of tensors.
 
-Shape legend: T time, C H W image, D one reading's dimension, A action, L language embedding.
+Shape legend: T time, C H W image, D dimension of a proprioceptive input, A action, L language embedding.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import ConcatDataset, Dataset
+from torch.utils.data import ConcatDataset, Dataset, Subset
 
-from libero._adapters.lifelong.observations import picture
+from libero._adapters.lifelong.observations import image_tensor
 from libero_env.demos.read import demo_files, demo_names, open_demo_file, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import SequenceVLDataset as Windows
@@ -25,13 +25,14 @@ _DEFAULT_KEYS = {
 
 
 class SequenceDataset(Dataset):
-    """All windows of a demonstration file; every frame begins one, and past the end the last repeats.
+    """All windows of a demonstration file: one begins at every frame, and past the end the last frame repeats.
 
-    A window is `{"obs": {view: (T, C, H, W) in [0, 1] lowest row first, reading: (T, D)}, "actions": (T, A)}`. Frames
-    are held in memory as bytes.
+    A window is `{"obs": {view: (T, C, H, W) in [0, 1] bottom row first, proprioceptive input: (T, D)}, "actions":
+    (T, A)}`. Frames are in memory as uint8.
 
     Attributes:
-        n_demos, total_num_sequences: demonstrations and windows.
+        n_demos: Number of demonstrations.
+        total_num_sequences: Number of windows.
     """
 
     def __init__(self, windows: Windows, views: Sequence[str], frame_stack: int = 1):
@@ -49,53 +50,44 @@ class SequenceDataset(Dataset):
         w, steps = self.windows, torch.arange(1 - self.frame_stack, self.seq_length)
         frames = (index + steps).clamp(int(self._first[index]), int(w.last[index]))
         images = w.images[frames].flip(-3)  # (T, V, H, W, C)
-        obs = {view: picture(images[:, k]) for k, view in enumerate(self.views)}
+        obs = {view: image_tensor(images[:, k]) for k, view in enumerate(self.views)}
         obs.update({name: values[frames] for name, values in w.proprio.items()})
         return {"actions": w.actions[frames[self.frame_stack - 1 :]], "obs": obs}
 
 
 class SequenceVLDataset(Dataset):
-    """Windows with their task's language embedding (L,) under `task_emb`."""
+    """Windows with the embedding of their task's instruction, (L,), under `task_emb`."""
 
-    def __init__(self, sequence_dataset: Dataset, task_emb: Tensor):
+    def __init__(self, sequence_dataset: Any, task_emb: Tensor):
         self.sequence_dataset, self.task_emb = sequence_dataset, task_emb
-        self.n_demos, self.total_num_sequences = _counts([sequence_dataset])
+        self.n_demos, self.total_num_sequences = getattr(sequence_dataset, "n_demos", 0), len(self)
 
     def __len__(self) -> int:
-        return len(self.sequence_dataset)  # type: ignore[arg-type]
+        return len(self.sequence_dataset)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         return {**self.sequence_dataset[index], "task_emb": self.task_emb}
 
 
-class GroupedTaskDataset(Dataset):
-    """The windows of several tasks that are learned together, each with its task's embedding."""
+class GroupedTaskDataset(ConcatDataset):
+    """Windows of several tasks that are learned together, each with its task's embedding."""
 
     def __init__(self, sequence_datasets: Sequence[Dataset], task_embs: Sequence[Tensor]):
         parts = [SequenceVLDataset(*pair) for pair in zip(sequence_datasets, task_embs, strict=True)]
+        super().__init__(parts)
         self.sequence_datasets, self.task_embs = list(sequence_datasets), task_embs
-        self.n_demos, self.total_num_sequences = _counts(parts)
-        self._joined: ConcatDataset = ConcatDataset(parts)
-
-    def __len__(self) -> int:
-        return len(self._joined)
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        return self._joined[index]
+        self.n_demos, self.total_num_sequences = sum(part.n_demos for part in parts), len(self)
 
 
-class TruncatedSequenceDataset(Dataset):
-    """The first `buffer_size` windows of a dataset, or all if it has fewer."""
+class TruncatedSequenceDataset(Subset):
+    """First `buffer_size` windows of a dataset, or all if it has fewer."""
 
-    def __init__(self, sequence_dataset: Dataset, buffer_size: int):
-        self.sequence_dataset = sequence_dataset
-        self.buffer_size = min(int(buffer_size), len(sequence_dataset))  # type: ignore[arg-type]
-
-    def __len__(self) -> int:
-        return self.buffer_size
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        return self.sequence_dataset[range(self.buffer_size)[index]]
+    def __init__(self, sequence_dataset: Any, buffer_size: int):
+        self.sequence_dataset, self.buffer_size = (
+            sequence_dataset,
+            min(int(buffer_size), len(sequence_dataset)),
+        )
+        super().__init__(sequence_dataset, range(self.buffer_size))
 
 
 def get_dataset(
@@ -110,44 +102,46 @@ def get_dataset(
     pairing: str = "stored",
     labels: str = "expert",
 ) -> tuple[SequenceDataset, dict[str, Any]]:
-    """The windows of a demonstration file.
+    """Read the windows of a demonstration file.
 
     Args:
-        dataset_path: HDF5 in the original's layout.
-        obs_modality: `rgb` and `low_dim` -> keys of the observation; or a list of these two, for the usual keys.
-        initialize_obs_utils: without a meaning here: nothing global is set up.
-        seq_len: T.
-        frame_stack: observations begin so many frames, less one, before the window.
-        filter_key: a subset of the demonstrations that the file names in its group `mask`.
-        hdf5_cache_mode: without a meaning here: pictures are in memory as bytes.
+        dataset_path: HDF5 file in the original's layout.
+        obs_modality: Keys of the observation under `rgb` and `low_dim`; or a list of these two, for the default keys.
+        initialize_obs_utils: Without effect: there is no global state.
+        seq_len: Number of steps of a window, T.
+        frame_stack: Number of frames at the first step: observations begin `frame_stack - 1` frames before the window.
+        filter_key: Subset of the demonstrations in the file's group `mask`.
+        hdf5_cache_mode: Without effect: images are in memory as uint8.
         pairing: `stored` takes the file as it is, which in the original's files pairs an action with the
-            observation after it; `aligned` with the one before it.
-        labels: see `libero_env.demos.read.read_demos`.
+            observation after it; `aligned` pairs it with the one before it.
+        labels: See `libero_env.demos.read.read_demos`.
 
     Returns:
-        The windows, and what a policy is built from: `ac_dim`, `all_shapes` (key -> shape), `all_obs_keys`,
-        `use_images`, and `obs.rgb_shape`.
+        The windows, and the shapes that a policy is built from: `ac_dim`, `all_shapes` (key -> shape),
+        `all_obs_keys`, `use_images`, and `obs.rgb_shape`.
 
     Raises:
-        DemoError: no such file, a broken one, or no such key or subset.
+        DemoError: The file does not exist, is broken, or lacks a key or the subset.
     """
-    views, readings, depths = (_keys(obs_modality, kind) for kind in ("rgb", "low_dim", "depth"))
+    views, proprio, depths = (_keys(obs_modality, kind) for kind in ("rgb", "low_dim", "depth"))
     if depths:
-        raise DemoError(f"depth ({', '.join(depths)}) is not read here; leave obs_modality['depth'] empty")
-    shapes = _shapes(Path(dataset_path), [*views, *readings])
+        raise DemoError(
+            f"depth images ({', '.join(depths)}) are not supported; leave obs_modality['depth'] empty"
+        )
+    shapes = _shapes(Path(dataset_path), [*views, *proprio])
     spec = PolicySpec(
         views=tuple(views),
         image_size=tuple(shapes[views[0]][:2]) if views else (0, 0),  # type: ignore[arg-type]
-        proprio={name: shapes[name][0] for name in readings},
+        proprio={name: shapes[name][0] for name in proprio},
         language_dim=1,
         seq_len=seq_len,
     )
     windows = _read(Path(dataset_path), spec, filter_key, pairing, labels)
-    all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in readings}
+    all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in proprio}
     shape_meta = {
         "ac_dim": spec.action_dim,
         "all_shapes": all_shapes,
-        "all_obs_keys": [*views, *readings],
+        "all_obs_keys": [*views, *proprio],
         "use_images": bool(views),
         "obs": {"rgb_shape": (3, *spec.image_size)},
     }
@@ -161,7 +155,7 @@ def _keys(obs_modality: Mapping[str, Sequence[str]] | Sequence[str], kind: str) 
 
 
 def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """Shapes of one frame's observations."""
+    """Return the shapes of one frame's observations."""
     file = next(iter(demo_files(path)), path)
     with open_demo_file(file) as handle:
         names = demo_names(handle, file)
@@ -182,14 +176,8 @@ def _read(path: Path, spec: PolicySpec, filter_key: str | None, pairing: str, la
         if filter_key not in handle.get("mask", {}):
             known = ", ".join(handle.get("mask", {})) or "none"
             raise DemoError(f"{path}: no subset {filter_key!r}; there is {known}")
-        wanted = {name.decode() for name in handle["mask"][filter_key][()]}
+        names = {name.decode() for name in handle["mask"][filter_key][()]}
     keys = [*spec.views, *(spec.proprio or ())]
     demos = read_demos(path, keys, pairing=pairing, labels=labels)  # type: ignore[arg-type]
-    kept = [demo for demo in demos if demo.name in wanted]
+    kept = [demo for demo in demos if demo.name in names]
     return Windows.from_demos(kept, spec=spec, language=language, source=str(path))
-
-
-def _counts(datasets: Sequence[Dataset]) -> tuple[int, int]:
-    """Demonstrations, where the datasets say how many, and windows."""
-    demos = sum(getattr(dataset, "n_demos", 0) for dataset in datasets)
-    return demos, sum(len(dataset) for dataset in datasets)  # type: ignore[arg-type]

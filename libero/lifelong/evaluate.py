@@ -9,35 +9,33 @@ from libero._adapters.lifelong.config import ALGOS, BENCHMARKS, POLICIES
 
 
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """The arguments, by default of the command line."""
+    """Parse the arguments, by default those of the command line."""
     parser = argparse.ArgumentParser(
         prog="lifelong.eval", description="Success of a stored policy on a task."
     )
-    parser.add_argument("--experiment_dir", default="experiments", help="where runs are kept")
-    parser.add_argument(
-        "--benchmark", required=True, help=f"{', '.join(BENCHMARKS)}, or one that is registered"
-    )
-    parser.add_argument("--task_id", type=int, required=True, help="position of the task to act on")
+    parser.add_argument("--experiment_dir", default="experiments", help="folder of the runs")
+    parser.add_argument("--benchmark", required=True, help=f"{', '.join(BENCHMARKS)}, or a registered one")
+    parser.add_argument("--task_id", type=int, required=True, help="position of the task in the benchmark")
     parser.add_argument("--algo", required=True, choices=ALGOS)
     parser.add_argument("--policy", required=True, choices=POLICIES)
     parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--ep", type=int, help="epoch of a multitask run's checkpoint; default: the last")
     parser.add_argument(
-        "--ep", type=int, help="of a multitask run: the checkpoint of this epoch; default: the last"
+        "--load_task", type=int, help="task after which the checkpoint was written; default: task_id"
     )
-    parser.add_argument("--load_task", type=int, help="the checkpoint made after this task; default: task_id")
     parser.add_argument("--run", type=int, help="number of the run; default: the newest")
-    parser.add_argument("--device_id", type=int, default=0, help="of the GPU, if there is one")
-    parser.add_argument("--n_eval", type=int, help="episodes; default: as in the run")
-    parser.add_argument("--max_steps", type=int, help="most steps of an episode; default: as in the run")
+    parser.add_argument("--device_id", type=int, default=0, help="number of the GPU, if there is one")
+    parser.add_argument("--n_eval", type=int, help="number of episodes; default: as in the run")
+    parser.add_argument("--max_steps", type=int, help="maximum steps of an episode; default: as in the run")
     parser.add_argument("--save-videos", action="store_true")
     return parser.parse_args(argv)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Evaluate what the arguments name.
+    """Evaluate the checkpoint that the arguments name.
 
     Returns:
-        Exit status: 0, or 1 where something went wrong (told in one line).
+        Exit status: 0, or 1 after an error, which is printed on one line.
     """
     from libero.lifelong.run_evaluation import evaluate
     from libero_env.errors import LiberoError

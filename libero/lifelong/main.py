@@ -5,10 +5,10 @@ from pathlib import Path
 
 
 def main() -> int:
-    """Run what the command line asks for; keys are those of `libero/configs`.
+    """Run the configuration of the command line, with the keys of `libero/configs`.
 
     Returns:
-        Exit status: 0, or 1 where something went wrong (told in one line).
+        Exit status: 0, 1 after an error, which is printed on one line, or 130 if interrupted.
     """
     import hydra
     from hydra.errors import HydraException
@@ -30,13 +30,13 @@ def main() -> int:
             print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
 
     try:
-        check_choices(sys.argv[1:], CONFIGS)
+        check_choices(sys.argv[1:], [CONFIGS])
         hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")(job)()
     except LiberoError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("interrupted; train.resume=true goes on after the last task that is done", file=sys.stderr)
+        print("interrupted; train.resume=true resumes after the last finished task", file=sys.stderr)
         return 130
     return int(failed)
 

@@ -1,13 +1,14 @@
 """Success and loss of an algorithm's policy on a benchmark's tasks.
 
-Rollouts are those of `lifelong.evaluation.rollout`, many simulations at once in this process.
+Rollouts are those of `lifelong.evaluation.rollout`: many simulations at once in this process.
 
-Shape legend: B episodes, C H W image, L language embedding.
+Shape legend: B episodes, C H W image, D dimension of a proprioceptive input, L language embedding.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from libero._adapters.envs.files import generated_paths
 from libero._adapters.lifelong.batches import map_tensors
-from libero._adapters.lifelong.observations import picture
-from libero.lifelong.utils import present, safe_device
+from libero._adapters.lifelong.observations import image_tensor
+from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import NUM_INIT_STATES, split_row
@@ -33,30 +34,30 @@ SETTLE_STEPS = 5
 
 
 def raw_obs_to_tensor_obs(obs: Any, task_emb: Tensor, cfg: Any) -> dict[str, Any]:
-    """What the original's environments observe, as a policy takes it when acting.
+    """Convert observations of the original's environments to the input of a policy that acts.
 
     Args:
-        obs: one dictionary for each environment; pictures (H, W, C) uint8, lowest row first.
-        task_emb: (L,).
-        cfg: `data.obs.modality` says what is taken, `data.obs_key_mapping` its name in the environment.
+        obs: One dictionary for each environment; images (H, W, C) uint8, bottom row first.
+        task_emb: Embedding of the instruction, (L,).
+        cfg: Configuration. `data.obs.modality` names the entries, `data.obs_key_mapping` their names in `obs`.
 
     Returns:
-        `obs` {view: (B, C, H, W) in [0, 1], reading: (B, D)} and `task_emb` (B, L), on `cfg.device`.
+        `obs` {view: (B, C, H, W) in [0, 1], proprioceptive input: (B, D)} and `task_emb` (B, L), on `cfg.device`.
     """
     names = cfg.data.obs_key_mapping
     stacked = {key: np.stack([one[names.get(key, key)] for one in obs]) for key in _keys(cfg)}
-    return as_data(stacked, task_emb, cfg)
+    return _policy_input(stacked, task_emb, cfg)
 
 
-def as_data(stacked: Mapping[str, np.ndarray], task_emb: Tensor, cfg: Any) -> dict[str, Any]:
-    """The same from arrays (B, ...) by the names of the demonstration files, pictures lowest row first."""
+def _policy_input(stacked: Mapping[str, np.ndarray], task_emb: Tensor, cfg: Any) -> dict[str, Any]:
+    """Convert (B, ...) arrays under their names in the demonstration files; images are bottom row first."""
     rgb = set(cfg.data.obs.modality.get("rgb") or [])
-    found = {
-        key: picture(value) if key in rgb else torch.from_numpy(np.asarray(value, np.float32))
+    obs = {
+        key: image_tensor(value) if key in rgb else torch.from_numpy(np.asarray(value, np.float32))
         for key, value in stacked.items()
     }
-    batch = len(next(iter(found.values())))
-    data = {"obs": found, "task_emb": torch.as_tensor(task_emb).expand(batch, -1)}
+    batch = len(next(iter(obs.values())))
+    data = {"obs": obs, "task_emb": torch.as_tensor(task_emb).expand(batch, -1)}
     return map_tensors(data, lambda x: safe_device(x, cfg.device))
 
 
@@ -71,17 +72,18 @@ def evaluate_one_task_success(
     *,
     selecting: bool = False,
 ) -> float:
-    """Share of successes on a task, from its first `eval.n_eval` initial states.
+    """Return the success rate on a task, from its first `eval.n_eval` initial states.
 
     Args:
-        cfg: `eval` says how many episodes, how long, and how many at once.
-        algo: its policy acts, with torch's global generator seeded by `cfg.seed`.
-        task: of a benchmark.
-        task_emb: (L,).
-        task_id: position in the benchmark.
-        sim_states: if given, `n_eval` lists to which the states [time, qpos, qvel] of each episode are appended.
-        task_str: a name for the evaluation; it has no effect.
-        selecting: whether the result chooses a checkpoint. With `eval.selection=apart` other states are used then.
+        cfg: Configuration; `eval` has the number of episodes, their length, and how many run at once.
+        algo: Algorithm whose policy acts, with torch's global generator seeded by `cfg.seed`.
+        task: Task of a benchmark.
+        task_emb: Embedding of the instruction, (L,).
+        task_id: Position in the benchmark.
+        sim_states: `n_eval` lists to which the states [time, qpos, qvel] of each episode are appended.
+        task_str: Name of the evaluation; it has no effect.
+        selecting: Whether the result selects a checkpoint. With `eval.selection=apart` such episodes begin in other
+            states than reported ones.
     """
     total = int(cfg.eval.n_eval)
     apart = selecting and cfg.eval.get("selection", "reporting") == "apart"
@@ -100,27 +102,45 @@ def rollouts(
     init_states: Sequence[int],
     *,
     sim_states: list | None = None,
-    watch: Any = None,
+    on_step: Callable[[int, Obs, np.ndarray], None] | None = None,
 ) -> list[Rollouts]:
-    """Episodes of an algorithm's policy, as many at once as `eval.num_procs` says.
+    """Run episodes of an algorithm's policy, `eval.num_procs` at once.
 
     Args:
-        cfg, algo, task, task_emb, task_id, sim_states: as in `evaluate_one_task_success`.
-        init_states: where the episodes begin.
-        watch: called with the positions of the episodes, their pictures (B, H, W, C) and which are over, at each step.
+        cfg, algo, task, task_emb, task_id, sim_states: See `evaluate_one_task_success`.
+        init_states: Indices of the initial states.
+        on_step: Function called after each step with the position of the first of the episodes, their observations
+            (B, ...), and which of them are over, (B,) bool.
     """
     at_once = min(int(cfg.eval.num_procs), len(init_states)) if cfg.eval.use_mp else 1
-    done: list[Rollouts] = []
-    with seeded(int(cfg.seed), task_id, device=present(cfg.device)), acting(algo, task_id) as own:
+    results: list[Rollouts] = []
+    with seeded(int(cfg.seed), task_id, device=available_device(cfg.device)), acting(algo, task_id) as actor:
         for start in range(0, len(init_states), at_once):
             rows = init_states[start : start + at_once]
-            with _opened(cfg, task, len(rows)) as env:
-                env.states = None if sim_states is None else sim_states[start : start + at_once]
-                env.watch = watch and (lambda *seen, s=start: watch(s, *seen))
-                actor = _PolicyActor(own, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
+            states = None if sim_states is None else sim_states[start : start + at_once]
+            with closing(_EvalEnv(cfg, task, len(rows), states, on_step and partial(on_step, start))) as env:
+                policy = _PolicyActor(actor, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
                 horizon = int(cfg.eval.max_steps)
-                done.append(play(actor, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS))
-    return done
+                results.append(play(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS))
+    return results
+
+
+def success_rates(
+    cfg: Any,
+    algo: Any,
+    benchmark: Any,
+    task_ids: Sequence[int],
+    sim_states: Callable[[int], list | None] = lambda task_id: None,
+    selecting: bool = False,
+) -> np.ndarray:
+    """Return the success rate on each of the given tasks, (n,); see `evaluate_one_task_success`."""
+    algo.eval()
+    rates = []
+    for i in task_ids:
+        task, emb = benchmark.get_task(i), benchmark.get_task_emb(i)
+        rate = evaluate_one_task_success(cfg, algo, task, emb, i, sim_states(i), selecting=selecting)
+        rates.append(rate)
+    return np.array(rates)
 
 
 def evaluate_success(
@@ -130,70 +150,61 @@ def evaluate_success(
     task_ids: Sequence[int],
     result_summary: Mapping[str, Any] | None = None,
 ) -> np.ndarray:
-    """Success on each of the tasks, (n,).
+    """Return the success rate on each of the given tasks, (n,).
 
     Args:
-        cfg, algo: see `evaluate_one_task_success`.
-        benchmark: tasks and their embeddings.
-        task_ids: positions.
-        result_summary: where `eval.save_sim_states` keeps states, under `k<last task>_p<task>`.
+        cfg, algo: See `evaluate_one_task_success`.
+        benchmark: Benchmark with the tasks and their embeddings.
+        task_ids: Positions in the benchmark.
+        result_summary: Receives simulator states under `k<last task>_p<task>` if `eval.save_sim_states` is set.
     """
-    algo.eval()
-    rates = []
-    for i in task_ids:
-        keep = cfg.eval.save_sim_states and result_summary is not None
-        states = result_summary[f"k{task_ids[-1]}_p{i}"] if keep else None  # type: ignore[index]
-        task, emb = benchmark.get_task(i), benchmark.get_task_emb(i)
-        rates.append(evaluate_one_task_success(cfg, algo, task, emb, i, sim_states=states))
-    return np.array(rates)
+    kept: Mapping[str, Any] = (result_summary or {}) if cfg.eval.save_sim_states else {}
+    return success_rates(cfg, algo, benchmark, task_ids, lambda i: kept.get(f"k{task_ids[-1]}_p{i}"))
 
 
 def evaluate_multitask_training_success(
     cfg: Any, algo: Any, benchmark: Any, task_ids: Sequence[int]
 ) -> np.ndarray:
-    """Success on each of the tasks while they are learned together, (n,)."""
-    algo.eval()
-    return np.array(
-        [
-            evaluate_one_task_success(
-                cfg, algo, benchmark.get_task(i), benchmark.get_task_emb(i), i, selecting=True
-            )
-            for i in task_ids
-        ]
-    )
+    """Return the success rate on each of the given tasks while they are learned together, (n,)."""
+    return success_rates(cfg, algo, benchmark, task_ids, selecting=True)
 
 
 def evaluate_loss(cfg: Any, algo: Any, benchmark: Any, datasets: Sequence[Dataset]) -> np.ndarray:
-    """Mean loss on each of the datasets, (n,), without augmentation or dropout."""
+    """Return the mean loss on each of the given datasets, (n,), without augmentation or dropout."""
     algo.eval()
     size, losses = int(cfg.data.task_group_size), []
     for i, dataset in enumerate(datasets):
-        loader = DataLoader(dataset, batch_size=cfg.eval.batch_size, num_workers=cfg.eval.num_workers)
-        with acting(algo, i * size) as own:
-            losses.append(np.mean([own.eval_observe(data) for data in loader]))
+        with acting(algo, i * size) as actor:
+            losses.append(mean_loss(actor, dataset, cfg.eval.batch_size, cfg.eval.num_workers))
     return np.array(losses)
+
+
+def mean_loss(algo: Any, dataset: Dataset, batch_size: int, num_workers: int) -> float:
+    """Return the mean over a dataset's batches of `algo.eval_observe`."""
+    loader = DataLoader(dataset, batch_size=batch_size, num_workers=num_workers)
+    return float(np.mean([algo.eval_observe(data) for data in loader]))
 
 
 @contextmanager
 def acting(algo: Any, task_id: int) -> Iterator[Any]:
-    """The algorithm with the weights it uses for a task."""
-    with algo.acting_on(task_id) if hasattr(algo, "acting_on") else nullcontext(algo) as own:
-        yield own
+    """Use, within the context, the weights that an algorithm acts with on a task."""
+    with algo.acting_on(task_id) if hasattr(algo, "acting_on") else nullcontext(algo) as actor:
+        yield actor
 
 
 def native_task(task: Any, bddl_folder: str | None) -> Task:
-    """A benchmark's task as `libero_env` has it: its own, unless the folder has another file of that name."""
+    """Return a benchmark's task as a `Task`: that of the suite, unless the folder has another file of its name."""
     path = Path(bddl_folder or "", task.problem_folder, task.bddl_file)
-    known = get_suite(task.problem_folder).tasks if task.problem_folder in suite_names() else ()
-    own = next((t for t in known if f"{t.name}.bddl" == task.bddl_file), None)
-    if own is not None and (not path.is_file() or path.read_text(encoding="utf-8") == own.bddl_text):
-        return own
+    tasks = get_suite(task.problem_folder).tasks if task.problem_folder in suite_names() else ()
+    known = next((t for t in tasks if f"{t.name}.bddl" == task.bddl_file), None)
+    if known is not None and (not path.is_file() or path.read_text(encoding="utf-8") == known.bddl_text):
+        return known
     return read_task(path)
 
 
 @dataclass
 class _PolicyActor:
-    """An algorithm's policy; see `lifelong.evaluation.actors.Actor`."""
+    """Policy of an algorithm; see `lifelong.evaluation.actors.Actor`."""
 
     algo: Any
     cfg: Any
@@ -207,81 +218,67 @@ class _PolicyActor:
 
     def act(self, obs: Obs) -> np.ndarray:
         stacked = {
-            key: obs[key][:, ::-1] if key in self.views else _reading(obs, key) for key in _keys(self.cfg)
+            key: obs[key][:, ::-1] if key in self.views else _proprio(obs, key) for key in _keys(self.cfg)
         }
-        actions = self.algo.policy.get_action(as_data(stacked, self.task_emb, self.cfg))
+        actions = self.algo.policy.get_action(_policy_input(stacked, self.task_emb, self.cfg))
         return np.asarray(actions, np.float64).reshape(len(next(iter(stacked.values()))), -1)
 
 
-class _WatchedEnv:
-    """A `BatchEnv` that begins in given states, and whose states and pictures are noted on the way."""
+class _EvalEnv(BatchEnv):
+    """Simulations of a task that begin in the configured states.
 
-    def __init__(self, env: BatchEnv, rows: np.ndarray | None):
-        self.env, self.rows, self.num_envs = env, rows, env.num_envs
-        self.states: list | None = None
-        self.watch: Any = None
+    Args:
+        cfg: Configuration.
+        task: Task of a benchmark.
+        num_envs: Number of simulations.
+        sim_states: One list for each simulation, to which [time, qpos, qvel] is appended at each step.
+        on_step: Function of the observations and of which episodes are over, called after each step.
+    """
 
-    @property
-    def atoms(self) -> tuple[str, ...]:
-        return self.env.atoms
+    def __init__(self, cfg: Any, task: Any, num_envs: int, sim_states: list | None, on_step: Any):
+        super().__init__(
+            native_task(task, cfg.get("bddl_folder")),
+            num_envs,
+            cameras=[CAMERAS[view] for view in cfg.data.obs.modality.rgb],
+            camera_size=(int(cfg.data.img_h), int(cfg.data.img_w)),
+            horizon=int(cfg.eval.max_steps) + SETTLE_STEPS,
+        )
+        self.rows = _user_init_states(cfg.get("init_states_folder"), task)
+        self.sim_states, self.on_step = sim_states, on_step
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict]:
-        obs, info = self.env.reset(seed=seed, options=options)
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        obs, info = super().reset(seed=seed, options=options)
         if self.rows is not None and options is not None:
-            self._place(self.rows[np.asarray(options["init_state"]) % len(self.rows)])
+            rows = self.rows[np.asarray(options["init_state"]) % len(self.rows)]
+            qpos, qvel, fixtures = split_row(self.world.scene.model, rows)
+            self.world.simulations.reset(
+                range(self.num_envs), qpos, qvel, fixtures=fixtures if fixtures.size else None
+            )
         return obs, info
 
-    def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict]:
-        running = self.env.running
-        result = self.env.step(actions)
-        for i in np.flatnonzero(running) if self.states is not None else ():
-            self.states[i].append(self._state(int(i)))  # type: ignore[index]
-        if self.watch is not None:
-            self.watch(result[0], ~self.env.running)
+    def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
+        running = self.running
+        result = super().step(actions)
+        simulations, fields = self.world.simulations, self.world.simulations.fields
+        if self.sim_states is not None:
+            for i in np.flatnonzero(running).tolist():
+                state = np.concatenate([[simulations.time(i)], fields["qpos"][i], fields["qvel"][i]])
+                self.sim_states[i].append(state)
+        if self.on_step is not None:
+            self.on_step(result[0], ~self.running)
         return result
 
-    def close(self) -> None:
-        self.env.close()
 
-    def _state(self, i: int) -> np.ndarray:
-        simulations = self.env.world.simulations
-        fields = simulations.fields
-        return np.concatenate([[simulations.time(i)], fields["qpos"][i], fields["qvel"][i]])
-
-    def _place(self, rows: np.ndarray) -> None:
-        """Start in rows of an initial-state file; fixtures stay where they are if the rows do not have them."""
-        world, ids = self.env.world, range(self.num_envs)
-        model = world.scene.model
-        qpos, qvel, fixtures = split_row(model, rows)
-        world.simulations.reset(ids, qpos, qvel, fixtures=fixtures if fixtures.size else None)
-
-
-@contextmanager
-def _opened(cfg: Any, task: Any, num: int) -> Iterator[_WatchedEnv]:
-    """The task's simulations, begun in the configured states."""
-    env = BatchEnv(
-        native_task(task, cfg.get("bddl_folder")),
-        num,
-        cameras=[CAMERAS[view] for view in cfg.data.obs.modality.rgb],
-        camera_size=(int(cfg.data.img_h), int(cfg.data.img_w)),
-        horizon=int(cfg.eval.max_steps) + SETTLE_STEPS,
-    )
-    try:
-        yield _WatchedEnv(env, _foreign_states(cfg.get("init_states_folder"), task))
-    finally:
-        env.close()
-
-
-def _foreign_states(folder: str | None, task: Any) -> np.ndarray | None:
-    """Initial states of a folder that is not this package's own; None where there are none for the task."""
+def _user_init_states(folder: str | None, task: Any) -> np.ndarray | None:
+    """Return a task's initial states in a folder that is not this package's own; None if there are none."""
     path = Path(folder or "", task.problem_folder, task.init_states_file)
     if not folder or folder == generated_paths()["init_states"] or not path.is_file():
         return None
     return read_states(path)
 
 
-def _reading(obs: Obs, key: str) -> np.ndarray:
-    """A reading under its name in the demonstration files, where position and rotation of the hand are one."""
+def _proprio(obs: Obs, key: str) -> np.ndarray:
+    """Return an observation under its name in the demonstration files; there `ee_states` is position and rotation."""
     return np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=-1) if key == "ee_states" else obs[key]
 
 

@@ -1,4 +1,4 @@
-"""What `evaluate.py` does: a checkpoint of a run, rolled out on one task."""
+"""Evaluation of a run's checkpoint on one task; the work of `evaluate.py`."""
 
 import argparse
 from pathlib import Path
@@ -20,15 +20,15 @@ from lifelong.results.metrics import wilson_interval
 
 
 def evaluate(args: argparse.Namespace) -> dict[str, Any]:
-    """Loss and success of a checkpoint on a task; they are printed, and written beside the run's checkpoints.
+    """Measure loss and success of a checkpoint on a task; print them, and write them beside the checkpoint.
 
     Returns:
-        `loss` (nan where there are no demonstrations of the task), `success_rate`, its 95 % interval (Wilson), and
-        which episodes succeeded.
+        `loss` (NaN if there are no demonstrations of the task), `success_rate`, its 95 % interval (Wilson), and
+        the success of each episode.
 
     Raises:
-        CheckpointError: no such run or checkpoint.
-        LiberoError: no such benchmark or task.
+        CheckpointError: There is no such run or checkpoint.
+        LiberoError: There is no such benchmark or task.
     """
     path = checkpoint_path(args)
     control_seed(args.seed)
@@ -41,32 +41,26 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
     benchmark = get_benchmark(args.benchmark)(cfg.data.task_order_index)
     task = benchmark.get_task(args.task_id)
     benchmark.set_task_embs(get_task_embs(cfg, [t.language for t in benchmark.tasks]))
-    algo = _algorithm(args, cfg, benchmark, weights, masks)
-    emb = benchmark.get_task_emb(args.task_id)
-
+    algo = _load_algorithm(args, cfg, benchmark, weights, masks)
+    emb, view = benchmark.get_task_emb(args.task_id), cfg.data.obs.modality.rgb[0]
     loss = _loss(cfg, algo, benchmark, args.task_id)
-    film = VideoWriter(
-        path.parent / f"{path.stem}_on{args.task_id}_videos", args.save_videos, single_video=False
-    )
-    with film:
-        episodes = rollouts(
-            cfg,
-            algo,
-            task,
-            emb,
-            args.task_id,
-            range(cfg.eval.n_eval),
-            watch=_camera(film, cfg.data.obs.modality.rgb[0]) if args.save_videos else None,
-        )
-    successes = [e.success for part in episodes for e in part.episodes]
-    return _told(path, args, task, loss, successes)
+    folder = path.parent / f"{path.stem}_on{args.task_id}_videos"
+    with VideoWriter(folder, args.save_videos, single_video=False) as video:
+
+        def record(start: int, obs: Any, over: np.ndarray) -> None:
+            for i, done in enumerate(over):
+                video.append_obs({view: obs[view][i][::-1]}, bool(done), start + i, view)
+
+        states, on_step = range(cfg.eval.n_eval), record if args.save_videos else None
+        parts = rollouts(cfg, algo, task, emb, args.task_id, states, on_step=on_step)
+    return _report(path, args, task, loss, [e.success for part in parts for e in part.episodes])
 
 
 def checkpoint_path(args: argparse.Namespace) -> Path:
-    """The checkpoint that the arguments name.
+    """Return the checkpoint that the arguments name.
 
     Raises:
-        CheckpointError: no such run or file.
+        CheckpointError: There is no such run or file.
     """
     name = f"{POLICIES[args.policy]}_seed{args.seed}"
     found = sorted(p for p in Path(args.experiment_dir).glob(f"*/{ALGOS[args.algo]}/{name}") if p.is_dir())
@@ -83,23 +77,25 @@ def checkpoint_path(args: argparse.Namespace) -> Path:
         file = f"task{args.task_id if args.load_task is None else args.load_task}_model.pth"
     path = Path(folder or roots[0], file)
     if not path.is_file():
-        raise CheckpointError(f"no checkpoint {path}; there is {', '.join(_models(path.parent)) or 'none'}")
+        names = sorted(file.name for file in path.parent.glob("*_model*.pth"))
+        raise CheckpointError(f"no checkpoint {path}; there is {', '.join(names) or 'none'}")
     return path
 
 
-def _algorithm(args: argparse.Namespace, cfg: Any, benchmark: Any, weights: Any, masks: Any) -> Sequential:
-    """The stored policy in its algorithm, ready to act on the task."""
+def _load_algorithm(
+    args: argparse.Namespace, cfg: Any, benchmark: Any, weights: Any, masks: Any
+) -> Sequential:
+    """Return the algorithm with the stored policy, ready to act on the task."""
     algo = get_algo_class(ALGOS[args.algo])(benchmark.n_tasks, cfg)
     algo.policy.load_state_dict(weights)
     if isinstance(algo, PackNet):
-        size = int(cfg.data.task_group_size)
-        algo.take_masks(masks, args.task_id if args.load_task is None else args.load_task)
-        algo = algo.get_eval_algo(args.task_id // size)
+        algo.load_masks(masks, args.task_id if args.load_task is None else args.load_task)
+        algo = algo.get_eval_algo(args.task_id // int(cfg.data.task_group_size))
     return safe_device(algo, cfg.device)
 
 
 def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
-    """The loss on the task's demonstrations, where there are any; none are recorded for it."""
+    """Return the loss on the task's demonstrations, NaN if there are none; none are generated for it."""
     name = benchmark.get_task_demonstration(task_id)
     known = [Path(cfg.folder, name), *map(Path, cfg.get("demonstrations") or ())]
     path = next((p for p in known if p.name == Path(name).name and p.exists()), None)
@@ -109,36 +105,24 @@ def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
     return float(evaluate_loss(cfg, algo, benchmark, [dataset])[0])
 
 
-def _camera(film: VideoWriter, view: str) -> Any:
-    """Adds what is seen at each step to a film of each episode."""
-
-    def watch(start: int, obs: Any, over: np.ndarray) -> None:
-        for i, done in enumerate(over):
-            film.append_obs({view: obs[view][i][::-1]}, bool(done), start + i, view)
-
-    return watch
-
-
-def _told(
+def _report(
     path: Path, args: argparse.Namespace, task: Any, loss: float, successes: list[bool]
 ) -> dict[str, Any]:
-    low, high = wilson_interval(sum(successes), len(successes))
-    found = {
+    """Print and write the results."""
+    count, total = sum(successes), len(successes)
+    low, high = wilson_interval(count, total)
+    results = {
         "loss": loss,
-        "success_rate": sum(successes) / len(successes),
+        "success_rate": count / total,
         "interval": [float(low), float(high)],
         "successes": successes,
         "task": task.name,
         "checkpoint": str(path),
     }
     stats = path.with_name(f"{path.stem}_on{args.task_id}.stats")
-    torch.save(found, stats)
+    torch.save(results, stats)
     print(
-        f"{task.name}: success {sum(successes)}/{len(successes)} = {found['success_rate']:.0%} "
+        f"{task.name}: success {count}/{total} = {count / total:.0%} "
         f"(95 %: {low:.0%} to {high:.0%}), loss {loss:.3f}; {stats}"
     )
-    return found
-
-
-def _models(folder: Path) -> list[str]:
-    return sorted(file.name for file in folder.glob("*_model*.pth"))
+    return results

@@ -1,4 +1,4 @@
-"""The original's helpers around a run: seeds, devices, checkpoints, costs."""
+"""The original's helpers of a run: seeds, devices, checkpoints, costs."""
 
 import copy
 import json
@@ -20,19 +20,6 @@ from lifelong.errors import CheckpointError
 from lifelong.language import embed
 from lifelong.results.metrics import wilson_interval
 
-__all__ = [
-    "NpEncoder",
-    "compute_flops",
-    "confidence_interval",
-    "control_seed",
-    "create_experiment_dir",
-    "get_task_embs",
-    "get_train_test_loader",
-    "safe_device",
-    "torch_load_model",
-    "torch_save_model",
-]
-
 
 def control_seed(seed: int) -> None:
     """Seed the global generators of Python, NumPy and PyTorch."""
@@ -41,22 +28,21 @@ def control_seed(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def present(device: Any) -> torch.device:
-    """A device that this machine has: the one asked for (a number is a GPU's), or the CPU."""
-    wanted = torch.device(f"cuda:{device}" if isinstance(device, int) else device or "cpu")
-    return torch.device("cpu") if wanted.type == "cuda" and not torch.cuda.is_available() else wanted
+def available_device(device: Any) -> torch.device:
+    """Return the requested device (an integer is a GPU's number), or the CPU if there is no GPU."""
+    requested = torch.device(f"cuda:{device}" if isinstance(device, int) else device or "cpu")
+    return torch.device("cpu") if requested.type == "cuda" and not torch.cuda.is_available() else requested
 
 
 def safe_device(x: Any, device: str | torch.device = "cpu") -> Any:
-    """A tensor or a module on a device; on the CPU where a GPU is asked for and there is none."""
-    return x.to(present(device))
+    """Return a tensor or a module on a device, or on the CPU if there is no GPU."""
+    return x.to(available_device(device))
 
 
 class NpEncoder(json.JSONEncoder):
-    """JSON of what NumPy and PyTorch compute with."""
+    """Encodes NumPy and PyTorch arrays as lists, their scalars as numbers."""
 
     def default(self, o: Any) -> Any:
-        """Arrays as lists, scalars as numbers."""
         if isinstance(o, np.ndarray | Tensor | np.generic):
             return o.tolist()
         return super().default(o)
@@ -78,13 +64,13 @@ def torch_save_model(
 def torch_load_model(
     model_path: str | Path, map_location: Any = None
 ) -> tuple[dict[str, Tensor], Config | None, Any]:
-    """What `torch_save_model` wrote: weights, configuration, masks. Nothing in the file is executed.
+    """Read a file of `torch_save_model`: weights, configuration, masks. Nothing in the file is executed.
 
     Raises:
-        CheckpointError: no such file, a broken one, or one with objects that would have to be executed.
+        CheckpointError: The file does not exist, is broken, or holds objects other than tensors and plain data.
     """
     try:
-        stored = torch.load(model_path, map_location=present(map_location), weights_only=True)
+        stored = torch.load(model_path, map_location=available_device(map_location), weights_only=True)
         cfg = stored.get("cfg")
         return stored["state_dict"], None if cfg is None else Config(cfg), stored.get("previous_masks")
     except (OSError, pickle.UnpicklingError, EOFError, KeyError, RuntimeError) as error:
@@ -102,7 +88,7 @@ def get_train_test_loader(
     test_batch_size: int,
     num_workers: tuple[int, int] = (0, 0),
 ) -> tuple[DataLoader, DataLoader]:
-    """A dataset parted at random, the same way each time; the training part is shuffled."""
+    """Split a dataset at random, with a fixed seed, into a shuffled training part and a test part."""
     size = len(dataset)  # type: ignore[arg-type]
     first = int(size * train_ratio)
     parts = random_split(dataset, [first, size - first], torch.Generator().manual_seed(0))
@@ -111,13 +97,13 @@ def get_train_test_loader(
 
 
 def confidence_interval(p: float, n: int) -> float:
-    """Half the width of the 95 % interval of a success rate p of n episodes, after Wilson: above 0 also at 0 and 1."""
+    """Return half the width of Wilson's 95 % interval of a success rate p of n episodes; it is above 0 for all p."""
     low, high = wilson_interval(p * n, n)
     return float(high - low) / 2
 
 
 def compute_flops(algo: Any, dataset: Dataset, cfg: Any) -> tuple[float, float]:
-    """Billions of floating-point operations of one forward pass on a window, and millions of parameters."""
+    """Return the floating-point operations of one forward pass on a window, [1e9], and the parameters, [1e6]."""
     policy = copy.deepcopy(algo.policy).eval()
     window = algo.map_tensor_to_device(default_collate([dataset[0]]))
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
@@ -129,17 +115,14 @@ def compute_flops(algo: Any, dataset: Dataset, cfg: Any) -> tuple[float, float]:
 
 
 def create_experiment_dir(cfg: Any) -> str:
-    """A new folder `experiments/<benchmark>/<algorithm>/<policy>_seed<seed>/run_<number>`.
+    """Create a folder `experiments/<benchmark>/<algorithm>/<policy>_seed<seed>/run_<number>` and return its path.
 
-    It is noted in `cfg.experiment_dir`, and as `cfg.experiment_name` on one line. Runs that begin with given weights
-    are in `experiments_finetune`.
-
-    Returns:
-        Its path.
+    `cfg.experiment_dir` receives it, `cfg.experiment_name` its name on one line. Runs from given weights are in
+    `experiments_finetune`.
     """
     root = experiment_root(cfg)
     root.mkdir(parents=True, exist_ok=True)
-    number = max((_number(path) for path in root.glob("run_*")), default=0) + 1
+    number = max((_run_number(path) for path in root.glob("run_*")), default=0) + 1
     while True:
         path = root / f"run_{number:03d}"
         try:
@@ -153,24 +136,24 @@ def create_experiment_dir(cfg: Any) -> str:
 
 
 def experiment_root(cfg: Any) -> Path:
-    """The folder of all runs of a name."""
+    """Return the folder of all runs of a configuration."""
     prefix = "experiments_finetune" if cfg.get("pretrain_model_path") else "experiments"
     return Path(prefix, cfg.benchmark_name, cfg.lifelong.algo, f"{cfg.policy.policy_type}_seed{cfg.seed}")
 
 
 def latest_run(root: Path) -> Path | None:
-    """The newest run in a folder of them."""
-    return max(root.glob("run_*"), key=_number, default=None)
+    """Return the newest run in a folder of runs."""
+    return max(root.glob("run_*"), key=_run_number, default=None)
 
 
 def get_task_embs(cfg: Any, descriptions: list[str]) -> Tensor:
-    """Embeddings of instructions, (N, L); L is noted as the language encoder's `input_size`.
+    """Return embeddings of instructions, (N, L); the language encoder's `input_size` is set to L.
 
-    `task_embedding_format`: minilm (comes with the package), bert, clip, gpt2, roberta (their weights are needed),
+    `task_embedding_format` is minilm (comes with the package), bert, clip, gpt2, roberta (their weights are needed),
     or one-hot: task i is number `task_embedding_one_hot_offset` + i.
 
     Raises:
-        LanguageError: another format, or weights that cannot be had; the message names the remedy.
+        LanguageError: The format is unknown, or its weights cannot be obtained; the message names the remedy.
     """
     kind = cfg.task_embedding_format
     if kind == "one-hot":
@@ -183,6 +166,6 @@ def get_task_embs(cfg: Any, descriptions: list[str]) -> Tensor:
     return embs
 
 
-def _number(path: Path) -> int:
+def _run_number(path: Path) -> int:
     text = path.name.rpartition("_")[2]
     return int(text) if text.isdigit() else 0

@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,6 +19,9 @@ from lifelong.seeding import generator, seeded
 from lifelong.training.distributed import Ranks
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation, Step
+from lifelong.types import Batch
+
+TrainStep = Callable[[Batch, torch.Generator, float], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,8 @@ def fit(
     label: str = "",
     progress: bool = False,
     ranks: Ranks = Ranks(),  # noqa: B008 - frozen
+    step: TrainStep | None = None,
+    load: Callable[[Sequence[Tensor]], Iterable[Batch]] | None = None,
 ) -> None:
     """Train a policy on one task's windows, with the replay and the penalties of an algorithm.
 
@@ -87,6 +93,10 @@ def fit(
         label: Text before the progress bar.
         progress: Whether to show a progress bar with the remaining time.
         ranks: Rank of this process among those that train together.
+        step: Function that moves the weights once, given a batch, the epoch's generator and the learning rate, and
+            returns the loss and the penalty. Default: `Step` with AdamW.
+        load: Function that returns the batches of an epoch, given the indices of each; it may read ahead. Default:
+            `dataset.batch`.
 
     Raises:
         TrainingError: The dataset is empty, or the loss is not finite.
@@ -96,7 +106,8 @@ def fit(
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
     device, size = torch.device(device), settings.batch_size
     optimizer = _make_optimizer(algorithm.trained(policy), settings)
-    step = Step(policy, algorithm, optimizer, settings, device, augment, ranks)
+    default_step = Step(policy, algorithm, optimizer, settings, device, augment, ranks)
+    step, load = step or default_step, load or partial(map, dataset.batch)
     steps = settings.steps_per_epoch or math.ceil(len(dataset) / size)
     total = settings.epochs * steps
     first, loss, penalty = 0, math.nan, 0.0
@@ -113,12 +124,12 @@ def fit(
             began, draws = time.perf_counter(), generator(*seed, epoch, 0)
             order = _shuffled_indices(len(dataset), steps * size, draws)
             losses = []  # of each step: the policy's loss, the penalty
-            step.synchronise()
+            default_step.synchronise()
             algorithm.mode_train(policy)
             with seeded(*seed, epoch, 1, *own_draws, device=device):
-                for k, indices in enumerate(order.split(size)):
+                for k, batch in enumerate(load(order.split(size))):
                     lr = learning_rate(epoch * steps + k, total, settings)
-                    losses.append(torch.stack(step(dataset.batch(indices), draws, lr)))
+                    losses.append(torch.stack(step(batch, draws, lr)))
                     bar.update()
             loss, penalty = ranks.sum(torch.stack(losses).mean(0)).tolist()
             if not math.isfinite(loss):

@@ -35,6 +35,7 @@ class Step:
         device: Device of the policy.
         augment: Augmentation of the mixed batch.
         ranks: Rank of this process among those that train together.
+        loss_scale: Factor of the gradients before they are clipped.
 
     Raises:
         ConfigError: The batch is divided, and the policy normalises over the batch.
@@ -47,18 +48,21 @@ class Step:
     device: torch.device
     augment: BatchAugmentation | None = None
     ranks: Ranks = Ranks()
+    loss_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if self.settings.accumulate * self.ranks.size > 1:
             refuse_batch_norm(self.policy)
 
-    def __call__(self, batch: Batch, generator: torch.Generator, lr: float) -> tuple[Tensor, Tensor]:
+    def __call__(
+        self, batch: Batch, generator: torch.Generator, lr: float | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Make one step on a batch of the task's windows.
 
         Args:
             batch: Windows of the task, before replay and augmentation.
             generator: CPU generator for replay and augmentation.
-            lr: Learning rate of this step.
+            lr: Learning rate of this step. Default: that of the optimiser.
 
         Returns:
             This rank's share of the policy's loss and of the penalty; their sums over the ranks are the whole.
@@ -74,7 +78,7 @@ class Step:
             part = part.to(self.device)
             with self._autocast():
                 loss = self._loss(part) * (len(part) / len(batch))
-            loss.backward()
+            (loss * self.loss_scale).backward()
             total = total + loss.detach().float()
             if self._uses_cuda_graphs and self.settings.accumulate > 1:
                 self._copy_gradients()
@@ -84,7 +88,7 @@ class Step:
             self.algorithm.after_backward(self.policy)
         if self.settings.grad_clip:
             nn.utils.clip_grad_norm_(self._optimized, self.settings.grad_clip)
-        for group in self.optimizer.param_groups:
+        for group in self.optimizer.param_groups if lr is not None else ():
             group["lr"] = lr
         self.optimizer.step()
         self.algorithm.after_step(self.policy)
@@ -110,7 +114,7 @@ class Step:
         if penalty is None:
             return torch.zeros((), device=self.device)
         share = penalty / self.ranks.size
-        share.backward()
+        (share * self.loss_scale).backward()
         return share.detach().float()
 
     def _copy_gradients(self) -> None:

@@ -10,8 +10,8 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from libero._adapters.lifelong.config import Config, plain
-from libero.lifelong import algos, utils
-from libero.lifelong.algos import base, multitask
+from libero.lifelong import algos, metric, utils
+from libero.lifelong.algos import multitask
 from libero.lifelong.metric import evaluate_loss
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class
 from libero.lifelong.models.bc_transformer_policy import ExtraModalityTokens
@@ -57,7 +57,7 @@ def succeed(monkeypatch):
             asked.append((task_id, selecting, sim_states))
             return next(given)
 
-        monkeypatch.setattr(base, "evaluate_one_task_success", success)
+        monkeypatch.setattr(metric, "evaluate_one_task_success", success)
         return asked
 
     return give
@@ -197,7 +197,7 @@ def test_packnet_forgets_nothing(files, succeed):
     stored, _, masks = utils.torch_load_model(f"{cfg.experiment_dir}/task1_model.pth")
     fresh, _, _ = learner(files, "packnet")
     fresh.policy.load_state_dict(stored)
-    fresh.take_masks(masks, 1)
+    fresh.load_masks(masks, 1)
     assert torch.equal(means(fresh.get_eval_algo(0)), first), "and out of a checkpoint"
 
 

@@ -74,7 +74,7 @@ def test_keys_without_effect_exist_and_are_told():
     assert set(NO_EFFECT) <= paths
     assert notes(composed) == []
     (note,) = notes(load_config("data.action_scale=2.0"))
-    assert note == "data.action_scale=2.0 has no effect: actions are learned as they are"
+    assert note == "data.action_scale=2.0 has no effect: actions are not scaled"
 
 
 @pytest.mark.parametrize("file", PARTS, ids=str)

@@ -16,6 +16,7 @@ from lifelong.training.distributed import Ranks
 from lifelong.training.fit import fit, learning_rate
 from lifelong.training.precision import check_compiler, compiled, deterministic
 from lifelong.training.settings import FitSettings
+from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 from tests.harness import ranks_worker as worker
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
@@ -85,6 +86,34 @@ def test_every_window_is_seen_once_an_epoch_and_steps_can_be_fixed():
     fit(LinearPolicy(), Spy(size=16), Sequential(), settings=settings, seed=(0,))
     assert [len(s) for s in seen] == [8] * 7
     assert sorted(torch.cat(seen[:2]).tolist()) == list(range(16))
+
+
+def test_a_callers_own_step_and_loader_take_part_in_the_same_loop():
+    """With another optimiser whose rate is its own, and batches that are read elsewhere."""
+    data, policy, twin = Windows(size=16), LinearPolicy(), LinearPolicy()
+    twin.load_state_dict(policy.state_dict())
+    settings, sizes = FitSettings(epochs=2, batch_size=8, grad_clip=0, precision="fp32"), []
+    rates = []
+
+    def load(order):
+        sizes.append([len(indices) for indices in order])
+        return (data.batch(indices) for indices in order)
+
+    def own_step(one, scale):
+        optimizer = torch.optim.SGD(one.parameters(), lr=0.1 / scale)
+        step = Step(one, Sequential(), optimizer, settings, torch.device("cpu"), loss_scale=scale)
+
+        def call(batch, draws, lr):
+            rates.append(lr)
+            return step(batch, draws)
+
+        return call
+
+    fit(policy, data, Sequential(), settings=settings, seed=(0,), step=own_step(policy, 1.0), load=load)
+    fit(twin, data, Sequential(), settings=settings, seed=(0,), step=own_step(twin, 4.0))
+    assert sizes == [[8, 8]] * 2 and rates[:4] == rates[4:] and rates[0] == settings.lr
+    for a, b in zip(policy.parameters(), twin.parameters(), strict=True):
+        assert torch.allclose(a, b, atol=1e-6), "four times the gradient, a quarter of the rate"
 
 
 def test_augmentation_sees_the_mixed_batch():

@@ -1,4 +1,4 @@
-"""The original's configuration: composed by Hydra from `libero/configs`, then a dictionary with attributes."""
+"""The original's configuration, composed by Hydra from `libero/configs`."""
 
 import copy
 from collections.abc import Iterator, Mapping
@@ -13,25 +13,25 @@ from libero_env.errors import UnknownNameError
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
-# Keys that change nothing: what to do instead. Most were read nowhere in the original either.
+# key without effect -> what to do instead; most had none in the original either
 NO_EFFECT: Mapping[str, str] = {
-    "load_previous_model": "pretrain_model_path names the weights to begin with",
-    "data.data_modality": "data.obs.modality lists what is seen",
-    "data.frame_stack": "data.seq_len is the history that policies see",
-    "data.max_word_len": "instructions are never cut",
-    "data.state_dim": "readings have the sizes of the demonstration files",
+    "load_previous_model": "pretrain_model_path names the initial weights",
+    "data.data_modality": "data.obs.modality lists the observations",
+    "data.frame_stack": "data.seq_len is the length of the history",
+    "data.max_word_len": "instructions are never truncated",
+    "data.state_dim": "proprioceptive inputs have the sizes of the demonstration files",
     "data.num_kp": "the number of keypoints follows from the size of the image embedding",
     "data.shuffle_task": "data.task_order_index chooses one of the published orders",
-    "data.affine_translate": "policy.translation_aug.network_kwargs.translation is what is used",
-    "data.action_scale": "actions are learned as they are",
-    "data.train_dataset_ratio": "all demonstrations are learned from",
+    "data.affine_translate": "policy.translation_aug.network_kwargs.translation is used",
+    "data.action_scale": "actions are not scaled",
+    "data.train_dataset_ratio": "all demonstrations are used for training",
     "train.debug": "train.n_epochs=1 eval.n_eval=1 makes a short run",
     "eval.load_path": "lifelong.eval evaluates stored checkpoints",
 }
 
 
 class Config(dict):
-    """A dictionary whose keys are attributes too; dictionaries inside are of the same kind."""
+    """Dictionary whose keys are attributes too; nested dictionaries are of the same class."""
 
     def __init__(self, values: Mapping[str, Any] | None = None, **more: Any):
         super().__init__()
@@ -39,7 +39,7 @@ class Config(dict):
             self[key] = value
 
     def __setitem__(self, key: str, value: Any) -> None:
-        super().__setitem__(key, _wrapped(value))
+        super().__setitem__(key, _wrap(value))
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -61,22 +61,19 @@ class Config(dict):
 
 
 def load_config(*overrides: str) -> Config:
-    """What the original's command line gives: defaults and overrides such as `lifelong=er`, `seed=100`."""
-    held = copy.copy(GlobalHydra.instance())
+    """Compose the configuration from defaults and overrides such as `lifelong=er`, `seed=100`."""
+    previous = copy.copy(GlobalHydra.instance())
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             return Config(plain(compose("config", list(overrides))))
     finally:
-        if held.hydra is not None:
-            GlobalHydra.instance().initialize(held.hydra)
+        if previous.hydra is not None:
+            GlobalHydra.instance().initialize(previous.hydra)
 
 
 def plain(value: Any) -> Any:
-    """The same with plain dictionaries and lists, whatever kind of configuration it is.
-
-    Tuples stay tuples; what is neither plain nor a container becomes its text.
-    """
+    """Convert a configuration of any kind to plain dictionaries, lists and tuples; other objects become strings."""
     if isinstance(value, DictConfig | ListConfig):
         return OmegaConf.to_container(value, resolve=True)
     if isinstance(value, Mapping):
@@ -87,7 +84,7 @@ def plain(value: Any) -> Any:
 
 
 def assign(node: Any, key: str, value: Any) -> None:
-    """Set a key of a configuration of any kind, also one that is closed to new keys."""
+    """Set a key of a configuration of any kind, even if it is closed to new keys."""
     if isinstance(node, DictConfig):
         with open_dict(node):
             node[key] = value
@@ -96,7 +93,7 @@ def assign(node: Any, key: str, value: Any) -> None:
 
 
 def notes(cfg: Any) -> list[str]:
-    """One line for each key that was changed though it has no effect."""
+    """Return one line for each key that was changed but has no effect."""
     now, default = dict(_leaves(plain(cfg))), dict(_leaves(plain(load_config())))
     return [
         f"{key}={now[key]} has no effect: {why}"
@@ -105,11 +102,11 @@ def notes(cfg: Any) -> list[str]:
     ]
 
 
-def named(table: Mapping[str, Any], kind: str, name: str) -> Any:
-    """An entry by its name, whatever its case.
+def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
+    """Return the entry of a name, ignoring case.
 
     Raises:
-        UnknownNameError: no such name; the message lists those there are.
+        UnknownNameError: There is no such name; the message lists the valid ones.
     """
     for key, value in table.items():
         if key.lower() == str(name).lower():
@@ -117,16 +114,16 @@ def named(table: Mapping[str, Any], kind: str, name: str) -> Any:
     raise UnknownNameError(kind, name, sorted(table))
 
 
-def _wrapped(value: Any) -> Any:
+def _wrap(value: Any) -> Any:
     if isinstance(value, Mapping) and not isinstance(value, Config):
         return Config(value)
     if type(value) in (list, tuple):
-        return type(value)(_wrapped(part) for part in value)
+        return type(value)(_wrap(part) for part in value)
     return value
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key by its path. Lists are leaves."""
+    """Yield every leaf with its dotted path; lists are leaves."""
     if not isinstance(node, Mapping):
         yield path, node
         return
@@ -135,7 +132,6 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 BENCHMARKS = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90", "libero_100")
-
 
 ALGOS = {
     "base": "Sequential",
@@ -146,7 +142,6 @@ ALGOS = {
     "ewc": "EWC",
     "packnet": "PackNet",
 }
-
 
 POLICIES = {
     "bc_rnn_policy": "BCRNNPolicy",

@@ -1,4 +1,4 @@
-"""The original's algorithms: hooks of `lifelong.algorithms` in a loop over dictionaries."""
+"""The original's lifelong-learning algorithms."""
 
 from libero.lifelong.algos.agem import AGEM
 from libero.lifelong.algos.base import REGISTERED_ALGOS, Sequential, get_algo_class, get_algo_list

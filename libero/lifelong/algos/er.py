@@ -9,9 +9,9 @@ from lifelong import algorithms
 
 
 class ER(Sequential):
-    """Every batch is joined by as many windows of earlier tasks; see `lifelong.algorithms.ER`.
+    """Joins to every batch as many windows of earlier tasks; see `lifelong.algorithms.ER`.
 
-    `lifelong.n_memories` windows of each task are kept, drawn uniformly (the original keeps the file's first).
+    `lifelong.n_memories` windows of each task are kept, drawn uniformly (the original keeps the first of each file).
     """
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
@@ -19,12 +19,6 @@ class ER(Sequential):
         return algorithms.ER(budget=cfg.lifelong.n_memories)
 
     def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
-        """Take the task's windows in."""
-        grow_memory(self, task_id)
+        """Add the task's windows to the memory, whose native budget is that of all tasks together."""
+        self.hooks.memory.budget = self.cfg.lifelong.n_memories * (task_id + 1)
         super().end_task(dataset, task_id, benchmark, env)
-
-
-def grow_memory(algo: Sequential, task_id: int) -> None:
-    """Room for one more task: the memory's budget is over all of them, the original's for each."""
-    memory: Any = algo.hooks
-    memory.memory.budget = algo.cfg.lifelong.n_memories * (task_id + 1)

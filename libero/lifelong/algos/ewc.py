@@ -7,10 +7,9 @@ from lifelong import algorithms
 
 
 class EWC(Sequential):
-    """Weights are pulled to where earlier tasks left them; see `lifelong.algorithms.EWC`.
+    """Pulls weights towards their values after earlier tasks; see `lifelong.algorithms.EWC`.
 
-    Fisher information is the original's estimate from whole batches of all windows, which `lifelong.e_lambda` goes
-    with.
+    The Fisher information is the original's estimate from batches of all windows, which `lifelong.e_lambda` is for.
     """
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:

@@ -1,4 +1,4 @@
-"""All tasks at once."""
+"""Training on all tasks together."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from lifelong import algorithms
 
 
 class Multitask(Sequential):
-    """Train on the windows of all tasks, shuffled together."""
+    """Trains on the windows of all tasks, shuffled together."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
         """See `Sequential`."""
@@ -22,13 +22,13 @@ class Multitask(Sequential):
     def learn_all_tasks(
         self, datasets: Sequence[Dataset], benchmark: Any, result_summary: Mapping[str, Any]
     ) -> tuple[float, float]:
-        """Train on all; `multitask_model.pth` holds the weights, `multitask_model_ep<n>.pth` those on the way.
+        """Train on all tasks; write `multitask_model.pth`, and `multitask_model_ep<n>.pth` at each evaluation.
 
-        With `lifelong.eval_in_train` success on all tasks is measured on the way and the best weights are kept, else
-        the last.
+        With `lifelong.eval_in_train` the success on all tasks is measured at each evaluation and the best weights are
+        kept, else the last.
 
         Returns:
-            Success (0 where it is not measured) and loss, as `learn_one_task` gives them.
+            Success (0 if it is not measured) and loss, as `learn_one_task` returns them.
         """
         self.start_task(-1)
         tasks, every = list(range(benchmark.n_tasks)), self.cfg.eval.eval_every
@@ -39,7 +39,7 @@ class Multitask(Sequential):
                 return None
             return float(np.mean(evaluate_multitask_training_success(self.cfg, self, benchmark, tasks)))
 
-        path = os.path.join(self.experiment_dir, "multitask_model.pth")
-        progress = self.practise(ConcatDataset(datasets), self.cfg.train.n_epochs, every, path, measure)
-        self.end_task(ConcatDataset(datasets), 0, benchmark)
-        return progress.held()
+        windows, path = ConcatDataset(datasets), os.path.join(self.experiment_dir, "multitask_model.pth")
+        curve = self.train_policy(windows, self.cfg.train.n_epochs, every, path, measure)
+        self.end_task(windows, 0, benchmark)
+        return curve.means()

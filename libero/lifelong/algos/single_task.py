@@ -1,4 +1,4 @@
-"""A policy for each task."""
+"""One policy for each task."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from lifelong import algorithms
 
 
 class SingleTask(Sequential):
-    """Every task begins with the first weights, and is acted on with its own; see `lifelong.algorithms.SingleTask`."""
+    """Trains every task from the initial weights and acts with its own; see `lifelong.algorithms.SingleTask`."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
         """See `Sequential`."""

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from libero._adapters.lifelong.batches import DictBatch, map_tensors
-from libero._adapters.lifelong.config import named, plain
+from libero._adapters.lifelong.config import lookup, plain
 from libero.lifelong.models.modules.data_augmentation import AUGMENTATIONS, DataAugGroup
 
 REGISTERED_POLICIES: dict[str, type["BasePolicy"]] = {}
@@ -28,7 +28,7 @@ def get_policy_class(policy_name: str) -> type["BasePolicy"]:
     Raises:
         UnknownNameError: no such policy.
     """
-    return named(REGISTERED_POLICIES, "policy", policy_name)
+    return lookup(REGISTERED_POLICIES, "policy", policy_name)
 
 
 def get_policy_list() -> dict[str, type["BasePolicy"]]:
@@ -113,7 +113,7 @@ def _augmentations(policy_cfg: Any) -> list[nn.Module]:
     """Those that the configuration names, colours first."""
     nodes = [policy_cfg.get(key) for key in ("color_aug", "translation_aug")]
     return [
-        named(AUGMENTATIONS, "augmentation", node["network"])(**plain(node["network_kwargs"]))
+        lookup(AUGMENTATIONS, "augmentation", node["network"])(**plain(node["network_kwargs"]))
         for node in nodes
         if node
     ]

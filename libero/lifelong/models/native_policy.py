@@ -12,8 +12,8 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.config import named, plain
-from libero._adapters.lifelong.observations import spec_of, to_native
+from libero._adapters.lifelong.config import lookup, plain
+from libero._adapters.lifelong.observations import policy_spec, to_native
 from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS
 from libero.lifelong.models.modules.rgb_modules import fuse, resnet_sizes
@@ -42,7 +42,7 @@ class NativePolicy(BasePolicy, registered=False):
         super().__init__(cfg, shape_meta)
         policy = cfg.policy
         self.max_seq_len = int(policy.get("transformer_max_seq_len") or cfg.data.seq_len)
-        self.spec = spec_of(cfg, shape_meta, self.max_seq_len)
+        self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
         self.network: HistoryPolicy = self._network(
             policy, {**_head(policy), **plain(policy.get("native") or {})}
         )
@@ -106,7 +106,7 @@ def build_language(policy: Any, kind: str, output_size: int) -> nn.Module:
         )
     if node.network != "IdentityEncoder":
         kwargs["output_size"] = output_size
-    return named(ENCODERS, "language encoder", node.network)(**kwargs)
+    return lookup(ENCODERS, "language encoder", node.network)(**kwargs)
 
 
 def image_sizes(policy: Any) -> dict[str, Any]:
@@ -167,7 +167,7 @@ def encode_positions(network: Any, policy: Any) -> None:
 def _head(policy: Any) -> dict[str, Any]:
     """Arguments of the head."""
     node = policy.policy_head
-    kind, kwargs = named(HEADS, "policy head", node.network), node.network_kwargs
+    kind, kwargs = lookup(HEADS, "policy head", node.network), node.network_kwargs
     sizes = {"head_hidden": kwargs.hidden_size, "head_layers": kwargs.num_layers}
     if kind is not GMMHead:
         return {"head": "deterministic", **sizes}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from libero._adapters.lifelong.batches import map_tensors
-from libero._adapters.lifelong.observations import picture, pixels
+from libero._adapters.lifelong.observations import image_tensor, uint8_image
 from lifelong.evaluation.saliency import SaliencySettings, saliency
 from lifelong.types import Batch, Observation
 
@@ -58,7 +58,7 @@ class PerturbationAttention:
     def _maps(self, data: Mapping[str, Any], views: Sequence[str], row: int) -> Tensor:
         """(V, H, W) of one row, upright."""
         one = map_tensors(dict(data), lambda x: x[row : row + 1])
-        images = torch.stack([pixels(one["obs"][view]).flip(-3) for view in views], dim=2)
+        images = torch.stack([uint8_image(one["obs"][view]).flip(-3) for view in views], dim=2)
         nothing = torch.zeros(1, 1, device=self.device)
         batch = Batch(Observation(images, {}, nothing), nothing, nothing[0].long(), nothing[0].long())
         return saliency(cast(Any, _Answering(self.model, one, views)), batch, self.settings)
@@ -75,6 +75,6 @@ class _Answering(nn.Module):
         """(B, T, A)."""
         images = batch.observation.images.flip(-3)
         data = map_tensors(dict(self.data), lambda x: x.expand(len(images), *x.shape[1:]))
-        seen = {view: picture(images[:, :, k]) for k, view in enumerate(self.views)}
+        seen = {view: image_tensor(images[:, :, k]) for k, view in enumerate(self.views)}
         answer = self.model({**data, "obs": {**data["obs"], **seen}})
         return (answer if isinstance(answer, Tensor) else answer.mean).float()

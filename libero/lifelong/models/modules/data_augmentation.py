@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.observations import pixels
+from libero._adapters.lifelong.observations import uint8_image
 from lifelong.nn.augmentation import Augmentation, ColorJitter, RandomShift
 
 __all__ = [
@@ -54,7 +54,7 @@ class _Aug(IdentityAug):
         if not self.training:
             return x
         b, t = x.shape[:2]
-        images = pixels(x)[:, :, None]  # (B, T, 1, H, W, C)
+        images = uint8_image(x)[:, :, None]  # (B, T, 1, H, W, C)
         if self.together == "batch":
             images = images.flatten(0, 1)[None]
         changed = self.augmentation.images(images).view(b, t, *images.shape[-3:])

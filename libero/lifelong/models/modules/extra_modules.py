@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.observations import READINGS, reading
+from libero._adapters.lifelong.observations import PROPRIO, proprio_input
 from libero.lifelong.models.modules.language_modules import mlp
 from lifelong.errors import PolicyError
 
@@ -19,12 +19,12 @@ class _Readings(nn.Module):
     def __init__(self, use_joint: bool, use_gripper: bool, use_ee: bool):
         super().__init__()
         used = {"use_joint": use_joint, "use_gripper": use_gripper, "use_ee": use_ee}
-        self.sizes = dict(READINGS[key] for key, wanted in used.items() if wanted)
+        self.sizes = dict(PROPRIO[key] for key, wanted in used.items() if wanted)
         if not self.sizes:
             raise PolicyError("no reading is used: set use_joint, use_gripper or use_ee")
 
     def _read(self, obs_dict: Mapping[str, Tensor]) -> list[Tensor]:
-        return [reading(obs_dict, name) for name in self.sizes]
+        return [proprio_input(obs_dict, name) for name in self.sizes]
 
 
 class ExtraModalities(_Readings):

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.observations import pixels
+from libero._adapters.lifelong.observations import uint8_image
 from lifelong.errors import PolicyError
 from lifelong.nn import patches, vision
 
@@ -107,7 +107,7 @@ class ResnetEncoder(nn.Module):
             (N, E).
         """
         langs = x.new_zeros(1, self.language_dim) if langs is None else langs
-        return self.encoder(pixels(x), langs.float())
+        return self.encoder(uint8_image(x), langs.float())
 
     def output_shape(self, input_shape: Sequence[int] = (), shape_meta: Any = None) -> tuple[int, ...]:
         """(E,)."""
@@ -146,7 +146,7 @@ class PatchEncoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, H, W) in [0, 1] -> (N, E, rows, columns)."""
         rows = round((self.num_patches / self._aspect) ** 0.5)
-        return self.encoder(pixels(x)).transpose(1, 2).unflatten(2, (rows, -1))
+        return self.encoder(uint8_image(x)).transpose(1, 2).unflatten(2, (rows, -1))
 
 
 class _WithoutLanguage(nn.Module):
