@@ -1,1 +1,1 @@
-"""Import paths of the original benchmark, for code written against it: adapters to `libero_env` only."""
+"""Import paths of the original benchmark, for code that was written for it; adapters to `libero_env`."""

@@ -1,7 +1,7 @@
-"""Where the original looks for task files, initial states, demonstrations and assets.
+"""Folders of task files, initial states, demonstrations and assets, as the original configures them.
 
-The configuration file is read if it is there and never written unasked. Without it, task files and initial states are
-those of this package, laid out as files in the cache folder when somebody asks for their path.
+The configuration file is read if it exists, and only `set_libero_default_path` writes it. Without it, task files and
+initial states are those of this package, which `get_libero_path` writes to the cache folder.
 """
 
 import os
@@ -32,17 +32,14 @@ _KEYS = ("benchmark_root", "bddl_files", "init_states", "datasets", "assets")
 
 
 def __getattr__(name: str) -> str:
-    """`libero_config_path` and `config_file` follow `$LIBERO_CONFIG_PATH`."""
+    """Return `libero_config_path` or `config_file`, which depend on `$LIBERO_CONFIG_PATH`."""
     if name in ("libero_config_path", "config_file"):
         return str(_config_file().parent if name == "libero_config_path" else _config_file())
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def get_default_path_dict(custom_location: str | os.PathLike | None = None) -> dict[str, str]:
-    """Key -> path: of a folder laid out like the original package, or without one of what this package generates.
-
-    Nothing is written: `get_libero_path` lays the files out.
-    """
+    """Return key -> path: in a folder laid out like the original package, or by default in the cache folder."""
     from libero._adapters.envs.files import generated_paths
 
     if custom_location is None:
@@ -53,16 +50,16 @@ def get_default_path_dict(custom_location: str | os.PathLike | None = None) -> d
 
 
 def get_path_dict() -> dict[str, str]:
-    """Key -> path as configured, the default where the configuration says nothing."""
+    """Return key -> path as configured, with defaults for missing keys."""
     configured: dict[str, Any] = read_config()
     return {**get_default_path_dict(), **{k: str(v) for k, v in configured.items() if k in _KEYS and v}}
 
 
 def get_libero_path(query_key: str) -> str:
-    """One of the paths; warns where there is nothing.
+    """Return one of the paths, and warn if it does not exist.
 
     Raises:
-        UnknownNameError: no such key.
+        UnknownNameError: The key does not exist.
     """
     from libero._adapters.envs.files import ensure
 

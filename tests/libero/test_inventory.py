@@ -288,7 +288,7 @@ def test_samplers():
     both.append_sampler(regions.ObjectBasedSampler("on", cup, rng=rng), {"reference": "milk_1"})
     found = both.sample()
     assert found["mug_1"][0][2] > found["milk_1"][0][2]
-    with pytest.raises(LiberoError, match="no free place"):
+    with pytest.raises(LiberoError, match="no free placement"):
         regions.TableRegionSampler("small", items, [(0, 0)], [(0, 0)], rng=rng).sample()
     assert 0.5 <= regions.TurnOnOffSampler("knob", "turnon", None, (0.5, 2.1), rng).sample() <= 2.1
     assert regions.OpenCloseSampler("door", "open", None, (-0.1, -0.2), rng).sample() < 0

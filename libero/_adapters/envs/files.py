@@ -1,4 +1,4 @@
-"""This package's tasks as the files that the original ships: `<suite>/<task>.bddl`, `<suite>/<task>.pruned_init`."""
+"""The tasks of this package as files of the original: `<suite>/<task>.bddl`, `<suite>/<task>.pruned_init`."""
 
 import hashlib
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from libero_env.init_states.store import shipped_path
 from libero_env.paths import cache_dir, demos_dir
 from libero_env.tasks import Task, get_suite, suite_names
 
-_COMPLETE = ".complete"  # written last, so that an interrupted layout is laid out again
+_COMPLETE = ".complete"  # written last: after an interruption all files are written again
 
 
 def generated_paths() -> dict[str, str]:
-    """Where task files, initial states, demonstrations and assets are without a configuration; not made yet."""
+    """Return the default folders of task files, initial states, demonstrations and assets; nothing is written."""
     root = cache_dir() / "facade"
     assets = chosen_assets().value
     return {
@@ -29,15 +29,15 @@ def generated_paths() -> dict[str, str]:
 
 
 def ensure(key: str, path: str) -> None:
-    """Lay files out if `path` is where the generated ones belong."""
-    makers: dict[str, Callable[[Path], None]] = {"bddl_files": _write_tasks, "init_states": _write_states}
-    if key in makers and path == generated_paths()[key] and not (Path(path) / _COMPLETE).exists():
-        makers[key](Path(path))
+    """Write the files if `path` is a default folder and they are missing."""
+    writers: dict[str, Callable[[Path], None]] = {"bddl_files": _write_tasks, "init_states": _write_states}
+    if key in writers and path == generated_paths()[key] and not (Path(path) / _COMPLETE).exists():
+        writers[key](Path(path))
         (Path(path) / _COMPLETE).touch()
 
 
 def suite_tasks() -> dict[str, tuple[Task, ...]]:
-    """Suite with tasks of its own -> its tasks."""
+    """Return suite -> tasks, for the suites that are not made of others."""
     suites = {name: get_suite(name).tasks for name in suite_names()}
     return {name: tasks for name, tasks in suites.items() if all(task.suite == name for task in tasks)}
 

@@ -1,4 +1,4 @@
-"""A scene as MJCF, as demonstrations store it, and what is read back of it."""
+"""A scene as MJCF, as demonstrations store it, and the poses of fixtures that are read from it."""
 
 from xml.etree import ElementTree
 
@@ -11,7 +11,7 @@ Pose = tuple[list[float], list[float]]
 
 
 def write_model(scene: Scene, model: mujoco.MjModel) -> str:
-    """The scene as MJCF without textures, fixtures where they stand in `model`."""
+    """Return the scene as MJCF without textures, with the poses of the fixtures in `model`."""
     spec = scene_spec(scene.problem, scene.pack)
     for material in spec.materials:
         material.textures = [""] * len(list(material.textures))
@@ -25,15 +25,19 @@ def write_model(scene: Scene, model: mujoco.MjModel) -> str:
 
 
 def fixtures_of(scene: Scene, xml: str) -> dict[str, Pose]:
-    """Fixture -> position (3,) m and orientation wxyz (4,) in a stored model of the task, ours or the original's.
+    """Return fixture -> position (3,), m, and orientation (4,), wxyz, in a stored model of the task.
+
+    Args:
+        scene: Scene of the task.
+        xml: Stored model, of this package or of the original.
 
     Raises:
-        LiberoError: it is no XML.
+        LiberoError: The text is not XML.
     """
     try:
         root = ElementTree.fromstring(xml)
     except ElementTree.ParseError as error:
-        raise LiberoError(f"the stored model is no XML: {error}") from error
+        raise LiberoError(f"the stored model is not XML: {error}") from error
     found = {}
     for body in root.iter("body"):
         name = body.get("name", "").removesuffix("_main")

@@ -1,4 +1,4 @@
-"""The window of `has_renderer=True`, where there is a screen."""
+"""The window of `has_renderer=True`."""
 
 import os
 import sys
@@ -9,39 +9,37 @@ import mujoco
 
 
 class Window:
-    """MuJoCo's viewer of a simulation, opened with the first picture.
+    """MuJoCo's viewer of a simulation, opened at the first `show`.
 
-    Without a screen nothing is shown, which one warning says; everything else goes on, so that a script with
-    `has_renderer=True` also runs on a server.
+    Without a screen, `show` warns once and does nothing, so a script with `has_renderer=True` also runs on a server.
 
     Args:
-        camera: what is shown at first.
+        camera: Camera of the first view.
     """
 
     def __init__(self, camera: str):
         self.camera = camera
         self._viewer: Any = None
-        self._told = False
+        self._tried = False
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Show the present state; a window that the user has closed stays closed."""
-        if self._viewer is None and not self._told:
+        """Show the present state; a window that the user closed stays closed."""
+        if self._viewer is None and not self._tried:
             self._viewer = self._opened(model, data)
         if self._viewer is not None and self._viewer.is_running():
             self._viewer.sync()
 
     def close(self) -> None:
-        """Close it. Idempotent."""
+        """Close the window. Idempotent."""
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
 
     def _opened(self, model: mujoco.MjModel, data: mujoco.MjData) -> Any:
-        self._told = True
+        self._tried = True
         if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
             warnings.warn(
-                "has_renderer=True: there is no screen, so nothing is shown; draw with camera observations "
-                "or sim.render",
+                "has_renderer=True: there is no screen, so nothing is shown; use camera observations or sim.render",
                 stacklevel=4,
             )
             return None

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ libero_suites = ["libero_spatial", "libero_object", "libero_goal", "libero_90", 
 
 
 class Task(NamedTuple):
-    """What a benchmark says about a task."""
+    """A task of a benchmark."""
 
     name: str
     language: str
@@ -33,7 +33,7 @@ class Task(NamedTuple):
 
 
 def __getattr__(name: str) -> Any:
-    """`task_maps` (suite -> task name -> Task) and `task_orders`, read when asked for."""
+    """Return `task_maps` (suite -> task name -> Task) or `task_orders`, which are read at the first use."""
     if name == "task_maps":
         return _task_maps()
     if name == "task_orders":
@@ -42,23 +42,23 @@ def __getattr__(name: str) -> Any:
 
 
 def register_benchmark(target_class: type["Benchmark"]) -> type["Benchmark"]:
-    """Make a class known by its name; case does not count."""
+    """Register a class by its name; case does not matter."""
     BENCHMARK_MAPPING[target_class.__name__.lower()] = target_class
     return target_class
 
 
 def get_benchmark_dict(help: bool = False) -> dict[str, type["Benchmark"]]:
-    """Lower-case name -> class; with `help` the names are printed."""
+    """Return lower-case name -> class; with `help`, print the names."""
     if help:
         print_benchmark()
     return BENCHMARK_MAPPING
 
 
 def get_benchmark(benchmark_name: str) -> type["Benchmark"]:
-    """The class of this name; case does not count.
+    """Return the class of this name; case does not matter.
 
     Raises:
-        UnknownNameError: no such benchmark.
+        UnknownNameError: The benchmark does not exist.
     """
     if benchmark_name.lower() not in BENCHMARK_MAPPING:
         raise UnknownNameError("benchmark", benchmark_name, BENCHMARK_MAPPING)
@@ -71,7 +71,7 @@ def print_benchmark() -> None:
 
 
 def grab_language_from_filename(x: str) -> str:
-    """The instruction that a task file's name spells."""
+    """Return the instruction that the name of a task file spells."""
     return language_from_name(x.removesuffix(".bddl"))
 
 
@@ -95,8 +95,8 @@ class Benchmark:
     """A sequence of tasks. Subclasses set `name` and call `_make_benchmark`.
 
     Attributes:
-        tasks: in the order of `task_order_index`.
-        task_embs: one embedding for each task, once set.
+        tasks: Tasks in the order of `task_order_index`.
+        task_embs: One embedding for each task, once set.
     """
 
     name: str
@@ -119,48 +119,49 @@ class Benchmark:
         self.n_tasks = len(self.tasks)
 
     def get_num_tasks(self) -> int:
-        """How many tasks."""
+        """Return the number of tasks."""
         return self.n_tasks
 
     def get_task_names(self) -> list[str]:
-        """Names in order."""
+        """Return the names of the tasks."""
         return [task.name for task in self.tasks]
 
     def get_task_problems(self) -> list[str]:
-        """Kind of problem of each task."""
+        """Return the kind of problem of each task."""
         return [task.problem for task in self.tasks]
 
     def get_task_bddl_files(self) -> list[str]:
-        """File name of each task."""
+        """Return the file name of each task."""
         return [task.bddl_file for task in self.tasks]
 
     def get_task_bddl_file_path(self, i: int) -> str:
-        """Path of a task's file."""
+        """Return the path of the file of a task."""
         return str(Path(get_libero_path("bddl_files"), self.tasks[i].problem_folder, self.tasks[i].bddl_file))
 
     def get_task_demonstration(self, i: int) -> str:
-        """Path of a task's demonstrations below the datasets folder.
+        """Return the path of the demonstrations of a task below the datasets folder.
 
         Raises:
-            UnknownNameError: no such task.
+            UnknownNameError: The task does not exist.
         """
         if i not in range(self.n_tasks):
             raise UnknownNameError(f"task index of {self.name}", i, range(self.n_tasks))
         return f"{self.tasks[i].problem_folder}/{self.tasks[i].name}_demo.hdf5"
 
     def get_task(self, i: int) -> Task:
-        """A task."""
+        """Return a task."""
         return self.tasks[i]
 
     def get_task_emb(self, i: int) -> Any:
-        """A task's embedding, set before with `set_task_embs`."""
+        """Return the embedding of a task, which `set_task_embs` has set."""
         assert self.task_embs is not None, "call set_task_embs first"
         return self.task_embs[i]
 
     def get_task_init_states(self, i: int) -> np.ndarray:
-        """A task's fixed initial states for `set_init_state`, (n, size).
+        """Return the fixed initial states of a task for `set_init_state`, (n, size).
 
-        Those of the configured folder: [time, qpos, qvel]; else this package's, followed by the fixtures' poses.
+        States of the configured folder are [time, qpos, qvel]; in those of this package the poses of the fixtures
+        follow.
         """
         task = self.tasks[i]
         path = Path(get_libero_path("init_states"), task.problem_folder, task.init_states_file)
@@ -171,56 +172,27 @@ class Benchmark:
         return load_init_states(native, build_scene(native.problem))
 
     def set_task_embs(self, task_embs: Sequence[Any]) -> None:
-        """Remember one embedding for each task."""
+        """Set one embedding for each task."""
         self.task_embs = task_embs
 
 
-class _Suite(Benchmark):
-    suite: ClassVar[str]
+def _suite(suite: str, doc: str) -> type[Benchmark]:
+    """Register the class of a suite of this package."""
 
-    def __init__(self, task_order_index: int = 0, *, task_order: int | None = None):
-        super().__init__(task_order_index if task_order is None else task_order)
-        self.name = self.suite
-        self._make_benchmark()
+    class Suite(Benchmark):
+        def __init__(self, task_order_index: int = 0, *, task_order: int | None = None):
+            super().__init__(task_order_index if task_order is None else task_order)
+            self.name = suite
+            self._make_benchmark()
 
-
-@register_benchmark
-class LIBERO_SPATIAL(_Suite):
-    """The same objects at other places."""
-
-    suite = "libero_spatial"
+    Suite.__name__ = Suite.__qualname__ = suite.upper()
+    Suite.__doc__ = doc
+    return register_benchmark(Suite)
 
 
-@register_benchmark
-class LIBERO_OBJECT(_Suite):
-    """Other objects, the same act."""
-
-    suite = "libero_object"
-
-
-@register_benchmark
-class LIBERO_GOAL(_Suite):
-    """Other goals, the same objects and places."""
-
-    suite = "libero_goal"
-
-
-@register_benchmark
-class LIBERO_90(_Suite):
-    """Ninety short tasks."""
-
-    suite = "libero_90"
-
-
-@register_benchmark
-class LIBERO_10(_Suite):
-    """Ten long tasks."""
-
-    suite = "libero_10"
-
-
-@register_benchmark
-class LIBERO_100(_Suite):
-    """The ninety short tasks and the ten long ones."""
-
-    suite = "libero_100"
+LIBERO_SPATIAL = _suite("libero_spatial", "Ten tasks with the same objects at other places.")
+LIBERO_OBJECT = _suite("libero_object", "Ten tasks with other objects and the same action.")
+LIBERO_GOAL = _suite("libero_goal", "Ten tasks with other goals and the same objects and places.")
+LIBERO_90 = _suite("libero_90", "Ninety short tasks.")
+LIBERO_10 = _suite("libero_10", "Ten long tasks.")
+LIBERO_100 = _suite("libero_100", "The ninety short tasks and the ten long ones.")

@@ -1,4 +1,4 @@
-"""The environments that clients make: a task file in, robosuite's observations and the old four-tuple out."""
+"""Environments of a task file with robosuite's observations and the four-tuple of old Gym."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,17 +20,14 @@ class ControlEnv:
     """One simulation of a task file. `step` returns (observation, reward, success, info); there is no `truncated`.
 
     Args:
-        bddl_file_name: task file; of the benchmark's tasks the name without a folder is enough.
-        controller: `OSC_POSE` or `OSC_POSITION`.
-        use_camera_obs: whether pictures are drawn.
-        camera_names, camera_heights, camera_widths, camera_depths, camera_segmentations: one value, or one per camera.
-        has_renderer, render_camera: whether `env.render()` shows a window, and from where; see `Window`.
-        horizon: control steps after which `step` raises.
-        kwargs: further arguments of `BDDLBaseDomain`.
+        bddl_file_name: Task file; for the tasks of the benchmark its name without a folder is enough.
+        controller: Name of the controller, such as `OSC_POSE`, or its configuration.
+        camera_names, camera_heights, camera_widths: One value, or one for each camera.
+        kwargs: Further arguments of `BDDLBaseDomain`, such as `use_camera_obs`, `horizon` and `has_renderer`.
 
     Raises:
-        BDDLError: it is no task file.
-        UnknownNameError: no such problem class, controller or camera.
+        BDDLError: The file is not a task file.
+        UnknownNameError: The problem class, an argument, the controller or a camera does not exist.
     """
 
     def __init__(
@@ -43,21 +40,10 @@ class ControlEnv:
         use_camera_obs: bool = True,
         has_renderer: bool = False,
         has_offscreen_renderer: bool = True,
-        render_camera: str = "frontview",
-        render_collision_mesh: bool = False,
-        render_visual_mesh: bool = True,
-        render_gpu_device_id: int = -1,
-        control_freq: float = 20,
-        horizon: int = 1000,
-        ignore_done: bool = False,
-        hard_reset: bool = True,
+        *,
         camera_names: str | Sequence[str] = DEFAULT_CAMERAS,
         camera_heights: int | Sequence[int] = 128,
         camera_widths: int | Sequence[int] = 128,
-        camera_depths: bool | Sequence[bool] = False,
-        camera_segmentations: Any = None,
-        renderer: str = "mujoco",
-        renderer_config: Any = None,
         **kwargs: Any,
     ):
         info = BDDLUtils.get_problem_info(bddl_file_name)
@@ -74,21 +60,15 @@ class ControlEnv:
             use_camera_obs=use_camera_obs,
             has_renderer=has_renderer,
             has_offscreen_renderer=has_offscreen_renderer,
-            render_camera=render_camera,
-            control_freq=control_freq,
-            horizon=horizon,
-            ignore_done=ignore_done,
             camera_names=camera_names,
             camera_heights=camera_heights,
             camera_widths=camera_widths,
-            camera_depths=camera_depths,
-            camera_segmentations=camera_segmentations,
             **kwargs,
         )
 
     @property
     def obj_of_interest(self) -> list[str]:
-        """What the task is about."""
+        """Names of the objects of interest."""
         return self.env.obj_of_interest
 
     @property
@@ -106,14 +86,14 @@ class ControlEnv:
         return self.env._visualizations
 
     def step(self, action: Any) -> tuple[Mapping[str, np.ndarray], float, bool, dict[str, Any]]:
-        """Act for 50 ms; see `BDDLBaseDomain.step`."""
+        """Act for 50 ms, see `BDDLBaseDomain.step`."""
         return self.env.step(action)
 
     def reset(self) -> Mapping[str, np.ndarray]:
-        """Place everything anew.
+        """Sample an initial state and observe it.
 
         Raises:
-            PlacementError: nothing fits, five times.
+            PlacementError: The objects did not fit in five attempts.
         """
         for _ in range(_RESETS - 1):
             try:
@@ -123,43 +103,43 @@ class ControlEnv:
         return self.env.reset()
 
     def get_observation(self) -> Mapping[str, np.ndarray]:
-        """What was observed last."""
+        """Return the last observation."""
         return self.env._get_observations()
 
     def check_success(self) -> bool:
-        """Whether the goal holds."""
+        """Return whether the goal holds."""
         return self.env._check_success()
 
     def get_sim_state(self) -> np.ndarray:
-        """[time, qpos, qvel]."""
+        """Return [time, qpos, qvel]."""
         return self.env.sim.get_state().flatten()
 
     def set_state(self, mujoco_state: np.ndarray) -> None:
-        """Go to a state of `get_sim_state`; see `set_init_state`."""
+        """Set the state, as `get_sim_state` returns it; see `set_init_state`."""
         self.env.restart(mujoco_state)
 
     def set_init_state(self, init_state: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Go to a state and observe it; the arm holds its pose and the horizon counts from here.
+        """Set the state and observe it; the arm holds its pose and the horizon counts from here.
 
         Args:
-            init_state: [time, qpos, qvel], and behind it the poses of the fixtures or nothing.
+            init_state: [time, qpos, qvel], with or without the poses of the fixtures after it.
         """
         self.env.timestep, self.env.done = 0, False
         return self.regenerate_obs_from_state(init_state)
 
     def regenerate_obs_from_state(self, mujoco_state: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Go to a state and observe it."""
+        """Set the state and observe it."""
         self.set_state(mujoco_state)
         self._post_process()
         self._update_observables(force=True)
         return self.env._get_observations()
 
     def reset_from_xml_string(self, xml_string: str) -> None:
-        """Put the fixtures where a stored model has them; see `BDDLBaseDomain.reset_from_xml_string`."""
+        """Set the poses of the fixtures from a stored model, see `BDDLBaseDomain.reset_from_xml_string`."""
         self.env.reset_from_xml_string(xml_string)
 
     def seed(self, seed: int) -> None:
-        """Placements from now on follow from this number; nothing else does."""
+        """Seed the placements from now on, and nothing else."""
         self.env.seed(seed)
 
     def close(self) -> None:
@@ -180,60 +160,45 @@ class OffScreenRenderEnv(ControlEnv):
         super().__init__(**{**kwargs, "has_renderer": False, "has_offscreen_renderer": True})
 
 
-class DemoRenderEnv(ControlEnv):
-    """An environment for replaying demonstrations into pictures."""
-
-    def __init__(self, **kwargs: Any):
-        defaults = {"render_camera": "frontview"}
-        super().__init__(**{**defaults, **kwargs, "has_renderer": False, "has_offscreen_renderer": True})
+class DemoRenderEnv(OffScreenRenderEnv):
+    """An environment that renders demonstrations."""
 
     def _get_observations(self) -> Mapping[str, np.ndarray]:
-        """What was observed last."""
+        """Return the last observation."""
         return self.env._get_observations()
 
 
 class SegmentationRenderEnv(OffScreenRenderEnv):
-    """An environment that also draws which pixel belongs to what.
+    """An environment that also draws segmentation pictures.
 
     Attributes:
-        segmentation_id_mapping: index of an instance -> its name, without the parts of the robot.
-        instance_to_id: name -> its number in segmentation pictures.
-        segmentation_robot_id: index of the robot.
+        segmentation_id_mapping: Index of an instance -> its name, without the parts of the robot.
+        instance_to_id: Name -> number in segmentation pictures.
+        segmentation_robot_id: Index of the robot.
     """
 
-    def __init__(
-        self,
-        camera_segmentations: Any = "instance",
-        camera_heights: int | Sequence[int] = 128,
-        camera_widths: int | Sequence[int] = 128,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            camera_segmentations=camera_segmentations,
-            camera_heights=camera_heights,
-            camera_widths=camera_widths,
-            **kwargs,
-        )
+    def __init__(self, camera_segmentations: Any = "instance", **kwargs: Any):
+        super().__init__(camera_segmentations=camera_segmentations, **kwargs)
         names = list(self.env.model.instances_to_ids)
         self.segmentation_robot_id = names.index("Panda0")
         self.segmentation_id_mapping = dict(enumerate(names[: self.segmentation_robot_id]))
         self.instance_to_id = {name: i + 1 for i, name in self.segmentation_id_mapping.items()}
 
     def get_segmentation_instances(self, segmentation_image: np.ndarray) -> dict[str, np.ndarray]:
-        """Name of each instance, and `robot` -> the picture with everything else 0."""
+        """Return the picture of each instance, and of `robot`, with everything else 0."""
         image, robot = segmentation_image, self.segmentation_robot_id + 1
         found = {"robot": np.where(image >= robot, robot, 0)}
         return found | {name: np.where(image == i, i, 0) for name, i in self.instance_to_id.items()}
 
     def get_segmentation_of_interest(self, segmentation_image: np.ndarray) -> np.ndarray:
-        """1 where an object of interest is, -1 in the background, 0 elsewhere."""
+        """Return a picture with 1 for objects of interest, -1 for the background, and 0 elsewhere."""
         found = np.where(segmentation_image == 0, -1, 0).astype(segmentation_image.dtype)
         ids = [self.instance_to_id[name] for name in self.obj_of_interest if name in self.instance_to_id]
         found[np.isin(segmentation_image, ids)] = 1
         return found
 
     def segmentation_to_rgb(self, seg_im: np.ndarray, random_colors: bool = False) -> np.ndarray:
-        """A colour for each number, (H, W, 3) uint8: well apart from each other, or drawn once from a fixed seed."""
+        """Return a colour for each number, (H, W, 3) uint8: evenly spread hues, or random ones of a fixed seed."""
         image = np.asarray(seg_im)
         image = image[..., 0] if image.ndim == 3 else image
         count = int(max(image.max(initial=0), 0)) + 1

@@ -1,4 +1,4 @@
-"""The pictures in the original's `textures` folder."""
+"""Texture files in the `textures` folder of the original."""
 
 import os
 from pathlib import Path
@@ -26,10 +26,10 @@ _WORDS = {
 
 
 def get_texture_file_list(type: str, texture_path: str | os.PathLike) -> list[tuple[str, str]]:
-    """Name and path of the pictures of a kind, `floor`, `wall`, `table` or `sky`.
+    """Return name and path of the textures of a kind: `floor`, `wall`, `table` or `sky`.
 
     Raises:
-        UnknownNameError: no such kind.
+        UnknownNameError: The kind does not exist.
     """
     if type not in TYPES:
         raise UnknownNameError("kind of texture", type, TYPES)

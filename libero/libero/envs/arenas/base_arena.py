@@ -1,4 +1,4 @@
-"""A scene that is being put together, with the interface of robosuite's arenas."""
+"""A scene before it is compiled, with the interface of robosuite's arenas."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ class Arena:
     """Floor, walls, table, cameras and lights as an editable model.
 
     Attributes:
-        spec: the model.
+        spec: The model.
     """
 
     def __init__(self, spec: mujoco.MjSpec):
@@ -22,7 +22,7 @@ class Arena:
 
     @property
     def worldbody(self) -> Any:
-        """The world's body."""
+        """The world body."""
         return self.spec.worldbody
 
     def set_camera(
@@ -32,16 +32,15 @@ class Arena:
         quat: Sequence[float],
         camera_attribs: Mapping[str, Any] | None = None,
     ) -> None:
-        """Move a camera, or add one; attributes as in MJCF, such as `fovy`."""
+        """Set the pose of a camera, or add one; of `camera_attribs`, `fovy` has an effect."""
         camera = self.spec.camera(camera_name)
         camera = self.spec.worldbody.add_camera(name=camera_name) if camera is None else camera
         camera.pos, camera.quat = pos, quat
-        for key, value in (camera_attribs or {}).items():
-            if key == "fovy":
-                camera.fovy = float(value)
+        if camera_attribs and "fovy" in camera_attribs:
+            camera.fovy = float(camera_attribs["fovy"])
 
     def get_xml(self) -> str:
-        """The model as MJCF."""
+        """Return the model as MJCF."""
         return self.spec.to_xml()
 
 
@@ -49,9 +48,9 @@ class WorkspaceArena(Arena):
     """The arena of one workspace.
 
     Args:
-        floor_style, wall_style: names of `libero.libero.envs.arenas.style`.
-        scene: style of the whole scene, such as `warm`.
-        kwargs: what else the original's classes take (`table_full_size`, `xml`, ...) is accepted, of no effect.
+        floor_style, wall_style: Names in `libero.libero.envs.arenas.style`.
+        scene: Style of the whole scene, such as `warm`.
+        kwargs: Other arguments of the original's classes, such as `table_full_size`, have no effect.
     """
 
     category: ClassVar[str]

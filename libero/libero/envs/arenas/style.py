@@ -9,10 +9,10 @@ STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
 
 
 def get_texture_filename(type: str, style: str) -> str:
-    """Name of the picture of a style in the original's `textures`.
+    """Return the texture file of a style in the `textures` folder of the original.
 
     Raises:
-        UnknownNameError: no such kind or style.
+        UnknownNameError: The kind or style does not exist.
     """
     if type not in STYLE_MAPPING:
         raise UnknownNameError("kind of style", type, STYLE_MAPPING)

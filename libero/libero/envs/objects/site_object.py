@@ -1,4 +1,4 @@
-"""Regions as objects: a named site."""
+"""Regions as objects."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ import numpy as np
 
 
 class SiteObject:
-    """A region that is a box around a site.
+    """A region that is a box around a named site.
 
     Attributes:
-        name: address of the region.
-        parent_name: the thing that it belongs to.
-        size: half size, (3,) m.
-        joints: names of the joints that move it.
+        name: Address of the region.
+        parent_name: Object or fixture that the region belongs to.
+        size: Half size, (3,) m.
+        joints: Names of the joints that move it.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class SiteObject:
         self.object_properties = object_properties or {"vis_site_names": {}}
 
     def in_box(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
-        """Whether a point is in the box of half size |R size| around the site, or up to 1 cm below it."""
+        """Return whether a point is in the box of half size |R size| around the site, or up to 1 cm below it."""
         half = np.abs(np.asarray(this_mat).reshape(3, 3) @ self.size)
         low, high = np.asarray(this_position) - half, np.asarray(this_position) + half
         low[2] -= 0.01
@@ -42,7 +42,7 @@ class SiteObject:
     def under(
         self, this_position: Any, this_mat: Any, other_position: Any, other_height: float = 0.10
     ) -> bool:
-        """Whether a point is over the box, by less than `other_height`."""
+        """Return whether a point is above the box, by less than `other_height`, m."""
         delta = np.asarray(this_mat).reshape(3, 3) @ (np.asarray(other_position) - np.asarray(this_position))
         over = self.size[2] - 0.005 < delta[2] < self.size[2] + other_height
         return bool(over and (np.abs(delta[:2]) < self.size[:2]).all())

@@ -9,11 +9,11 @@ from libero.libero.envs.base_object import BuiltinObject, register_object
 
 @register_object
 class TargetZone(BuiltinObject):
-    """A flat rectangle that things are put on.
+    """A flat rectangle on which objects are placed.
 
     Attributes:
-        size: half size along x and y, m.
-        pos: its middle, (3,) m, world frame.
+        size: Half size, (3,) m.
+        pos: Centre in the world frame, (3,) m.
     """
 
     def __init__(
@@ -32,11 +32,11 @@ class TargetZone(BuiltinObject):
         self.pos = np.array([*zone_centroid_xy[:2], z_offset], np.float64)
 
     def in_box(self, this_position: Any, other_position: Any) -> bool:
-        """Whether a point is in the box of the zone."""
+        """Return whether a point is in the box of the zone."""
         return bool((np.abs(np.asarray(other_position) - np.asarray(this_position)) < self.size).all())
 
     def on_top(self, this_position: Any, other_position: Any, other_height: float = 0.02) -> bool:
-        """Whether a point is over the zone, by less than `other_height`."""
+        """Return whether a point is above the zone, by less than `other_height`, m."""
         delta = np.asarray(other_position) - np.asarray(this_position)
         return bool(
             (np.abs(delta[:2]) < self.size[:2]).all() and self.size[2] - 0.005 < delta[2] < other_height

@@ -8,11 +8,23 @@ from libero_env.tasks.problem import Atom
 
 
 class Expression(ABC):
-    """Anything that is true or false of object states."""
+    """An expression that is true or false for object states."""
 
     @abstractmethod
     def __call__(self, *args: Any) -> bool:
-        """Truth for these object states."""
+        """Return the truth for these object states."""
+
+
+class UnaryAtomic(Expression):
+    """A predicate of one object state."""
+
+
+class BinaryAtomic(Expression):
+    """A predicate of two object states."""
+
+
+class MultiarayAtomic(Expression):
+    """A predicate of any number of object states."""
 
 
 class _Native(Expression):
@@ -21,39 +33,26 @@ class _Native(Expression):
     predicate: ClassVar[str]
 
     def __call__(self, *args: Any) -> bool:
-        """Truth for these object states."""
+        """Return the truth for these object states."""
         return evaluate(Atom(self.predicate, tuple(arg.object_name for arg in args)), args[0].env.view)
 
 
-class UnaryAtomic(Expression):
-    """A predicate of one thing."""
+class _StateMethod(UnaryAtomic):
+    """A predicate that is a method of the object state."""
 
-    def __call__(self, arg1: Any) -> bool:
-        """Truth for this object state."""
-        raise NotImplementedError
-
-
-class BinaryAtomic(Expression):
-    """A predicate of two things."""
-
-    def __call__(self, arg1: Any, arg2: Any) -> bool:
-        """Truth for these object states."""
-        raise NotImplementedError
-
-
-class MultiarayAtomic(Expression):
-    """A predicate of any number of things."""
+    method: ClassVar[str]
 
     def __call__(self, *args: Any) -> bool:
-        """Truth for these object states."""
-        raise NotImplementedError
+        """Return the truth for this object state."""
+        (state,) = args
+        return getattr(state, self.method)()
 
 
 class TruePredicateFn(MultiarayAtomic):
     """Always true."""
 
     def __call__(self, *args: Any) -> bool:
-        """True."""
+        """Return True."""
         return True
 
 
@@ -61,7 +60,7 @@ class FalsePredicateFn(MultiarayAtomic):
     """Never true."""
 
     def __call__(self, *args: Any) -> bool:
-        """False."""
+        """Return False."""
         return False
 
 
@@ -78,61 +77,53 @@ class In(_Native, BinaryAtomic):
 
 
 class On(_Native, BinaryAtomic):
-    """The first stands on the second."""
+    """The first is on the second."""
 
     predicate = "On"
 
 
 class Up(_Native, UnaryAtomic):
-    """At least a metre above the floor."""
+    """The object is at least a metre above the floor."""
 
     predicate = "Up"
 
 
 class Stack(_Native, BinaryAtomic):
-    """The first stands on the second and is inside it."""
+    """The first is on the second and inside it."""
 
     predicate = "Stack"
 
 
 class PrintJointState(_Native, UnaryAtomic):
-    """Always true; prints the joints."""
+    """Always true; prints the joint positions."""
 
     predicate = "Printjointstate"
 
     def __call__(self, *args: Any) -> bool:
-        """True."""
+        """Print the joint positions and return True."""
         print(args[0].get_joint_state())
         return super().__call__(*args)
 
 
-class Open(UnaryAtomic):
-    """Any joint is as far out as open begins."""
+class Open(_StateMethod):
+    """Any joint is in the open range."""
 
-    def __call__(self, arg1: Any) -> bool:
-        """Truth for this object state."""
-        return arg1.is_open()
+    method = "is_open"
 
 
-class Close(UnaryAtomic):
-    """All joints are as far in as closed begins."""
+class Close(_StateMethod):
+    """All joints are in the closed range."""
 
-    def __call__(self, arg1: Any) -> bool:
-        """Truth for this object state."""
-        return arg1.is_close()
+    method = "is_close"
 
 
-class TurnOn(UnaryAtomic):
-    """Any joint is as far as on begins."""
+class TurnOn(_StateMethod):
+    """Any joint is in the range of on."""
 
-    def __call__(self, arg1: Any) -> bool:
-        """Truth for this object state."""
-        return arg1.turn_on()
+    method = "turn_on"
 
 
-class TurnOff(UnaryAtomic):
-    """All joints are as far back as off begins."""
+class TurnOff(_StateMethod):
+    """All joints are in the range of off."""
 
-    def __call__(self, arg1: Any) -> bool:
-        """Truth for this object state."""
-        return arg1.turn_off()
+    method = "turn_off"

@@ -26,26 +26,27 @@ def update_predicate_fn_dict(fn_key: str, fn_name: str | type | Callable[..., bo
     """Add a predicate or replace one.
 
     Args:
-        fn_key: as task files write it; case does not count.
-        fn_name: name of a class of this package, a class, or a callable of object states.
+        fn_key: Name in task files; case does not matter.
+        fn_name: Name of a class of this package, a class, or a callable of object states.
     """
     if isinstance(fn_name, str):
         if not hasattr(known, fn_name):
             raise UnknownNameError("predicate class", fn_name, vars(known))
         fn_name = getattr(known, fn_name)
-    VALIDATE_PREDICATE_FN_DICT[fn_key.lower()] = fn_name() if isinstance(fn_name, type) else fn_name  # type: ignore[assignment]
+    predicate: Any = fn_name() if isinstance(fn_name, type) else fn_name
+    VALIDATE_PREDICATE_FN_DICT[fn_key.lower()] = predicate
 
 
 def get_predicate_fn_dict() -> dict[str, Callable[..., bool]]:
-    """All predicates."""
+    """Return all predicates by name."""
     return VALIDATE_PREDICATE_FN_DICT
 
 
 def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
-    """One predicate; case does not count.
+    """Return a predicate by its name; case does not matter.
 
     Raises:
-        UnknownNameError: no predicate has this name.
+        UnknownNameError: The predicate does not exist.
     """
     if predicate_fn_name.lower() not in VALIDATE_PREDICATE_FN_DICT:
         raise UnknownNameError("predicate", predicate_fn_name, VALIDATE_PREDICATE_FN_DICT)
@@ -53,5 +54,5 @@ def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
 
 
 def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:
-    """Truth of a predicate for object states."""
+    """Return the truth of a predicate for object states."""
     return get_predicate_fn(predicate_fn_name)(*args)

@@ -1,4 +1,4 @@
-"""Samplers of places and of joint positions, by problem and region."""
+"""Samplers of positions and of joint positions, by problem and region."""
 
 from libero.libero.envs.regions.object_property_sampler import (
     ObjectPropertySampler,
@@ -31,10 +31,10 @@ REGION_SAMPLERS: dict[str, dict[str, type]] = {
 
 
 def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
-    """The sampler of a workspace in a problem.
+    """Return the sampler of a workspace in a problem.
 
     Raises:
-        UnknownNameError: no such problem or workspace.
+        UnknownNameError: The problem or workspace does not exist.
     """
     if problem_name not in REGION_SAMPLERS:
         raise UnknownNameError("problem", problem_name, REGION_SAMPLERS)

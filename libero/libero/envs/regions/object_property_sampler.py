@@ -9,14 +9,17 @@ from libero_env.errors import UnknownNameError
 
 
 class ObjectPropertySampler:
-    """Draws one number from a range.
+    """Samples a joint position from a range.
 
     Args:
-        name: what messages call it.
-        state_type: what the number stands for.
-        mujoco_objects: the object it is for.
-        joint_ranges: (low, high), rad or m.
-        rng: draws the number.
+        name: Name of the sampler in messages.
+        state_type: State that the position stands for, such as `open`.
+        mujoco_objects: Object with the joint.
+        joint_ranges: Range (low, high), rad or m.
+        rng: Generator of the position.
+
+    Raises:
+        UnknownNameError: The sampler does not have the state.
     """
 
     states: Sequence[str] = ()
@@ -36,17 +39,17 @@ class ObjectPropertySampler:
         self.rng = np.random.default_rng() if rng is None else rng
 
     def sample(self) -> float:
-        """A number of the range."""
+        """Return a position in the range."""
         return float(self.rng.uniform(min(self.joint_ranges), max(self.joint_ranges)))
 
 
 class OpenCloseSampler(ObjectPropertySampler):
-    """How far a thing is open."""
+    """Samples how far an object is open."""
 
     states = ("open", "close")
 
 
 class TurnOnOffSampler(ObjectPropertySampler):
-    """How far a knob is turned."""
+    """Samples how far a knob is turned."""
 
     states = ("turnon", "turnoff")

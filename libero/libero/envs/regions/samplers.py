@@ -1,6 +1,6 @@
-"""Where objects go, for clients that place them themselves: name -> (pos (3,) m, quat wxyz (4,), object).
+"""Samplers of placements, name -> (pos (3,) m, quat wxyz (4,), object), for clients that place objects themselves.
 
-The environments place things with `libero_env.init_states.placement`; these samplers share its rule of bounded tries.
+The environments sample with `libero_env.init_states.placement`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,18 +16,18 @@ _TRIES = 5000
 
 
 class MultiRegionRandomSampler:
-    """Puts objects into rectangles, each range of x with the range of y at its place, without overlap.
+    """Samples placements in rectangles, of the x and y ranges of the same index, without overlap.
 
     Args:
-        name: what messages call it.
-        mujoco_objects: one or several with `name`, `bottom_offset`, `top_offset`, `horizontal_radius` and `init_quat`.
-        x_ranges, y_ranges: (low, high), m, from `reference_pos`.
-        rotation: (low, high) rad about the vertical, a number, or None for a full turn.
-        ensure_object_boundary_in_range: whether the whole object stays inside.
-        ensure_valid_placement: whether objects keep off each other.
-        reference_pos: (3,) m, world frame.
-        z_offset: m, above the reference.
-        rng: draws the places.
+        name: Name of the sampler in messages.
+        mujoco_objects: One or several objects with `name`, `bottom_offset`, `top_offset` and `horizontal_radius`.
+        x_ranges, y_ranges: Ranges (low, high) relative to `reference_pos`, m.
+        rotation: Rotation about `rotation_axis`, rad: a range (low, high), a number, or None for any.
+        ensure_object_boundary_in_range: Whether the whole object stays in the rectangle.
+        ensure_valid_placement: Whether objects do not overlap.
+        reference_pos: Origin in the world frame, (3,) m.
+        z_offset: Height above the origin, m.
+        rng: Generator of the placements.
     """
 
     def __init__(
@@ -53,21 +53,21 @@ class MultiRegionRandomSampler:
         self.add_objects(mujoco_objects if mujoco_objects is not None else ())
 
     def add_objects(self, mujoco_objects: Any) -> None:
-        """Place these too."""
+        """Add objects to place."""
         self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
 
     def sample(
         self, fixtures: Mapping[str, Any] | None = None, reference: Any = None, on_top: bool = True
     ) -> Placements:
-        """Places for all objects.
+        """Return placements of all objects.
 
         Args:
-            fixtures: placements that are there already.
-            reference: name of one of them, or a position, to count from instead of `reference_pos`.
-            on_top: whether objects stand on the reference rather than at its height.
+            fixtures: Placements that exist already.
+            reference: Name of one of them, or a position (3,), m, as the origin instead of `reference_pos`.
+            on_top: Whether objects stand on the reference rather than at its height.
 
         Raises:
-            PlacementError: nothing free was found in 5000 tries.
+            PlacementError: No free placement was found in 5000 tries.
         """
         placed: Placements = dict(fixtures or {})
         origin = self._origin(placed, reference, on_top)
@@ -95,7 +95,7 @@ class MultiRegionRandomSampler:
             if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
                 return tuple(pos), self._quat(item), item
         raise PlacementError(
-            f"{self.name}: no free place for {item.name} in {_TRIES} tries. (1) make the ranges larger, (2) use "
+            f"{self.name}: no free placement for {item.name} in {_TRIES} tries. (1) Make the ranges larger, (2) use "
             "fewer or smaller objects"
         )
 
@@ -105,12 +105,13 @@ class MultiRegionRandomSampler:
 
     @staticmethod
     def _clear(item: Any, pos: np.ndarray, other: Any) -> bool:
-        """Whether circles of the two keep apart, or the one is over the other."""
-        there, _, thing = other
+        """Return whether the circles of the two do not overlap, or the one is above the other."""
+        other_pos, _, other_item = other
         apart = (
-            np.hypot(*(pos[:2] - np.asarray(there)[:2])) > item.horizontal_radius + thing.horizontal_radius
+            np.hypot(*(pos[:2] - np.asarray(other_pos)[:2]))
+            > item.horizontal_radius + other_item.horizontal_radius
         )
-        return bool(apart or pos[2] + item.bottom_offset[-1] >= there[2] + thing.top_offset[-1])
+        return bool(apart or pos[2] + item.bottom_offset[-1] >= other_pos[2] + other_item.top_offset[-1])
 
     def _quat(self, item: Any) -> np.ndarray:
         if self.rotation is None:
@@ -123,7 +124,7 @@ class MultiRegionRandomSampler:
 
 
 class TableRegionSampler(MultiRegionRandomSampler):
-    """Places on the table."""
+    """Samples placements on the table."""
 
     category = "table"
 
@@ -133,28 +134,28 @@ class TableRegionSampler(MultiRegionRandomSampler):
 
 
 class Libero100TableRegionSampler(TableRegionSampler):
-    """Places on the tables of LIBERO-100."""
+    """Samples placements on the tables of LIBERO-100."""
 
     category = "kitchen_table"
 
 
 class ObjectBasedSampler(MultiRegionRandomSampler):
-    """Places on another object: pass its name to `sample` as `reference`."""
+    """Samples placements on another object: pass its name to `sample` as `reference`."""
 
 
 class SiteRegionRandomSampler(MultiRegionRandomSampler):
-    """Places around a site: pass its position to `sample` as `reference`."""
+    """Samples placements around a site: pass its position to `sample` as `reference`."""
 
 
 class InSiteRegionRandomSampler(SiteRegionRandomSampler):
-    """Places inside a site's box, of which objects may stick out."""
+    """Samples placements in the box of a site; objects may extend beyond it."""
 
     def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
         super().__init__(name, mujoco_objects, *args, **{"ensure_object_boundary_in_range": False, **kwargs})
 
 
 class SiteSequentialCompositeSampler:
-    """Samplers one after the other, each with what the ones before it have placed."""
+    """Runs samplers in turn; each gets the placements of those before it."""
 
     def __init__(self, name: str):
         self.name = name
@@ -163,11 +164,11 @@ class SiteSequentialCompositeSampler:
     def append_sampler(
         self, sampler: MultiRegionRandomSampler, sample_args: Mapping[str, Any] | None = None
     ) -> None:
-        """Add a sampler at the end, with arguments of its `sample`."""
+        """Add a sampler at the end, with arguments for its `sample`."""
         self.samplers[sampler.name] = sampler, dict(sample_args or {})
 
     def sample(self, fixtures: Mapping[str, Any] | None = None, **_: Any) -> Placements:
-        """All placements."""
+        """Return all placements."""
         placed, found = dict(fixtures or {}), {}
         for sampler, arguments in self.samplers.values():
             new = sampler.sample(fixtures=placed, **arguments)
