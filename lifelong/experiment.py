@@ -1,12 +1,12 @@
-"""A run: everything built from its configuration, the task sequence walked, the results summed up."""
+"""A run: build everything from the configuration, learn the task sequence, write the results."""
 
 import hashlib
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +15,23 @@ from omegaconf import DictConfig, OmegaConf
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
-from lifelong.algorithms import Algorithm
 from lifelong.build import build
 from lifelong.checkpoints import load_weights
+from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.policies import Policy
-from lifelong.pretraining import pretrain, weights_of
+from lifelong.pretraining import load_initial_weights, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.records import PhaseRecord, RunEndRecord, start_record, utc_now
-from lifelong.results.run_directory import RunDirectory, decisive
+from lifelong.results.run_directory import RunDirectory, result_relevant
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
-from lifelong.sequence import Parts, TaskSequence
+from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings
 from lifelong.streams import StreamSettings
-from lifelong.tracking import Tracker
 from lifelong.training.distributed import Ranks
-from lifelong.training.fit import BatchAugmentation
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
@@ -48,80 +45,54 @@ INIT = 0  # first word of the seed of the policy's initial weights, see lifelong
 
 
 def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) -> Path:  # noqa: B008 - frozen
-    """Run a configuration to its end, or go on with a run that was interrupted.
+    """Run a configuration to its end, or resume a run that was interrupted.
 
     Args:
-        config: What configs/config.yaml composes.
-        names: The file chosen in each group, such as algo -> ewc; they name the run.
-        ranks: This process among those that train together.
+        config: Configuration composed from configs/config.yaml.
+        names: Name of the file chosen in each group, such as algo -> ewc; they name the run.
+        ranks: Rank of this process among those that train together.
 
     Returns:
         The run's directory, with results.json and report.html in it.
 
     Raises:
-        LiberoError: Something in the configuration, the data or the directory does not work.
+        LiberoError: The configuration, the data or the directory is invalid.
     """
     settings = RunSettings(**{str(k): v for k, v in config.items() if k not in GROUPS})
     if settings.threads:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
     with deterministic(settings.deterministic):
-        return _run(config, names, settings, ranks)
+        # before anything is written: an invalid configuration leaves no trace
+        context, pretraining = _build_contexts(config, names, settings, ranks)
+        directory = context.directory
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+        with _opened(context, plain, settings.resume):
+            finished = ranks.broadcast(lambda: directory.log.read().finished)
+            if finished and ranks.first:
+                print(
+                    f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
+                )
+            if not finished:
+                if ranks.first:
+                    context.tracker.start(_run_name(names, settings), str(directory.path), plain)
+                    _record_start(context, names, plain)
+                _run_sequence(context, pretraining, plain)
+            if ranks.first:
+                context.tracker.finish()
+                _write_results(directory, plain)
+    return directory.path
 
 
-def _run(config: DictConfig, names: Mapping[str, str], settings: RunSettings, ranks: Ranks) -> Path:
-    # before anything is written: what cannot work leaves no trace
-    built = _build_all(config, settings, ranks)
-    label = "_".join(
-        [names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])]
-    )
-    name = f"{names['benchmark']}/{names['algo']}/{label}"
-    directory = RunDirectory(Path(settings.runs_dir) / name)
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    with directory.opened(plain, settings.resume) if ranks.first else nullcontext():
-        finished = ranks.broadcast(lambda: directory.log.read().finished)
-        if finished and ranks.first:
-            print(f"{directory.path} is finished; its report is drawn anew (resume=false runs it again)")
-        if not finished and ranks.first:
-            built.tracker.start(name, str(directory.path), plain)
-            _record_start(directory, names, settings.seed, built.tasks, plain, built.group_size)
-        if not finished:
-            _walk(built, settings, directory, ranks, plain)
-        if ranks.first:
-            built.tracker.finish()
-            _sum_up(directory, plain)
-        return directory.path
-
-
-@dataclass(frozen=True)
-class Built:
-    """What the configuration describes, before any data are made or simulations opened."""
-
-    tasks: tuple[Task, ...]
-    data: DataSettings
-    languages: torch.Tensor  # (K, L)
-    group_size: int
-    stream: StreamSettings
-    counts: tuple[int, ...]  # demonstrations of each task
-    pretrain: PretrainSettings
-    first_tasks: tuple[Task, ...]  # learned before the sequence
-    first_languages: torch.Tensor
-    spec: PolicySpec
-    policy: Policy
-    algorithm: Algorithm
-    fit: FitSettings
-    eval: EvalSettings
-    augment: BatchAugmentation
-    tracker: Tracker
-    device: torch.device
-
-
-def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built:
+def _build_contexts(
+    config: DictConfig, names: Mapping[str, str], settings: RunSettings, ranks: Ranks
+) -> tuple[RunContext, RunContext | None]:
+    """Return the context of the run, and that of the pretraining before it if there is any."""
     benchmark: BenchmarkSettings = build(config.benchmark)
     tasks, device = benchmark.sequence(), ranks.device(settings.device)
     stream: StreamSettings = build(config.stream)
-    before: PretrainSettings = build(config.pretrain)
-    first = before.sequence()
+    pretrain: PretrainSettings = build(config.pretrain)
+    first = pretrain.sequence()
     data: DataSettings = build(config.data)
     fit: FitSettings = build(config.train)
     if fit.compile != "off":
@@ -131,145 +102,133 @@ def _build_all(config: DictConfig, settings: RunSettings, ranks: Ranks) -> Built
     with seeded(settings.seed, INIT):
         policy = build(config.policy, spec=spec).to(device)
     if settings.init_from is not None:
-        weights, file = weights_of(Path(settings.init_from).expanduser())
+        weights, file = load_initial_weights(Path(settings.init_from).expanduser())
         load_weights(policy, weights, file)
-    return Built(
+    demos, algorithm = stream.demos(data.demos, len(tasks), benchmark.group_size), build(config.algo)
+    evaluation: EvalSettings = build(config.eval)
+    progress = sys.stderr.isatty() if settings.progress is None else settings.progress
+    context = RunContext(
         tasks=tasks,
-        data=data,
         languages=languages[len(first) :],
-        group_size=benchmark.group_size,
-        stream=stream,
-        counts=stream.demos(data.demos, len(tasks), benchmark.group_size),
-        pretrain=before,
-        first_tasks=first,
-        first_languages=languages[: len(first)],
-        spec=spec,
+        demos=demos,
+        data=data,
         policy=policy,
-        algorithm=build(config.algo),
+        algorithm=algorithm,
         fit=fit,
-        eval=build(config.eval),
+        eval=evaluation,
         augment=build(config.augmentation),
+        stream=stream,
+        group_size=benchmark.group_size,
+        envs=EnvPool(partial(_make_env, tasks, spec, evaluation), evaluation.open_environments),
+        directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
         tracker=build(config.wandb),
+        seed=settings.seed,
         device=device,
+        progress=progress and ranks.first,
+        ranks=ranks,
+    )
+    if not first:
+        return context, None
+    relevant = result_relevant(_pretraining_config(OmegaConf.to_container(config, resolve=True)))
+    digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
+    directory = RunDirectory(Path(settings.runs_dir) / "pretrain" / str(pretrain.suite) / digest)
+    return context, pretraining_context(
+        context, tasks=first, languages=languages[: len(first)], settings=pretrain, directory=directory
     )
 
 
-def _record_start(
-    directory: RunDirectory,
-    names: Mapping[str, str],
-    seed: int,
-    tasks: tuple[Task, ...],
-    config: Any,
-    group_size: int,
-) -> None:
-    directory.log.append(
+def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
+    """Return the run's directory below `runs_dir`, which is also its name in W&B."""
+    words = [names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])]
+    return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
+
+
+def _pretraining_config(plain: Any) -> dict[str, Any]:
+    return {key: plain[key] for key in PRETRAIN_KEYS}
+
+
+def _make_env(tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings, key: Any) -> BatchEnv:
+    task, simulations = key
+    return BatchEnv(
+        tasks[task],
+        simulations,
+        num_threads=settings.sim_threads,
+        cameras=tuple(CAMERAS[view] for view in spec.views),
+        camera_size=spec.image_size,
+        horizon=settings.horizon + settings.settle_steps,
+    )
+
+
+def _opened(context: RunContext, plain: Mapping[str, Any], resume: bool) -> AbstractContextManager[Any]:
+    """Return the context manager that holds the directory's lock, on the first rank."""
+    return context.directory.opened(plain, resume) if context.ranks.first else nullcontext()
+
+
+def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> None:
+    context.directory.log.append(
         start_record(
             algo=names["algo"],
             benchmark=names["benchmark"],
             policy=names["policy"],
-            seed=seed,
+            seed=context.seed,
             preset=names.get("preset", ""),
-            tasks=[t.name for t in tasks],
-            instructions=[t.language for t in tasks],
-            config=OmegaConf.to_yaml(OmegaConf.create(config)),
-            group_size=group_size,
+            tasks=[t.name for t in context.tasks],
+            instructions=[t.language for t in context.tasks],
+            config=OmegaConf.to_yaml(OmegaConf.create(plain)),
+            group_size=context.group_size,
         )
     )
 
 
-def _walk(
-    built: Built, settings: RunSettings, directory: RunDirectory, ranks: Ranks, plain: Mapping[str, Any]
-) -> None:
-    """Make sure of the demonstrations and learn the sequence."""
+def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Mapping[str, Any]) -> None:
+    """Make sure of the demonstrations, pretrain, and learn the task sequence."""
     began = time.perf_counter()
-    progress = sys.stderr.isatty() if settings.progress is None else settings.progress
-    progress = progress and ranks.first
-    paths = ranks.broadcast(_demos, built.tasks, built.counts, built.data, directory, progress)
-    with EnvPool(lambda key: _env(built, key), built.eval.open_environments) as envs:
-        parts = Parts(
-            instructions=tuple(t.language for t in built.tasks),
-            languages=built.languages,
-            datasets=DemoDatasets(paths, built.counts, built.spec, built.languages, built.data, built.device),
-            policy=built.policy,
-            algorithm=built.algorithm,
-            envs=envs,
-            fit=built.fit,
-            eval=built.eval,
-            augment=built.augment,
-            directory=directory,
-            tracker=built.tracker,
-            seed=settings.seed,
-            device=built.device,
-            progress=progress,
-            ranks=ranks,
-            stream=built.stream,
-            group_size=built.group_size,
-        )
-        _pretrain(built, parts, directory, plain)
-        TaskSequence(parts).run()
-    if ranks.first:
-        directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
+    datasets = _open_datasets(context)
+    with context.envs:
+        if pretraining is not None and not context.ranks.broadcast(lambda: context.directory.started):
+            _pretrain(pretraining, context, plain)
+        TaskSequence(context, datasets).run()
+    if context.ranks.first:
+        seconds = time.perf_counter() - began
+        context.directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
 
 
-def _env(built: Built, key: tuple[int, int]) -> BatchEnv:
-    task, simulations = key
-    return BatchEnv(
-        built.tasks[task],
-        simulations,
-        num_threads=built.eval.sim_threads,
-        cameras=tuple(CAMERAS[view] for view in built.spec.views),
-        camera_size=built.spec.image_size,
-        horizon=built.eval.horizon + built.eval.settle_steps,
-    )
+def _open_datasets(context: RunContext) -> DemoDatasets:
+    """Find the tasks' demonstrations, record those that are missing, and return their windows."""
+    paths = context.ranks.broadcast(_find_demos, context)
+    spec = context.policy.spec
+    return DemoDatasets(paths, context.demos, spec, context.languages, context.data, context.device)
 
 
-def _demos(
-    tasks: tuple[Task, ...],
-    counts: Sequence[int],
-    data: DataSettings,
-    directory: RunDirectory,
-    progress: bool,
-) -> list[Path]:
-    """The demonstration file of each task, and a record of how long that took."""
+def _find_demos(context: RunContext) -> list[Path]:
     began = time.perf_counter()
-    paths = find_demos(tasks, counts, data, progress)
-    directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
+    paths = find_demos(context.tasks, context.demos, context.data, context.progress)
+    seconds = time.perf_counter() - began
+    context.directory.log.append(PhaseRecord(phase="demos", seconds=seconds))
     return paths
 
 
-def _pretrain(built: Built, parts: Parts, directory: RunDirectory, plain: Mapping[str, Any]) -> None:
-    """Let the policy learn what comes before the sequence, unless the sequence has begun or nothing does."""
-    tasks, ranks, began = built.first_tasks, parts.ranks, time.perf_counter()
-    if not tasks or ranks.broadcast(lambda: directory.started):
-        return
-    kept = {key: plain[key] for key in PRETRAIN_KEYS}
-    digest = hashlib.sha256(json.dumps(decisive(kept), sort_keys=True).encode()).hexdigest()[:12]
-    own = RunDirectory(Path(plain["runs_dir"]) / "pretrain" / str(built.pretrain.suite) / digest)
-    counts = [built.pretrain.demos or built.data.demos] * len(tasks)
-    with own.opened(kept, resume=True) if ranks.first else nullcontext():
-        done = ranks.broadcast(lambda: own.log.read().finished)
+def _pretrain(pretraining: RunContext, context: RunContext, plain: Mapping[str, Any]) -> None:
+    """Train the policy on what comes before the sequence, or load its weights if that is done."""
+    ranks, directory, began = context.ranks, pretraining.directory, time.perf_counter()
+    config, suite = _pretraining_config(plain), str(plain["pretrain"]["suite"])
+    with _opened(pretraining, config, resume=True):
+        done = ranks.broadcast(lambda: directory.log.read().finished)
         if not done and ranks.first:
-            print(
-                f"Before the sequence: {len(tasks)} tasks of {built.pretrain.suite} in {own.path}", flush=True
-            )
-            names = {"algo": "multitask", "benchmark": str(built.pretrain.suite), "policy": "pretrained"}
-            _record_start(own, names, parts.seed, tasks, kept, 1)
-        paths = ranks.broadcast(_demos, tasks, counts, built.data, own, parts.progress)
-        pretrain(
-            parts,
-            instructions=tuple(t.language for t in tasks),
-            languages=built.first_languages,
-            datasets=DemoDatasets(paths, counts, built.spec, built.first_languages, built.data, built.device),
-            directory=own,
-            epochs=built.pretrain.epochs or built.fit.epochs,
-        )
+            count = len(pretraining.tasks)
+            print(f"Before the sequence: {count} tasks of {suite} in {directory.path}", flush=True)
+            names = {"algo": "multitask", "benchmark": suite, "policy": "pretrained"}
+            _record_start(pretraining, names, config)
+        TaskSequence(pretraining, _open_datasets(pretraining)).run(evaluate=False)
         if not done and ranks.first:
-            own.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
+            seconds = time.perf_counter() - began
+            directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
     if ranks.first:
-        directory.log.append(PhaseRecord(phase="pretrain", seconds=time.perf_counter() - began))
+        seconds = time.perf_counter() - began
+        context.directory.log.append(PhaseRecord(phase="pretrain", seconds=seconds))
 
 
-def _sum_up(directory: RunDirectory, config: Mapping[str, Any]) -> None:
+def _write_results(directory: RunDirectory, config: Mapping[str, Any]) -> None:
     """Write results.json and the report."""
     results = directory.log.read()
     write_summary(directory.path / "results.json", results, config)

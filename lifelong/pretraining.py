@@ -1,34 +1,34 @@
-"""What a policy knows before the first task: another run's weights, or a suite learned jointly."""
+"""What a policy knows before the first task: the weights of another run, or a suite learned jointly."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
 
+from libero_env.tasks import Task
 from lifelong import checkpoints
-from lifelong.algorithms.base import WindowDataset
 from lifelong.algorithms.multitask import Multitask
+from lifelong.context import RunContext
 from lifelong.errors import CheckpointError
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import RunDirectory
-from lifelong.sequence import Parts, TaskSequence
+from lifelong.settings import PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
 
 
-def weights_of(path: Path) -> tuple[dict[str, Tensor], Path]:
-    """A policy's weights from another run.
+def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
+    """Read a policy's weights from another run.
 
     Args:
-        path: The directory of a finished run, whose weights after the last task are taken, or one of the
+        path: Directory of a finished run, for its weights after the last task, or one of the
             `task_<k>.safetensors` in its `checkpoints`.
 
     Returns:
-        The weights, and the file they are from.
+        The weights, and the file they were read from.
 
     Raises:
-        CheckpointError: There is nothing of the kind; the message says what there is.
+        CheckpointError: There are no such weights; the message states what was found.
     """
     file = _last_checkpoint(path) if path.is_dir() else path
     state = checkpoints.load(file)
@@ -40,15 +40,15 @@ def weights_of(path: Path) -> tuple[dict[str, Tensor], Path]:
 
 
 def _last_checkpoint(run: Path) -> Path:
-    """The checkpoint after the last task of a finished run."""
-    made = {
+    """Return the checkpoint after the last task of a finished run."""
+    found = {
         int(f.stem[5:]): f for f in (run / "checkpoints").glob("task_*.safetensors") if f.stem[5:].isdecimal()
     }
-    if not made:
+    if not found:
         raise CheckpointError(
-            f"{run} has no checkpoints/task_<k>.safetensors: it is no run, or has learned nothing yet"
+            f"{run} has no checkpoints/task_<k>.safetensors: it is no run directory, or no task is learned yet"
         )
-    last = made[max(made)]
+    last = found[max(found)]
     if not ResultLog(run / "results.jsonl").read().finished:
         raise CheckpointError(
             f"{run} is not finished; finish it, or name one of its checkpoints, such as init_from={last}"
@@ -56,38 +56,35 @@ def _last_checkpoint(run: Path) -> Path:
     return last
 
 
-def pretrain(
-    parts: Parts,
+def pretraining_context(
+    context: RunContext,
     *,
-    instructions: tuple[str, ...],
+    tasks: tuple[Task, ...],
     languages: Tensor,
-    datasets: Mapping[int, WindowDataset],
+    settings: PretrainSettings,
     directory: RunDirectory,
-    epochs: int,
-) -> None:
-    """Train the policy jointly on other tasks, as algo=multitask does, without evaluating it on them.
+) -> RunContext:
+    """Return the context of joint training on other tasks before the sequence, as algo=multitask does it.
 
-    Liu et al. 2023 (LIBERO, figure 5) pretrain on LIBERO-90 and then learn another suite. It can be killed and
-    goes on like a run; where it is done already, its weights are loaded.
+    Liu et al. 2023 (LIBERO, figure 5) pretrain on LIBERO-90 and then learn another suite. The policy is that of the
+    sequence, so `TaskSequence(...).run(evaluate=False)` trains it in place, or loads its weights if that is done.
 
     Args:
-        parts: Of the sequence that follows; its policy is trained in place.
-        instructions: Of the tasks learned before it.
-        languages: (K, L) embeddings of these.
-        datasets: Their windows.
-        directory: Where checkpoints and losses are kept, apart from the sequence's.
-        epochs: As of `FitSettings`.
+        context: Context of the sequence that follows.
+        tasks: Tasks learned before it.
+        languages: (K, L) embeddings of their instructions.
+        settings: Number of demonstrations and epochs.
+        directory: Directory of their checkpoints and losses, apart from that of the sequence.
     """
-    joint = replace(
-        parts,
-        instructions=instructions,
+    return replace(
+        context,
+        tasks=tasks,
         languages=languages,
-        datasets=datasets,
+        demos=(settings.demos or context.data.demos,) * len(tasks),
         algorithm=Multitask(),
-        fit=replace(parts.fit, epochs=epochs),
-        directory=directory,
-        tracker=Tracker(),
+        fit=replace(context.fit, epochs=settings.epochs or context.fit.epochs),
         stream=StreamSettings(),
         group_size=1,
+        directory=directory,
+        tracker=Tracker(),
     )
-    TaskSequence(joint).run(evaluate=False)

@@ -1,10 +1,10 @@
-"""The walk through the task sequence: learn a task, keep its best weights, evaluate all tasks so far.
+"""The task sequence of a run: learn a task, keep its best weights, evaluate all tasks learned so far.
 
-It can be killed anywhere. What is done is found again in the records and checkpoints; the rest comes out with
-the same bits, because all randomness is derived from the seed and the place in the sequence.
+A run can be killed at any time. What is done is read back from the records and checkpoints; the rest comes out with
+the same bits, because all randomness is derived from the seed and the position in the sequence.
 
-Where several processes train together, all of them walk, but only the first evaluates and writes. They wait for
-each other wherever one reads what another has written, or will write anew.
+Where several processes train together, all of them train, but only the first evaluates and writes. They wait for
+each other wherever one reads what another has written, or is about to overwrite.
 """
 
 import time
@@ -17,322 +17,330 @@ from torch import Tensor
 
 from libero_env.timing import CONTROL_PERIOD
 from lifelong import checkpoints
-from lifelong.algorithms.base import Algorithm, Phase, WindowDataset
-from lifelong.evaluation.environments import EnvPool
-from lifelong.evaluation.rollout import rollout, save_animation
-from lifelong.evaluation.settings import EvalSettings
-from lifelong.policies.base import Policy
+from lifelong.algorithms.base import Phase, WindowDataset
+from lifelong.context import RunContext
+from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
-from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator, seeded
-from lifelong.streams import StageData, StreamSettings, stages_of
-from lifelong.tracking import Tracker
+from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
-from lifelong.training.distributed import Ranks
-from lifelong.training.fit import BatchAugmentation, EpochEnd, fit
-from lifelong.training.settings import FitSettings
+from lifelong.training.fit import EpochEnd, fit
 
 # First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` has another.
 FIT, END_TASK, ROLLOUT = 1, 2, 3
-SAVE_EVERY = 60.0  # s between two saves while learning, but for those at points of the learning curve
+SAVE_EVERY = 60.0  # [s] between two saves during training, besides those at points of the learning curve
 
 
 @dataclass(frozen=True)
-class Parts:
-    """All that a walk needs, ready made."""
+class TrainingPhase:
+    """One phase of an algorithm on one stage: a task, or tasks that are learned together.
 
-    instructions: tuple[str, ...]
-    languages: Tensor  # (K, L)
-    datasets: Mapping[int, WindowDataset]  # by position; each is read when asked for
-    policy: Policy
-    algorithm: Algorithm
-    envs: EnvPool  # keys: (position, number of simulations)
-    fit: FitSettings
-    eval: EvalSettings
-    augment: BatchAugmentation | None
-    directory: RunDirectory
-    tracker: Tracker
-    seed: int
-    device: torch.device
-    progress: bool
-    ranks: Ranks = Ranks()
-    stream: StreamSettings = StreamSettings()
-    group_size: int = 1
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Where in the sequence training stands: a phase of a task, or of tasks that are learned together."""
+    Attributes:
+        stage: Positions of the tasks.
+        number: Number of the phase within the stage, from 0.
+        phase: Phase as the algorithm defines it.
+        epochs: Number of epochs of the phase.
+        steps_per_epoch: Number of steps per epoch; None: every window once.
+        offset: Number of epochs of the stage's earlier phases.
+    """
 
     stage: Sequence[int]
     number: int
     phase: Phase
     epochs: int
     steps_per_epoch: int | None
-    offset: int  # epochs of the task's earlier phases
+    offset: int
 
     @property
     def task(self) -> int:
-        """The last, if there are several."""
+        """Position of the last task, which identifies the stage."""
         return self.stage[-1]
 
 
 class TaskSequence:
-    """Learns the tasks in turn; `run` starts, or goes on where an earlier process stopped."""
+    """Learns the tasks of a run in turn; `run` starts, or resumes where an earlier process stopped.
 
-    def __init__(self, parts: Parts):
-        self.parts = parts
-        parts.algorithm.augment = parts.augment
-        self.log = parts.directory.log
+    Args:
+        context: Everything the run consists of.
+        datasets: Windows of each task, by position; each is read when first used.
+    """
+
+    def __init__(self, context: RunContext, datasets: Mapping[int, WindowDataset]):
+        self.context = context
+        self.log = context.directory.log
+        self.stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
+        self.data = StageData(datasets, self.stages, context.stream, context.seed)
         self._saved = time.monotonic()
-        self.stages = stages_of(parts.algorithm, len(parts.instructions), parts.group_size)
-        self.data = StageData(parts.datasets, self.stages, parts.stream, parts.seed)
+        context.algorithm.set_augmentation(context.augment)
 
     def run(self, *, evaluate: bool = True) -> None:
-        """Learn whatever is not learned yet, and evaluate all tasks so far after each stage."""
-        done = self._restore()
-        if done and evaluate:
-            self.parts.ranks.broadcast(self._finish, self.stages[done - 1])
-        for stage in self.stages[done:]:
-            self._learn(stage)
-            if evaluate:
-                self.parts.ranks.broadcast(self._finish, stage)
+        """Learn what is not learned yet, and evaluate all tasks so far after each stage.
 
-    def _restore(self) -> int:
-        """Take up the state after the last stage that was learned; how many are."""
-        p, done = self.parts, 0
-        while done < len(self.stages) and p.directory.task_path(self.stages[done][-1]).exists():
+        Args:
+            evaluate: Whether to fill the success matrix.
+        """
+        done = self._resume()
+        if done and evaluate:
+            self.context.ranks.broadcast(self._evaluate_seen_tasks, self.stages[done - 1])
+        for stage in self.stages[done:]:
+            self._learn_stage(stage)
+            if evaluate:
+                self.context.ranks.broadcast(self._evaluate_seen_tasks, stage)
+
+    def _resume(self) -> int:
+        """Load the checkpoint of the last stage that was learned, and return how many stages are."""
+        done = 0
+        while done < len(self.stages) and self.context.directory.task_path(self.stages[done][-1]).exists():
             done += 1
         if done:
-            self._take_up_task(self.stages[done - 1][-1])
+            self._load_checkpoint(self.stages[done - 1][-1])
         return done
 
-    def _take_up_task(self, task: int) -> None:
-        path = self.parts.directory.task_path(task)
-        self._take_up(checkpoints.load(path, self.parts.device), str(path))
+    def _load_checkpoint(self, task: int) -> None:
+        path = self.context.directory.task_path(task)
+        self._load_state(checkpoints.load(path, self.context.device), str(path))
 
-    def _take_up(self, state: Mapping[str, Any], source: str) -> None:
+    def _load_state(self, state: Mapping[str, Any], source: str) -> None:
         if state.get("policy") is not None:
-            checkpoints.load_weights(self.parts.policy, state["policy"], source)
-        self.parts.algorithm.load_state_dict(state["algorithm"], self.data)
+            checkpoints.load_weights(self.context.policy, state["policy"], source)
+        self.context.algorithm.load_state_dict(state["algorithm"], self.data)
 
-    def _learn(self, stage: Sequence[int]) -> None:
-        """Train on a stage, from its beginning or from what is saved of it, and write its checkpoint."""
-        p, task = self.parts, stage[-1]
-        dataset, saved = self.data[task], p.directory.progress(task, p.device)
-        numbers, what = f"Task {task + 1}", p.instructions[task]
+    def _learn_stage(self, stage: Sequence[int]) -> None:
+        """Train on a stage, from its start or from its saved progress, and write its checkpoint."""
+        context, task = self.context, stage[-1]
+        dataset, saved = self.data[task], context.directory.progress(task, context.device)
+        title = f"Task {task + 1}/{len(context.tasks)}: {context.tasks[task].language}"
         if len(stage) > 1:
-            numbers, what = f"Tasks {stage[0] + 1}-{task + 1}", "together"
-        self._say(f"{numbers}/{len(p.instructions)}: {what} ({len(dataset)} windows)")
-        p.ranks.barrier()  # all have read what is saved
-        costs.reset_peak(p.device)
+            title = f"Tasks {stage[0] + 1}-{task + 1}/{len(context.tasks)}: together"
+        self._log(f"{title} ({len(dataset)} windows)")
+        context.ranks.barrier()  # all have read the saved progress
+        costs.reset_peak(context.device)
         if saved is None:
-            p.algorithm.begin_task(task, dataset, p.policy)
+            context.algorithm.begin_task(task, dataset, context.policy)
         else:
-            self._take_up(saved, str(p.directory.progress_path))
-        for stretch in self._stretches(stage):
-            if saved is not None and stretch.number < saved["phase"]:
+            self._load_state(saved, str(context.directory.progress_path))
+        for phase in self._phases(stage):
+            if saved is not None and phase.number < saved["phase"]:
                 continue
-            resume = saved["fit"] if saved is not None and stretch.number == saved["phase"] else None
-            self._train(stretch, dataset, resume)
-            p.ranks.broadcast(self._save, task, stretch.number + 1)
-        p.ranks.broadcast(self._end_task, task, dataset)
-        if not p.ranks.first:
-            self._take_up_task(task)
+            resume = saved["fit"] if saved is not None and phase.number == saved["phase"] else None
+            self._train(phase, dataset, resume)
+            context.ranks.broadcast(self._save_progress, task, phase.number + 1)
+        context.ranks.broadcast(self._end_task, task, dataset)
+        if not context.ranks.first:
+            self._load_checkpoint(task)
 
-    def _end_task(self, task: int, dataset: WindowDataset) -> None:
-        """What the algorithm does after a task, and the checkpoint of it."""
-        p, draws = self.parts, generator(self.parts.seed, END_TASK, task)
-        began = time.perf_counter()
-        with seeded(p.seed, END_TASK, task, 1, device=p.device):  # for dropout
-            p.algorithm.end_task(task, dataset, p.policy, draws)
-        spent = {
-            "end_task_seconds": time.perf_counter() - began,
-            "stored_bytes": costs.stored_bytes(p.algorithm),
-        }
-        with p.algorithm.policy_for(task, p.policy) as acting:
-            spent |= costs.action_costs(acting) | costs.peak_costs(p.device)
-        self.log.append(CostRecord(task=task, costs=spent))
-        state = {"task": task, "policy": p.policy.state_dict(), "algorithm": p.algorithm.state_dict()}
-        checkpoints.save(p.directory.task_path(task), state)
-
-    def _stretches(self, stage: Sequence[int]) -> list[Stretch]:
-        stretches, offset = [], 0
-        steps = self.parts.fit.steps_per_epoch
+    def _phases(self, stage: Sequence[int]) -> list[TrainingPhase]:
+        """Return the phases of training on a stage, in order."""
+        phases, offset, fit_settings = [], 0, self.context.fit
+        steps = fit_settings.steps_per_epoch
         steps = steps and steps * len(stage)  # as many for each task, together or not
-        for number, phase in enumerate(self.parts.algorithm.phases()):
-            epochs = max(1, round(self.parts.fit.epochs * phase.share))
-            stretches.append(Stretch(stage, number, phase, epochs, steps, offset))
+        for number, phase in enumerate(self.context.algorithm.phases()):
+            epochs = max(1, round(fit_settings.epochs * phase.share))
+            phases.append(TrainingPhase(stage, number, phase, epochs, steps, offset))
             offset += epochs
-        return stretches
+        return phases
 
-    def _train(self, stretch: Stretch, dataset: WindowDataset, resume: dict[str, Any] | None) -> None:
-        """One phase, from its first step or a saved epoch to the weights that are kept of it."""
-        p = self.parts
+    def _train(self, phase: TrainingPhase, dataset: WindowDataset, resume: dict[str, Any] | None) -> None:
+        """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""
+        context = self.context
         if resume is None:
-            p.algorithm.begin_phase(stretch.phase, p.policy)
+            context.algorithm.begin_phase(phase.phase, context.policy)
         fit(
-            p.policy,
+            context.policy,
             dataset,
-            p.algorithm,
-            settings=replace(p.fit, epochs=stretch.epochs, steps_per_epoch=stretch.steps_per_epoch),
-            seed=(p.seed, FIT, stretch.task, stretch.number),
-            device=p.device,
-            augment=p.augment,
-            on_epoch=lambda end: p.ranks.broadcast(self._after_epoch, stretch, end),
+            context.algorithm,
+            settings=replace(context.fit, epochs=phase.epochs, steps_per_epoch=phase.steps_per_epoch),
+            seed=(context.seed, FIT, phase.task, phase.number),
+            device=context.device,
+            augment=context.augment,
+            on_epoch=lambda end: context.ranks.broadcast(self._after_epoch, phase, end),
             resume=resume,
-            label=f"task {stretch.task + 1} {stretch.phase.name}",
-            progress=p.progress,
-            ranks=p.ranks,
+            label=f"task {phase.task + 1} {phase.phase.name}",
+            progress=context.progress,
+            ranks=context.ranks,
         )
-        if self._selects(stretch):
-            best = p.ranks.broadcast(self._best_epoch, stretch, stretch.epochs)
-            state = checkpoints.load(p.directory.best_path, p.device)
-            if (state["task"], state["epoch"]) != (stretch.task, best):
-                raise checkpoints.CheckpointError(
-                    f"{p.directory.best_path} is of task {state['task']}, epoch {state['epoch']}; expected "
-                    f"task {stretch.task}, epoch {best}. Start afresh with resume=false"
-                )
-            checkpoints.load_weights(p.policy, state["policy"], str(p.directory.best_path))
-            with torch.no_grad():
-                for own, kept in zip(self._own(), state.get("own", []), strict=True):
-                    own.copy_(kept)
-        p.algorithm.end_phase(stretch.phase, p.policy)
+        if self._selects_best(phase):
+            self._load_best(phase)
+        context.algorithm.end_phase(phase.phase, context.policy)
 
-    def _after_epoch(self, stretch: Stretch, end: EpochEnd) -> None:
-        """Record the loss, save, and draw a point of the learning curve if one is due."""
-        p, task, epoch = self.parts, stretch.task, stretch.offset + end.epoch
+    def _after_epoch(self, phase: TrainingPhase, end: EpochEnd) -> None:
+        """Record the loss, save, and evaluate a point of the learning curve if one is due."""
+        context, task, epoch = self.context, phase.task, phase.offset + end.epoch
         if end.epoch and not self.log.read().has_loss(task, epoch):
             self.log.append(LossRecord(task=task, epoch=epoch, loss=end.loss, seconds=end.seconds))
-            p.tracker.log({"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty})
-        if (stretch.number, end.epoch) == (0, stretch.epochs) and not self.log.read().costs(task):
-            spent = costs.step_costs(p.policy, p.algorithm, self.data[task], p.fit.batch_size)
+            values = {"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty}
+            context.tracker.log(values)
+        if (phase.number, end.epoch) == (0, phase.epochs) and not self.log.read().costs(task):
+            spent = costs.step_costs(
+                context.policy, context.algorithm, self.data[task], context.fit.batch_size
+            )
             self.log.append(CostRecord(task=task, costs=spent))
-        due = end.epoch in p.eval.curve_epochs(stretch.epochs)
+        due = end.epoch in context.eval.curve_epochs(phase.epochs)
         if due or time.monotonic() - self._saved > SAVE_EVERY:
-            self._save(task, stretch.number, end.state())
-        if not (due and stretch.phase.measures_transfer):
+            self._save_progress(task, phase.number, end.state())
+        if not (due and phase.phase.measures_transfer):
             return
-        success = _mean([self._evaluate("curve", task, one, epoch) for one in stretch.stage])
+        success = _mean_rate([self._evaluate("curve", task, member, epoch) for member in phase.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
-        self._say(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
-        if self._selects(stretch) and self._best_epoch(stretch, end.epoch) == end.epoch:
-            best = {"task": task, "epoch": end.epoch, "policy": p.policy.state_dict(), "own": self._own()}
-            checkpoints.save(p.directory.best_path, best)
+        self._log(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
+        if self._selects_best(phase) and self._best_epoch(phase, end.epoch) == end.epoch:
+            best = {
+                "task": task,
+                "epoch": end.epoch,
+                "policy": context.policy.state_dict(),
+                "own": self._algorithm_parameters(),
+            }
+            checkpoints.save(context.directory.best_path, best)
 
-    def _own(self) -> list[Tensor]:
-        """What is trained besides the policy's parameters: the algorithm's own."""
-        of_policy = {id(p) for p in self.parts.policy.parameters()}
-        return [p for p in self.parts.algorithm.trained(self.parts.policy) if id(p) not in of_policy]
+    def _algorithm_parameters(self) -> list[Tensor]:
+        """Return the parameters that are trained besides those of the policy."""
+        of_policy = {id(p) for p in self.context.policy.parameters()}
+        return [p for p in self.context.algorithm.trained(self.context.policy) if id(p) not in of_policy]
 
-    def _selects(self, stretch: Stretch) -> bool:
-        return self.parts.eval.select == "best" and stretch.phase.measures_transfer
+    def _selects_best(self, phase: TrainingPhase) -> bool:
+        return self.context.eval.select == "best" and phase.phase.measures_transfer
 
-    def _best_epoch(self, stretch: Stretch, until: int) -> int:
-        """The earliest epoch of the phase with the highest success on the curve so far."""
-        results = self.log.read()
-        rates = {}
-        for epoch in self.parts.eval.curve_epochs(stretch.epochs):
-            keys = [("curve", stretch.task, task, stretch.offset + epoch) for task in stretch.stage]
+    def _best_epoch(self, phase: TrainingPhase, until: int) -> int:
+        """Return the earliest epoch of the phase with the highest success on the learning curve so far."""
+        results, rates = self.log.read(), {}
+        for epoch in self.context.eval.curve_epochs(phase.epochs):
+            keys = [("curve", phase.task, task, phase.offset + epoch) for task in phase.stage]
             found = [record for key in keys if (record := results.evaluation(*key)) is not None]
             if epoch <= until and len(found) == len(keys):
-                rates[epoch] = _mean(found)
+                rates[epoch] = _mean_rate(found)
         return max(rates, key=lambda e: (rates[e], -e))
 
-    def _save(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
-        """Save where learning a task stands: inside a phase, or before it."""
-        p = self.parts
-        state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": p.algorithm.state_dict()}
-        state["policy"] = None if fit_state is not None else p.policy.state_dict()
-        checkpoints.save(p.directory.progress_path, state)
+    def _load_best(self, phase: TrainingPhase) -> None:
+        """Load the weights of the phase's best epoch."""
+        context, path = self.context, self.context.directory.best_path
+        best = context.ranks.broadcast(self._best_epoch, phase, phase.epochs)
+        state = checkpoints.load(path, context.device)
+        if (state["task"], state["epoch"]) != (phase.task, best):
+            raise checkpoints.CheckpointError(
+                f"{path} is of task {state['task']}, epoch {state['epoch']}; expected task {phase.task}, "
+                f"epoch {best}. Start again with resume=false"
+            )
+        checkpoints.load_weights(context.policy, state["policy"], str(path))
+        with torch.no_grad():
+            for parameter, kept in zip(self._algorithm_parameters(), state.get("own", []), strict=True):
+                parameter.copy_(kept)
+
+    def _save_progress(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
+        """Save the progress on a task: inside a phase, or before it."""
+        algorithm = self.context.algorithm.state_dict()
+        state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": algorithm}
+        state["policy"] = None if fit_state is not None else self.context.policy.state_dict()
+        checkpoints.save(self.context.directory.progress_path, state)
         self._saved = time.monotonic()
 
-    def _finish(self, stage: Sequence[int]) -> None:
-        """Evaluate all tasks so far, unless that is done."""
-        p, task, results = self.parts, stage[-1], self.log.read()
-        first = self._stretches(stage)[0]
-        best = self._best_epoch(first, first.epochs) if self._selects(first) else first.epochs
-        row = [self._evaluate("matrix", task, other, best) for other in range(task + 1)]
+    def _end_task(self, task: int, dataset: WindowDataset) -> None:
+        """Let the algorithm end the task, record the costs, and write the task's checkpoint."""
+        policy, algorithm, seed = self.context.policy, self.context.algorithm, self.context.seed
+        began = time.perf_counter()
+        with seeded(seed, END_TASK, task, 1, device=self.context.device):  # for dropout
+            algorithm.end_task(task, dataset, policy, generator(seed, END_TASK, task))
+        spent = {
+            "end_task_seconds": time.perf_counter() - began,
+            "stored_bytes": costs.stored_bytes(algorithm),
+        }
+        with algorithm.policy_for(task, policy) as acting:
+            spent |= costs.action_costs(acting) | costs.peak_costs(self.context.device)
+        self.log.append(CostRecord(task=task, costs=spent))
+        state = {"task": task, "policy": policy.state_dict(), "algorithm": algorithm.state_dict()}
+        checkpoints.save(self.context.directory.task_path(task), state)
+
+    def _evaluate_seen_tasks(self, stage: Sequence[int]) -> None:
+        """Fill the stage's row of the success matrix: all tasks so far, as far as not recorded yet."""
+        task, results = stage[-1], self.log.read()
+        first = self._phases(stage)[0]
+        best = self._best_epoch(first, first.epochs) if self._selects_best(first) else first.epochs
+        row = [self._evaluate("matrix", task, seen, best) for seen in range(task + 1)]
         if results.task_end(task) is None:
             spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
             spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in row)
             spent += sum(r.seconds for r in row)
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
-        new, mean = _mean([r for r in row if r.task in stage]), _mean(row)
-        p.tracker.log({"success/just_learned": new, "success/mean": mean, "tasks": task + 1})
-        text = f"  learned: success {new:.0%} on it, {mean:.0%} over {task + 1} so far"
-        self._say(text + self._left(task))
+        new, mean = _mean_rate([r for r in row if r.task in stage]), _mean_rate(row)
+        values = {"success/just_learned": new, "success/mean": mean, "tasks": task + 1}
+        self.context.tracker.log(values)
+        self._log(f"  learned: success {new:.0%} on it, {mean:.0%} over {task + 1} so far{self._eta(task)}")
 
     def _evaluate(self, phase: Literal["curve", "matrix"], learned: int, task: int, epoch: int) -> EvalRecord:
-        """Rollouts on a task, or their record if they were done before."""
-        p = self.parts
+        """Evaluate a task and record it, or return the record if there is one."""
+        context, settings = self.context, self.context.eval
         found = self.log.read().evaluation(phase, learned, task, epoch if phase == "curve" else None)
         if found is not None:
             return found
-        states = p.eval.init_states(phase)
-        shown = phase == "matrix" and (task == learned or learned == len(p.instructions) - 1)
+        states = settings.init_states(phase)
+        recorded = phase == "matrix" and (task == learned or learned == len(context.tasks) - 1)
         stage = next(stage for stage in self.stages if task in stage)
-        with p.algorithm.policy_for(stage[-1], p.policy) as acting:
+        with context.algorithm.policy_for(stage[-1], context.policy) as acting:
             rollouts = rollout(
                 acting,
-                p.envs.get((task, len(states))),
+                context.envs.get((task, len(states))),
                 states,
-                language=p.languages[task],
-                horizon=p.eval.horizon,
-                settle_steps=p.eval.settle_steps,
-                seed=(p.seed, ROLLOUT, learned, epoch, task),
-                device=p.device,
-                precision=p.eval.precision,
-                record_every=p.eval.record_every if shown else 0,
+                language=context.languages[task],
+                horizon=settings.horizon,
+                settle_steps=settings.settle_steps,
+                seed=(context.seed, ROLLOUT, learned, epoch, task),
+                device=context.device,
+                precision=settings.precision,
+                record_every=settings.record_every if recorded else 0,
                 label=f"rollouts on task {task + 1}",
-                progress=p.progress,
+                progress=context.progress,
             )
         if rollouts.frames:
             self._save_video(learned, task, rollouts.frames, rollouts.episodes[0].success)
-        record = EvalRecord(
-            phase=phase,
-            learned=learned,
-            epoch=epoch,
-            task=task,
-            successes=tuple(e.success for e in rollouts.episodes),
-            lengths=tuple(e.length for e in rollouts.episodes),
-            init_states=tuple(e.init_state for e in rollouts.episodes),
-            seconds=rollouts.seconds,
-            atoms=rollouts.atoms,
-            atoms_at_start=tuple(e.at_start for e in rollouts.episodes),
-            atoms_ever=tuple(e.ever for e in rollouts.episodes),
-            atoms_at_end=tuple(e.at_end for e in rollouts.episodes),
-        )
+        record = _eval_record(rollouts, phase, learned, epoch, task)
         self.log.append(record)
         return record
 
     def _save_video(self, learned: int, task: int, frames: tuple, success: bool) -> None:
-        p = self.parts
-        path = p.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"
-        save_animation(frames, path, seconds_per_frame=CONTROL_PERIOD * p.eval.record_every)
+        context = self.context
+        path = context.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"
+        save_animation(frames, path, seconds_per_frame=CONTROL_PERIOD * context.eval.record_every)
         outcome = "success" if success else "failure"
-        caption = f"{p.instructions[task]}: {outcome}, after learning {learned + 1} tasks"
+        caption = f"{context.tasks[task].language}: {outcome}, after learning {learned + 1} tasks"
         path.with_suffix(".txt").write_text(caption + "\n", encoding="utf-8")
 
-    def _left(self, task: int) -> str:
-        """An estimate of the time left, from what training a task and filling a cell took so far."""
-        results, size = self.log.read(), len(self.parts.instructions)
-        learned, left = task + 1, size - task - 1
-        if not left:
+    def _eta(self, task: int) -> str:
+        """Return an estimate of the remaining time, from the time that training and evaluation took so far."""
+        results, count = self.log.read(), len(self.context.tasks)
+        learned, remaining = task + 1, count - task - 1
+        if not remaining:
             return ""
         evals = results.of(EvalRecord)
         cells = [r.seconds for r in evals if r.phase == "matrix"]
-        once = sum(r.seconds for r in results.of(LossRecord))
-        once += sum(r.seconds for r in evals if r.phase == "curve")
-        todo = sum(stage[-1] + 1 for stage in self.stages if stage[-1] > task)
-        seconds = left * once / learned + todo * sum(cells) / len(cells)
+        training = sum(r.seconds for r in results.of(LossRecord))
+        training += sum(r.seconds for r in evals if r.phase == "curve")
+        open_cells = sum(stage[-1] + 1 for stage in self.stages if stage[-1] > task)
+        seconds = remaining * training / learned + open_cells * sum(cells) / len(cells)
         return f"; about {max(1, round(seconds / 60))} min left"
 
-    def _say(self, text: str) -> None:
-        if self.parts.ranks.first:
+    def _log(self, text: str) -> None:
+        if self.context.ranks.first:
             print(text, flush=True)
 
 
-def _mean(records: Sequence[EvalRecord]) -> float:
-    """The mean success of evaluations."""
+def _mean_rate(records: Sequence[EvalRecord]) -> float:
+    """Return the mean success of evaluations."""
     return sum(r.rate for r in records) / len(records)
+
+
+def _eval_record(
+    rollouts: Rollouts, phase: Literal["curve", "matrix"], learned: int, epoch: int, task: int
+) -> EvalRecord:
+    return EvalRecord(
+        phase=phase,
+        learned=learned,
+        epoch=epoch,
+        task=task,
+        successes=tuple(e.success for e in rollouts.episodes),
+        lengths=tuple(e.length for e in rollouts.episodes),
+        init_states=tuple(e.init_state for e in rollouts.episodes),
+        seconds=rollouts.seconds,
+        atoms=rollouts.atoms,
+        atoms_at_start=tuple(e.at_start for e in rollouts.episodes),
+        atoms_ever=tuple(e.ever for e in rollouts.episodes),
+        atoms_at_end=tuple(e.at_end for e in rollouts.episodes),
+    )

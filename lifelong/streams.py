@@ -1,6 +1,6 @@
-"""What is learned in which order: tasks in groups, fewer demonstrations later on, boundaries that are not sharp.
+"""The order in which data arrive: groups of tasks, fewer demonstrations later on, blurred task boundaries.
 
-A stage is what is learned at a time: a task, or a group of them. It goes by its last task, in the hooks of
+A stage is what is learned at a time: a task, or a group of tasks. It is identified by its last task, in the hooks of
 algorithms, in records and in the names of files.
 """
 
@@ -15,29 +15,29 @@ from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from lifelong.types import Batch
 
-BLUR = 4  # first word of a seed, see `lifelong.sequence`
+BLUR = 4  # first word of the seeds of blurred boundaries, see `lifelong.sequence`
 
 Stages = tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """How data come in; the defaults are the benchmark's: all of a task, and nothing else, at a time.
+    """Settings of the order in which data arrive; by default all windows of one task at a time.
 
     Attributes:
-        demos_later: Demonstrations of each task after the first one (or after the first group): how many, which
-            share of `data.demos` (a number with a point, up to 1.0), or a list with as many entries as there are
-            such tasks. None: as many as of the first.
-        blur: Share of each stage's windows that come with neighbouring stages instead of their own.
-        blur_reach: How many stages before and after count as neighbours.
+        demos_later: Demonstrations of each task after the first one (or after the first group): a number, a share
+            of `data.demos` (a float up to 1.0), or a list with one entry for each of these tasks. None: as many as
+            of the first.
+        blur: Share of each stage's windows that are learned in neighbouring stages instead of their own.
+        blur_reach: Number of stages before and after that count as neighbours.
 
-    With `blur`, a stage's windows are split at random, once for the whole run: a share of `1 - blur` is learned
-    when its turn comes, the rest is dealt evenly to the neighbours. Every window is learned in one stage and no
-    other. That is the Blurry-M stream of Bang et al. 2021 ("Rainbow memory", section 3: each task consists of
-    100 - M % of its own classes' samples and M % of the others'), here between neighbours, as near a boundary;
-    Koh et al. 2022 (i-Blurry) blur likewise with classes that never end beside it. Algorithms are told of stages
-    as before: what is in them is mixed, and the memory of a stage is too. Success on a task before its turn
-    (epoch 0 of its learning curve) then is no longer that of a task never seen.
+    With `blur`, a stage's windows are divided at random, once for the whole run: a share of `1 - blur` is learned in
+    the stage itself, the rest is distributed evenly over the neighbours. Every window is learned in exactly one
+    stage. That is the Blurry-M stream of Bang et al. 2021 ("Rainbow memory", section 3: each task consists of
+    100 - M % of its own classes' samples and M % of the others'), here between neighbouring stages; Koh et al. 2022
+    (i-Blurry) add classes that occur in all tasks. Algorithms see the same stages as without blur, with mixed
+    contents, and so does the replay memory. Success on a task before its stage (epoch 0 of its learning curve) is
+    then no longer that on an unseen task.
     """
 
     demos_later: int | float | Sequence[int] | None = None
@@ -51,15 +51,15 @@ class StreamSettings:
             raise ConfigError(f"stream.blur_reach is {self.blur_reach}; it must be at least 1 stage")
 
     def demos(self, full: int, tasks: int, first: int = 1) -> tuple[int, ...]:
-        """Demonstrations of each task.
+        """Return the number of demonstrations of each task.
 
         Args:
-            full: Those of a task at the beginning.
+            full: Number of demonstrations of each task of the first stage.
             tasks: Number of tasks, K.
-            first: Tasks of the first stage.
+            first: Number of tasks of the first stage.
 
         Raises:
-            ConfigError: `demos_later` is no number of demonstrations, or a list of another length.
+            ConfigError: `demos_later` is not a number of demonstrations, or a list of the wrong length.
         """
         later, rest = self.demos_later, tasks - first
         if later is None:
@@ -74,8 +74,8 @@ class StreamSettings:
                 )
         if any(not isinstance(n, int) or n < 1 for n in counts):
             raise ConfigError(
-                f"stream.demos_later is {later!r}; valid: numbers of demonstrations from 1 on, or a share such "
-                "as 0.2"
+                f"stream.demos_later is {later!r}; valid: numbers of demonstrations, at least 1, or a share "
+                "such as 0.2"
             )
         return (*[full] * first, *counts)
 
@@ -83,19 +83,19 @@ class StreamSettings:
     def _share(share: float, full: int) -> int:
         if not 0 < share <= 1:
             raise ConfigError(
-                f"stream.demos_later is {share}; as a share it must be above 0 and at most 1.0, a number of "
-                "demonstrations has no point"
+                f"stream.demos_later is {share}; as a share it must be above 0 and at most 1.0; write a number of "
+                "demonstrations without a decimal point"
             )
         return max(1, round(share * full))
 
 
-def stages_of(algorithm: Algorithm, tasks: int, group_size: int = 1) -> Stages:
-    """What is learned together, stage after stage: the groups, or what an algorithm joins of them.
+def learning_stages(algorithm: Algorithm, tasks: int, group_size: int = 1) -> Stages:
+    """Return the tasks of each stage: the groups, or the groups that an algorithm learns together.
 
     Args:
-        algorithm: One that learns everything at once has one stage.
+        algorithm: Algorithm, which may learn several groups in one stage.
         tasks: Number of tasks, K.
-        group_size: Tasks of a group, which divides K.
+        group_size: Number of tasks of a group, a divisor of K.
     """
     groups = [tuple(range(k, k + group_size)) for k in range(0, tasks, group_size)]
     stages = algorithm.stages(len(groups))
@@ -103,10 +103,10 @@ def stages_of(algorithm: Algorithm, tasks: int, group_size: int = 1) -> Stages:
 
 
 class StageWindows(JoinedWindows):
-    """The windows of a stage that has more than one task in it, as those of its last task.
+    """The windows of a stage with several tasks, as if they were those of its last task.
 
-    Batches name that task, count windows through all datasets and keep the order asked for, so that an algorithm
-    which keeps windows of a stage finds them again by what a batch says.
+    Batches have the id of that task, window ids counted through all datasets, and the requested order, so that an
+    algorithm can store windows of a stage by the ids in a batch.
     """
 
     def __init__(self, datasets: Sequence[WindowDataset], task_id: int):
@@ -115,9 +115,9 @@ class StageWindows(JoinedWindows):
         self._ends = torch.tensor([len(d) for d in datasets]).cumsum(0)
 
     def batch(self, indices: Tensor) -> Batch:
-        """The windows of these indices ((B,) int64, counted through all datasets), as one batch."""
+        """Return the windows with these indices ((B,) int64, counted through all datasets) as one batch."""
         indices = torch.as_tensor(indices, dtype=torch.int64, device="cpu")
-        batch = super().batch(indices)  # one dataset's after another's
+        batch = super().batch(indices)  # ordered by dataset
         places = torch.bucketize(indices, self._ends, right=True).argsort(stable=True).argsort()
         batch = batch.rows(places.to(batch.window_ids.device))
         task_ids = torch.full_like(batch.task_ids, self.task_id)
@@ -125,29 +125,34 @@ class StageWindows(JoinedWindows):
 
 
 @dataclass(frozen=True, eq=False)
-class SomeWindows:
-    """Some of a dataset's windows."""
+class WindowSubset:
+    """A subset of a dataset's windows.
+
+    Attributes:
+        dataset: Dataset of the windows.
+        chosen: (n,) int64 indices of the windows in it.
+    """
 
     dataset: WindowDataset
-    chosen: Tensor  # (n,) int64
+    chosen: Tensor
 
     def __len__(self) -> int:
         return len(self.chosen)
 
     def batch(self, indices: Tensor) -> Batch:
-        """The windows of these indices ((B,) int64 in [0, n)), as one batch."""
+        """Return the windows with these indices ((B,) int64 in [0, n)) as one batch."""
         return self.dataset.batch(self.chosen[indices])
 
 
 @dataclass(frozen=True)
 class StageData(Mapping[int, WindowDataset]):
-    """What is learned at each stage, by its last task.
+    """The windows that are learned in each stage, by its last task.
 
     Attributes:
-        datasets: Windows of each task, by position; each is read when asked for.
-        stages: See `stages_of`.
-        settings: Of the stream.
-        seed: Of the run: it decides which windows come with a neighbour.
+        datasets: Windows of each task, by position; each is read when first used.
+        stages: Tasks of each stage, from `learning_stages`.
+        settings: Settings of the stream.
+        seed: Seed of the run, which decides the windows that are learned in neighbouring stages.
     """
 
     datasets: Mapping[int, WindowDataset]
@@ -162,7 +167,7 @@ class StageData(Mapping[int, WindowDataset]):
         here = ends.index(last)
         if not self.settings.blur:
             return self._own(here)
-        parts = [self._given(here, here)] + [self._given(k, here) for k in self._neighbours(here)]
+        parts = [self._portion(here, here)] + [self._portion(k, here) for k in self._neighbours(here)]
         return StageWindows([part for part in parts if len(part)], last)
 
     def __iter__(self) -> Iterator[int]:
@@ -172,7 +177,7 @@ class StageData(Mapping[int, WindowDataset]):
         return len(self.stages)
 
     def _own(self, place: int) -> WindowDataset:
-        """All windows of a stage's tasks."""
+        """Return all windows of a stage's tasks."""
         stage = self.stages[place]
         if len(stage) == 1:
             return self.datasets[stage[0]]
@@ -183,12 +188,13 @@ class StageData(Mapping[int, WindowDataset]):
         near = range(max(0, place - reach), min(len(self.stages), place + reach + 1))
         return [k for k in near if k != place]
 
-    def _given(self, giver: int, taker: int) -> SomeWindows:
-        """The windows of one stage that are learned in another, or in itself."""
-        windows, takers = self._own(giver), self._neighbours(giver)
-        draws = generator(self.seed, BLUR, self.stages[giver][-1])
+    def _portion(self, source: int, target: int) -> WindowSubset:
+        """Return the windows of one stage that are learned in another, or in itself."""
+        windows, neighbours = self._own(source), self._neighbours(source)
+        draws = generator(self.seed, BLUR, self.stages[source][-1])
         order = torch.randperm(len(windows), generator=draws)
-        away = round(self.settings.blur * len(windows)) if takers else 0
-        if giver == taker:
-            return SomeWindows(windows, order[away:].sort().values)
-        return SomeWindows(windows, order[:away].tensor_split(len(takers))[takers.index(taker)].sort().values)
+        moved = round(self.settings.blur * len(windows)) if neighbours else 0
+        if source == target:
+            return WindowSubset(windows, order[moved:].sort().values)
+        portions = order[:moved].tensor_split(len(neighbours))
+        return WindowSubset(windows, portions[neighbours.index(target)].sort().values)

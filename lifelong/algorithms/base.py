@@ -1,6 +1,7 @@
 """The hooks through which an algorithm acts on training; the defaults are plain fine-tuning.
 
-The order in which they are called, for every task (or every stage of `stages`):
+They are called in this order. `set_augmentation` comes once, before all others; the rest for every task (or every
+stage of `stages`):
 
     begin_task
       for each of phases():  begin_phase, trained
@@ -84,11 +85,15 @@ class Algorithm:
     """Sequential fine-tuning; a base for algorithms, which override the hooks they need.
 
     Attributes:
-        augment: What training does to the images of a batch, for an algorithm that wants it elsewhere too; the walk
-            through the sequence sets it.
+        augment: Augmentation of training batches, for algorithms that also apply it elsewhere; None for no
+            augmentation.
     """
 
     augment: Callable[[Batch, torch.Generator], Batch] | None = None
+
+    def set_augmentation(self, augment: Callable[[Batch, torch.Generator], Batch] | None) -> None:
+        """Receive the augmentation of training batches, before any other hook and also when a run is resumed."""
+        self.augment = augment
 
     def stages(self, tasks: int) -> tuple[tuple[int, ...], ...]:
         """Which tasks are learned together, stage after stage: by default one at a time.

@@ -21,7 +21,7 @@ from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
 from lifelong.saved_config import upgrade_config
 from lifelong.settings import BenchmarkSettings
-from lifelong.streams import stages_of
+from lifelong.streams import learning_stages
 from lifelong.training.distributed import Ranks
 
 
@@ -81,7 +81,7 @@ class Restored:
         """Within the context, the policy that acts on a task; on one that is not the run's, as on the last learned."""
         names = [t.name for t in self.tasks]
         position = names.index(task.name) if task.name in names else self.learned
-        stages = stages_of(self.algorithm, len(self.tasks), self.group_size)
+        stages = learning_stages(self.algorithm, len(self.tasks), self.group_size)
         stage = next(stage for stage in stages if position in stage)
         with self.algorithm.policy_for(stage[-1], self.policy) as policy:
             yield policy

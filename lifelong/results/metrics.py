@@ -1,4 +1,4 @@
-"""Success rates to forward transfer, forgetting and their intervals. Plain NumPy, no state.
+"""Forward transfer, forgetting and their confidence intervals from success rates. Plain NumPy, no state.
 
 Notation of Liu et al., "LIBERO: Benchmarking Knowledge Transfer for Lifelong Robot Learning"
 (NeurIPS 2023), eq. 3: c[i,j,e] is the success rate on task j after e epochs on task i, c[i,j] that at
@@ -22,7 +22,7 @@ class Curve:
     Attributes:
         epochs: (E,) epochs already trained; 0 is zero-shot.
         rates: (E,) success rates in [0, 1].
-        episodes: (E,) rollouts behind each rate.
+        episodes: (E,) number of rollouts of each rate.
     """
 
     epochs: NDArray[np.int64]
@@ -35,7 +35,7 @@ class Curve:
         return int(np.argmax(self.rates))
 
     def held(self) -> Floats:
-        """(E,) the rates with every epoch after e* counted as c[k,k,e*], as eq. 3 asks."""
+        """Return the (E,) rates with every epoch after e* counted as c[k,k,e*], as in eq. 3."""
         rates = np.array(self.rates, dtype=float)
         rates[self.best :] = rates[self.best]
         return rates
@@ -43,14 +43,14 @@ class Curve:
 
 @dataclass(frozen=True)
 class Scores:
-    """All that the metrics need to know of a run over K tasks.
+    """The input of the metrics: the success rates of a run over K tasks.
 
     Attributes:
-        curves: K learning curves, one for each task; empty ones make FWT and AUC undefined (NaN).
+        curves: K learning curves, one for each task; empty curves make FWT and AUC undefined (NaN).
         matrix: (K, K) c[i,j], success on task j after learning task i; NaN above the diagonal.
-        episodes: (K, K) rollouts behind each cell, 0 above the diagonal.
-        group_size: Where so many tasks were learned together, K is the number of groups, and a group is one task
-            whose success is the mean over its own.
+        episodes: (K, K) number of rollouts of each cell, 0 above the diagonal.
+        group_size: Number of tasks learned together. If above 1, K is the number of groups, and each group counts
+            as one task whose success is the mean over its tasks.
     """
 
     curves: tuple[Curve, ...]
@@ -69,12 +69,12 @@ class Scores:
 
 @dataclass(frozen=True)
 class Cells:
-    """All success rates of a run in one row, and every metric's weights on them: metric = weights · rates.
+    """All success rates of a run in one row, and the weights of every metric: metric = weights · rates.
 
     Attributes:
-        rates: (C,) the matrix up to its diagonal, then the learning curves.
-        episodes: (C,) rollouts behind each.
-        weights: (C,) for each name of `METRIC_NAMES`, with the best epochs as they are; NaN where undefined.
+        rates: (C,) success rates: the matrix up to its diagonal, then the learning curves.
+        episodes: (C,) number of rollouts of each rate.
+        weights: (C,) weights for each name of `METRIC_NAMES`, given the best epochs; NaN where undefined.
     """
 
     rates: Floats
@@ -93,7 +93,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Metrics:
-    """The measures of one run; `fwt_by_task` and the like are (K,), their means are fwt, nbt, auc."""
+    """The metrics of one run. `fwt_by_task` and its like are (K,); fwt, nbt and auc are their means."""
 
     fwt: Estimate
     nbt: Estimate
@@ -109,12 +109,12 @@ METRIC_NAMES = ("fwt", "nbt", "auc", "final_success", "just_learned")
 
 
 def forward_transfer(curves: Sequence[Curve]) -> Floats:
-    """FWT_k = mean over e of c[k,k,e], epochs after e* counted as c[k,k,e*] (eq. 3). Shape (K,)."""
+    """Return (K,) FWT_k = mean over e of c[k,k,e], with epochs after e* counted as c[k,k,e*] (eq. 3)."""
     return np.array([c.held().mean() if len(c.rates) else np.nan for c in curves], dtype=float)
 
 
 def negative_backward_transfer(matrix: ArrayLike) -> Floats:
-    """NBT_k = mean over t > k of (c[k,k] - c[t,k]) (eq. 3): how much of task k is forgotten. Shape (K,).
+    """Return (K,) NBT_k = mean over t > k of (c[k,k] - c[t,k]) (eq. 3): how much of task k is forgotten.
 
     No task follows the last one; its empty mean is 0 and still counts among the K terms of the average,
     as in the authors' own evaluation notebook.
@@ -125,26 +125,30 @@ def negative_backward_transfer(matrix: ArrayLike) -> Floats:
 
 
 def area_under_curve(fwt: ArrayLike, matrix: ArrayLike) -> Floats:
-    """AUC_k = (FWT_k + sum over t > k of c[t,k]) / (number of tasks from k on) (eq. 3). Shape (K,)."""
+    """Return (K,) AUC_k = (FWT_k + sum over t > k of c[t,k]) / (number of tasks from k on) (eq. 3)."""
     c, fwt = np.asarray(matrix, dtype=float), np.asarray(fwt, dtype=float)
     size = len(c)
     return np.array([(fwt[k] + c[k + 1 :, k].sum()) / (size - k) for k in range(size)], dtype=float)
 
 
 def average_success(matrix: ArrayLike) -> Floats:
-    """Mean over j <= i of c[i,j]: success over the tasks learned so far, after each task. Shape (K,)."""
+    """Return (K,) the mean over j <= i of c[i,j]: success over the tasks learned so far, after each task."""
     c = np.asarray(matrix, dtype=float)
     return np.array([c[i, : i + 1].mean() for i in range(len(c))], dtype=float)
 
 
 def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
-    """FWT, NBT, AUC (eq. 3), final average success and mean just-learned success, with intervals.
+    """Compute FWT, NBT, AUC (eq. 3), final average success and mean just-learned success, with intervals.
 
-    Every measure is a weighted sum of independent success rates once the best epochs are known, so the
-    intervals combine the cells' Wilson intervals (see `combine_intervals`): they have width also where
-    every episode succeeded or every one failed, and need no random numbers. They cover the chance in the
-    episodes of this run, given its checkpoints; the spread between seeds is `mean_and_standard_error`, and
-    `lifelong.results.bootstrap` has intervals over both.
+    Given the best epochs, every metric is a weighted sum of independent success rates, so the intervals combine
+    the cells' Wilson intervals (see `combine_intervals`). Their width is above 0 also where every episode succeeded
+    or every one failed, and they need no random numbers. They cover the chance in the episodes of this run, given
+    its checkpoints; the spread between seeds is `mean_and_standard_error`, and `lifelong.results.bootstrap` has
+    intervals over both.
+
+    Args:
+        scores: Success rates of the run.
+        confidence: Two-sided confidence level.
     """
     fwt = forward_transfer(scores.curves)
     nbt = negative_backward_transfer(scores.matrix)
@@ -152,22 +156,24 @@ def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
     row = cells(scores)
     low, high = wilson_interval(row.rates * row.episodes, row.episodes, confidence)
     estimates = {name: combine_intervals(w, row.rates, low, high) for name, w in row.weights.items()}
-    fwt, nbt, auc = (np.repeat(values, scores.group_size) for values in (fwt, nbt, auc))  # its group's, each
+    fwt, nbt, auc = (
+        np.repeat(values, scores.group_size) for values in (fwt, nbt, auc)
+    )  # every task has the value of its group
     return Metrics(**estimates, fwt_by_task=fwt, nbt_by_task=nbt, auc_by_task=auc)
 
 
 def wilson_interval(
     successes: ArrayLike, episodes: ArrayLike, confidence: float = 0.95
 ) -> tuple[Floats, Floats]:
-    """Wilson's score interval of a success rate; its width is above 0 also at 0 % and 100 %.
+    """Return Wilson's score interval of a success rate; its width is above 0 also at 0 % and 100 %.
 
     With p = s/n and z the normal quantile:
     (p + z²/2n ± z·sqrt(p(1-p)/n + z²/4n²)) / (1 + z²/n)   (Wilson 1927).
 
     Args:
-        successes: s, any shape.
-        episodes: n, same shape; where it is 0 the interval is [0, 1].
-        confidence: Two-sided level.
+        successes: Number of successes s, any shape.
+        episodes: Number of episodes n, same shape; where it is 0 the interval is [0, 1].
+        confidence: Two-sided confidence level.
 
     Returns:
         Lower and upper ends in [0, 1], of the broadcast shape.
@@ -184,10 +190,16 @@ def wilson_interval(
 
 
 def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high: ArrayLike) -> Estimate:
-    """A weighted sum of independent rates with the interval that theirs imply.
+    """Return a weighted sum of independent rates, with the interval implied by theirs.
 
     MOVER (Zou & Donner, Statistics in Medicine 2008): for θ = Σ w·p,
     θ_low = θ - sqrt(Σ (w·(p - end))²) with the cell's end that lowers w·p, and likewise θ_high.
+
+    Args:
+        weights: (C,) weights w.
+        rates: (C,) rates p.
+        low: (C,) lower ends of their intervals.
+        high: (C,) upper ends of their intervals.
     """
     w, p, lo, hi = (np.asarray(x, dtype=float) for x in (weights, rates, low, high))
     used = w != 0
@@ -199,7 +211,7 @@ def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high
 
 
 def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
-    """Mean over seeds and its standard error, s/sqrt(n) with n-1 in s; NaN error for a single seed."""
+    """Return the mean over seeds and its standard error, s/sqrt(n) with n-1 in s; NaN for the error of one seed."""
     x = np.asarray(values, dtype=float)
     if x.size == 0:
         return float("nan"), float("nan")
@@ -208,7 +220,7 @@ def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
 
 
 def cells(scores: Scores) -> Cells:
-    """The success rates of a run in one row, and how the metrics of eq. 3 weigh them."""
+    """Return the success rates of a run in one row, with the weights of the metrics of eq. 3."""
     size = len(scores.curves)
     rows, cols = np.tril_indices(size)
     counts = [scores.episodes[rows, cols], *(c.episodes for c in scores.curves)]
@@ -234,7 +246,7 @@ def cells(scores: Scores) -> Cells:
 
 
 def _held_weights(curve: Curve) -> Floats:
-    """(E,) weights w with Σ w·c[k,k,e] = FWT_k: the best epoch also stands for those after it."""
+    """Return (E,) weights w with Σ w·c[k,k,e] = FWT_k: the best epoch also counts for those after it."""
     size = len(curve.rates)
     if size == 0:
         return np.zeros(0)

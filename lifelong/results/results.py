@@ -1,7 +1,6 @@
-"""What a run did, one JSON line at a time: nothing recorded is ever lost or rewritten.
+"""The recorded results of a run: what is done already, and the inputs of metrics and reports.
 
-`ResultLog` appends records to `results.jsonl`; `Results` is the typed view that the trainer asks what is
-already done, and that metrics and reports are made from. Tasks are positions in the sequence.
+`lifelong.results.log.ResultLog` reads and appends the records. Tasks are positions in the sequence.
 """
 
 import math
@@ -29,18 +28,27 @@ from lifelong.results.subgoals import Subgoals, subgoals
 
 @dataclass(frozen=True)
 class Results:
-    """A typed view of a run's records. Of records with the same key the last one counts."""
+    """A typed view of a run's records. Of records with the same key the last one counts.
+
+    Attributes:
+        records: Records in the order they were written.
+        problems: Lines that could not be read, as file:line and the reason.
+    """
 
     records: tuple[Record, ...]
-    problems: tuple[str, ...] = ()  # lines that could not be read, as file:line
+    problems: tuple[str, ...] = ()
 
     def of(self, kind: type) -> list[Any]:
-        """The records of one class, in the order they were written."""
+        """Return the records of one class, in the order they were written."""
         return [r for r in self.records if isinstance(r, kind)]
 
     @property
     def run(self) -> RunRecord:
-        """The record that names the run. Raises: ResultsError if there is none."""
+        """Record that names the run.
+
+        Raises:
+            ResultsError: There is none.
+        """
         runs = self.of(RunRecord)
         if not runs:
             raise ResultsError("the results have no 'run' record: the run was stopped before it began")
@@ -52,7 +60,7 @@ class Results:
         return bool(self.of(RunEndRecord))
 
     def evaluation(self, phase: str, learned: int, task: int, epoch: int | None = None) -> EvalRecord | None:
-        """The evaluation with this key, whatever its epoch if none is given; None if not recorded."""
+        """Return the evaluation with this key, of any epoch if none is given; None if it is not recorded."""
         found = [
             r
             for r in self.of(EvalRecord)
@@ -60,32 +68,28 @@ class Results:
         ]
         return found[-1] if found else None
 
-    def has(self, phase: str, learned: int, task: int, epoch: int | None = None) -> bool:
-        """Whether this evaluation is recorded: a resumed run need not repeat it."""
-        return self.evaluation(phase, learned, task, epoch) is not None
-
     def has_loss(self, task: int, epoch: int) -> bool:
-        """Whether the loss of this epoch is recorded."""
+        """Return whether the loss of this epoch is recorded."""
         return any((r.task, r.epoch) == (task, epoch) for r in self.of(LossRecord))
 
     def task_end(self, task: int) -> TaskEndRecord | None:
-        """The record that closes a task; None while it is being learned."""
+        """Return the record that closes a task; None while it is being learned."""
         return next((r for r in reversed(self.of(TaskEndRecord)) if r.task == task), None)
 
     def learned_with(self, task: int) -> int:
-        """The task whose row of the matrix is the first after learning this one: the last of its group."""
+        """Return the task whose row of the matrix is the first after learning this one: the last of its group."""
         size = self.run.group_size
         return (task // size + 1) * size - 1
 
     def learned_tasks(self) -> int:
-        """How many tasks, from the first on, have a complete row in the matrix; all of them where the last has one."""
+        """Count the tasks, from the first, with a complete row in the matrix; all count if the last row is complete."""
         rates, _ = self.success_matrix()
         size = self.run.group_size
         full = [bool(np.isfinite(rates[i, : i + 1]).all()) for i in range(size - 1, len(rates), size)]
         return size * (full.index(False) if False in full and not full[-1] else len(full))
 
     def curves(self) -> dict[int, Curve]:
-        """Learning curve of each task that has one."""
+        """Return the learning curve of each task that has one."""
         points: dict[int, dict[int, EvalRecord]] = {}
         for r in self.of(EvalRecord):
             if r.phase == "curve" and r.learned == self.learned_with(r.task):
@@ -93,7 +97,7 @@ class Results:
         return {task: _curve([by_epoch[e] for e in sorted(by_epoch)]) for task, by_epoch in points.items()}
 
     def losses(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Task -> (epochs, mean training losses)."""
+        """Return the epochs and mean training losses of each task."""
         points: dict[int, dict[int, float]] = {}
         for r in self.of(LossRecord):
             points.setdefault(r.task, {})[r.epoch] = r.loss
@@ -105,13 +109,13 @@ class Results:
     def success_matrix(
         self, diagonal: Literal["matrix", "curve"] = "matrix"
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Success rates c[i,j] (K, K), NaN where not (yet) evaluated, and the episodes behind them (K, K).
+        """Return success rates c[i,j] (K, K), NaN where not evaluated, and their numbers of episodes (K, K).
 
         Args:
-            diagonal: Where c[i,i] comes from. "matrix": from the evaluation after learning task i, like
-                the rest of its column, which keeps the choice of the best epoch out of the reported
-                number; the best of the learning curve stands in where there is none. "curve": always
-                the latter, c[i,i] = max over e of c[i,i,e], eq. 3 to the letter.
+            diagonal: Source of c[i,i]. "matrix": the evaluation after learning task i, like the rest of its
+                column, so that the choice of the best epoch does not bias the reported number; the best of
+                the learning curve where there is none. "curve": always the latter,
+                c[i,i] = max over e of c[i,i,e], as eq. 3 is written.
         """
         size = len(self.run.tasks)
         rates, episodes = np.full((size, size), np.nan), np.zeros((size, size), dtype=np.int64)
@@ -130,14 +134,17 @@ class Results:
         return rates, episodes
 
     def scores(self, diagonal: Literal["matrix", "curve"] = "matrix") -> Scores:
-        """The metrics' input: the tasks learned so far as if they were the whole sequence.
+        """Return the input of the metrics, with the tasks learned so far as the whole sequence.
 
-        A group of tasks that were learned together is one task there: its success is the mean over its tasks.
+        A group of tasks that were learned together counts as one task; its success is the mean over its tasks.
+
+        Args:
+            diagonal: Source of c[i,i], see `success_matrix`.
         """
         size, group = self.learned_tasks(), self.run.group_size
         rates, episodes = self.success_matrix(diagonal)
-        curves, nothing = self._group_curves(self.curves()), _curve([])
-        used = tuple(curves.get(task, nothing) for task in range(group - 1, size, group))
+        curves, empty = self._group_curves(self.curves()), _curve([])
+        used = tuple(curves.get(task, empty) for task in range(group - 1, size, group))
         cells = (slice(group - 1, size, group), slice(0, size))
         shape = (size // group, size // group, group)
         return Scores(
@@ -145,7 +152,7 @@ class Results:
         )
 
     def _group_curves(self, curves: Mapping[int, Curve]) -> dict[int, Curve]:
-        """The learning curve of each group by its last task, at the epochs where all its tasks were evaluated."""
+        """Return each group's learning curve by its last task, at the epochs where all its tasks were evaluated."""
         groups: dict[int, list[Curve]] = {}
         for task, curve in sorted(curves.items()):
             groups.setdefault(self.learned_with(task), []).append(curve)
@@ -153,22 +160,22 @@ class Results:
         return {last: _mean_curve(found) for last, found in groups.items() if len(found) == size}
 
     def costs(self, task: int) -> dict[str, float]:
-        """What learning a task cost, by the names of `lifelong.training.costs`; empty where nothing is recorded."""
+        """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""
         return {k: v for r in self.of(CostRecord) if r.task == task for k, v in r.costs.items()}
 
     def task_seconds(self, task: int) -> dict[str, float]:
-        """Wall time in seconds of a task: of training on it, of evaluating while and after learning it."""
+        """Return the wall time of a task, [s]: of training on it, and of evaluation while and after learning it."""
         return {
             "training": sum(r.seconds for r in self.of(LossRecord) if r.task == task),
             "evaluation": sum(r.seconds for r in self.of(EvalRecord) if r.learned == task),
         }
 
     def subgoals(self) -> Subgoals:
-        """Which parts of the goals of the tasks learned so far were reached, and forgotten."""
+        """Return how often parts of the goals of the tasks learned so far were reached, and forgotten."""
         return subgoals(self.of(EvalRecord), self.learned_tasks())
 
     def seconds_by_phase(self) -> dict[str, float]:
-        """Wall time in seconds: the recorded phases (such as demos), then training and evaluation."""
+        """Return the wall time of the recorded phases (such as demos), of training and of evaluation, [s]."""
         times: dict[str, float] = {}
         for r in self.of(PhaseRecord):
             times[r.phase] = times.get(r.phase, 0.0) + r.seconds
@@ -189,7 +196,7 @@ def _curve(records: list[EvalRecord]) -> Curve:
 
 
 def _mean_curve(curves: Sequence[Curve]) -> Curve:
-    """The mean of several tasks' curves, over the episodes of all."""
+    """Return the mean of several tasks' curves, with the episodes of all."""
     if len(curves) == 1:
         return curves[0]
     epochs = sorted(set.intersection(*(set(c.epochs.tolist()) for c in curves)))

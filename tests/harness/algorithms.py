@@ -4,7 +4,6 @@ import torch
 
 from lifelong.algorithms import Algorithm
 from lifelong.seeding import generator
-from lifelong.sequence import TaskSequence
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
@@ -14,7 +13,7 @@ SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precis
 
 
 def learn(algorithm: Algorithm, policy, task: int) -> None:
-    """A task from its beginning to its end, as the experiment walks through it."""
+    """Learn a task from beginning to end, as `TaskSequence` does."""
     dataset = Windows(task)
     algorithm.begin_task(task, dataset, policy)
     for number, phase in enumerate(algorithm.phases()):
@@ -37,17 +36,17 @@ def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
 
 
 def killed_again_and_again(path, algo, monkeypatch):
-    """Walks through the sequence, killed in the second write of every process; how many were needed."""
+    """Learn the sequence, killed in the second write of every process; return the number of processes."""
     starts, writes = 0, 1
     while True:
         starts += 1
         assert starts < 100
         with monkeypatch.context() as patch:
-            p = walk.parts(path, algo)
+            p = walk.run_context(path, algo)
             killer = walk.Killer(patch, writes)
             patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
             try:
-                TaskSequence(p).run()
+                walk.sequence(p).run()
                 return starts, p
             except walk.Killed:
                 writes = 2 + starts % 3

@@ -17,7 +17,6 @@ from lifelong.nn.augmentation import RandomShift
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 from lifelong.seeding import seeded
-from lifelong.sequence import TaskSequence
 from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
@@ -42,18 +41,16 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
     walk.ALGORITHMS[algo] = lambda: instantiate(config.algo)
     with seeded(7):
         policy = small_transformer(walk.SPEC, dropout=0.0)
-    parts = walk.parts(folder / algo, algo)
-    parts = replace(
-        parts,
-        instructions=parts.instructions[:TASKS],
+    context = replace(
+        walk.run_context(folder / algo, algo, TASKS),
         policy=policy,
         augment=RandomShift(1),
         fit=replace(FIT, **changes),
         eval=EVAL,
         ranks=ranks,
     )
-    TaskSequence(parts).run()
-    losses = [record.loss for record in parts.directory.log.read().of(LossRecord)]
+    walk.sequence(context).run()
+    losses = [record.loss for record in context.directory.log.read().of(LossRecord)]
     return losses, {name: value.clone() for name, value in policy.state_dict().items()}
 
 

@@ -5,15 +5,19 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
+from libero_env.tasks import get_suite
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet, Sequential
+from lifelong.context import RunContext
 from lifelong.data import SequenceVLDataset
+from lifelong.data.settings import DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.results.records import CostRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator, seeded
-from lifelong.sequence import Parts
+from lifelong.sequence import TaskSequence
+from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
@@ -73,26 +77,33 @@ def dataset(task: int) -> SequenceVLDataset:
     )
 
 
-def parts(path, algo: str) -> Parts:
-    datasets = {task: dataset(task) for task in range(TASKS)}
+def run_context(path, algo: str, tasks: int = TASKS) -> RunContext:
     with seeded(7):
         policy = small_transformer(SPEC)
-    return Parts(
-        instructions=tuple(f"do {task}" for task in range(TASKS)),
-        languages=torch.stack([d.language for d in datasets.values()]),
-        datasets=datasets,
+    return RunContext(
+        tasks=get_suite("libero_object").tasks[:tasks],
+        languages=torch.stack([dataset(task).language for task in range(tasks)]),
+        demos=(2,) * tasks,
+        data=DataSettings(demos=2, image_size=16, seq_len=SPEC.seq_len, views=SPEC.views, proprio=()),
         policy=policy,
         algorithm=ALGORITHMS[algo](),
         envs=EnvPool(lambda key: FakeEnv(*key), 2),
         fit=FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32"),
         eval=EvalSettings(episodes=3, curve_episodes=2, every=1, horizon=6, settle_steps=1, precision="fp32"),
         augment=None,
+        stream=StreamSettings(),
+        group_size=1,
         directory=RunDirectory(path),
         tracker=Tracker(),
         seed=1,
         device=torch.device("cpu"),
         progress=False,
     )
+
+
+def sequence(context: RunContext, first: int = 0) -> TaskSequence:
+    """The tasks of a context with datasets of small random windows, numbered from `first` on."""
+    return TaskSequence(context, {task: dataset(task + first) for task in range(len(context.tasks))})
 
 
 def outcome(path, log):

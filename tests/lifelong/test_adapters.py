@@ -13,8 +13,7 @@ from lifelong.algorithms.dmpel import _padded
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import Router, change
 from lifelong.seeding import generator, seeded
-from lifelong.sequence import TaskSequence
-from lifelong.streams import SomeWindows, StageWindows
+from lifelong.streams import StageWindows, WindowSubset
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Observation
@@ -66,7 +65,7 @@ def walks(monkeypatch):
 
 @pytest.mark.parametrize("algo", ALL)
 def test_killed_and_resumed_equals_uninterrupted(walks, tmp_path, algo, monkeypatch):
-    TaskSequence(p := walks.parts(tmp_path / "whole", algo)).run()
+    walks.sequence(p := walks.run_context(tmp_path / "whole", algo)).run()
     records, state = walks.outcome(tmp_path / "whole", p.directory.log)
     starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
     assert starts > 2
@@ -105,8 +104,8 @@ def test_the_weights_kept_are_those_of_the_best_epoch(walks, tmp_path, make, mon
     """Success falls to nothing after the second task's first epoch: its adapter must be the first epoch's."""
     kept = {}
     monkeypatch.setitem(walk.ALGORITHMS, "this", make)
-    p = walks.parts(tmp_path, "this")
-    sequence = TaskSequence(p)
+    p = walks.run_context(tmp_path, "this")
+    sequence = walks.sequence(p)
     evaluate = sequence._evaluate
 
     def staged(phase, learned, task, epoch):
@@ -386,7 +385,7 @@ def test_dmpel_sees_the_first_frame_of_a_demonstration():
 
 def test_dmpel_finds_demonstrations_in_datasets_made_of_others():
     algorithm, parts = DMPEL(pool=2), [walk.dataset(t) for t in (0, 1)]
-    some = SomeWindows(parts[1], torch.tensor([3, 12, 15]))
+    some = WindowSubset(parts[1], torch.tensor([3, 12, 15]))
     queries, of_window = algorithm._contexts(StageWindows([parts[0], some], 1))
     expected = [0] * 10 + [1] * 10 + [2, 3, 3]
     assert of_window.tolist() == expected

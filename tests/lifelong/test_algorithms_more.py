@@ -12,7 +12,6 @@ from lifelong.algorithms.base import JoinedWindows
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator
-from lifelong.sequence import TaskSequence
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
@@ -92,7 +91,7 @@ def walks(monkeypatch):
 
 @pytest.mark.parametrize("algo", ALL)
 def test_killed_and_resumed_equals_uninterrupted(walks, tmp_path, algo, monkeypatch):
-    TaskSequence(p := walks.parts(tmp_path / "whole", algo)).run()
+    walks.sequence(p := walks.run_context(tmp_path / "whole", algo)).run()
     records, state = walks.outcome(tmp_path / "whole", p.directory.log)
     starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
     assert starts > 2
@@ -147,7 +146,7 @@ def test_single_task_begins_every_task_with_the_same_weights_and_acts_with_its_o
 
 
 def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(walks, tmp_path):
-    TaskSequence(p := walks.parts(tmp_path, "multitask")).run()
+    walks.sequence(p := walks.run_context(tmp_path, "multitask")).run()
     results, last = p.directory.log.read(), walks.TASKS - 1
     assert [r.task for r in results.of(TaskEndRecord)] == [last]
     cells = [(r.phase, r.learned, r.task) for r in results.of(EvalRecord)]
@@ -157,11 +156,11 @@ def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(walks, 
 
 
 def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(walks, tmp_path):
-    p = walks.parts(tmp_path, "multitask")
+    p = walks.run_context(tmp_path, "multitask")
     object.__setattr__(p, "fit", FitSettings(epochs=2, steps_per_epoch=3, precision="fp32"))
-    sequence = TaskSequence(p)
-    assert [s.steps_per_epoch for s in sequence._stretches((0, 1, 2))] == [9]
-    assert [s.steps_per_epoch for s in sequence._stretches((1,))] == [3]
+    sequence = walks.sequence(p)
+    assert [s.steps_per_epoch for s in sequence._phases((0, 1, 2))] == [9]
+    assert [s.steps_per_epoch for s in sequence._phases((1,))] == [3]
 
 
 def test_joined_windows_are_those_of_all_tasks_once_each():

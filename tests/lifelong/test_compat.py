@@ -11,7 +11,6 @@ from lifelong import checkpoints
 from lifelong.algorithms import AGEM, ER, EWC, PackNet
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
-from lifelong.sequence import TaskSequence
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
@@ -60,7 +59,7 @@ def test_memory_may_be_longer_than_a_task_and_is_taken_up_again():
 @pytest.mark.parametrize("compat", [None, "libero"])
 def test_agem_augments_its_reference_as_the_original_only(compat):
     algorithm = AGEM(budget=20, per_task=20, compat=compat)
-    algorithm.augment = mirrored
+    algorithm.set_augmentation(mirrored)
     algorithm.end_task(0, Windows(0), LinearPolicy(), generator(0))
     algorithm.mix(Windows(1).batch(torch.arange(20)), generator(0))
     reference, stored = algorithm._reference, Windows(0)
@@ -83,7 +82,7 @@ def test_ewc_fisher_is_of_augmented_batches_of_all_windows_in_training_mode():
     loss = policy.loss
     policy.loss = lambda batch: modes.append((policy.training, len(batch))) or loss(batch)
     theirs = EWC(compat="libero", fisher_batch_size=300)
-    theirs.augment = mirrored
+    theirs.set_augmentation(mirrored)
     fisher = theirs.estimate(data, policy.eval(), generator(0))
     assert modes == [(True, 300), (True, 300)] and not policy.training
     order = torch.randperm(600, generator=generator(0))
@@ -93,7 +92,7 @@ def test_ewc_fisher_is_of_augmented_batches_of_all_windows_in_training_mode():
 
     modes.clear()
     ours = EWC(fisher="batch", fisher_batch_size=300)
-    ours.augment = mirrored
+    ours.set_augmentation(mirrored)
     assert not torch.allclose(
         ours.estimate(data, policy, generator(0))["linear.weight"], fisher["linear.weight"]
     )
@@ -164,9 +163,10 @@ def test_another_choice_is_refused(make):
         make(compat="robomimic")
 
 
-def test_the_walk_tells_algorithms_the_augmentation(tmp_path):
-    p = walk.parts(tmp_path, "ewc")
-    assert TaskSequence(dataclasses.replace(p, augment=mirrored)).parts.algorithm.augment is mirrored
+def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
+    context = dataclasses.replace(walk.run_context(tmp_path, "ewc"), augment=mirrored)
+    walk.sequence(context)
+    assert context.algorithm.augment is mirrored
 
 
 @pytest.mark.parametrize("make", [lambda: ER(per_task=5, compat="libero"), lambda: PackNet(compat="libero")])
@@ -187,10 +187,12 @@ def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
 
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
     """EWC's estimate needs the augmentation even where a process was killed just before it."""
-    parts = walk.parts
+    run_context = walk.run_context
     monkeypatch.setitem(walk.ALGORITHMS, "ewc", lambda: EWC(compat="libero"))
-    monkeypatch.setattr(walk, "parts", lambda *a: dataclasses.replace(parts(*a), augment=mirrored))
-    TaskSequence(p := walk.parts(tmp_path / "whole", "ewc")).run()
+    monkeypatch.setattr(
+        walk, "run_context", lambda *a: dataclasses.replace(run_context(*a), augment=mirrored)
+    )
+    walk.sequence(p := walk.run_context(tmp_path / "whole", "ewc")).run()
     records, state = walk.outcome(tmp_path / "whole", p.directory.log)
     starts, p = killed_again_and_again(tmp_path / "killed", "ewc", monkeypatch)
     assert starts > 2

@@ -97,9 +97,24 @@ def test_reading_gives_back_what_was_appended(log: ResultLog):
 
 def test_no_file_yet_is_an_empty_run(tmp_path: Path):
     results = ResultLog(tmp_path / "results.jsonl").read()
-    assert results.records == () and not results.has("curve", 0, 0)
+    assert results.records == () and results.evaluation("curve", 0, 0) is None
     with pytest.raises(ResultsError, match="stopped before it began"):
         _ = results.run
+
+
+def test_each_line_is_parsed_once_however_often_it_is_read(log: ResultLog, monkeypatch: pytest.MonkeyPatch):
+    parsed = []
+    monkeypatch.setattr("lifelong.results.log.from_line", lambda line: parsed.append(line) or from_line(line))
+    second = ResultLog(log.path)  # of another process, such as a report's
+    for record in RUN[3:6]:
+        log.append(record)
+        assert all(log.read().records[-1] == record for _ in range(5))
+    assert len(parsed) == 3
+    assert second.read() == log.read() and len(parsed) == 3 + len(RUN) + 3
+    second.append(RUN[6])
+    assert log.read().records == (*RUN, *RUN[3:7]) and second.read() == log.read()
+    log.path.unlink()
+    assert log.read() == second.read() == Results(())
 
 
 def test_a_process_killed_at_any_byte_loses_at_most_the_last_record(log: ResultLog):
@@ -171,8 +186,8 @@ def test_a_device_that_is_full_is_an_error_with_the_path():
 
 def test_what_is_recorded_need_not_be_done_again(log: ResultLog):
     results = log.read()
-    assert results.has("matrix", 1, 0) and results.has("matrix", 1, 0, epoch=1)
-    assert not results.has("matrix", 1, 0, epoch=2) and not results.has("curve", 1, 0)
+    assert results.evaluation("matrix", 1, 0) == results.evaluation("matrix", 1, 0, epoch=1) == RUN[11]
+    assert results.evaluation("matrix", 1, 0, epoch=2) is None and results.evaluation("curve", 1, 0) is None
     assert results.has_loss(0, 1) and not results.has_loss(0, 2)
     assert results.task_end(1).best_epoch == 1 and results.task_end(2) is None
 

@@ -1,26 +1,34 @@
-"""The walk through the sequence: killed anywhere and resumed, it comes to the same records and weights."""
+"""The task sequence: killed anywhere and resumed, it comes to the same records and weights."""
 
 import pytest
 
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
-from lifelong.sequence import TaskSequence
 from lifelong.training.costs import COSTS
-from tests.harness.sequences import ALGORITHMS, TASKS, Killed, Killer, assert_same, outcome, parts
+from tests.harness.sequences import (
+    ALGORITHMS,
+    TASKS,
+    Killed,
+    Killer,
+    assert_same,
+    outcome,
+    run_context,
+    sequence,
+)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_killed_at_every_write_and_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch):
-    TaskSequence(p := parts(tmp_path / "whole", algo)).run()
+    sequence(p := run_context(tmp_path / "whole", algo)).run()
     records, state = outcome(tmp_path / "whole", p.directory.log)
     path, starts, writes = tmp_path / "killed", 0, 1
     while True:
         starts += 1
         with monkeypatch.context() as patch:
-            p = parts(path, algo)
+            p = run_context(path, algo)
             killer = Killer(patch, writes)
             patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
             try:
-                TaskSequence(p).run()
+                sequence(p).run()
                 break
             except Killed:
                 writes = 2 + starts % 3  # die after two, three or four more writes
@@ -32,7 +40,7 @@ def test_killed_at_every_write_and_resumed_equals_uninterrupted(tmp_path, algo, 
 
 
 def test_the_records_are_complete(tmp_path):
-    TaskSequence(p := parts(tmp_path, "packnet")).run()
+    sequence(p := run_context(tmp_path, "packnet")).run()
     results = p.directory.log.read()
     assert len(results.of(TaskEndRecord)) == TASKS
     evals = results.of(EvalRecord)
@@ -46,8 +54,8 @@ def test_the_records_are_complete(tmp_path):
 
 
 def test_the_last_weights_are_kept_when_asked_for(tmp_path):
-    p = parts(tmp_path, "sequential")
+    p = run_context(tmp_path, "sequential")
     object.__setattr__(p.eval, "select", "last")
-    TaskSequence(p).run()
+    sequence(p).run()
     assert not p.directory.best_path.exists()
     assert {r.best_epoch for r in p.directory.log.read().of(TaskEndRecord)} == {2}

@@ -11,10 +11,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from libero_env.tasks import get_suite
 from lifelong import checkpoints
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
+from lifelong.context import RunContext
 from lifelong.errors import CheckpointError, ConfigError
-from lifelong.pretraining import pretrain, weights_of
+from lifelong.pretraining import load_initial_weights, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
@@ -27,11 +29,11 @@ from lifelong.results.records import (
     utc_now,
 )
 from lifelong.results.run_directory import RunDirectory
-from lifelong.sequence import Parts, TaskSequence
+from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
-from lifelong.streams import StageData, StageWindows, StreamSettings, stages_of
+from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
 from tests.harness.fakes import Windows
-from tests.harness.sequences import Killed, Killer, assert_same, dataset, parts
+from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
 
 pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[2]
@@ -41,7 +43,7 @@ def stage_data(
     blur: float, *, sizes=(20, 30, 25, 40), group_size: int = 1, reach: int = 1, seed: int = 0
 ) -> StageData:
     datasets = {task: Windows(task, size) for task, size in enumerate(sizes)}
-    stages = stages_of(Sequential(), len(sizes), group_size)
+    stages = learning_stages(Sequential(), len(sizes), group_size)
     return StageData(datasets, stages, StreamSettings(blur=blur, blur_reach=reach), seed)
 
 
@@ -55,9 +57,9 @@ def rows(features: torch.Tensor) -> set[tuple[float, ...]]:
 
 
 def test_groups_are_neighbours_and_algorithms_join_groups() -> None:
-    assert stages_of(Sequential(), 3) == ((0,), (1,), (2,))
-    assert stages_of(Sequential(), 6, 2) == ((0, 1), (2, 3), (4, 5))
-    assert stages_of(Multitask(), 6, 2) == ((0, 1, 2, 3, 4, 5),)
+    assert learning_stages(Sequential(), 3) == ((0,), (1,), (2,))
+    assert learning_stages(Sequential(), 6, 2) == ((0, 1), (2, 3), (4, 5))
+    assert learning_stages(Multitask(), 6, 2) == ((0, 1, 2, 3, 4, 5),)
 
 
 def test_without_a_stream_a_stage_is_the_task_itself() -> None:
@@ -178,10 +180,9 @@ def test_pretraining_takes_a_suite_or_nothing() -> None:
         PretrainSettings(epochs=0)
 
 
-def four(path: Path, algorithm, **changes) -> Parts:
+def four(path: Path, algorithm, **changes) -> RunContext:
     """Four tasks in groups of two, of one epoch each."""
-    datasets = {task: dataset(task) for task in range(4)}
-    p = parts(path, "sequential")
+    context = run_context(path, "sequential", tasks=4)
     record = start_record(
         algo="x",
         benchmark="y",
@@ -193,17 +194,10 @@ def four(path: Path, algorithm, **changes) -> Parts:
         config="",
         group_size=changes.get("group_size", 2),
     )
-    if not p.directory.log.read().records:
-        p.directory.log.append(record)
-    return replace(
-        p,
-        instructions=tuple("abcd"),
-        languages=torch.stack([d.language for d in datasets.values()]),
-        datasets=datasets,
-        algorithm=algorithm,
-        fit=replace(p.fit, epochs=1, steps_per_epoch=2),
-        **({"group_size": 2} | changes),
-    )
+    if not context.directory.log.read().records:
+        context.directory.log.append(record)
+    fit = replace(context.fit, epochs=1, steps_per_epoch=2)
+    return replace(context, algorithm=algorithm, fit=fit, **({"group_size": 2} | changes))
 
 
 def kept(path: Path) -> tuple[dict, dict]:
@@ -218,7 +212,7 @@ def kept(path: Path) -> tuple[dict, dict]:
 @pytest.mark.parametrize("algorithm", [lambda: DERpp(budget=12), SingleTask])
 def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorithm) -> None:
     blurred = {"stream": StreamSettings(blur=0.2)}
-    TaskSequence(four(tmp_path / "whole", algorithm(), **blurred)).run()
+    sequence(four(tmp_path / "whole", algorithm(), **blurred)).run()
     results = ResultLog(tmp_path / "whole" / "results.jsonl").read()
     evals = results.of(EvalRecord)
     assert {(r.learned, r.task) for r in evals if r.phase == "matrix"} == {
@@ -242,8 +236,8 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
             killer = Killer(patch, writes)
             patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
             with pytest.raises(Killed):
-                TaskSequence(p).run()
-    TaskSequence(four(tmp_path / "killed", algorithm(), **blurred)).run()
+                sequence(p).run()
+    sequence(four(tmp_path / "killed", algorithm(), **blurred)).run()
     (records, state), (again, end) = kept(tmp_path / "whole"), kept(tmp_path / "killed")
     assert again == records
     assert_same(end, state)
@@ -309,7 +303,7 @@ def test_metrics_take_a_group_for_one_task(tmp_path) -> None:
 
 
 def test_without_groups_nothing_changes(tmp_path) -> None:
-    TaskSequence(p := four(tmp_path, Sequential(), group_size=1)).run()
+    sequence(p := four(tmp_path, Sequential(), group_size=1)).run()
     results = p.directory.log.read()
     scores = results.scores()
     rates, episodes = results.success_matrix()
@@ -318,21 +312,20 @@ def test_without_groups_nothing_changes(tmp_path) -> None:
     assert [r.task for r in results.of(TaskEndRecord)] == [0, 1, 2, 3]
 
 
-def before(p: Parts, path: Path) -> None:
+def before(context: RunContext, path: Path) -> None:
     """Learn two other tasks first."""
-    datasets = {task: dataset(task + 7) for task in range(2)}
-    pretrain(
-        p,
-        instructions=("u", "v"),
-        languages=torch.stack([d.language for d in datasets.values()]),
-        datasets=datasets,
+    pretraining = pretraining_context(
+        context,
+        tasks=get_suite("libero_goal").tasks[:2],
+        languages=torch.stack([dataset(task).language for task in (7, 8)]),
+        settings=PretrainSettings(epochs=2),
         directory=RunDirectory(path),
-        epochs=2,
     )
+    sequence(pretraining, first=7).run(evaluate=False)
 
 
 def test_pretraining_learns_jointly_evaluates_nothing_and_is_not_done_twice(tmp_path, monkeypatch) -> None:
-    first, second, third = (parts(tmp_path / name, "sequential") for name in "abc")
+    first, second, third = (run_context(tmp_path / name, "sequential") for name in "abc")
     untrained = {k: v.clone() for k, v in first.policy.state_dict().items()}
     before(first, tmp_path / "whole")
     results = RunDirectory(tmp_path / "whole").log.read()
@@ -346,8 +339,8 @@ def test_pretraining_learns_jointly_evaluates_nothing_and_is_not_done_twice(tmp_
             before(second, tmp_path / "killed")
     before(third, tmp_path / "killed")
     assert_same(dict(third.policy.state_dict()), dict(trained))
-    monkeypatch.setattr(TaskSequence, "_learn", lambda *_: pytest.fail("done already"))
-    again = parts(tmp_path / "d", "sequential")
+    monkeypatch.setattr(TaskSequence, "_learn_stage", lambda *_: pytest.fail("done already"))
+    again = run_context(tmp_path / "d", "sequential")
     before(again, tmp_path / "whole")
     assert_same(dict(again.policy.state_dict()), dict(trained))
 
@@ -359,30 +352,30 @@ def test_a_policy_may_begin_with_a_finished_runs_weights(tmp_path) -> None:
         checkpoints.save(run.task_path(task), state)
     run.log.append(LossRecord(task=0, epoch=1, loss=1.0, seconds=1.0))
     with pytest.raises(CheckpointError, match=r"not finished.*init_from=.*task_10\.safetensors"):
-        weights_of(run.path)
+        load_initial_weights(run.path)
     run.log.append(RunEndRecord(seconds=1.0, finished=utc_now()))
-    weights, file = weights_of(run.path)
+    weights, file = load_initial_weights(run.path)
     assert weights["w"].tolist() == [10.0, 10.0] and file == run.task_path(10)
-    assert weights_of(run.task_path(1))[0]["w"].tolist() == [1.0, 1.0]
+    assert load_initial_weights(run.task_path(1))[0]["w"].tolist() == [1.0, 1.0]
 
 
 def test_what_holds_no_weights_is_refused(tmp_path) -> None:
-    with pytest.raises(CheckpointError, match=r"no run, or has learned nothing"):
-        weights_of(tmp_path)
+    with pytest.raises(CheckpointError, match=r"no run directory, or no task is learned yet"):
+        load_initial_weights(tmp_path)
     with pytest.raises(CheckpointError, match="no checkpoint at"):
-        weights_of(tmp_path / "absent")
+        load_initial_weights(tmp_path / "absent")
     progress = RunDirectory(tmp_path).progress_path
     checkpoints.save(progress, {"task": 0, "policy": None, "fit": {}})
     with pytest.raises(CheckpointError, match="holds no policy's weights"):
-        weights_of(progress)
+        load_initial_weights(progress)
 
 
 def test_single_task_begins_each_task_with_what_was_there_before(tmp_path) -> None:
-    p = parts(tmp_path, "sequential")
+    p = run_context(tmp_path, "sequential")
     p = replace(p, algorithm=SingleTask(), fit=replace(p.fit, epochs=1, steps_per_epoch=1))
     before(p, tmp_path / "first")
     trained = {k: v.clone() for k, v in p.policy.state_dict().items()}
-    TaskSequence(p).run()
+    sequence(p).run()
     initial = checkpoints.load(p.directory.task_path(2))["algorithm"]["initial"]
     assert_same(dict(initial), trained)
 

@@ -1,0 +1,64 @@
+"""The context of a run: everything it consists of, as one value."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from libero_env.tasks import Task
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.settings import DataSettings
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.settings import EvalSettings
+from lifelong.policies.base import Policy
+from lifelong.results.run_directory import RunDirectory
+from lifelong.streams import StreamSettings
+from lifelong.tracking import Tracker
+from lifelong.training.distributed import Ranks
+from lifelong.training.settings import FitSettings
+from lifelong.training.step import BatchAugmentation
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """Everything a run consists of, built once from its configuration.
+
+    Attributes:
+        tasks: The K tasks in learning order.
+        languages: (K, L) embeddings of their instructions.
+        demos: Number of demonstrations of each task.
+        data: Settings of the demonstrations and observations.
+        policy: Policy, trained in place.
+        algorithm: Lifelong algorithm.
+        fit: Settings of training.
+        eval: Settings of evaluation.
+        augment: Augmentation of training batches.
+        stream: Settings of the order in which data arrive.
+        group_size: Number of tasks learned together as one step of the sequence.
+        envs: Environments by (position of the task, number of simulations).
+        directory: Directory of checkpoints and records.
+        tracker: Mirror of the metrics to Weights & Biases.
+        seed: Seed from which all randomness of the run is derived.
+        device: Device of the policy.
+        progress: Whether to show progress bars.
+        ranks: Rank of this process among those that train together.
+    """
+
+    tasks: tuple[Task, ...]
+    languages: Tensor
+    demos: tuple[int, ...]
+    data: DataSettings
+    policy: Policy
+    algorithm: Algorithm
+    fit: FitSettings
+    eval: EvalSettings
+    augment: BatchAugmentation | None
+    stream: StreamSettings
+    group_size: int
+    envs: EnvPool
+    directory: RunDirectory
+    tracker: Tracker
+    seed: int
+    device: torch.device
+    progress: bool
+    ranks: Ranks = Ranks()
