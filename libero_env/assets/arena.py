@@ -7,7 +7,7 @@ from typing import Any
 
 import mujoco
 
-from libero_env.assets.furniture import add_furniture, add_visual_mesh, furniture, solid
+from libero_env.assets.furniture import add_furniture, add_visual_mesh, furniture, solid_mesh
 from libero_env.assets.robot import robosuite_assets
 from libero_env.assets.styles import add_material, furniture_of, styles_of
 from libero_env.errors import UnknownNameError
@@ -15,7 +15,7 @@ from libero_env.mujoco_compat import delete
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.storage import read_yaml
 
-# Fixture category that is a workspace -> its file in `libero_env/assets/workspaces`.
+# Fixture category of a workspace -> its file in `libero_env/assets/workspaces`.
 WORKSPACES: Mapping[str, str] = {
     "table": "table",
     "kitchen_table": "kitchen_table",
@@ -24,25 +24,25 @@ WORKSPACES: Mapping[str, str] = {
     "coffee_table": "coffee_table",
     "floor": "floor",
 }
-_ROOM = "room"  # the file with what all have in common
-_MOUNT_LIFT = 0.01  # m, the mount's origin over the arm's
+_ROOM = "room"  # file with the parameters that all workspaces share
+_MOUNT_LIFT = 0.01  # [m] height of the mount's origin above the arm's
 _SHARED = ("cameras", "lights", "walls", "floor")
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a task happens; the parameters of one file in `libero_env/assets/workspaces`. Metres, world frame.
+    """Table or floor that a task takes place on, from a file in `libero_env/assets/workspaces`. World frame.
 
     Attributes:
-        name: fixture category, such as `kitchen_table`.
-        problem: name of the problem class in task files.
-        offset: origin of the regions, (3,).
-        region_height: z of the surface that things stand on, over the offset.
-        zone_origin: of the flat boxes over regions that goals ask after, (3,): x and y of regions count from here, z is
-            the middle of the boxes. The original puts them at another height in each problem.
-        robot_base_pos: origin of `robot0_base`, (3,).
-        mount: what stands under the arm: `rethink` or None.
-        parameters: all of the file.
+        name: Fixture category, such as `kitchen_table`.
+        problem: Name of the problem class in task files.
+        offset: Origin of the regions, (3,) [m].
+        region_height: Height of the surface that objects stand on above `offset`, [m].
+        zone_origin: Origin of the flat boxes over regions, which goals refer to, (3,) [m]. Its z is the centre of the
+            boxes; the original has another height in each problem.
+        robot_base_pos: Origin of `robot0_base`, (3,) [m].
+        mount: Name of the mount below the arm, `rethink`; None where there is none.
+        parameters: Content of the file.
     """
 
     name: str
@@ -56,16 +56,16 @@ class Workspace:
 
     @property
     def surface_height(self) -> float:
-        """World z of the surface that things stand on, m."""
+        """World z of the surface that objects stand on, [m]."""
         return self.offset[2] + self.region_height
 
 
 @cache
 def load_workspace(category: str) -> Workspace:
-    """The workspace that a fixture category stands for.
+    """Return the workspace that a fixture category stands for.
 
     Raises:
-        UnknownNameError: no such workspace; the message lists the valid ones.
+        UnknownNameError: The workspace does not exist; the message lists the valid ones.
     """
     if category not in WORKSPACES:
         raise UnknownNameError("workspace", category, WORKSPACES)
@@ -84,10 +84,10 @@ def load_workspace(category: str) -> Workspace:
 
 
 def workspace_of_problem(problem: str) -> Workspace:
-    """The workspace of a problem class, such as `LIBERO_Floor_Manipulation`, in whatever case.
+    """Return the workspace of a problem class, such as `LIBERO_Floor_Manipulation`, ignoring case.
 
     Raises:
-        UnknownNameError: no such problem; the message lists the valid ones.
+        UnknownNameError: The problem class does not exist; the message lists the valid ones.
     """
     known = {load_workspace(category).problem: category for category in WORKSPACES}
     for name, category in known.items():
@@ -100,13 +100,13 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     """Add cameras, lights, floor, walls and the table to a scene.
 
     Args:
-        spec: the scene.
-        workspace: which.
-        scene_properties: what a task file's `:scene_properties` say: `floor` and `wall` name a style of each, `scene`
-            one of the whole scene; without them it looks as the workspace's file says.
+        spec: Scene to extend.
+        workspace: Workspace of the scene.
+        scene_properties: `:scene_properties` of the task file: `floor` and `wall` name the style of each, `scene` that
+            of the whole scene. Styles that are not given are those of the workspace's file.
 
     Raises:
-        UnknownNameError: a property or a style that does not exist; the message lists the valid ones.
+        UnknownNameError: A property or a style does not exist; the message lists the valid ones.
     """
     parameters = workspace.parameters
     styles = styles_of(parameters["styles"], scene_properties)
@@ -133,17 +133,17 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
 
 
 def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
-    """Add what the arm stands on, where the workspace has it: names start with `mount0_`, the root is `mount0_base`.
+    """Add the mount below the arm, if the workspace has one: names start with `mount0_`, the root is `mount0_base`.
 
     Raises:
-        LiberoError: robosuite, which supplies the model, is not installed.
+        MissingPackageError: robosuite, which supplies the model, is not installed.
     """
     if workspace.mount is None:
         return
     mount = mujoco.MjSpec.from_file(str(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml"))
     mount.compiler.degree = False
     mount.body("base").pos = [0.0, 0.0, 0.0]
-    delete(mount, mount.geom("pedestal_vis"))  # 33,000 triangles
+    delete(mount, mount.geom("pedestal_vis"))  # too detailed: 33,000 triangles
     delete(mount, mount.mesh("pedestal"))
     add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
     pos = (*workspace.robot_base_pos[:2], workspace.robot_base_pos[2] + _MOUNT_LIFT)
@@ -218,8 +218,8 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
 
 
 def _from_above(table: Mapping[str, Any]) -> Mesh:
-    """The table's shapes with the texture laid on from above, its second axis along y."""
-    mesh = merge([solid(shape) for shape in table["shapes"]])
+    """Return the shapes of a table with its texture projected from above, the second texture axis along y."""
+    mesh = merge([solid_mesh(shape) for shape in table["shapes"]])
     period = table["style"]["period"]
     return Mesh(mesh.vertices, mesh.faces, mesh.vertices[:, [1, 0]] / period)
 
@@ -230,5 +230,5 @@ def _read(name: str) -> Mapping[str, Any]:
 
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Both, one's own entries first choice; what is null in it is left out."""
+    """Return both, where entries of `own` take precedence; those that are null there are left out."""
     return {key: value for key, value in {**common, **own}.items() if value is not None}

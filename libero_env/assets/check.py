@@ -1,4 +1,4 @@
-"""Whether a pack is complete: every object and room can be built, every file is as it was published."""
+"""Completeness of a pack: every object and room can be built, every downloaded file is unchanged."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from libero_env.errors import LiberoError
 
 
 def problems(pack: Pack) -> list[str]:
-    """One line for each object or room that does not compile, and for each downloaded file that has changed."""
+    """Return a line for each object or room that does not compile and each downloaded file that has changed."""
     found = [f"{what}: {error}" for what in pack.categories() if (error := _build_error(pack, what))]
     found += [f"{what}: {error}" for what in WORKSPACES if (error := _arena_error(pack, what))]
     if isinstance(pack, OriginalPack) and (record := read_manifest(Path(pack.root))):
@@ -24,7 +24,7 @@ def problems(pack: Pack) -> list[str]:
 def _build_error(pack: Pack, category: str) -> str | None:
     try:
         pack.build(category).spec.compile()
-    except (LiberoError, ValueError) as error:  # ValueError: MuJoCo's, of a broken mesh or picture
+    except (LiberoError, ValueError) as error:  # MuJoCo raises ValueError for a broken mesh or texture
         return str(error)
     return None
 

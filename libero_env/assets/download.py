@@ -1,7 +1,7 @@
-"""Fetching the original's assets from the Hugging Face Hub, pinned and verified.
+"""Download of the original's assets from the Hugging Face Hub, pinned and verified.
 
-What arrives is compared with the digests that the Hub gives for the revision, and these are kept beside the files, so
-that a later check needs no network.
+Files are compared with the digests that the Hub lists for the revision. They are stored beside the files: a later check
+needs no network.
 """
 
 import errno
@@ -13,45 +13,45 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from libero_env.assets.hub import DownloadError, Remote, broken_files, check_room
-from libero_env.errors import LiberoError
+from libero_env.assets.hub import DownloadError, Remote, broken_files, check_free_space
+from libero_env.errors import MissingPackageError
 from libero_env.paths import cache_dir
 from libero_env.storage import atomic_write_text
 
 REPO = "lerobot/libero-assets"  # a data set; CC BY 4.0
 REVISION = "0b3ea86be5fe169d0fd036ae63d1070ec09e90f6"
-MANIFEST = "libero-assets.json"  # written beside the files when all of them are there and right
+MANIFEST = "libero-assets.json"  # written when all files are complete and verified
 
 
 def default_folder() -> Path:
-    """Where `download` puts the files."""
+    """Return the folder that `download` writes to by default."""
     return cache_dir() / "assets"
 
 
 def download(dest: Path | None = None, revision: str = REVISION) -> Path:
-    """Fetch the assets, or what is missing of them; `HF_ENDPOINT` names another server than the Hub.
+    """Download the assets, or those that are missing; `HF_ENDPOINT` selects another server than the Hub.
 
     Args:
-        dest: the folder; `default_folder()` by default.
-        revision: commit, tag or branch of the repository.
+        dest: Folder to write to; None is `default_folder()`.
+        revision: Commit, tag or branch of the repository.
 
     Returns:
-        The folder, complete and verified.
+        Folder with all files, verified.
 
     Raises:
-        DownloadError: no network, no room, or files that stay different from what the Hub announces. Running it again
-            goes on where it stopped.
-        LiberoError: huggingface_hub is not installed.
+        DownloadError: There is no network, too little disk space, or files differ from what the Hub lists. The next
+            call resumes where this one stopped.
+        MissingPackageError: huggingface_hub is not installed.
     """
     folder = (dest or default_folder()).expanduser().absolute()
     with _hub(folder) as hub:
         endpoint = os.environ.get("HF_ENDPOINT")
         remote = _listing(hub.HfApi(endpoint=endpoint), revision)
         wrong = broken_files(folder, remote)
-        for _ in range(2):  # once more for files that arrived broken
+        for _ in range(2):  # the second time for files that arrived broken
             if not wrong:
                 break
-            check_room(folder, sum(remote[name].size for name in wrong))
+            check_free_space(folder, sum(remote[name].size for name in wrong))
             for name in wrong:
                 (folder / name).unlink(missing_ok=True)
             hub.snapshot_download(
@@ -60,7 +60,7 @@ def download(dest: Path | None = None, revision: str = REVISION) -> Path:
             wrong = broken_files(folder, remote)
         if wrong:
             raise DownloadError(
-                f"{len(wrong)} files in {folder} differ from what the Hub announces, such as {wrong[0]}: the server or "
+                f"{len(wrong)} files in {folder} differ from what the Hub lists, such as {wrong[0]}: the server or "
                 "a proxy changes them, or the disk is failing; try again, or set HF_ENDPOINT to another server"
             )
         _write_manifest(folder, revision, remote)
@@ -68,7 +68,7 @@ def download(dest: Path | None = None, revision: str = REVISION) -> Path:
 
 
 def read_manifest(folder: Path) -> tuple[str, dict[str, Remote]] | None:
-    """Revision and files of a download that was completed; None where there is no (valid) record of one."""
+    """Return revision and files of a completed download; None where there is no valid manifest."""
     try:
         record = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         return record["revision"], {name: Remote(**file) for name, file in record["files"].items()}
@@ -87,7 +87,7 @@ def _write_manifest(folder: Path, revision: str, remote: Mapping[str, Remote]) -
 
 def _listing(api: Any, revision: str) -> dict[str, Remote]:
     entries = api.list_repo_tree(REPO, recursive=True, revision=revision, repo_type="dataset")
-    files = [entry for entry in entries if hasattr(entry, "blob_id")]  # the others are folders
+    files = [entry for entry in entries if hasattr(entry, "blob_id")]  # entries without a blob are folders
     if bad := [f.path for f in files if Path(f.path).is_absolute() or ".." in Path(f.path).parts]:
         raise DownloadError(f"the server lists files outside the folder, such as {bad[0]}: do not trust it")
     return {
@@ -98,31 +98,31 @@ def _listing(api: Any, revision: str) -> dict[str, Remote]:
 
 @contextmanager
 def _hub(folder: Path) -> Iterator[Any]:
-    """huggingface_hub with plain HTTP, which resumes and which mirrors speak; its errors become ours."""
+    """Yield huggingface_hub with plain HTTP, which resumes and which mirrors support; its errors become ours."""
     try:
         import huggingface_hub as hub
         from huggingface_hub import constants
         from huggingface_hub.errors import HfHubHTTPError
     except ImportError as error:
-        raise LiberoError(
-            "huggingface_hub is not installed; it fetches the assets: pip install huggingface_hub"
+        raise MissingPackageError(
+            "huggingface_hub, which downloads the assets, is not installed", "pip install huggingface_hub"
         ) from error
     errors: tuple[type[Exception], ...] = (
         OSError,
         HfHubHTTPError.__mro__[1],
-    )  # and what the HTTP library raises
+    )
     before = constants.HF_HUB_DISABLE_XET
     constants.HF_HUB_DISABLE_XET = True
-    again = f"what arrived is kept in {folder}: run it again to go on"
+    resume = f"what was downloaded is kept in {folder}: run it again to resume"
     try:
         yield hub
     except errors as error:
         where = os.environ.get("HF_ENDPOINT", constants.ENDPOINT)
         if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
-            raise DownloadError(f"{folder}: the disk is full; make room. {again}") from error
+            raise DownloadError(f"{folder}: the disk is full; free some space. {resume}") from error
         if isinstance(error, PermissionError):
-            raise DownloadError(f"{error}; name a folder that you may write with --dest") from error
+            raise DownloadError(f"{error}; give a folder that you can write to with --dest") from error
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DownloadError(f"downloading {REPO} from {where} failed: {reason}; {again}") from error
+        raise DownloadError(f"downloading {REPO} from {where} failed: {reason}; {resume}") from error
     finally:
         constants.HF_HUB_DISABLE_XET = before

@@ -1,4 +1,4 @@
-"""Fetching one large file over HTTP: goes on where it was broken off, and refuses what is not what was announced."""
+"""Download of one large file over HTTP that resumes after an interruption and verifies the result."""
 
 import http.client
 import time
@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from libero_env.assets.hub import DownloadError
 
-TRIES = 5  # in a row without a byte
-TIMEOUT = 60.0  # s, without a byte
-_BLOCK = 1 << 18
+TRIES = 5  # consecutive attempts that receive no byte
+TIMEOUT = 60.0  # [s] without a byte
+_BLOCK = 1 << 18  # [bytes] read at a time
 
 
 def fetch(
@@ -22,22 +22,22 @@ def fetch(
     target: Path,
     *,
     size: int | None = None,
-    is_right: Callable[[Path], bool] | None = None,
+    is_valid: Callable[[Path], bool] | None = None,
     progress: bool | None = None,
     pause: float = 1.0,
 ) -> Path:
-    """Fetch a file; what has arrived so far is kept beside it as `<name>.partial`, and a later call goes on from there.
+    """Download a file; an incomplete one is kept beside it as `<name>.partial`, from which a later call resumes.
 
     Args:
-        url: http or https.
-        target: where it goes; replaced when all of it has arrived and is right.
-        size: bytes, where they are known.
-        is_right: judges what arrived, such as by its digest.
-        progress: show a bar; None where stderr is a terminal.
-        pause: seconds before the connection is tried again, twice as long each time.
+        url: Address, http or https.
+        target: File to write; replaced when the download is complete and valid.
+        size: Expected number of bytes; None where it is not known.
+        is_valid: Decides whether the downloaded file is valid, such as by its digest.
+        progress: Whether to show a bar; None shows it where stderr is a terminal.
+        pause: Time before the first new attempt to connect, [s]; it doubles each time.
 
     Raises:
-        DownloadError: no connection, the server says no, or what arrived is not right; then it is removed.
+        DownloadError: The server cannot be reached or refuses, or the file is not valid; then it is removed.
     """
     if urlparse(url).scheme not in ("http", "https"):
         raise DownloadError(f"{url}: not an http or https address")
@@ -46,10 +46,10 @@ def fetch(
     hidden = None if progress is None else not progress
     with tqdm(total=size, unit="B", unit_scale=True, desc=target.name[:40], disable=hidden) as bar:
         _fetch_all(url, partial, size, bar, pause)
-    if is_right is not None and not is_right(partial):
+    if is_valid is not None and not is_valid(partial):
         partial.unlink()
         raise DownloadError(
-            f"{url}: what arrived is not the announced file (its checksum differs) and was removed: the server or a "
+            f"{url}: the downloaded file has the wrong checksum and was removed: the server or a "
             "proxy changes it, or the disk is failing; try again, or another server"
         )
     partial.replace(target)
@@ -57,7 +57,7 @@ def fetch(
 
 
 def _fetch_all(url: str, partial: Path, size: int | None, bar: tqdm, pause: float) -> None:
-    """Connect until everything is there."""
+    """Connect until the file is complete."""
     if size is not None and partial.is_file() and partial.stat().st_size > size:
         partial.unlink()
     failures = 0
@@ -66,25 +66,27 @@ def _fetch_all(url: str, partial: Path, size: int | None, bar: tqdm, pause: floa
         try:
             if _fetch_rest(url, partial, size, bar):
                 return
-            reason = "the connection was broken off"
+            reason = "the connection was closed early"
         except urllib.error.HTTPError as error:
             if error.code < 500 and error.code != 429:
                 raise DownloadError(f"{url}: the server answers {error.code} {error.reason}") from error
             reason = f"the server answers {error.code} {error.reason}"
         except (http.client.HTTPException, OSError) as error:
-            if getattr(error, "filename", None) is not None:  # the disk, not the network
-                raise DownloadError(f"{error}; make room, or name a folder that you may write") from error
+            if getattr(error, "filename", None) is not None:  # an error of the disk, not of the network
+                raise DownloadError(
+                    f"{error}; free some space, or give a folder that you can write to"
+                ) from error
             reason = str(getattr(error, "reason", error)) or type(error).__name__
         failures = 0 if _length(partial) > before else failures + 1
         if failures >= TRIES:
             raise DownloadError(
-                f"{url}: {reason}; tried {TRIES} times. {before} bytes are kept: run it again to go on"
+                f"{url}: {reason}; tried {TRIES} times. {before} bytes are kept: run it again to resume"
             )
         time.sleep(pause * 2 ** max(failures - 1, 0))
 
 
 def _fetch_rest(url: str, partial: Path, size: int | None, bar: tqdm) -> bool:
-    """Append what is missing, as far as it comes; whether that was all."""
+    """Append the missing bytes until the connection ends; return whether the file is complete."""
     start = _length(partial)
     if size is not None and start == size:
         return True
@@ -96,10 +98,10 @@ def _fetch_rest(url: str, partial: Path, size: int | None, bar: tqdm) -> bool:
     except urllib.error.HTTPError as error:
         if error.code != 416:
             raise
-        partial.unlink()  # there is no such rest: it was another file
+        partial.unlink()  # the range does not exist: the partial file is of another file
         return False
     with response:
-        start = start if response.status == 206 else 0  # a server without ranges begins again
+        start = start if response.status == 206 else 0  # a server without ranges starts at the beginning
         announced = response.headers.get("Content-Length")
         total = size if size is not None else start + int(announced) if announced else None
         bar.total = total

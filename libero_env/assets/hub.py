@@ -1,4 +1,4 @@
-"""Downloads from the Hugging Face Hub: retries, free space, verification of files."""
+"""Common parts of downloads: the error, the check of free space, the verification of files."""
 
 import hashlib
 import shutil
@@ -8,50 +8,58 @@ from pathlib import Path
 
 from libero_env.errors import LiberoError
 
-_PAUSE_BYTES = 1 << 20
-
-
-_SPARE_BYTES = 64 << 20  # left free on the disk
+_BLOCK = 1 << 20  # [bytes] read at a time
+_SPARE_BYTES = 64 << 20  # [bytes] to leave free on the disk
 
 
 class DownloadError(LiberoError):
-    """Files did not arrive; what did is kept, and the message says how to go on."""
+    """A download failed; what was downloaded is kept, and the message says how to resume."""
 
 
 @dataclass(frozen=True)
 class Remote:
-    """What the Hub says of a file: bytes, and a digest: `sha256`, or `git` for what git calls a blob."""
+    """A file as the Hub lists it.
+
+    Attributes:
+        size: Number of bytes.
+        kind: Kind of digest: `sha256`, or `git` for the id of a git blob.
+        digest: Digest, in hexadecimal digits.
+    """
 
     size: int
     kind: str
     digest: str
 
     def matches(self, path: Path) -> bool:
-        """Whether a file is this one."""
+        """Return whether a file exists and has this size and digest."""
         if not path.is_file() or path.stat().st_size != self.size:
             return False
         digest = hashlib.sha256() if self.kind == "sha256" else hashlib.sha1(f"blob {self.size}\0".encode())
         with path.open("rb") as file:
-            while block := file.read(_PAUSE_BYTES):
+            while block := file.read(_BLOCK):
                 digest.update(block)
         return digest.hexdigest() == self.digest
 
 
 def broken_files(folder: Path, remote: Mapping[str, Remote]) -> list[str]:
-    """Names of the files that are missing or different."""
+    """Return the names of the files that are missing or different."""
     return [name for name, file in remote.items() if not file.matches(folder / name)]
 
 
-def check_room(folder: Path, needed: int) -> None:
-    """Look whether so many bytes fit on the disk.
+def check_free_space(folder: Path, needed: int) -> None:
+    """Check that a number of bytes fits on the disk.
+
+    Args:
+        folder: Folder to write to; it need not exist.
+        needed: Number of bytes.
 
     Raises:
-        DownloadError: they do not.
+        DownloadError: The disk has too little free space.
     """
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if free < needed + _SPARE_BYTES:
         raise DownloadError(
-            f"{existing}: {free >> 20} MiB free, {(needed + _SPARE_BYTES) >> 20} MiB needed; make room, or name "
+            f"{existing}: {free >> 20} MiB free, {(needed + _SPARE_BYTES) >> 20} MiB needed; free some space, or give "
             "another folder with --dest"
         )

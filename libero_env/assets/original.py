@@ -1,7 +1,7 @@
-"""The original benchmark's objects and rooms, from its own files.
+"""The original benchmark's objects and rooms, read from its own files.
 
-Collision geometry, masses, joints and contact parameters are those of the files, so that the original's states mean the
-same; how an object rests and what counts as open are facts of the benchmark, which no file holds.
+Collision geometry, masses, joints and contact parameters are those of the files, so that the original's
+initial states are valid. How an object rests and when it counts as open is not in the files: it is the builtin pack's.
 """
 
 import os
@@ -9,20 +9,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 
+from libero_env.assets.arena import Workspace, add_cameras_and_lights
+from libero_env.assets.original_arena import arena_spec
 from libero_env.assets.original_mjcf import object_xml
+from libero_env.assets.simplify import simplify_visuals
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.builtin.physics import load_physics
-from libero_env.objects.catalog import get_object, own_names
+from libero_env.objects.catalog import get_object, user_defined_names
 from libero_env.objects.model import ObjectModel
 
-if TYPE_CHECKING:
-    from libero_env.assets.arena import Workspace
-
-# Folder -> categories, one file each.
+# Folder -> its categories; each has one file.
 FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "articulated_objects": (
@@ -46,20 +46,20 @@ FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )  # fmt: skip
 _STEMS = {"rack": "simple_rack"}
-_PHYSICS_FIELDS = (  # of an `ObjectModel` that the files do not hold
+_PHYSICS_FIELDS = (  # fields of `ObjectModel` that the original's files do not contain
     "joint_damping", "rotation", "rotation_axis", "bottom_offset", "top_offset", "horizontal_radius", "articulation",
 )  # fmt: skip
 _ROOM = "room_"
-_NAMED_ONLY = ("cherries", "corn", "mayo")  # the original has the names, its files were never published
+_NAMED_ONLY = ("cherries", "corn", "mayo")  # categories of the original whose files were never published
 
 
 @dataclass(frozen=True)
 class OriginalPack:
-    """The original's asset folder.
+    """Models that are read from the original's asset folder.
 
     Attributes:
-        root: the folder that holds `articulated_objects`, `scenes`, ...
-        lod: number of triangles that a visual mesh is simplified to; None leaves them as they are.
+        root: Folder that contains `articulated_objects`, `scenes`, ...
+        lod: Largest number of triangles of a visual mesh; None keeps all triangles.
     """
 
     root: str
@@ -67,25 +67,25 @@ class OriginalPack:
 
     @property
     def name(self) -> str:
-        """`original`, with the level of detail where there is one."""
+        """Name of the pack: `original`, or such as `original-lod500` with a level of detail."""
         return "original" if self.lod is None else f"original-lod{self.lod}"
 
     def categories(self) -> tuple[str, ...]:
-        """All categories, sorted, with those that users registered."""
-        return tuple(sorted({*own_names(), *(c for group in FAMILIES.values() for c in group)}))
+        """Return all categories, those that users registered included, sorted."""
+        return tuple(sorted({*user_defined_names(), *(c for group in FAMILIES.values() for c in group)}))
 
     def build(self, category: str) -> ObjectModel:
-        """Model of a category, anew at each call; what users registered comes first.
+        """Return a new model of a category at each call; a category that users registered takes precedence.
 
         Raises:
-            UnknownNameError: no object has this name.
-            LiberoError: the pack has no model of it, or its files are missing.
+            UnknownNameError: No object has this name.
+            LiberoError: The pack has no model of this category, or its files are missing.
         """
-        if category in own_names():
+        if category in user_defined_names():
             return get_object(category)
         if category in _NAMED_ONLY:
             raise LiberoError(
-                f"the original assets have no model of {category!r}, only its name; add one with "
+                f"the original assets contain no model of {category!r}, only its name; add one with "
                 "libero_env.objects.register_object, or use the builtin pack where it has one (LIBERO_ASSETS=builtin)"
             )
         spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category))
@@ -95,10 +95,10 @@ class OriginalPack:
         return ObjectModel(category, spec, **fields)
 
     def file(self, category: str) -> Path:
-        """The MJCF file of a category.
+        """Return the MJCF file of a category.
 
         Raises:
-            UnknownNameError: no object has this name.
+            UnknownNameError: No object has this name.
         """
         folder = next((name for name, group in FAMILIES.items() if category in group), None)
         if folder is None:
@@ -108,31 +108,28 @@ class OriginalPack:
         return flat if folder == "articulated_objects" else flat.with_suffix("") / flat.name
 
     def add_arena(
-        self, spec: mujoco.MjSpec, workspace: "Workspace", scene_properties: Mapping[str, str]
+        self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
     ) -> None:
         """Attach the original's room, with its cameras and lights.
 
         Raises:
-            UnknownNameError: a property names a style that does not exist.
-            LiberoError: files are missing.
+            UnknownNameError: A property names a style that does not exist.
+            LiberoError: Files are missing.
         """
-        from libero_env.assets.arena import add_cameras_and_lights
-        from libero_env.assets.original_arena import arena_spec
-
         room = arena_spec(Path(self.root), workspace, scene_properties)
         self._simplify(room)
         spec.attach(room, prefix=_ROOM, frame=spec.worldbody.add_frame())
         for item in (*spec.bodies, *spec.geoms, *spec.sites):
-            item.name = item.name.removeprefix(_ROOM)  # MuJoCo warns of an empty prefix; assets keep theirs
+            item.name = item.name.removeprefix(
+                _ROOM
+            )  # MuJoCo warns about an empty prefix; assets keep theirs
         add_cameras_and_lights(spec, workspace)
 
     def _simplify(self, spec: mujoco.MjSpec) -> None:
         if self.lod is not None:
-            from libero_env.assets.simplify import simplify_visuals
-
             simplify_visuals(spec, self.lod)
 
 
 def is_original(root: str | os.PathLike) -> bool:
-    """Whether a folder looks like the original's assets."""
+    """Return whether a folder looks like the original's assets."""
     return all((Path(root) / folder).is_dir() for folder in (*FAMILIES, "scenes"))

@@ -1,20 +1,18 @@
-"""The original's rooms: its scene files, with table, floor and walls set as its problem classes set them."""
+"""The original's rooms: its scene files, with table, floor and walls as its problem classes set them."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import mujoco
 
+from libero_env.assets.arena import Workspace
 from libero_env.assets.original_mjcf import read_file, to_xml, used_assets
 from libero_env.assets.styles import load_styles, styles_of
 
-if TYPE_CHECKING:
-    from libero_env.assets.arena import Workspace
-
-# Workspace -> what its scene files are called.
+# Workspace -> beginning of the names of its scene files.
 SCENES: Mapping[str, str] = MappingProxyType(
     {
         "coffee_table": "libero_coffee_table",
@@ -25,7 +23,7 @@ SCENES: Mapping[str, str] = MappingProxyType(
         "table": "libero_tabletop",
     }
 )
-# Name of a style in task files -> picture in `textures`.
+# Name of a style in task files -> file in `textures`.
 TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(
     {
         "floor": {
@@ -52,50 +50,50 @@ TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(
     }
 )
 _TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
-_STIFF = 0.004  # s, the stiffest time constant that the timestep allows
-_FIRM_SOLREF = (0.02, 1.0)
-_DEEP_BOXES = tuple(int(n) for n in mujoco.__version__.split(".")[:2]) >= (3, 4)
-_NOT_HERE = ("camera", "light")  # they come with the parameters of the workspace
+_STIFF = 0.004  # [s] smallest time constant that the timestep allows
+_FIRM_SOLREF = (0.02, 1.0)  # time constant [s] and damping ratio
+_FULL_BOX_DEPTH = tuple(int(n) for n in mujoco.__version__.split(".")[:2]) >= (3, 4)
+_EXCLUDED = ("camera", "light")  # those of the workspace's parameters are used
 
 
-def arena_spec(root: Path, workspace: "Workspace", scene_properties: Mapping[str, str]) -> mujoco.MjSpec:
-    """A room as a model of its own, without cameras and lights.
+def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, str]) -> mujoco.MjSpec:
+    """Return a room as a model of its own, without cameras and lights.
 
     Args:
-        root: the asset folder.
-        workspace: which.
-        scene_properties: as `libero_env.assets.arena.add_arena` takes them.
+        root: Asset folder.
+        workspace: Workspace that the room belongs to.
+        scene_properties: Styles, as for `libero_env.assets.arena.add_arena`.
 
     Raises:
-        UnknownNameError: a property or a style that does not exist.
-        LiberoError: files are missing.
+        UnknownNameError: A property or a style does not exist.
+        LiberoError: Files are missing.
     """
     own = workspace.parameters["styles"]
-    styles_of(own, scene_properties)  # raises what is wrong with them
-    wanted = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
-    scene = wanted.pop("scene", "base")
-    pictures = {**own, **load_styles()["scene"][scene], **wanted}
+    styles_of(own, scene_properties)  # raises where a name is wrong
+    chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
+    scene = chosen.pop("scene", "base")
+    pictures = {**own, **load_styles()["scene"][scene], **chosen}
     assets, world = read_file(scene_file(root, workspace.name, scene))
     for element in assets:
         for kind, name in _TEXTURE_NAMES.items():
             if element.tag == "texture" and element.get("name") == name:
                 element.set("file", str(root / "textures" / TEXTURES[kind][pictures[kind]]))
     for element in list(world):
-        if element.tag in _NOT_HERE:
+        if element.tag in _EXCLUDED:
             world.remove(element)
     _fit_table(world, workspace.parameters.get("table", {}))
     spec = mujoco.MjSpec.from_string(to_xml(workspace.name, used_assets(assets, world), world))
-    if _DEEP_BOXES:
-        _soften(spec)
+    if _FULL_BOX_DEPTH:
+        _soften_tables(spec)
     return spec
 
 
-def _soften(spec: mujoco.MjSpec) -> None:
+def _soften_tables(spec: mujoco.MjSpec) -> None:
     """Make stiff table tops as firm as before MuJoCo 3.4.
 
-    Since then the depth between two boxes is what they overlap by, where it was half of that; and a push grows with the
-    depth over the square of the time constant. Some of the original's states start three centimetres deep in the table
-    of the living room: the same parameters would shoot things half a metre up.
+    Since then the penetration depth of two boxes is their overlap, where it was half of it, and the contact force grows
+    with the depth over the square of the time constant. Some of the original's states start three centimetres deep in
+    the living room table: with the same parameters, the objects would fly half a metre up.
     """
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_BOX and geom.contype and geom.solref[0] < _STIFF:
@@ -103,14 +101,14 @@ def _soften(spec: mujoco.MjSpec) -> None:
 
 
 def scene_file(root: Path, workspace: str, scene: str = "base") -> Path:
-    """The file of a scene; the base one where the workspace has none of that name."""
+    """Return the file of a scene; the base one where the workspace has none of that name."""
     folder = root / "scenes"
     path = folder / f"{SCENES[workspace]}_{scene}_style.xml"
     return path if path.is_file() else folder / f"{SCENES[workspace]}_base_style.xml"
 
 
 def _fit_table(world: ET.Element, table: Mapping[str, Any]) -> None:
-    """Give the named parts of a table the size that they have in the workspace: the files hold placeholders."""
+    """Set the size of the named parts of a table to that of the workspace: the files contain placeholders."""
     named: dict[tuple[str, str], Mapping[str, Any]] = {
         ("geom", part["name"]): part
         for key in ("collision", "visual")

@@ -1,7 +1,7 @@
-"""Reading the original's MJCF files the way its loader did, with MuJoCo's own reader behind it.
+"""Conversion of the original's MJCF files into what MuJoCo reads, with the semantics of the original's loader.
 
-The files rely on what that loader overlooked: it wrote default classes into the elements and dropped `<compiler>` and
-`<size>`, it took the first of two assets of one name, and the mass of a body from collision geoms (group 0) only.
+The files rely on that loader: it wrote default classes into the elements, dropped `<compiler>` and `<size>`, took the
+first of two assets of one name, and computed the mass of a body from collision geoms (group 0) only.
 """
 
 import copy
@@ -14,17 +14,17 @@ from libero_env.errors import LiberoError
 from libero_env.objects.builtin.assemble import GLOWING_SITES, HIDDEN_GROUP
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
 
-REMEDY = "`libero assets check` lists what is missing, `libero assets download` fetches it"
-_OF_BODIES = ("body", "geom", "inertial", "joint", "site")
-_OF_ASSETS = ("material", "mesh", "texture")
+REMEDY = "`libero assets check` lists what is missing, `libero assets download` downloads it"
+_BODY_TAGS = ("body", "geom", "inertial", "joint", "site")
+_ASSET_TAGS = ("material", "mesh", "texture")
 _REFERENCES = ("material", "mesh", "texture")
 
 
 def read_file(path: Path) -> tuple[list[ET.Element], ET.Element]:
-    """Assets, with absolute paths, and world body of a file, its default classes written out.
+    """Return the assets of a file, with absolute paths, and its world body, with default classes written out.
 
     Raises:
-        LiberoError: the file is missing or no XML.
+        LiberoError: The file is missing or not XML.
     """
     try:
         root = ET.parse(path).getroot()
@@ -43,17 +43,17 @@ def read_file(path: Path) -> tuple[list[ET.Element], ET.Element]:
             element.set("file", str((path.parent / element.attrib["file"]).absolute()))
             if element.tag == "mesh":
                 element.attrib.setdefault("name", Path(element.attrib["file"]).stem)
-        if element.tag in _OF_ASSETS:
+        if element.tag in _ASSET_TAGS:
             assets.setdefault((element.tag, element.get("name", "")), element)
     return list(assets.values()), world
 
 
 @lru_cache(maxsize=64)
 def object_xml(path: Path, category: str) -> str:
-    """MJCF of an object: one body `main` with what the file has below its body `object`.
+    """Return the MJCF text of an object: one body `main` with the content of the file's body `object`.
 
     Raises:
-        LiberoError: a file is missing or not as expected.
+        LiberoError: A file is missing or not as expected.
     """
     assets, world = read_file(path)
     body = world.find("body/body[@name='object']")
@@ -63,13 +63,18 @@ def object_xml(path: Path, category: str) -> str:
 
 
 def attachable_xml(category: str, assets: Iterable[ET.Element], body: ET.Element) -> str:
-    """MJCF of an object as scenes attach it, from its body, which is changed, and the assets of its file.
+    """Return the MJCF text of an object that scenes can attach.
+
+    Args:
+        category: Name of the category; it becomes the prefix of the assets' names.
+        assets: Assets of the file.
+        body: Body of the object; it is changed.
 
     Raises:
-        LiberoError: a file that is needed is missing.
+        LiberoError: A required file is missing.
     """
-    body.attrib = {"name": ROOT_BODY}  # where it stands is up to the scene
-    _keep(body, _OF_BODIES)
+    body.attrib = {"name": ROOT_BODY}  # the scene sets its pose
+    _keep(body, _BODY_TAGS)
     for joint in body.findall("joint"):
         body.remove(joint)
     for number, geom in enumerate(body.iter("geom")):
@@ -87,10 +92,10 @@ def attachable_xml(category: str, assets: Iterable[ET.Element], body: ET.Element
 
 
 def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Element]:
-    """The assets that these elements need, and no others: files of the others may be missing.
+    """Return the assets that the given elements need, and no others: files of the others may be missing.
 
     Raises:
-        LiberoError: a file that is needed is missing.
+        LiberoError: A required file is missing.
     """
     wanted = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _REFERENCES}
     wanted |= {("texture", a.get("texture")) for a in assets if (a.tag, a.get("name")) in wanted}
@@ -102,14 +107,14 @@ def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Ele
 
 
 def to_xml(name: str, assets: Iterable[ET.Element], bodies: Iterable[ET.Element]) -> str:
-    """A file of its own: angles in radians; masses of collision geoms only; meshes may be open."""
+    """Return a complete MJCF text: angles in radians, mass from collision geoms only, open meshes allowed."""
     root = ET.Element("mujoco", {"model": name})
     ET.SubElement(root, "compiler", {"angle": "radian", "inertiagrouprange": "0 0", "autolimits": "true"})
     section = ET.SubElement(root, "asset")
     for asset in assets:
         asset = copy.copy(asset)
         if asset.tag == "mesh":
-            # of visual meshes, which weigh nothing: the volume need not be closed
+            # visual meshes have no mass: their volume need not be closed
             asset.attrib.setdefault("inertia", "shell")
         section.append(asset)
     ET.SubElement(root, "worldbody").extend(bodies)
@@ -130,7 +135,7 @@ def _group(site: ET.Element) -> int:
 
 
 def _prefix(element: ET.Element, prefix: str) -> None:
-    keys = ("name", *_REFERENCES) if element.tag in _OF_ASSETS else _REFERENCES
+    keys = ("name", *_REFERENCES) if element.tag in _ASSET_TAGS else _REFERENCES
     for key in keys:
         if key in element.attrib:
             element.set(key, prefix + element.attrib[key])

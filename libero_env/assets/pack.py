@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 import mujoco
 
 from libero_env.assets.arena import Workspace, add_arena
+from libero_env.assets.original import OriginalPack, is_original
 from libero_env.errors import LiberoError
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.paths import config_file, read_config
@@ -18,26 +19,26 @@ VARIABLE = "LIBERO_ASSETS"
 
 
 class Pack(Protocol):
-    """Where the models of objects and rooms come from. Hashable: scenes are cached by it."""
+    """Source of the models of objects and rooms. It is hashable: scenes are cached by it."""
 
     def __hash__(self) -> int: ...
 
     @property
     def name(self) -> str:
-        """What results and messages call it."""
+        """Name of the pack in results and messages."""
         ...
 
     def build(self, category: str) -> ObjectModel:
-        """Model of a category, anew at each call.
+        """Return a new model of a category at each call: the caller may change its spec.
 
         Raises:
-            UnknownNameError: no object has this name.
-            LiberoError: this pack has no model of it.
+            UnknownNameError: No object has this name.
+            LiberoError: This pack has no model of it.
         """
         ...
 
     def categories(self) -> tuple[str, ...]:
-        """All categories that `build` knows, sorted."""
+        """Return all categories that `build` knows, sorted."""
         ...
 
     def add_arena(
@@ -46,7 +47,7 @@ class Pack(Protocol):
         """Add floor, walls, table, lights and cameras to a scene.
 
         Raises:
-            UnknownNameError: a property names a style that does not exist.
+            UnknownNameError: A property names a style that does not exist.
         """
         ...
 
@@ -57,7 +58,7 @@ class BuiltinPack:
 
     @property
     def name(self) -> str:
-        """`builtin`"""
+        """Name of the pack: `builtin`."""
         return BUILTIN
 
     def build(self, category: str) -> ObjectModel:
@@ -76,16 +77,21 @@ class BuiltinPack:
 
 
 class Choice(NamedTuple):
-    """A pack and why it is in use."""
+    """A pack and why it is used.
 
-    value: str  # `builtin`, or a folder
+    Attributes:
+        value: `builtin`, or a folder.
+        reason: Where the choice was made.
+    """
+
+    value: str
     reason: str
 
 
 def chosen_assets(assets: str | os.PathLike | None = None) -> Choice:
-    """What `select_pack` goes by: the argument, `LIBERO_ASSETS`, the configuration file's `assets`, or the default."""
+    """Return the choice of `select_pack`: the argument, `LIBERO_ASSETS`, the configured `assets`, or the default."""
     if assets is not None:
-        return Choice(os.fspath(assets), "asked for by the caller")
+        return Choice(os.fspath(assets), "requested by the caller")
     if value := os.environ.get(VARIABLE):
         return Choice(value, f"${VARIABLE}")
     if value := read_config().get("assets"):
@@ -94,20 +100,19 @@ def chosen_assets(assets: str | os.PathLike | None = None) -> Choice:
 
 
 def select_pack(assets: str | os.PathLike | None = None, lod: int | None = None) -> Pack:
-    """The pack to build scenes from.
+    """Return the pack to build scenes from.
 
     Args:
-        assets: `builtin`, or the folder of the original's files; by default `$LIBERO_ASSETS`, then the key `assets` of
+        assets: `builtin`, or the folder of the original's files. Default: `$LIBERO_ASSETS`, then the key `assets` of
             `$LIBERO_CONFIG_PATH/config.yaml`, then `builtin`.
-        lod: number of triangles that a visual mesh of the original is simplified to; None leaves them as they are.
+        lod: Largest number of triangles of a visual mesh of the original; None keeps all triangles.
 
     Raises:
-        LiberoError: the folder does not hold the original's files.
+        LiberoError: The folder does not hold the original's files.
     """
     value, reason = chosen_assets(assets)
     if value == BUILTIN:
         return BuiltinPack()
-    from libero_env.assets.original import OriginalPack, is_original
 
     root = Path(value).expanduser().absolute()
     if is_original(root):
@@ -116,6 +121,6 @@ def select_pack(assets: str | os.PathLike | None = None, lod: int | None = None)
         return BuiltinPack()  # the original writes this key whether there are files or not
     raise LiberoError(
         f"{root} ({reason}) does not hold the original assets: a folder with articulated_objects, scenes, "
-        f"stable_hope_objects, ... is expected. `libero assets download` fetches them; {VARIABLE}={BUILTIN} "
-        "does without"
+        f"stable_hope_objects, ... is expected. `libero assets download` downloads them; {VARIABLE}={BUILTIN} "
+        "selects the builtin pack, which needs none"
     )

@@ -44,7 +44,7 @@ def robosuite_assets() -> Path:
     """Return the folder of robosuite's MJCF files.
 
     Raises:
-        MissingPackageError: robosuite is not installed, or its model files are missing.
+        MissingPackageError: Robosuite is not installed, or its model files are missing.
     """
     spec = importlib.util.find_spec("robosuite")
     if spec is None or spec.origin is None:
@@ -63,7 +63,7 @@ def robosuite_version() -> str:
     """Return the version of the installed robosuite.
 
     Raises:
-        MissingPackageError: robosuite is not installed.
+        MissingPackageError: Robosuite is not installed.
     """
     try:
         return importlib.metadata.version("robosuite")
@@ -82,7 +82,7 @@ def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float]) -> None:
         pos_world: Position of the base, (3,) [m].
 
     Raises:
-        MissingPackageError: robosuite, which supplies the models, is not installed.
+        MissingPackageError: Robosuite, which supplies the models, is not installed.
     """
     root = robosuite_assets()
     arm, gripper = _load(root / _ARM_FILE), _load(root / _GRIPPER_FILE)

@@ -13,8 +13,8 @@ from libero_env.geometry import quat_to_mat
 from libero_env.paths import cache_dir
 from libero_env.storage import atomic_path
 
-_CACHE_VERSION = 3  # of `lod-*.npz`
-_MERGE_CACHE_VERSION = 2  # of the files of `merge_and_simplify`
+_CACHE_VERSION = 3  # in the digests of `lod-*.npz`
+_MERGE_CACHE_VERSION = 2  # in the digests of `merge_and_simplify`
 _CHUNK = 64  # points whose distances to all others are in memory at once
 _PER_SIDE = 40  # samples along the longest side of the mesh
 
@@ -38,7 +38,15 @@ class MeshSource(NamedTuple):
 
 
 def simplify_visuals(spec: mujoco.MjSpec, faces: int) -> None:
-    """Give the meshes that nothing collides with at most about this many triangles; others stay as they are."""
+    """Simplify the meshes of a model that are visual only, in place.
+
+    Args:
+        spec: Model to change.
+        faces: Approximate largest number of triangles of a mesh.
+
+    Raises:
+        LiberoError: A mesh file cannot be read, or a mesh cannot be simplified that far.
+    """
     solid = {g.meshname for g in spec.geoms if g.contype or g.conaffinity}
     for mesh in spec.meshes:
         if mesh.name not in solid and mesh.file:
@@ -53,11 +61,11 @@ def simplify_visuals(spec: mujoco.MjSpec, faces: int) -> None:
 
 @lru_cache(maxsize=256)
 def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | None:
-    """Vertices (n, 3), triangles (f, 3), texture coordinates (t, 2) and their indices (f, 3); None: small as it is."""
+    """Return vertices (n, 3), triangles (f, 3), texture coordinates (t, 2), indices (f, 3); None without faces."""
     try:
         content = Path(file).read_bytes()
     except OSError as error:
-        raise LiberoError(f"{file}: {error}; `libero assets download` fetches it") from error
+        raise LiberoError(f"{file}: {error}; `libero assets download` downloads it") from error
     digest = hashlib.sha256(repr((_CACHE_VERSION, scale, faces)).encode() + content).hexdigest()[:24]
     path = cache_dir() / "meshes" / f"lod-{digest}.npz"
     if path.exists():
@@ -73,13 +81,13 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
 def merge_and_simplify(
     stem: str, name: str, groups: tuple[tuple[MeshSource, ...], ...], faces: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Merge the meshes of each group into one with at most about a number of triangles.
+    """Merge the meshes of each group into one and simplify it.
 
     Args:
         stem: Beginning of the name of the cache file.
         name: Name of the model; it distinguishes models whose meshes have the same names.
         groups: Meshes to merge.
-        faces: Largest number of triangles of a merged mesh.
+        faces: Approximate largest number of triangles of a merged mesh.
 
     Returns:
         Vertices (n, 3) [m] and triangles (f, 3) of each group.
@@ -128,7 +136,7 @@ def _store(path: Path, arrays: Arrays) -> None:
 
 
 def _load(file: str, scale: tuple[float, ...]) -> Arrays:
-    """A mesh as MuJoCo reads it, in the frame of the file."""
+    """Return a mesh as MuJoCo reads it, in the frame of the file."""
     spec = mujoco.MjSpec()
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     spec.add_mesh(name="mesh", file=file, scale=scale, inertia=shell)
@@ -145,20 +153,20 @@ def _load(file: str, scale: tuple[float, ...]) -> Arrays:
 def decimate(
     vertices: np.ndarray, triangles: np.ndarray, texcoords: np.ndarray, indices: np.ndarray, faces: int
 ) -> Arrays:
-    """Simplify by quadric error; corners take the texture coordinate of the nearest point of the old surface.
+    """Simplify a mesh by quadric error; corners take the texture coordinate of the nearest point of the old surface.
 
-    A patch is a piece of the surface that the texture covers without a seam; a new triangle belongs to the patch that
-    lies nearest to its centre and faces the same way, and keeps to it: none stretches across a seam.
+    A patch is a piece of the surface that the texture covers without a seam. A new triangle belongs to the patch that
+    is nearest to its centre and faces the same way, so that none stretches across a seam.
 
     Args:
-        vertices: (n, 3), metres.
-        triangles: (f, 3), vertex indices.
-        texcoords: (t, 2); (0, 2) for a mesh without.
-        indices: (f, 3), which texture coordinate each corner has.
-        faces: number of triangles to aim at.
+        vertices: Vertices, (n, 3) [m].
+        triangles: Vertex indices, (f, 3).
+        texcoords: Texture coordinates, (t, 2); (0, 2) for a mesh without.
+        indices: Indices into `texcoords` of each corner, (f, 3).
+        faces: Desired number of triangles.
 
     Returns:
-        The same four of the simplified mesh.
+        The same four arrays of the simplified mesh.
     """
     import fast_simplification  # only needed the first time on a machine
 
@@ -169,7 +177,7 @@ def decimate(
     new = new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
     if not len(new):
         raise LiberoError(
-            f"a mesh of {len(triangles)} triangles cannot be simplified to {faces}; ask for more"
+            f"a mesh of {len(triangles)} triangles cannot be simplified to {faces}; allow more triangles"
         )
     if not len(texcoords):
         return new_points, new, texcoords, np.zeros((0, 3), np.int32)
@@ -187,7 +195,7 @@ def decimate(
 
 
 def nearest(points: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """For each of points (n, d) the index of the nearest of `among` (m, d); (n,)."""
+    """Return the index (n,) of the nearest of `among` (m, d) for each of `points` (n, d)."""
     half = 0.5 * (among**2).sum(axis=1)
     parts = [points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
     return np.concatenate([np.argmin(half - part @ among.T, axis=1) for part in parts])
@@ -196,7 +204,7 @@ def nearest(points: np.ndarray, among: np.ndarray) -> np.ndarray:
 def _samples(
     points: np.ndarray, triangles: np.ndarray, texcoords: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points all over a surface: what `_facing` says of them (s, 6), texture coordinates (s, 2), triangles (s,)."""
+    """Sample a surface; return the descriptors of `_facing` (s, 6), texture coordinates (s, 2), triangles (s,)."""
     corners = points[triangles]  # (f, 3, 3)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     steps = np.clip(np.ceil(_PER_SIDE * longest / _extent(points)), 1, _PER_SIDE).astype(int)
@@ -213,7 +221,7 @@ def _samples(
 
 
 def _facing(whole: np.ndarray, where: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Points (f, 3) on triangles (f, 3) and the triangles' normals, at a tenth of the size of the whole; (f, 6)."""
+    """Return descriptors (f, 6): points on triangles, and the normals scaled to a tenth of the size of the mesh."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
@@ -225,9 +233,9 @@ def _extent(points: np.ndarray) -> float:
 
 
 def _patches(triangles: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
-    """Label of the piece of texture that each of triangles (f, 3) is on, (f,); texcoords of the corners (f, 3, 2).
+    """Return the label (f,) of the texture patch of each triangle (f, 3), from the corners' texcoords (f, 3, 2).
 
-    Two triangles are on one piece where they share a vertex that has the same texture coordinate in both.
+    Two triangles are on one patch if they share a vertex that has the same texture coordinate in both.
     """
     corners = np.concatenate([triangles.reshape(-1, 1), texcoords.reshape(-1, 2).round(6)], axis=1)
     shared = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)

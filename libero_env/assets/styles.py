@@ -1,4 +1,4 @@
-"""Floors and walls: named styles and the small pictures that are generated for them."""
+"""Floors and walls: named styles and the small textures that are generated for them."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -10,35 +10,39 @@ import numpy as np
 from libero_env.errors import UnknownNameError
 from libero_env.storage import read_yaml
 
-_SIZE = 128  # pixels, side of a texture unless the style says otherwise
+_SIZE = 128  # [pixels] default side of a texture
 
 
 @cache
 def load_styles() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
-    """kind (`floor`, `wall`, `scene`) -> name -> parameters."""
+    """Return kind (`floor`, `wall`, `scene`) -> name -> parameters."""
     return read_yaml("assets/workspaces/styles.yaml")
 
 
 def styles_of(own: Mapping[str, str], scene_properties: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
-    """`floor` and `wall` -> parameters of the style: that of the properties, else of their scene, else one's own.
+    """Return the parameters of the styles of `floor` and `wall`.
+
+    Args:
+        own: Default styles, those of the workspace.
+        scene_properties: Styles of the task file; they take precedence, after them that of their `scene`.
 
     Raises:
-        UnknownNameError: a property or a style that does not exist; the message lists the valid ones.
+        UnknownNameError: A property or a style does not exist; the message lists the valid ones.
     """
-    wanted = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
+    chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
     known = load_styles()
-    for kind, name in wanted.items():
+    for kind, name in chosen.items():
         if kind not in known:
             raise UnknownNameError("scene property", kind, known)
         if name not in known[kind]:
             raise UnknownNameError(f"{kind} style", name, known[kind])
-    scene = known["scene"][wanted.pop("scene", "base")]
-    chosen = {**own, **scene, **wanted}
-    return {kind: known[kind][chosen[kind]] for kind in ("floor", "wall")}
+    scene = known["scene"][chosen.pop("scene", "base")]
+    styles = {**own, **scene, **chosen}
+    return {kind: known[kind][styles[kind]] for kind in ("floor", "wall")}
 
 
 def furniture_of(own: Sequence[str], scene_properties: Mapping[str, str]) -> tuple[str, ...]:
-    """Names of the sets of furniture: one's own, and those that the scene's style adds."""
+    """Return the names of the sets of furniture: those of the workspace, and those that the scene's style adds."""
     scene = scene_properties.get("scene", scene_properties.get("scene_style", "base"))
     return tuple(dict.fromkeys([*own, *load_styles()["scene"][scene].get("furniture", ())]))
 
@@ -46,17 +50,20 @@ def furniture_of(own: Sequence[str], scene_properties: Mapping[str, str]) -> tup
 def add_material(
     spec: mujoco.MjSpec, name: str, style: Mapping[str, Any], specular: float = 0.0, shininess: float = 0.0
 ) -> None:
-    """Add a style to a scene as a material; its texture repeats each period, on meshes as their coordinates say."""
+    """Add a style to a scene as a material.
+
+    The texture repeats each period; on meshes it follows the texture coordinates.
+    """
     material = spec.add_material(name=name, specular=specular, shininess=shininess)
     if style["pattern"] == "plain":
         material.rgba = [*style["colours"][0], 1.0]
         return
-    add_texture(spec, material, picture(style))
+    add_texture(spec, material, make_texture(style))
     material.texuniform, material.texrepeat = True, [1.0 / style["period"]] * 2
 
 
 def add_texture(spec: mujoco.MjSpec, material: mujoco.MjsMaterial, image: np.ndarray) -> None:
-    """Give a material a picture, (height, width, 3) uint8."""
+    """Set the texture of a material to an image, (height, width, 3) uint8."""
     texture = spec.add_texture(
         name=material.name,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -68,8 +75,8 @@ def add_texture(spec: mujoco.MjSpec, material: mujoco.MjsMaterial, image: np.nda
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
 
 
-def picture(style: Mapping[str, Any]) -> np.ndarray:
-    """One period of a style, (size, size, 3) uint8; always the same, and it continues itself at its edges."""
+def make_texture(style: Mapping[str, Any]) -> np.ndarray:
+    """Return one period of a style as a texture, (size, size, 3) uint8: the same at each call, and it tiles."""
     size, rng = style.get("size", _SIZE), np.random.default_rng(0)
     image = np.empty((size, size, 3))
     image[:] = style["colours"][0]
@@ -78,13 +85,13 @@ def picture(style: Mapping[str, Any]) -> np.ndarray:
 
 
 def _tiles(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """Square tiles with joints."""
+    """Return square tiles with joints."""
     image[:1] = image[:, :1] = style["colours"][1]
     return image + rng.normal(0.0, style["grain"], (*image.shape[:2], 1))
 
 
 def _planks(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """Rows of boards of differing tint, their ends at random."""
+    """Return rows of boards with random tints and ends."""
     size, grain = len(image), style["grain"]
     image = image + _streaks(size, rng)[..., None] * grain
     edges = np.linspace(0, size, style["rows"] + 1).astype(int)
@@ -100,21 +107,21 @@ def _planks(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generato
 
 
 def _plaster(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """Uneven colour with a little roughness."""
+    """Return an uneven colour with some roughness."""
     size = len(image)
     rough = _smooth(size, (8, 8), rng) + 0.4 * _smooth(size, (2, 2), rng)
     return image + rough[..., None] * style["grain"]
 
 
 def _linen(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """Threads, more of them upwards."""
+    """Return threads, more of them vertical."""
     size = len(image)
     threads = _smooth(size, (1, 24), rng) + 0.4 * _smooth(size, (24, 1), rng)
     return image + threads.T[..., None] * style["grain"]
 
 
 def _marble(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """Veins: where a smooth field crosses zero."""
+    """Return veins, which are where a smooth field crosses zero."""
     size = len(image)
     field = _smooth(size, (12, 12), rng) + 0.5 * _smooth(size, (4, 4), rng)
     vein = (
@@ -125,7 +132,7 @@ def _marble(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generato
 
 
 def _wood(image: np.ndarray, style: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """One board; the grain runs along the second axis."""
+    """Return one board whose grain runs along the second axis."""
     streaks = _streaks(len(image), rng)[..., None]
     return image + np.clip(streaks, -2, 2) * (np.array(style["colours"][0]) - style["colours"][1]) * 0.5
 
@@ -135,7 +142,7 @@ def _streaks(size: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _smooth(size: int, widths: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-    """Periodic noise of mean 0 and deviation 1 that is correlated over so many pixels down and across."""
+    """Return periodic noise (size, size), mean 0 and deviation 1, correlated over `widths` pixels down and across."""
     frequency = np.fft.fftfreq(size)
     decay = [np.exp(-2.0 * (np.pi * frequency * width) ** 2) for width in widths]
     noise = np.fft.fft2(rng.normal(size=(size, size))) * np.outer(*decay)

@@ -36,7 +36,7 @@ def run_download(args: argparse.Namespace) -> None:
 
 
 def run_info(args: argparse.Namespace) -> None:
-    """Name the models and the setting that chose them."""
+    """Return the name the models and the setting that chose them."""
     from libero_env.assets.download import default_folder, read_manifest
     from libero_env.assets.pack import chosen_assets, select_pack
 

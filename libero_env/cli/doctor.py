@@ -79,14 +79,14 @@ def examine(gl_only: bool = False) -> list[Finding]:
 
 
 def check_python() -> Finding:
-    """The interpreter and the machine."""
+    """Return the interpreter and the machine."""
     detail = f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
     remedy = "use Python 3.11 or newer: make PYTHON=/path/to/python3.11 setup"
     return Finding("Python", detail, sys.version_info >= (3, 11), remedy)
 
 
 def check_package(name: str, remedy: str = "make setup", essential: bool = True) -> Finding:
-    """Whether a package is installed, without importing it."""
+    """Return whether a package is installed, without importing it."""
     try:
         return Finding(name, importlib.metadata.version(name), essential=essential)
     except importlib.metadata.PackageNotFoundError:
@@ -134,7 +134,7 @@ def check_gl() -> Finding:
 
 
 def check_cache() -> Finding:
-    """The cache folder: where, how full, whether it can be written."""
+    """Return the cache folder: where, how full, whether it can be written."""
     path = cache_dir()
     remedy = "set LIBERO_CACHE to a folder you can write to"
     existing = next(parent for parent in [path, *path.parents] if parent.exists())
@@ -147,7 +147,7 @@ def check_cache() -> Finding:
 
 
 def check_demos() -> Finding:
-    """The demonstrations that are there."""
+    """Return the demonstrations that are there."""
     path = demos_dir()
     files = sorted(path.rglob("*.hdf5"))
     remedy = "training makes what it needs; or: libero demos generate --benchmark libero_object --n 50"
@@ -169,7 +169,7 @@ def folder_bytes(path: Path) -> int:
 
 
 def render_findings(findings: Iterable[Finding]) -> str:
-    """The findings as text, one line each and a second one where something is to be mended."""
+    """Return the findings as text, one line each and a second one where something is to be mended."""
     rows = []
     for finding in findings:
         mark = "ok  " if finding.ok else ("FAIL" if finding.essential else "note")
@@ -180,5 +180,5 @@ def render_findings(findings: Iterable[Finding]) -> str:
 
 
 def is_broken(findings: Iterable[Finding]) -> bool:
-    """Whether something essential is missing."""
+    """Return whether something essential is missing."""
     return any(finding.essential and not finding.ok for finding in findings)

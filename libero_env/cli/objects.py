@@ -67,19 +67,23 @@ def run_add(args: argparse.Namespace) -> None:
     names = ("name", "size", "mass", "density", "up", "collision", "faces", "container", "replace", "out")
     added = add_object(args.file, **{name: getattr(args, name) for name in names})
     print(f"{added.name}: {added.folder}")
-    print("\n".join(describe(added.facts)))
+    print("\n".join(describe(added.properties)))
     for note in added.notes:
         print(f"note: {note}")
     if args.out and args.out.absolute() != objects_dir().absolute():
         print(f"tasks find it with LIBERO_OBJECTS={args.out}")
 
 
-def describe(facts: Mapping[str, Any]) -> list[str]:
+def describe(properties: Mapping[str, Any]) -> list[str]:
     """Lines about an object, from its `object.yaml`."""
-    size, grasp, collision = facts.get("size", ()), facts.get("grasp") or {}, facts.get("collision") or {}
+    size, grasp, collision = (
+        properties.get("size", ()),
+        properties.get("grasp") or {},
+        properties.get("collision") or {},
+    )
     lines = [f"  size      {' x '.join(f'{100 * side:.1f}' for side in size)} cm"] if size else []
-    if "mass" in facts:
-        lines.append(f"  mass      {1000 * facts['mass']:.0f} g")
+    if "mass" in properties:
+        lines.append(f"  mass      {1000 * properties['mass']:.0f} g")
     if collision:
         lines.append(f"  collision {collision['pieces']} shapes, by {collision['method']}")
     if grasp.get("width") is not None:
@@ -88,8 +92,8 @@ def describe(facts: Mapping[str, Any]) -> list[str]:
         )
     elif grasp:
         lines.append(f"  hold      none: {grasp['reason']}")
-    if "stands" in facts:
-        lines.append(f"  stands    {'yes' if facts['stands'] else 'no, it falls over or slides'}")
+    if "stands" in properties:
+        lines.append(f"  stands    {'yes' if properties['stands'] else 'no, it falls over or slides'}")
     return lines
 
 
@@ -114,7 +118,7 @@ def run_show(args: argparse.Namespace) -> None:
         item, place = get_object(name), folder.find(name)
         print(f"{name}: {place or 'builtin'}")
         height = item.top_offset[2] - item.bottom_offset[2]
-        lines = describe(folder.read_facts(place)) if place else [f"  height    {100 * height:.1f} cm"]
+        lines = describe(folder.read_properties(place)) if place else [f"  height    {100 * height:.1f} cm"]
         print("\n".join([*lines, f"  radius    {100 * item.horizontal_radius:.1f} cm"]))
         print(f"  places    {', '.join(places_of(name)) or 'none'}")
 

@@ -92,10 +92,10 @@ def _states(text: str) -> int:
 
 
 def find_tasks(names: Sequence[str]) -> list["Task"]:
-    """The tasks that are meant, each once: suites, tasks of suites, and task files.
+    """Return the tasks that are meant, each once: suites, tasks of suites, and task files.
 
     Raises:
-        LiberoError: no such suite, task or file, or a file that is no task.
+        LiberoError: No such suite, task or file, or a file that is no task.
     """
     from libero_env.tasks import get_suite, get_task, suite_names
     from libero_env.tasks.files import read_yaml_tasks
@@ -156,7 +156,7 @@ def run_lint(args: argparse.Namespace) -> int:
 
 
 def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
-    """The findings of each task."""
+    """Yield the findings of each task."""
     from libero_env.assets.pack import select_pack
     from libero_env.design.lint.checks import lint_file, lint_task, lint_text
 
@@ -183,7 +183,7 @@ def run_tasks_list(args: argparse.Namespace) -> None:
 
 
 def run_tasks_show(args: argparse.Namespace) -> None:
-    """The task file, as generated."""
+    """Return the task file, as generated."""
     from libero_env.tasks import get_task
 
     print(get_task(args.task).bddl_text, end="")

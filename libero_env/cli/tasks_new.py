@@ -54,7 +54,7 @@ def run_new(args: argparse.Namespace) -> None:
     """Write the file and say how to go on.
 
     Raises:
-        LiberoError: a name that does not exist, or the file is there.
+        LiberoError: A name that does not exist, or the file is there.
     """
     from libero_env.design.template import task_template
     from libero_env.errors import LiberoError

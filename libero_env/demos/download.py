@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
 from libero_env.assets.http import TIMEOUT, fetch
-from libero_env.assets.hub import DownloadError, Remote, check_room
+from libero_env.assets.hub import DownloadError, Remote, check_free_space
 from libero_env.paths import demos_dir
 from libero_env.tasks import get_suite, get_task
 
@@ -76,10 +76,10 @@ def download_demos(
             "with --dest, or replace it with --overwrite"
         )
     downloaded = sum(_partial_size(folder / file) for file in missing)
-    check_room(folder, sum(remote[file].size for file in missing) - downloaded)
+    check_free_space(folder, sum(remote[file].size for file in missing) - downloaded)
     for file in missing:
         url = f"{_endpoint()}/datasets/{REPO}/resolve/{quote(revision, safe='')}/{quote(file)}"
-        fetch(url, folder / file, size=remote[file].size, is_right=remote[file].matches, progress=progress)
+        fetch(url, folder / file, size=remote[file].size, is_valid=remote[file].matches, progress=progress)
     return [folder / file for file in files]
 
 

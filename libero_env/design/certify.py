@@ -40,11 +40,11 @@ class Outcome:
     """One attempt.
 
     Attributes:
-        state: number of the start.
-        success: whether the goal was reached.
-        steps: control steps until then, or until the expert was stopped.
-        retries: how often it had to start over.
-        reason: why it did not succeed, or "".
+        state: Number of the start.
+        success: Whether the goal was reached.
+        steps: Control steps until then, or until the expert was stopped.
+        retries: How often it had to start over.
+        reason: Why it did not succeed, or "".
     """
 
     state: int
@@ -108,14 +108,14 @@ def certify(
     """Let the expert try the first starts of each task.
 
     Args:
-        tasks: with stored starts, or read from a file (starts are then drawn, number i from seed i).
-        states: number of starts, at most the 50 that are stored.
-        jobs: processes; the outcomes do not depend on it. 1 stays in this one, with the objects registered in it.
-        out: folder with a JSON file for each task; what is there for the same scene and expert is not run again.
-        assets: where the models come from, as for `select_pack`.
-        disturb: disturb the actions as demonstrations do.
-        again: run what is there too.
-        progress: show a bar; None where stderr is a terminal.
+        tasks: With stored starts, or read from a file (starts are then drawn, number i from seed i).
+        states: Number of starts, at most the 50 that are stored.
+        jobs: Processes; the outcomes do not depend on it. 1 stays in this one, with the objects registered in it.
+        out: Folder with a JSON file for each task; what is there for the same scene and expert is not run again.
+        assets: Where the models come from, as for `select_pack`.
+        disturb: Disturb the actions as demonstrations do.
+        again: Run what is there too.
+        progress: Show a bar; None where stderr is a terminal.
 
     Returns:
         One certificate for each task, in order. A task that cannot be built, or whose goal the expert has no skill
@@ -142,7 +142,7 @@ def certify(
 def results(
     certificates: Sequence[Certificate], *, assets: str | Path | None = None, disturb: bool = False
 ) -> dict:
-    """All figures of a run with what they depend on, for `results.json`."""
+    """Return all figures of a run with what they depend on, for `results.json`."""
     return {
         "mujoco": mujoco.__version__,
         "generator": GENERATOR,
@@ -155,7 +155,7 @@ def results(
 
 
 def markdown_table(certificates: Sequence[Certificate]) -> str:
-    """A table: success, lengths, retries and the commonest reasons of failure of each task."""
+    """Return a table: success, lengths, retries and the commonest reasons of failure of each task."""
     lines = [
         "| task | success | steps, median (max) | retries | failures |",
         "| --- | ---: | ---: | ---: | --- |",
@@ -245,7 +245,7 @@ def _path(folder: Path, task: Task, disturb: bool) -> Path:
 
 
 def _stored(path: Path, empty: Certificate) -> Certificate:
-    """The certificate on disk if it is of the same scene and expert."""
+    """Return the certificate on disk if it is of the same scene and expert."""
     if not path.is_file():
         return empty
     try:

@@ -36,10 +36,10 @@ def write_results(
 
 
 def draw(certificates: Sequence[Certificate], path: Path, title: str) -> None:
-    """A picture of a suite: a row for each task, a column for each start, coloured by length; failures red.
+    """Return a picture of a suite: a row for each task, a column for each start, coloured by length; failures red.
 
     Raises:
-        ModuleNotFoundError: matplotlib is not installed.
+        ModuleNotFoundError: Matplotlib is not installed.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LinearSegmentedColormap

@@ -22,13 +22,13 @@ _BAND = 14  # pixels of writing over a picture
 def contact_sheet(
     task: Task, path: Path, *, starts: int = 3, cameras: Sequence[str] = CAMERAS, size: int = 256
 ) -> Path:
-    """A PNG of the first starts of a task, a row for each, a column for each camera.
+    """Return a PNG of the first starts of a task, a row for each, a column for each camera.
 
     A task of a suite shows its stored starts, one of a file those of the seeds 0, 1, ...
 
     Raises:
-        PlacementError: there is no room for what the task places.
-        UnknownNameError: there is no such camera.
+        PlacementError: There is no room for what the task places.
+        UnknownNameError: There is no such camera.
     """
     env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
     try:
@@ -52,13 +52,13 @@ def contact_sheet(
 def expert_video(
     task: Task, path: Path, *, start: int = 0, camera: str = "agentview", size: int = 256
 ) -> tuple[bool, str]:
-    """A video (.webp, .gif or .mp4) of the expert at a task.
+    """Return a video (.webp, .gif or .mp4) of the expert at a task.
 
     Returns:
         Whether it reached the goal, and why not.
 
     Raises:
-        UnsupportedGoalError: the goal needs a skill that the expert does not have.
+        UnsupportedGoalError: The goal needs a skill that the expert does not have.
     """
     env = LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS)
     try:

@@ -25,17 +25,17 @@ def task_template(
     goal: Sequence[str] = (),
     language: str | None = None,
 ) -> tuple[str, Task]:
-    """A task file, and the task that it is.
+    """Return a task file, and the task that it is.
 
     Args:
-        scene: of the benchmark, or an empty one.
-        objects: categories; by default, in an empty scene, a bowl and a plate. A plate comes to one that is alone.
-        furniture: categories.
-        goal: atoms; by default the first object on, or in, the last.
-        language: the instruction; by default that of the goal.
+        scene: Of the benchmark, or an empty one.
+        objects: Categories; by default, in an empty scene, a bowl and a plate. A plate comes to one that is alone.
+        furniture: Categories.
+        goal: Atoms; by default the first object on, or in, the last.
+        language: The instruction; by default that of the goal.
 
     Raises:
-        LiberoError: a name that does not exist, or no room for so many.
+        LiberoError: A name that does not exist, or no room for so many.
     """
     objects = list(objects)
     if scene in EMPTY and len(objects) < 2 and not goal:
@@ -62,7 +62,7 @@ def _usual_goal(names: Mapping[str, str]) -> list[str]:
 
 
 def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
-    """An instruction, where goals are as plain as those of `_usual_goal`."""
+    """Return an instruction, where goals are as plain as those of `_usual_goal`."""
     said = []
     for atom in goal:
         predicate, *args = atom.strip("()").split()
@@ -84,7 +84,7 @@ def _numbered(categories: Iterable[str]) -> dict[str, str]:
 
 
 def _taken(scene: str) -> list[tuple[float, float]]:
-    """Where things stand in a scene of the benchmark already."""
+    """Return where things stand in a scene of the benchmark already."""
     if scene not in scene_names():
         return []
     regions = [facts for target in load_scene(scene).get("regions", {}).values() for facts in _values(target)]
@@ -96,7 +96,7 @@ def _values(regions: object) -> list[dict]:
 
 
 def _given(names: Iterable[str], slots: Sequence[tuple], taken: list[tuple[float, float]], kind: str):
-    """Each name with the first slot that is free; slots are taken as they are given."""
+    """Yield each name with the first slot that is free; slots are taken as they are given."""
     for name in names:
         free = [slot for slot in slots if all(hypot(slot[0] - x, slot[1] - y) >= _APART for x, y in taken)]
         if not free:

@@ -1,6 +1,6 @@
-"""Catalog of objects: a category name gives a MuJoCo model with the figures that placement needs.
+"""Catalog of objects: a category name gives a MuJoCo model with the parameters that placement needs.
 
-The builtin pack is generated in code; users add their own with `register_object`, or with `add_object` and
+The builtin pack is generated in code; users define more with `register_object`, or with `add_object` and
 `register_object_file` of `libero_env.design.objects`.
 """
 

@@ -1,4 +1,4 @@
-"""Category name -> object model: of the builtin pack, of what users registered, of their folder of objects."""
+"""Lookup of object models by category: builtin, registered in this process, or in the user's folder of objects."""
 
 from collections.abc import Callable
 
@@ -13,11 +13,17 @@ _registered: dict[str, Builder] = {}
 
 
 def get_object(category: str) -> ObjectModel:
-    """Builds the model of a category, anew at each call: the caller may change its spec.
+    """Build a new model of a category at each call: the caller may change its spec.
+
+    Args:
+        category: Name in task files, such as `alphabet_soup`; `object_names()` lists them.
+
+    Returns:
+        The model, ready to be attached to a scene.
 
     Raises:
-        UnknownNameError: no object has this name; the message lists the valid ones.
-        LiberoError: a registered builder returned something that a scene cannot attach, or a file in the user's
+        UnknownNameError: The category does not exist; the message lists the valid ones.
+        LiberoError: A registered builder returned something that a scene cannot attach, or a file in the user's
             folder is missing or broken.
     """
     builder = _registered.get(category) or BUILDERS.get(category)
@@ -32,28 +38,36 @@ def get_object(category: str) -> ObjectModel:
 
 
 def object_names() -> tuple[str, ...]:
-    """All categories that `get_object` knows, sorted."""
-    return tuple(sorted({*BUILDERS, *own_names()}))
+    """Return all categories that `get_object` accepts, sorted."""
+    return tuple(sorted({*BUILDERS, *user_defined_names()}))
 
 
-def own_names() -> frozenset[str]:
-    """The categories that users added: registered in this process, or kept in their folder of objects."""
+def user_defined_names() -> frozenset[str]:
+    """Return the user-defined categories: registered in this process, or in the user's folder of objects."""
     return frozenset({*_registered, *folder.names()})
 
 
 def register_object(category: str, builder: Builder) -> None:
-    """Adds a category, or replaces one of the builtin pack, for this process.
+    """Add a category of objects for this process, or replace one of the builtin pack.
 
     Args:
-        category: name to be used in task files: letters, digits and underscores.
-        builder: called at each `get_object`; returns a model with a fresh spec.
+        category: Name for task files: letters, digits and underscores.
+        builder: Function that `get_object` calls each time; it returns a model with a new spec.
 
     Raises:
-        LiberoError: the name cannot stand in a task file.
+        LiberoError: The name cannot be used in a task file.
+
+    Example:
+        >>> def red_cube() -> ObjectModel:
+        ...     spec = mujoco.MjSpec()
+        ...     body = spec.worldbody.add_body(name="main")
+        ...     body.add_geom(name="g0", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=0.05, group=0)
+        ...     return ObjectModel("red_cube", spec, bottom_offset=(0, 0, -0.02), top_offset=(0, 0, 0.02))
+        >>> register_object("red_cube", red_cube)
     """
     if not category.isidentifier():
         raise LiberoError(
-            f"register_object: {category!r} is no valid category; use letters, digits and underscores"
+            f"register_object: {category!r} is not a valid category; use letters, digits and underscores"
         )
     _registered[category] = builder
 
@@ -67,5 +81,5 @@ def _check(category: str, model: ObjectModel) -> None:
     if names != [ROOT_BODY]:
         raise LiberoError(
             f"object {category!r}: the world body of its spec has the children {names}, expected exactly "
-            f"one, named {ROOT_BODY!r}; name its root body so and move everything else below it"
+            f"one, named {ROOT_BODY!r}; rename its root body and move everything else below it"
         )

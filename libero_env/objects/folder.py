@@ -1,6 +1,6 @@
-"""The user's own objects on disk: a folder each, with an MJCF file, its meshes and pictures, and `object.yaml`.
+"""User-defined objects on disk: a folder each, with an MJCF file, its meshes and textures, and `object.yaml`.
 
-Nothing is read before a scene asks for a name, and files may be edited by hand: they are what counts.
+Files are read when a scene requests the object, so that they may be edited by hand.
 """
 
 import hashlib
@@ -16,92 +16,92 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.paths import objects_dir
 
-MODEL, FACTS, PREVIEW = "object.xml", "object.yaml", "preview.png"
-_FIGURES = ("bottom_offset", "top_offset", "horizontal_radius")
-_MAY_SAY = ("joint_damping", "rotation", "rotation_axis", "articulation")
+MODEL, PROPERTIES, PREVIEW = "object.xml", "object.yaml", "preview.png"
+_REQUIRED = ("bottom_offset", "top_offset", "horizontal_radius")
+_OPTIONAL = ("joint_damping", "rotation", "rotation_axis", "articulation")
 
 
 def names() -> tuple[str, ...]:
-    """The user's objects, sorted; none where there is no folder."""
+    """Return the names of the user-defined objects, sorted; empty where the folder does not exist."""
     root = objects_dir()
-    return tuple(sorted(path.parent.name for path in root.glob(f"*/{FACTS}"))) if root.is_dir() else ()
+    return tuple(sorted(path.parent.name for path in root.glob(f"*/{PROPERTIES}"))) if root.is_dir() else ()
 
 
 def find(name: str) -> Path | None:
-    """The folder of one of the user's objects; None where there is none of this name."""
+    """Return the folder of a user-defined object; None where it does not exist."""
     place = objects_dir() / name
-    return place if name.isidentifier() and (place / FACTS).is_file() else None
+    return place if name.isidentifier() and (place / PROPERTIES).is_file() else None
 
 
 def folder_of(name: str) -> Path:
-    """As `find`.
+    """Return the folder of a user-defined object.
 
     Raises:
-        UnknownNameError: none of the user's objects has this name; the message lists them.
+        UnknownNameError: The object does not exist; the message lists the existing ones.
     """
     place = find(name)
     if place is None:
-        raise UnknownNameError(f"object of your own in {objects_dir()}", name, names())
+        raise UnknownNameError(f"user-defined object in {objects_dir()}", name, names())
     return place
 
 
 def remove(name: str) -> Path:
-    """Remove one of the user's objects and say where it was.
+    """Remove a user-defined object and return the folder that it was in.
 
     Raises:
-        UnknownNameError: there is none of this name.
+        UnknownNameError: The object does not exist; the message lists the existing ones.
     """
     place = folder_of(name)
     shutil.rmtree(place)
     return place
 
 
-def read_facts(place: Path) -> dict[str, Any]:
-    """What `object.yaml` says.
+def read_properties(place: Path) -> dict[str, Any]:
+    """Return the content of `object.yaml`.
 
     Raises:
-        LiberoError: it is no YAML, or a figure that scenes need is missing.
+        LiberoError: The file is not valid YAML, or a required key is missing.
     """
-    path = place / FACTS
+    path = place / PROPERTIES
     try:
-        facts = yaml.safe_load(path.read_text(encoding="utf-8"))
+        properties = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
-        raise LiberoError(f"{path}: {error}; mend it, or add the object anew with --replace") from error
-    missing = [key for key in _FIGURES if not isinstance(facts, dict) or key not in facts]
+        raise LiberoError(f"{path}: {error}; fix it, or add the object again with --replace") from error
+    missing = [key for key in _REQUIRED if not isinstance(properties, dict) or key not in properties]
     if missing:
-        raise LiberoError(f"{path} does not say {', '.join(missing)}; add the object anew with --replace")
-    return facts
+        raise LiberoError(f"{path} has no {', '.join(missing)}; add the object again with --replace")
+    return properties
 
 
 def load(place: Path, category: str) -> ObjectModel:
-    """The model of an object's folder, anew at each call.
+    """Return a new model of the object in a folder at each call.
 
     Raises:
-        LiberoError: a file is missing or broken.
+        LiberoError: A file is missing or broken.
     """
-    facts = read_facts(place)
+    properties = read_properties(place)
     spec = read_spec(place / MODEL)
     bodies = [body.name for body in spec.worldbody.bodies]
     if bodies != [ROOT_BODY]:
         raise LiberoError(f"{place / MODEL}: expected one body {ROOT_BODY!r} in the world, found {bodies}")
-    figures: dict[str, Any] = {key: facts[key] for key in _MAY_SAY if key in facts}
-    bottom, top = (tuple(map(float, facts[key])) for key in ("bottom_offset", "top_offset"))
+    optional: dict[str, Any] = {key: properties[key] for key in _OPTIONAL if key in properties}
+    bottom, top = (tuple(map(float, properties[key])) for key in ("bottom_offset", "top_offset"))
     return ObjectModel(
         category,
         spec,
         bottom_offset=(bottom[0], bottom[1], bottom[2]),
         top_offset=(top[0], top[1], top[2]),
-        horizontal_radius=float(facts["horizontal_radius"]),
+        horizontal_radius=float(properties["horizontal_radius"]),
         digest=digest(place),
-        **figures,
+        **optional,
     )
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
-    """An MJCF file with the files that it names by their whole paths, so that it can be attached to any scene.
+    """Return an MJCF file with absolute paths of its meshes and textures, so that any scene can attach it.
 
     Raises:
-        LiberoError: it cannot be read, or a mesh or picture is missing.
+        LiberoError: The file cannot be read, or a mesh or texture is missing.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -114,7 +114,7 @@ def read_spec(path: Path) -> mujoco.MjSpec:
                 file = path.parent.absolute() / folders[kind] / element.file
                 if not file.is_file():
                     raise LiberoError(
-                        f"{path}: {kind} {file} is missing; put it there, or mend the file's path"
+                        f"{path}: {kind} {file} is missing; put it there, or fix the path in the file"
                     )
                 element.file = str(file)
     spec.meshdir = spec.texturedir = ""
@@ -122,15 +122,15 @@ def read_spec(path: Path) -> mujoco.MjSpec:
 
 
 def digest(place: Path) -> str:
-    """Of the files that a scene is built from; 16 hex digits."""
+    """Return a digest of the files that a scene is built from, 16 hexadecimal digits."""
     hashed = hashlib.sha256()
     for path in sorted(place.iterdir()):
-        if path.is_file() and path.name not in (PREVIEW, FACTS):
+        if path.is_file() and path.name not in (PREVIEW, PROPERTIES):
             hashed.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return hashed.hexdigest()[:16]
 
 
-def write_facts(place: Path, facts: Mapping[str, Any]) -> None:
+def write_properties(place: Path, properties: Mapping[str, Any]) -> None:
     """Write `object.yaml`."""
-    text = yaml.safe_dump(dict(facts), sort_keys=False, allow_unicode=True, width=110)
-    (place / FACTS).write_text(text, encoding="utf-8")
+    text = yaml.safe_dump(dict(properties), sort_keys=False, allow_unicode=True, width=110)
+    (place / PROPERTIES).write_text(text, encoding="utf-8")

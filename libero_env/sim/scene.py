@@ -17,8 +17,7 @@ from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
-from libero_env.tasks.bddl import Problem
-from libero_env.tasks.problem import Region
+from libero_env.tasks.problem import Problem, Region
 from libero_env.timing import TIMESTEP
 
 ROBOT = "robot"  # what contacts call arm and gripper

@@ -1,4 +1,4 @@
-"""What a task says: suites and tasks of the benchmark from the facts in `data/`, and user-defined task files."""
+"""Tasks: the suites of the benchmark, built from the YAML files in `data/`, and user-defined task files."""
 
 import lazy_loader
 

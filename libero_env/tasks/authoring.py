@@ -1,4 +1,4 @@
-"""Tasks of one's own: a scene and a goal in one YAML file, or in one call.
+"""User-defined tasks: a scene and a goal in one YAML file, or in one call.
 
     scene: kitchen
     furniture: [wooden_cabinet]
@@ -10,16 +10,16 @@
     goal: On akita_black_bowl_1 plate_1
     language: put the bowl on the plate
 
-The keys are those of `libero_env.tasks.builder`, and these, which are short for what it takes many to say:
+The keys are those of `libero_env.tasks.builder`, and the following short forms:
 
-    scene      a scene of the benchmark (`kitchen_scene1`, with what stands in it), an empty one (`kitchen`,
-               `living_room`, `study`, `coffee`, `table`, `floor`), or the YAML file of one
-    furniture  categories of fixtures, besides those of the scene; numbered as objects are
-    objects    categories, besides those of the scene
-    place      thing: where it is at the start: [x, y] on the workspace in metres (x points away from the robot,
-               y to its left), `{at: [x, y], half: h, yaw: angle}` for any point within h of it, or what it stands on:
-               `plate_1`, `wooden_cabinet_1_top_side`, `In wooden_cabinet_1_top_region`; for a thing of the scene
-               instead of what the scene says
+    scene      a scene of the benchmark with its objects (`kitchen_scene1`), an empty one (`kitchen`,
+               `living_room`, `study`, `coffee`, `table`, `floor`), or the YAML file of a scene
+    furniture  categories of fixtures, in addition to those of the scene; numbered like objects
+    objects    categories of objects, in addition to those of the scene
+    place      object or fixture: its initial place. Either [x, y] on the workspace in metres (x points away from the
+               robot, y to its left), or `{at: [x, y], half: h, yaw: angle}` for any point within h of it, or its
+               support: `plate_1`, `wooden_cabinet_1_top_side`, `In wooden_cabinet_1_top_region`. It replaces the place
+               that the scene gives
     goal       one atom, several, or an expression; an atom is `On a b`, `(On a b)` or, in Python, `("On", "a", "b")`
 
 Places of objects and fixtures, such as `basket_1_contain_region`, need no declaration.
@@ -37,7 +37,14 @@ from libero_env.assets.arena import WORKSPACES, load_workspace
 from libero_env.assets.pack import select_pack
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import ObjectModel
-from libero_env.tasks.builder import KEYS, build_problem, filled, language_from_name, load_scene, scene_names
+from libero_env.tasks.builder import (
+    KEYS,
+    build_problem,
+    fill_parameters,
+    language_from_name,
+    load_scene,
+    scene_names,
+)
 from libero_env.tasks.problem import Problem
 from libero_env.tasks.task import Task
 
@@ -50,58 +57,70 @@ EMPTY: Mapping[str, str] = {
     "floor": "floor",
 }
 SHORT = ("scene", "furniture", "objects", "place", "goal", "name", "with")
-_OWN_KEYS = tuple(dict.fromkeys((*SHORT, *KEYS)))
-_HALF = {"object": 0.025, "fixture": 0.01}  # m, of places that say none, as in the original's scenes
-_PLACING = ("On", "In")  # predicates that say where something stands
-_TABLE = "main_table"  # the original's name of the fixture `table`
-FILE = "file"  # suite of a task that was read alone
+_KEYS = tuple(dict.fromkeys((*SHORT, *KEYS)))
+_HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the original's scenes
+_PLACEMENT_PREDICATES = ("On", "In")  # predicates of init atoms that give an entity its place
+_TABLE = "main_table"  # name of the fixture `table` in the original's task files
+FILE = "file"  # suite of a task that was read from a file on its own
 
-Facts = Mapping[str, Any]
+Definition = Mapping[str, Any]
 
 
-def make_task(name: str | None = None, **facts: Any) -> Task:
-    """A task of your own; `libero_env.tasks.authoring` lists the facts.
-
-        make_task(scene="kitchen", objects=["red_cup", "plate"], place={"red_cup_1": (0, 0), "plate_1": (0.05, 0.2)},
-                  goal=("On", "red_cup_1", "plate_1"), language="put the red cup on the plate")
+def make_task(name: str | None = None, **definition: Any) -> Task:
+    """Return a user-defined task, from the keys that a task's YAML file may contain.
 
     Args:
-        name: of its files; by default the words of the language, joined.
-        facts: what the YAML file would say.
+        name: Name of the task and of its files; by default the words of the language, joined by underscores.
+        definition: Keys such as `scene`, `objects`, `place`, `goal` and `language`, and their values; see
+            `libero_env.tasks.authoring`. Values that are None are ignored.
+
+    Returns:
+        The task; its suite is `file`.
 
     Raises:
-        LiberoError: a key, scene, thing or place that does not exist, or a thing without a place; the message lists
-            the valid ones.
+        LiberoError: A key, scene, object or place does not exist, or an object has no place; the message lists the
+            valid names.
+
+    Example:
+        >>> task = make_task(
+        ...     scene="kitchen",
+        ...     objects=["red_cup", "plate"],
+        ...     place={"red_cup_1": (0, 0), "plate_1": (0.05, 0.2)},
+        ...     goal=("On", "red_cup_1", "plate_1"),
+        ...     language="put the red cup on the plate",
+        ... )
+        >>> task.name
+        'put_the_red_cup_on_the_plate'
     """
-    facts = {key: value for key, value in facts.items() if value is not None}
-    return task_of({**facts, **({"name": name} if name else {})}, "task", Path())
+    definition = {key: value for key, value in definition.items() if value is not None}
+    return task_from_definition({**definition, **({"name": name} if name else {})}, "task", Path())
 
 
-def read_facts(path: Path) -> dict[str, Any]:
-    """What a YAML file says.
+def read_definition(path: Path) -> dict[str, Any]:
+    """Return the content of a task's or scene's YAML file.
 
     Raises:
-        LiberoError: it is missing, no YAML, or has a key that does not exist.
+        LiberoError: The file is missing, not valid YAML, or has a key that does not exist.
     """
     try:
-        facts = yaml.safe_load(path.read_text(encoding="utf-8"))
+        definition = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise LiberoError(f"{path}: {error.strerror or error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise LiberoError(f"{path} is not valid YAML: {error}") from error
-    if not isinstance(facts, dict):
+    if not isinstance(definition, dict):
         raise LiberoError(f"{path}: expected keys such as scene, objects, place and goal")
-    for key in facts:
-        if key not in (*_OWN_KEYS, "tasks"):
-            raise UnknownNameError(f"key of {path}", key, _OWN_KEYS)
-    return facts
+    for key in definition:
+        if key not in (*_KEYS, "tasks"):
+            raise UnknownNameError(f"key of {path}", key, _KEYS)
+    return definition
 
 
 def places_of(category: str) -> tuple[str, ...]:
-    """The places of an object or fixture that atoms can name after it, such as `contain_region`, sorted.
+    """Return the places on an object or fixture that atoms can refer to, such as `contain_region`, sorted.
 
     Raises:
-        UnknownNameError: no object has this name.
+        UnknownNameError: No object has this name.
     """
     return _places(select_pack().build(category))
 
@@ -113,87 +132,102 @@ def _places(item: ObjectModel) -> tuple[str, ...]:
     )
 
 
-def task_of(facts: Facts, where: str, folder: Path) -> Task:
-    """The task that facts amount to; see `make_task`.
+def task_from_definition(definition: Definition, where: str, folder: Path) -> Task:
+    """Return the task of a definition; see `make_task`.
 
     Args:
-        facts: what a YAML file says.
-        where: for messages.
-        folder: that of the file, beside which a scene's file may be.
+        definition: Content of a YAML file.
+        where: Name of the source in error messages.
+        folder: Folder that the path of a scene's file is relative to.
+
+    Raises:
+        LiberoError: The definition is not valid; the message starts with `where` and lists the valid names.
     """
-    for key in facts:
-        if key not in _OWN_KEYS:
-            raise UnknownNameError(f"key of {where}", key, _OWN_KEYS)
-    said = str(facts.get("language") or language_from_name(str(facts.get("name", ""))))
-    name = str(facts.get("name") or re.sub(r"\W+", "_", said.strip().lower()).strip("_"))
-    if not said:
-        raise LiberoError(f"{where}: it has neither a name nor a language; say what is to be done")
-    problem = _problem({**facts, "name": name, "language": said}, where, folder)
-    return Task(FILE, 0, name, said, said, problem)
+    for key in definition:
+        if key not in _KEYS:
+            raise UnknownNameError(f"key of {where}", key, _KEYS)
+    language = str(definition.get("language") or language_from_name(str(definition.get("name", ""))))
+    name = str(definition.get("name") or re.sub(r"\W+", "_", language.strip().lower()).strip("_"))
+    if not language:
+        raise LiberoError(
+            f"{where}: it has neither a name nor a language; add `language:` with the instruction"
+        )
+    problem = _problem({**definition, "name": name, "language": language}, where, folder)
+    return Task(FILE, 0, name, language, language, problem)
 
 
-def _problem(facts: Facts, where: str, folder: Path) -> Problem:
-    """The problem of facts in which the short forms are used."""
-    whole = _written_out(facts, {}, where, folder)
-    if "goal" not in whole:
+def _problem(definition: Definition, where: str, folder: Path) -> Problem:
+    """Return the problem of a definition that may use the short forms."""
+    expanded = _expand(definition, {}, where, folder)
+    if "goal" not in expanded:
         raise LiberoError(f"{where}: it has no goal; add one, such as `goal: On red_cup_1 plate_1`")
-    things = {**whole["fixtures"], **_numbered(whole["objects"], (), where)}
-    placed = {words[1] for words in map(str.split, whole["init"]) if len(words) == 3 and words[0] in _PLACING}
-    missing = [name for name, category in things.items() if name not in placed and category not in WORKSPACES]
+    entities = {**expanded["fixtures"], **_number(expanded["objects"], (), where)}
+    placed = {
+        words[1]
+        for words in map(str.split, expanded["init"])
+        if len(words) == 3 and words[0] in _PLACEMENT_PREDICATES
+    }
+    missing = [
+        name for name, category in entities.items() if name not in placed and category not in WORKSPACES
+    ]
     if missing:
         raise LiberoError(
-            f"{where}: nothing says where {', '.join(missing)} stands; add it below place: `{missing[0]}: [0, 0]`"
+            f"{where}: {', '.join(missing)} has no place; add it below place: `{missing[0]}: [0, 0]`"
         )
-    if "problem" not in whole:
-        whole["problem"] = load_workspace(_workspace(things, where)[1]).problem
-    return build_problem({}, whole)
+    if "problem" not in expanded:
+        expanded["problem"] = load_workspace(_workspace(entities, where)[1]).problem
+    return build_problem({}, expanded)
 
 
-def _written_out(facts: Facts, given: Facts, where: str, folder: Path) -> dict[str, Any]:
-    """Facts of a task or scene, with those of the scene that it names, in the builder's words alone."""
-    given = {**facts.get("with", {}), **given}
-    scene = _scene(facts, given, where, folder)
-    facts = filled(facts, given, where)
-    fixtures = {**scene.get("fixtures", {}), **facts.get("fixtures", {})}
-    fixtures |= _numbered(facts.get("furniture", ()), fixtures.values(), where)
-    objects = _numbered(scene.get("objects", ()), (), where)
-    objects |= _numbered(facts.get("objects", ()), objects.values(), where)
-    things = {**fixtures, **objects}
-    regions, starts = _placed(facts.get("place", {}), fixtures, things, where)
+def _expand(definition: Definition, given: Definition, where: str, folder: Path) -> dict[str, Any]:
+    """Return a definition merged with that of its scene, in the builder's keys only."""
+    given = {**definition.get("with", {}), **given}
+    scene = _scene(definition, given, where, folder)
+    definition = fill_parameters(definition, given, where)
+    fixtures = {**scene.get("fixtures", {}), **definition.get("fixtures", {})}
+    fixtures |= _number(definition.get("furniture", ()), fixtures.values(), where)
+    objects = _number(scene.get("objects", ()), (), where)
+    objects |= _number(definition.get("objects", ()), objects.values(), where)
+    entities = {**fixtures, **objects}
+    regions, starts = _placements(definition.get("place", {}), fixtures, entities, where)
     moved = {atom.split()[1] for atom in starts}
-    rest = map(_atom, facts["init"] if "init" in facts else scene.get("init", ()))
-    init = [*map(_atom, facts.get("init_also", ())), *starts]
-    init += [atom for atom in rest if not _places_one(atom, moved)]
-    goal = _goal(facts.get("goal") or scene.get("goal") or [])
-    declared = _joined(scene.get("regions"), facts.get("regions"))
+    rest = map(_atom, definition["init"] if "init" in definition else scene.get("init", ()))
+    init = [*map(_atom, definition.get("init_also", ())), *starts]
+    init += [atom for atom in rest if not _is_placement(atom, moved)]
+    goal = _goal(definition.get("goal") or scene.get("goal") or [])
+    declared = _merge_regions(scene.get("regions"), definition.get("regions"))
     for target, own in regions.items():
         declared.setdefault(target, {}).update(own)
-    declared = _joined(declared, _undeclared([*init, *goal], declared, things, where))
-    said = {key: scene[key] for key in ("problem",) if key in scene}
-    if not facts.get("goal") and "obj_of_interest" in scene:
-        said["obj_of_interest"] = scene["obj_of_interest"]
-    said |= {key: facts[key] for key in ("name", "language", "problem", "obj_of_interest") if key in facts}
-    said |= {"goal": goal[0] if goal[0].startswith("(") else goal} if goal else {}
-    styles = {**scene.get("scene_properties", {}), **facts.get("scene_properties", {})}
-    whole = {"fixtures": fixtures, "objects": _counts(objects), "regions": declared, "init": init}
-    return {**said, **whole, "scene_properties": styles}
+    declared = _merge_regions(declared, _undeclared([*init, *goal], declared, entities, where))
+    other = {key: scene[key] for key in ("problem",) if key in scene}
+    if not definition.get("goal") and "obj_of_interest" in scene:
+        other["obj_of_interest"] = scene["obj_of_interest"]
+    other |= {
+        key: definition[key]
+        for key in ("name", "language", "problem", "obj_of_interest")
+        if key in definition
+    }
+    other |= {"goal": goal[0] if goal[0].startswith("(") else goal} if goal else {}
+    styles = {**scene.get("scene_properties", {}), **definition.get("scene_properties", {})}
+    expanded = {"fixtures": fixtures, "objects": _counts(objects), "regions": declared, "init": init}
+    return {**other, **expanded, "scene_properties": styles}
 
 
-def _places_one(atom: str, names: set[str]) -> bool:
-    """Whether an atom says where one of these things stands."""
+def _is_placement(atom: str, names: set[str]) -> bool:
+    """Return whether an atom gives one of the named entities its place."""
     words = atom.split()
-    return len(words) == 3 and words[0] in _PLACING and words[1] in names
+    return len(words) == 3 and words[0] in _PLACEMENT_PREDICATES and words[1] in names
 
 
-def _scene(facts: Facts, given: Facts, where: str, folder: Path) -> dict[str, Any]:
-    """The facts of the scene that is named: of the benchmark, an empty one, or in a file beside this one."""
-    scene, valid = facts.get("scene"), (*EMPTY, *scene_names())
+def _scene(definition: Definition, given: Definition, where: str, folder: Path) -> dict[str, Any]:
+    """Return the definition of the scene: one of the benchmark, an empty one, or that of a file in `folder`."""
+    scene, valid = definition.get("scene"), (*EMPTY, *scene_names())
     if scene is None:
-        if any(category in WORKSPACES for category in facts.get("fixtures", {}).values()):
+        if any(category in WORKSPACES for category in definition.get("fixtures", {}).values()):
             return {}
-        raise LiberoError(f"{where}: it says no scene; add one of {', '.join(valid)}")
+        raise LiberoError(f"{where}: it has no scene; add one of {', '.join(valid)}")
     if isinstance(scene, Mapping):
-        return _written_out(scene, given, where, folder)
+        return _expand(scene, given, where, folder)
     scene = str(scene)
     if scene in EMPTY or scene in EMPTY.values():
         category = EMPTY.get(scene, scene)
@@ -202,17 +236,17 @@ def _scene(facts: Facts, given: Facts, where: str, folder: Path) -> dict[str, An
         path = folder / scene
         if not path.is_file():
             raise LiberoError(f"{where}: its scene {path} is missing")
-        return _written_out(read_facts(path), given, str(path), path.parent)
+        return _expand(read_definition(path), given, str(path), path.parent)
     if scene not in valid:
         raise UnknownNameError(f"scene of {where}", scene, valid)
-    return filled(load_scene(scene), given, where)
+    return fill_parameters(load_scene(scene), given, where)
 
 
-def _numbered(entries: Any, there: Iterable[str], where: str) -> dict[str, str]:
-    """Name -> category of entries such as `plate` or `{plate: 2}`, counted on from those that are there."""
+def _number(entries: Any, existing: Iterable[str], where: str) -> dict[str, str]:
+    """Return name -> category of entries such as `plate` or `{plate: 2}`, numbered after those that exist already."""
     if isinstance(entries, str | Mapping):
         entries = [entries]
-    count, named = Counter(there), {}
+    count, named = Counter(existing), {}
     known = {*select_pack().categories(), *WORKSPACES}
     for entry in entries:
         for category, number in entry.items() if isinstance(entry, Mapping) else [(entry, 1)]:
@@ -225,63 +259,65 @@ def _numbered(entries: Any, there: Iterable[str], where: str) -> dict[str, str]:
 
 
 def _counts(objects: Mapping[str, str]) -> list[dict[str, int]]:
-    """Objects as the builder takes them; those of one category come together."""
+    """Return the objects as the builder expects them, those of one category together."""
     return [{category: number} for category, number in Counter(objects.values()).items()]
 
 
-def _placed(
-    places: Facts, fixtures: Mapping[str, str], things: Mapping[str, str], where: str
+def _placements(
+    places: Definition, fixtures: Mapping[str, str], entities: Mapping[str, str], where: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Regions and init atoms of what `place` says."""
+    """Return the regions and the init atoms of the key `place`."""
     workspace = _workspace(fixtures, where)[0]
     regions: dict[str, Any] = {}
     atoms = []
-    for thing, place in places.items():
-        if thing not in things:
-            thing = f"{thing}_1" if f"{thing}_1" in things else thing
-        if thing not in things or thing == workspace:
-            raise UnknownNameError(f"thing to place of {where}", thing, set(things) - {workspace})
+    for entity, place in places.items():
+        if entity not in entities:
+            entity = f"{entity}_1" if f"{entity}_1" in entities else entity
+        if entity not in entities or entity == workspace:
+            raise UnknownNameError(
+                f"object or fixture to place of {where}", entity, set(entities) - {workspace}
+            )
         if isinstance(place, str):
             predicate, _, rest = place.strip("() ").rpartition(" ")
-            atoms.append(f"{predicate or 'On'} {thing} {rest}")
+            atoms.append(f"{predicate or 'On'} {entity} {rest}")
             continue
-        regions[f"{thing}_start"] = _rectangle(
-            place, "fixture" if thing in fixtures else "object", thing, where
+        regions[f"{entity}_start"] = _rectangle(
+            place, "fixture" if entity in fixtures else "object", entity, where
         )
-        atoms.append(f"On {thing} {workspace}_{thing}_start")
+        atoms.append(f"On {entity} {workspace}_{entity}_start")
     return {workspace: regions} if regions else {}, atoms
 
 
 def _workspace(fixtures: Mapping[str, str], where: str) -> tuple[str, str]:
-    """Name and category of the fixture that is the workspace."""
+    """Return the name and category of the fixture that is the workspace."""
     for name, category in fixtures.items():
         if category in WORKSPACES:
             return name, category
-    raise LiberoError(f"{where}: none of its fixtures is a workspace; name a scene: {', '.join(EMPTY)}")
+    raise LiberoError(f"{where}: none of its fixtures is a workspace; add a scene: {', '.join(EMPTY)}")
 
 
-def _rectangle(place: Any, kind: str, thing: str, where: str) -> dict[str, Any]:
-    """The facts of a region: [x, y], or `at`, `half` and `yaw`."""
-    facts = dict(place) if isinstance(place, Mapping) else {"at": place}
-    if "ranges" in facts:
-        return facts
-    at, half = facts.pop("at", None), facts.pop("half", _HALF[kind])
+def _rectangle(place: Any, kind: str, entity: str, where: str) -> dict[str, Any]:
+    """Return the region of a place: [x, y], or `at`, `half` and `yaw`."""
+    region = dict(place) if isinstance(place, Mapping) else {"at": place}
+    if "ranges" in region:
+        return region
+    at, half = region.pop("at", None), region.pop("half", _HALF_EXTENT[kind])
     half = half if isinstance(half, list | tuple) else (half, half)
     if not isinstance(at, list | tuple) or len(at) != 2 or len(half) != 2:
         raise LiberoError(
-            f"{where}: the place of {thing} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}"
+            f"{where}: the place of {entity} is {place!r}; expected [x, y] or {{at: [x, y], half: h}}"
         )
-    facts["ranges"] = [[round(float(at[k % 2]) + (-1, 1)[k // 2] * float(half[k % 2]), 6) for k in range(4)]]
-    return facts
+    region["ranges"] = [[round(float(at[k % 2]) + (-1, 1)[k // 2] * float(half[k % 2]), 6) for k in range(4)]]
+    return region
 
 
 def _atom(atom: Any) -> str:
-    """`On a b` of `On a b`, `(On a b)` or `("On", "a", "b")`."""
+    """Return `On a b` for `On a b`, `(On a b)` or `("On", "a", "b")`."""
     return atom.strip().removeprefix("(").removesuffix(")") if isinstance(atom, str) else " ".join(atom)
 
 
 def _goal(goal: Any) -> list[str]:
-    """Atoms, or one expression in brackets."""
+    """Return the atoms of a goal, or its one expression in brackets."""
     if isinstance(goal, str):
         nested = goal.count("(") > 1 or re.match(r"\(\s*(and|or|not|forall)\b", goal.strip(), re.IGNORECASE)
         return [goal.strip()] if nested else [_atom(goal)]
@@ -290,35 +326,35 @@ def _goal(goal: Any) -> list[str]:
     return [_atom(atom) for atom in goal]
 
 
-def _joined(*several: Mapping[str, Any] | None) -> dict[str, dict[str, Any]]:
-    """The regions of several sources by target; a later one changes facts of an earlier one of its name."""
-    joined: dict[str, dict[str, Any]] = {}
-    for regions in several:
+def _merge_regions(*sources: Mapping[str, Any] | None) -> dict[str, dict[str, Any]]:
+    """Return the regions of several sources by target; later ones override keys of earlier ones of the same name."""
+    merged: dict[str, dict[str, Any]] = {}
+    for regions in sources:
         for target, named in (regions or {}).items():
-            there = joined.setdefault(target, {})
-            for name, facts in (named if isinstance(named, Mapping) else dict.fromkeys(named, {})).items():
-                there[name] = {**(there.get(name) or {}), **facts} if isinstance(facts, Mapping) else facts
-    return joined
+            known = merged.setdefault(target, {})
+            for name, region in (named if isinstance(named, Mapping) else dict.fromkeys(named, {})).items():
+                known[name] = {**(known.get(name) or {}), **region} if isinstance(region, Mapping) else region
+    return merged
 
 
 def _undeclared(
-    atoms: Iterable[str], declared: Mapping[str, Facts], things: Mapping[str, str], where: str
+    atoms: Iterable[str], declared: Mapping[str, Definition], entities: Mapping[str, str], where: str
 ) -> dict[str, dict[str, Any]]:
-    """The places of models that atoms speak of and nothing declares.
+    """Return the places on models that atoms refer to and no region declares.
 
     Raises:
-        LiberoError: a name that is none, with the places that there are.
+        UnknownNameError: A place does not exist; the message lists the valid ones.
     """
-    known = {*things, *(f"{target}_{name}" for target, facts in declared.items() for name in facts)}
+    known = {*entities, *(f"{target}_{name}" for target, names in declared.items() for name in names)}
     found: dict[str, dict[str, Any]] = {}
     for atom in atoms:
         words = re.findall(r"[\w?]+", atom)
         for name in words if atom.startswith("(") else words[1:]:
-            target = max((t for t in things if name.startswith(f"{t}_")), key=len, default=None)
-            if name in known or target is None or things[target] in WORKSPACES:
+            target = max((t for t in entities if name.startswith(f"{t}_")), key=len, default=None)
+            if name in known or target is None or entities[target] in WORKSPACES:
                 continue
             site = name.removeprefix(f"{target}_")
-            if site not in (places := places_of(things[target])):
+            if site not in (places := places_of(entities[target])):
                 raise UnknownNameError(f"place of {target} ({where}: {atom})", site, places or ("none",))
             found.setdefault(target, {})[site] = {}
     return found

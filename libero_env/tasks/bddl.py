@@ -1,8 +1,8 @@
-"""Task files: BDDL text <-> frozen `Problem`.
+"""Reading and writing of task files: BDDL text <-> frozen `Problem`.
 
 The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:language ...) (:regions ...)
 (:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with
-`;` comments. `:requirements` is read and dropped. Goals may nest and, or, not and forall. Numbers may be
+`;` comments. `:requirements` is ignored. Goals may nest and, or, not and forall. Numbers may be
 arithmetic with `pi`; nothing in a file is ever executed.
 """
 
@@ -21,28 +21,8 @@ from libero_env.tasks.problem import (
     Or,
     Problem,
     Region,
-    differences,
-    same_meaning,
 )
 from libero_env.tasks.sexpr import List, Word, fail, number, parse_tree, show
-
-__all__ = [
-    "And",
-    "Atom",
-    "Expression",
-    "ForAll",
-    "Not",
-    "Or",
-    "Problem",
-    "Region",
-    "differences",
-    "parse",
-    "parse_atom",
-    "parse_expression",
-    "read",
-    "same_meaning",
-    "write",
-]
 
 SECTIONS = (
     ":domain",
@@ -61,17 +41,21 @@ _PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
 
 def parse(text: str, file: str = "<string>") -> Problem:
-    """Read a task from BDDL text; `file` is only for messages.
+    """Return the problem of a BDDL text.
+
+    Args:
+        text: Content of a task file.
+        file: Name of the file for error messages.
 
     Raises:
-        BDDLError: "file:line: what; expected ..." for anything that is not the dialect, a name declared
-            twice, or an atom about a name that the file does not declare.
+        BDDLError: The text is not of the dialect, declares a name twice, or has an atom with a name that it does not
+            declare. The message is "file:line: what; expected ...".
     """
     return _Reader(file).problem(text)
 
 
 def read(path: str | Path) -> Problem:
-    """Read a task file; see `parse`."""
+    """Return the problem of a task file; see `parse`."""
     content = Path(path).read_bytes()
     try:
         return parse(content.decode("utf-8-sig"), str(path))
@@ -81,19 +65,21 @@ def read(path: str | Path) -> Problem:
 
 
 def parse_expression(text: str, known: Collection[str], file: str = "<string>") -> Expression:
-    """Read one atom or goal, such as `On plate_1 stove_1` or `(Or (Open a) (Not (On b c)))`.
+    """Return the expression of an atom or goal, such as `On plate_1 stove_1` or `(Or (Open a) (Not (On b c)))`.
 
     Args:
-        known: the names it may speak of.
+        text: Text of the expression; the brackets of a single atom may be omitted.
+        known: Names that it may refer to.
+        file: Name of the source for error messages.
 
     Raises:
-        BDDLError: as in `parse`.
+        BDDLError: As in `parse`.
     """
     return _Reader(file).expression(_one_list(text, file), set(known))
 
 
 def parse_atom(text: str, known: Collection[str], file: str = "<string>") -> Atom:
-    """Read one atom, such as `On plate_1 stove_1`; see `parse_expression`."""
+    """Return the atom of a text such as `On plate_1 stove_1`; see `parse_expression`."""
     return _Reader(file).atom(_one_list(text, file), set(known))
 
 
@@ -102,7 +88,7 @@ def _one_list(text: str, file: str) -> List:
 
 
 def write(problem: Problem) -> str:
-    """The problem as BDDL text; `parse(write(problem)) == problem`, in the original's layout."""
+    """Return a problem as BDDL text in the original's layout; `parse(write(problem)) == problem`."""
     sections = [
         f"  (:domain {problem.domain})",
         f"  (:language {problem.language})",
@@ -160,7 +146,7 @@ def _expression_text(node: Expression) -> str:
 
 
 class _Reader:
-    """One file on its way to a `Problem`; holds the file name for messages."""
+    """Conversion of one file into a `Problem`; it holds the name of the file for error messages."""
 
     def __init__(self, file: str):
         self.file = file
@@ -221,7 +207,7 @@ class _Reader:
         return node.text
 
     def names(self, section: List) -> dict[str, str]:
-        """`a_1 a_2 - a  b_1 - b` -> {a_1: a, a_2: a, b_1: b}."""
+        """Return {a_1: a, a_2: a, b_1: b} for `a_1 a_2 - a  b_1 - b`."""
         found: dict[str, str] = {}
         waiting: list[tuple[str, int]] = []
         items = iter(section.items[1:])
@@ -289,7 +275,7 @@ class _Reader:
         try:
             return number(self.word(node))
         except ValueError:
-            self.fail(node.line, f"{show(node)} is no number", "a finite number such as 0.25 or -pi/4")
+            self.fail(node.line, f"{show(node)} is not a number", "a finite number such as 0.25 or -pi/4")
 
     def scene_property(self, node: Word | List) -> tuple[str, str]:
         if not isinstance(node, List) or not node.head.startswith(":"):
@@ -301,7 +287,7 @@ class _Reader:
             self.fail(node.line, f"not an atom: {show(node)}", "(PREDICATE NAME ...)")
         predicate, *args = map(self.word, node.items)
         if not _PREDICATE.fullmatch(predicate):
-            self.fail(node.line, f"{predicate} is no predicate", "letters, such as On, In, Open or Turnon")
+            self.fail(node.line, f"{predicate} is not a predicate", "letters, such as On, In, Open or Turnon")
         for name, item in zip(args, node.items[1:], strict=True):
             if name not in known:
                 valid = ", ".join(sorted(known)) or "a name, but none is declared"

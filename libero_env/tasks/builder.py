@@ -1,23 +1,23 @@
-"""YAML facts -> `Problem`.
+"""Conversion of the YAML definition of a task into a `Problem`.
 
-A scene says what stands where; a task names its scene, fills in the scene's parameters (`with`) and adds
-to or replaces what the scene says. Keys of both:
+A scene gives objects and places. A task names its scene, sets the scene's parameters (`with`), and adds to or replaces
+keys of the scene. Keys of both:
 
     problem          name of the problem class, as in BDDL
-    language         what the task file's `:language` says; by default the words of the task's name
+    language         `:language` of the task file; by default the words of the task's name
     fixtures         name: category
     objects          categories in joint order; `plate` is plate_1, `{plate: 2}` is plate_1 and plate_2
-    regions          target: {name: facts}; facts are empty for a site of the target's model, else `at` (x, y)
+    regions          target: {name: region}; the region is empty for a site of the target's model, else `at` (x, y)
                      and `half` (one number or two), or `ranges` [[x0, y0, x1, y1], ...], with `yaw` (one
                      angle or two) and `rgba`; metres and radians, angles may be arithmetic with pi.
-                     `target: [a, b]` are sites without facts
+                     `target: [a, b]` are sites of the model
     init             atoms such as `On plate_1 stove_1`; those of a task's `init_also` come first
-    obj_of_interest  names; by default the objects and then the fixtures that the goal speaks of, a region's
-                     target for the region
+    obj_of_interest  names; by default the objects and then the fixtures that the goal refers to, where a region
+                     stands for its target
     scene_properties key: value
     goal             a list of atoms that must all hold, or one expression: `(Or (Open a) (Not (On b c)))`
 
-`$x` stands for the parameter x and `$x_0` for the first of a list; a region that a task sets to `null` goes.
+`$x` is the value of the parameter x and `$x_0` the first of a list; a region that a task sets to `null` is removed.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,10 +48,10 @@ KEYS = (
 
 @cache
 def load_data(name: str) -> Any:
-    """The content of one of the package's task files; do not change it.
+    """Return the content of a file in `data/`; it is shared, do not change it.
 
     Raises:
-        UnknownNameError: there is no such file.
+        UnknownNameError: The file does not exist.
     """
     folder = resources.files("libero_env.tasks") / "data"
     file = folder.joinpath(*name.split("/"))
@@ -61,72 +61,77 @@ def load_data(name: str) -> Any:
 
 
 def load_scene(name: str) -> Mapping[str, Any]:
-    """The facts of a scene of the package."""
+    """Return the definition of a scene of the benchmark."""
     return load_data(f"scenes/{name}.yaml")
 
 
 def scene_names() -> tuple[str, ...]:
-    """The names that `load_scene` knows, sorted."""
+    """Return the names that `load_scene` accepts, sorted."""
     files = (resources.files("libero_env.tasks") / "data" / "scenes").iterdir()
     return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
 
 
-def filled(facts: Mapping[str, Any], given: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Facts with the values of their parameters.
+def fill_parameters(definition: Mapping[str, Any], given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return a definition in which every `$parameter` is replaced by its value.
+
+    Args:
+        definition: Definition of a task or scene.
+        given: Parameter -> value.
+        where: Name of the source in error messages.
 
     Raises:
-        UnknownNameError: a parameter that has no value.
+        UnknownNameError: A parameter has no value.
     """
-    return _fill(facts, _parameters(given), where)
+    return _fill(definition, _parameters(given), where)
 
 
 def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
-    """The problem that a task in a scene amounts to.
+    """Return the problem of a task in a scene.
 
     Args:
-        scene: facts shared by the tasks of the scene.
-        task: `name`, `scene`, `with` (values of the scene's parameters) and the task's own facts.
+        scene: Keys shared by the tasks of the scene.
+        task: `name`, `scene`, `with` (values of the scene's parameters) and the keys of the task.
 
     Raises:
-        LiberoError: a key or a parameter that is not known, or an atom about a name that nothing declares.
+        LiberoError: A key or a parameter does not exist, or an atom refers to a name that is not declared.
     """
     where = f"task {task.get('name', '?')}"
     own = {key: value for key, value in task.items() if key not in ("name", "scene", "with")}
     for key in [*scene, *own]:
         if key not in KEYS:
             raise UnknownNameError(f"key of {where} or its scene", key, KEYS)
-    facts = {"language": language_from_name(task.get("name", "")), **scene, **own}
-    facts["regions"] = _merge(_sites(scene.get("regions")), _sites(own.get("regions")))
+    definition = {"language": language_from_name(task.get("name", "")), **scene, **own}
+    definition["regions"] = _merge(_sites(scene.get("regions")), _sites(own.get("regions")))
     for key in ("fixtures", "scene_properties"):
-        facts[key] = _merge(scene.get(key) or {}, own.get(key) or {})
-    facts = _fill(facts, _parameters(task.get("with", {})), where)
+        definition[key] = _merge(scene.get(key) or {}, own.get(key) or {})
+    definition = _fill(definition, _parameters(task.get("with", {})), where)
     for key in ("problem", "goal"):
-        if key not in facts:
-            raise LiberoError(f"{where}: neither it nor its scene says {key!r}; add it to the YAML")
-    regions = tuple(_regions(facts["regions"]))
-    objects = dict(_objects(facts.get("objects", [])))
-    known = {*facts["fixtures"], *objects, *(region.address for region in regions)}
+        if key not in definition:
+            raise LiberoError(f"{where}: neither it nor its scene has the key {key!r}; add it to the YAML")
+    regions = tuple(_regions(definition["regions"]))
+    objects = dict(_objects(definition.get("objects", [])))
+    known = {*definition["fixtures"], *objects, *(region.address for region in regions)}
     atoms = lambda texts: tuple(bddl.parse_atom(text, known, where) for text in texts)  # noqa: E731
-    goal = facts["goal"]
+    goal = definition["goal"]
     goal = bddl.parse_expression(goal, known, where) if isinstance(goal, str) else And(atoms(goal))
-    interest = facts.get("obj_of_interest")
+    interest = definition.get("obj_of_interest")
     if interest is None:
-        interest = entities_in_goal(goal, regions, objects, facts["fixtures"])
+        interest = entities_in_goal(goal, regions, objects, definition["fixtures"])
     return Problem(
-        name=facts["problem"],
-        language=facts["language"],
-        fixtures=facts["fixtures"],
+        name=definition["problem"],
+        language=definition["language"],
+        fixtures=definition["fixtures"],
         objects=objects,
         regions=regions,
-        init=atoms([*facts.get("init_also", []), *facts.get("init", [])]),
+        init=atoms([*definition.get("init_also", []), *definition.get("init", [])]),
         obj_of_interest=tuple(interest),
-        scene_properties=facts["scene_properties"],
+        scene_properties=definition["scene_properties"],
         goal=goal,
     )
 
 
 def language_from_name(name: str) -> str:
-    """The instruction that a task's name spells: without the scene prefix (`KITCHEN_SCENE1_`)."""
+    """Return the words of a task's name, without the scene prefix (`KITCHEN_SCENE1_`), as an instruction."""
     words = name.split("_")
     prefix = next((i + 1 for i, word in enumerate(words) if word.startswith("SCENE")), 0)
     return " ".join(words[prefix:])
@@ -149,15 +154,15 @@ def _arguments(node: Expression) -> Iterable[str]:
 
 
 def _sites(regions: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The regions with `target: [a, b]` written out as `target: {a: {}, b: {}}`."""
+    """Return the regions with `target: [a, b]` expanded to `target: {a: {}, b: {}}`."""
     return {
-        target: {name: {} for name in facts} if isinstance(facts, list) else facts
-        for target, facts in (regions or {}).items()
+        target: {name: {} for name in named} if isinstance(named, list) else named
+        for target, named in (regions or {}).items()
     }
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with `over` on top, mappings joined at every level; the order is that of `base` first."""
+    """Return `base` updated by `over`, with mappings merged at every level; keys of `base` come first."""
     merged = dict(base)
     for key, value in over.items():
         nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
@@ -171,7 +176,7 @@ def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
-    """The facts with every `$parameter` replaced; a string that is only a parameter becomes its value."""
+    """Return `node` with every `$parameter` replaced; a string that is only a parameter becomes its value."""
     if isinstance(node, Mapping):
         return {_fill(key, values, where): _fill(value, values, where) for key, value in node.items()}
     if isinstance(node, list):
@@ -195,25 +200,25 @@ def _objects(entries: Sequence[str | Mapping[str, int]]):
 
 def _regions(targets: Mapping[str, Mapping[str, Any]]):
     for target, regions in targets.items():
-        for name, facts in regions.items():
-            if facts is not None:
-                yield _region(name, target, facts)
+        for name, region in regions.items():
+            if region is not None:
+                yield _region(name, target, region)
 
 
-def _region(name: str, target: str, facts: Mapping[str, Any]) -> Region:
-    for key in facts:
+def _region(name: str, target: str, region: Mapping[str, Any]) -> Region:
+    for key in region:
         if key not in ("at", "half", "ranges", "yaw", "rgba"):
             raise UnknownNameError(
                 f"key of region {target}_{name}", key, ("at", "half", "ranges", "yaw", "rgba")
             )
-    ranges = [(float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in facts.get("ranges", [])]
-    if "at" in facts:
-        (x, y), half = facts["at"], facts["half"]
+    ranges = [(float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in region.get("ranges", [])]
+    if "at" in region:
+        (x, y), half = region["at"], region["half"]
         half_x, half_y = half if isinstance(half, list) else (half, half)
         ranges.append((x - half_x, y - half_y, x + half_x, y + half_y))
     yaw: tuple[tuple[float, float], ...] = ()
-    if "yaw" in facts:
-        angles = facts["yaw"] if isinstance(facts["yaw"], list) else [facts["yaw"]] * 2
+    if "yaw" in region:
+        angles = region["yaw"] if isinstance(region["yaw"], list) else [region["yaw"]] * 2
         low, high = (number(str(angle)) for angle in angles)
         yaw = ((low, high),)
-    return Region(name, target, tuple(ranges), yaw, tuple(map(float, facts.get("rgba", ()))))
+    return Region(name, target, tuple(ranges), yaw, tuple(map(float, region.get("rgba", ()))))

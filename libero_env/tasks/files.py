@@ -1,4 +1,4 @@
-"""Task files of one's own: one task, several, or a suite of them."""
+"""Tasks by name or from user-defined files: one task, several, or a suite of files."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -6,35 +6,44 @@ from pathlib import Path
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks import bddl
-from libero_env.tasks.authoring import read_facts, task_of
+from libero_env.tasks.authoring import FILE, read_definition, task_from_definition
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.suites import get_suite, suite_names
 from libero_env.tasks.task import Suite, Task
 
-OWN = "own"  # suite of one's own files
+OWN = "own"  # suite of user-defined task files
+ENDINGS = (".bddl", ".yaml", ".yml")  # of the names of task files
 
 
 def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
-    """The task of a YAML file; or several, which stand below `tasks` and share what the file says beside that.
+    """Return the tasks of a YAML file: one, or the list below `tasks`, which share the other keys of the file.
 
     Raises:
-        LiberoError: as `make_task`, and where the file is no YAML; the message names the file.
+        LiberoError: The file is not valid YAML, or a task is not valid (see `make_task`); the message names the file.
     """
     path = Path(path)
-    facts = read_facts(path)
-    if "tasks" not in facts:
-        return (task_of({"name": path.stem, **facts}, str(path), path.parent),)
-    shared = {key: value for key, value in facts.items() if key != "tasks"}
+    definition = read_definition(path)
+    if "tasks" not in definition:
+        return (task_from_definition({"name": path.stem, **definition}, str(path), path.parent),)
+    shared = {key: value for key, value in definition.items() if key != "tasks"}
     return tuple(
-        task_of({**shared, **own}, f"{path}, task {i}", path.parent) for i, own in enumerate(facts["tasks"])
+        task_from_definition({**shared, **own}, f"{path}, task {i}", path.parent)
+        for i, own in enumerate(definition["tasks"])
     )
 
 
 def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
-    """A suite of one's own: the tasks of BDDL and YAML files, in their order.
+    """Return a suite of user-defined tasks.
+
+    Args:
+        files: BDDL and YAML files, in the order of the tasks.
+        name: Name of the suite.
+
+    Returns:
+        The suite; its tasks have its name and consecutive indices.
 
     Raises:
-        LiberoError: a file that cannot be read, two tasks of one name, or no file.
+        LiberoError: A file cannot be read, two tasks have the same name, or there is no file.
     """
     tasks: list[Task] = []
     for file in files:
@@ -42,36 +51,47 @@ def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
     names = [task.name for task in tasks]
     if twice := sorted({n for n in names if names.count(n) > 1}):
         raise LiberoError(
-            f"two tasks of the suite {name} are called {', '.join(twice)}; rename one of their files"
+            f"two tasks of the suite {name} are named {', '.join(twice)}; rename one of their files"
         )
     if not tasks:
-        raise LiberoError(f"the suite {name} has no files; name some that end in .yaml or .bddl")
+        raise LiberoError(f"the suite {name} has no files; give files that end in .yaml or .bddl")
     return Suite(name, tuple(replace(task, suite=name, index=i) for i, task in enumerate(tasks)))
 
 
 def write_task(task: Task, path: str | Path) -> Path:
-    """Write a task's BDDL; what reads it takes its instruction from the file's name.
+    """Write a task as a BDDL file. Readers derive the instruction from the name of the file, as in the original.
+
+    Args:
+        task: Task to write.
+        path: File to write, whose name ends in .bddl; its folder is created.
+
+    Returns:
+        `path`.
 
     Raises:
-        LiberoError: the file's name does not end in .bddl.
+        LiberoError: The name of the file does not end in .bddl.
     """
     path = Path(path)
     if path.suffix != ".bddl":
-        raise LiberoError(f"{path}: task files are .bddl")
+        raise LiberoError(f"{path}: the name of a task file must end in .bddl")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(task.bddl_text, encoding="utf-8")
     return path
 
 
-ENDINGS = (".bddl", ".yaml", ".yml")  # of task files
-
-
 def get_task(key: str) -> Task:
-    """The task called `suite/index`, `suite-index` or by its name alone; or of a file, see `read_task`.
+    """Return a task of the benchmark, or that of a file.
+
+    Args:
+        key: `suite/index` or `suite-index` (`libero_object/3`), the name of a task, or the path of a file that ends in
+            .bddl, .yaml or .yml (see `read_task`).
+
+    Returns:
+        The task.
 
     Raises:
-        UnknownNameError: no such suite, index or task.
-        LiberoError: the file is not a task.
+        UnknownNameError: The suite, index or task does not exist; the message lists the valid ones.
+        LiberoError: The file is not a valid task.
     """
     if key.endswith(ENDINGS):
         return read_task(key)
@@ -89,23 +109,27 @@ def get_task(key: str) -> Task:
 
 
 def read_task(path: str | Path) -> Task:
-    """A task of your own from a BDDL or YAML file; its suite is `file`, its name the file's.
+    """Return the user-defined task of a BDDL or YAML file.
 
-    A BDDL file's instruction is that of its name, as in the original; a YAML file's what it says, see
-    `libero_env.tasks.authoring`.
+    The instruction of a BDDL file is derived from its name, as in the original; that of a YAML file is its `language`
+    (see `libero_env.tasks.authoring`).
+
+    Args:
+        path: File to read. Without `name` in a YAML file, its stem is the name of the task.
+
+    Returns:
+        The task; its suite is `file` and its index 0.
 
     Raises:
-        BDDLError: the file is not a task; the message starts with file:line.
-        LiberoError: a YAML file that is not one task.
+        BDDLError: The BDDL file is not valid; the message starts with file:line.
+        LiberoError: The YAML file is not valid, or contains several tasks.
     """
     if str(path).endswith(ENDINGS[1:]):
-        from libero_env.tasks.files import read_yaml_tasks
-
         tasks = read_yaml_tasks(path)
         if len(tasks) != 1:
             raise LiberoError(
-                f"{path} holds {len(tasks)} tasks, and one is wanted; put it in a file of its own"
+                f"{path} contains {len(tasks)} tasks, expected one; put each in a separate file"
             )
         return tasks[0]
     problem, name = bddl.read(path), Path(path).stem
-    return Task("file", 0, name, language_from_name(name), problem.language, problem)
+    return Task(FILE, 0, name, language_from_name(name), problem.language, problem)

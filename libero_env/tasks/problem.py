@@ -1,4 +1,4 @@
-"""What a task is: the values that a task file holds, and what it takes for two of them to mean the same."""
+"""The dataclass `Problem`, its parts, and the comparison of two problems."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -8,8 +8,13 @@ from dataclasses import dataclass, field, fields
 class Region:
     """A place on or in a fixture, object or workspace.
 
-    `ranges` are rectangles (x0, y0, x1, y1) in metres in the frame of the target; a region without any is a
-    named site of the target's model (a drawer, the inside of a basket). `yaw` holds (low, high) in radians.
+    Attributes:
+        name: Name, unique within the target.
+        target: Name of the fixture, object or workspace.
+        ranges: Rectangles (x0, y0, x1, y1) in the frame of the target, [m]. A region without any is a site of the
+            target's model, such as a drawer or the inside of a basket.
+        yaw: Ranges (low, high) of the yaw of what is placed there, [rad].
+        rgba: Colour in task files; nothing is drawn.
     """
 
     name: str
@@ -20,13 +25,13 @@ class Region:
 
     @property
     def address(self) -> str:
-        """What atoms call the region: `floor_bin_region`."""
+        """Name of the region in atoms, such as `floor_bin_region`."""
         return f"{self.target}_{self.name}"
 
 
 @dataclass(frozen=True)
 class Atom:
-    """A predicate applied to names: `On butter_1 floor_bin_region`. Predicates are always capitalised."""
+    """A predicate applied to names, such as `On butter_1 floor_bin_region`; its predicate is capitalised."""
 
     predicate: str
     args: tuple[str, ...]
@@ -34,28 +39,28 @@ class Atom:
 
 @dataclass(frozen=True)
 class And:
-    """True where every part is."""
+    """Conjunction: true if all parts are true."""
 
     parts: "tuple[Expression, ...]"
 
 
 @dataclass(frozen=True)
 class Or:
-    """True where any part is."""
+    """Disjunction: true if any part is true."""
 
     parts: "tuple[Expression, ...]"
 
 
 @dataclass(frozen=True)
 class Not:
-    """True where the part is not."""
+    """Negation: true if the part is false."""
 
     part: "Expression"
 
 
 @dataclass(frozen=True)
 class ForAll:
-    """True where the body holds for each object of the categories; variables are (`?name`, category)."""
+    """Quantifier: true if the body is true for each object of the categories; variables are (`?name`, category)."""
 
     variables: tuple[tuple[str, str], ...]
     body: "Expression"
@@ -66,7 +71,20 @@ Expression = Atom | And | Or | Not | ForAll
 
 @dataclass(frozen=True)
 class Problem:
-    """What a task file says. `fixtures` and `objects` are name -> category in file order, the joint order."""
+    """Content of a task file.
+
+    Attributes:
+        name: Name of the problem class, such as `LIBERO_Floor_Manipulation`.
+        language: Instruction in `:language`.
+        goal: Condition of success.
+        fixtures: Name -> category, the workspace included, in the order of the file, which is that of the joints.
+        objects: Name -> category, in the order of the file, which is that of the joints.
+        regions: Places that are declared.
+        init: Initial conditions.
+        obj_of_interest: Names of the objects that the task is about.
+        scene_properties: Kind (`floor`, `wall`, `scene`) -> style.
+        domain: Name of the planning domain.
+    """
 
     name: str
     language: str
@@ -80,7 +98,7 @@ class Problem:
     domain: str = "robosuite"
 
     def __eq__(self, other: object) -> bool:
-        """All the same, the order of fixtures and objects included."""
+        """Return whether all fields are equal, the order of fixtures and objects included."""
         return isinstance(other, Problem) and self._key() == other._key()
 
     def _key(self) -> tuple[object, ...]:
@@ -88,15 +106,20 @@ class Problem:
         return tuple(tuple(value.items()) if isinstance(value, Mapping) else value for value in values)
 
     def region(self, address: str) -> Region | None:
-        """The region with this address (`floor_bin_region`), or None where the file declares none."""
+        """Return the region with an address such as `floor_bin_region`; None where it is not declared."""
         return next((region for region in self.regions if region.address == address), None)
 
 
 def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
-    """What two problems say differently, one line each; empty where they mean the same.
+    """Return the differences in meaning of two problems, one line each; empty if they describe the same task.
 
-    The order of fixtures and objects has a meaning (joint order), the order of regions, init atoms and the
-    parts of a conjunction has none. Case and spacing of the language do not count.
+    The order of fixtures and objects matters (it is the joint order). The order of regions, of init atoms and of the
+    parts of a conjunction does not, nor do case and spacing of the language.
+
+    Args:
+        a: First problem.
+        b: Second problem.
+        tolerance: Largest difference of two equal numbers.
     """
     words = lambda p: " ".join(p.language.split()).casefold()  # noqa: E731
     pairs = {
@@ -119,7 +142,7 @@ def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
 
 
 def same_meaning(a: Problem, b: Problem) -> bool:
-    """Whether two problems describe the same task; see `differences`."""
+    """Return whether two problems describe the same task; see `differences`."""
     return not differences(a, b)
 
 

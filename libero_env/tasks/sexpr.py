@@ -1,4 +1,4 @@
-"""S-expressions: text -> nested lists of words that remember their line, and numbers as arithmetic."""
+"""Parsing of S-expressions into nested lists of words with line numbers, and of numbers as arithmetic."""
 
 import math
 import re
@@ -7,16 +7,16 @@ from typing import NoReturn
 
 from libero_env.errors import BDDLError
 
-MAX_DEPTH = 64  # brackets in brackets; deeper is a mistake, and what walks a tree is recursive
+MAX_DEPTH = 64  # nested brackets; deeper is an error, and the functions on trees are recursive
 
 _TOKEN = re.compile(r";[^\n]*|[()]|\n|[^\s();]+")
 _UNREADABLE = re.compile("[\x00-\x08\x0e-\x1f\x7f\ud800-\udfff]")
-_SHOWN = 80  # characters of a node in a message
+_MAX_SHOWN = 80  # characters of a node in a message
 
 
 @dataclass(frozen=True)
 class Word:
-    """Anything between blanks and brackets."""
+    """Text between blanks and brackets."""
 
     text: str
     line: int
@@ -24,26 +24,26 @@ class Word:
 
 @dataclass(frozen=True)
 class List:
-    """What stands between a ( and its )."""
+    """Content of a pair of brackets."""
 
     items: "tuple[Word | List, ...]"
     line: int
 
     @property
     def head(self) -> str:
-        """The first word in lower case; empty where the list starts with no word."""
+        """First word in lower case; empty where the list does not start with a word."""
         return self.items[0].text.casefold() if self.items and isinstance(self.items[0], Word) else ""
 
 
 def fail(file: str, line: int, what: str, expected: str) -> NoReturn:
-    """Raise the error of a task file, in one form everywhere."""
+    """Raise the error of a task file, in the common format."""
     raise BDDLError(f"{file}:{line}: {what}; expected {expected}")
 
 
 def show(node: Word | List) -> str:
-    """The node as text, on one line, its end left off where it is long."""
+    """Return a node as text on one line, truncated where it is long."""
     text = _text(node)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
 def _text(node: Word | List) -> str:
@@ -51,15 +51,15 @@ def _text(node: Word | List) -> str:
 
 
 def parse_tree(text: str, file: str) -> List:
-    """The one list that the text holds; `;` starts a comment.
+    """Return the one list in a text; `;` starts a comment.
 
     Raises:
-        BDDLError: brackets do not match or go too deep, the text is not one list, or it holds characters that
-            no text file has.
+        BDDLError: Brackets do not match or nest too deeply, the text is not one list, or it contains characters that
+            are not text.
     """
     if bad := _UNREADABLE.search(text):
         line = text.count("\n", 0, bad.start()) + 1
-        fail(file, line, f"the character {bad[0]!a}", "text; is this a task file, and is it whole?")
+        fail(file, line, f"the character {bad[0]!a}", "text; is this a complete task file?")
     stack: list[tuple[list, int]] = [([], 1)]
     line = 1
     for token in _TOKEN.findall(text):
@@ -67,7 +67,7 @@ def parse_tree(text: str, file: str) -> List:
             line += 1
         elif token == "(":
             if len(stack) > MAX_DEPTH:
-                fail(file, line, f"more than {MAX_DEPTH} brackets inside each other", "a flatter expression")
+                fail(file, line, f"more than {MAX_DEPTH} nested brackets", "a flatter expression")
             stack.append(([], line))
         elif token == ")":
             if len(stack) == 1:
@@ -92,10 +92,13 @@ _FACTOR = re.compile(
 
 
 def number(text: str) -> float:
-    """The value of `0.25`, `-pi/4`, `2*pi`: numbers, pi, + - * / and signs, never executed.
+    """Return the value of an expression such as `0.25`, `-pi/4` or `2*pi`, without executing it.
+
+    Args:
+        text: Numbers, pi, + - * / and signs.
 
     Raises:
-        ValueError: the text is anything else, or not finite.
+        ValueError: The text contains anything else, or its value is not finite.
     """
     if len(text) > 64:
         raise ValueError(text)

@@ -1,4 +1,4 @@
-"""Suites and tasks by name, with the original's task orders."""
+"""Suites of the benchmark by name."""
 
 from functools import cache
 
@@ -8,12 +8,12 @@ from libero_env.tasks.task import Suite, Task
 
 
 def suite_names() -> tuple[str, ...]:
-    """The names that `get_suite` knows; a suite that consists of others comes after them."""
+    """Return the names that `get_suite` accepts; a suite that consists of others comes after them."""
     return tuple(_parts())
 
 
 def _parts() -> dict[str, list[str]]:
-    """Suite -> the suites it consists of; none for a suite with tasks of its own."""
+    """Return suite -> the suites that it consists of; an empty list for a suite with tasks in its file."""
     found: dict[str, list[str]] = {}
     for entry in load_data("suites.yaml"):
         found |= entry if isinstance(entry, dict) else {entry: []}
@@ -22,24 +22,32 @@ def _parts() -> dict[str, list[str]]:
 
 @cache
 def get_suite(name: str) -> Suite:
-    """The suite of this name.
+    """Return a suite of the benchmark.
+
+    Args:
+        name: Name such as `libero_object`; `suite_names()` lists them.
+
+    Returns:
+        The suite with its tasks in their published order; the same object at each call.
 
     Raises:
-        UnknownNameError: no suite has this name; the message lists them.
+        UnknownNameError: No suite has this name; the message lists them.
     """
     parts = _parts()
     if name not in parts:
         raise UnknownNameError("suite", name, parts)
     if parts[name]:
         return Suite(name, tuple(task for part in parts[name] for task in get_suite(part).tasks))
-    facts = load_data(f"{name}.yaml")
-    return Suite(name, tuple(_task(name, i, {**facts, **task}) for i, task in enumerate(facts["tasks"])))
+    definition = load_data(f"{name}.yaml")
+    return Suite(
+        name, tuple(_task(name, i, {**definition, **task}) for i, task in enumerate(definition["tasks"]))
+    )
 
 
-def _task(suite: str, index: int, facts: dict) -> Task:
-    name = facts["name"]
-    if "scene" not in facts:
-        raise LiberoError(f"task {name}: neither it nor {suite}.yaml says 'scene'; add it to the YAML")
-    own = {key: value for key, value in facts.items() if key != "tasks"}
-    problem = build_problem(load_scene(facts["scene"]), own)
+def _task(suite: str, index: int, definition: dict) -> Task:
+    name = definition["name"]
+    if "scene" not in definition:
+        raise LiberoError(f"task {name}: neither it nor {suite}.yaml has the key 'scene'; add it to the YAML")
+    own = {key: value for key, value in definition.items() if key != "tasks"}
+    problem = build_problem(load_scene(definition["scene"]), own)
     return Task(suite, index, name, language_from_name(name), problem.language, problem)

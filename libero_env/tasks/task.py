@@ -1,4 +1,4 @@
-"""The values `Task` and `Suite`."""
+"""The dataclasses `Task` and `Suite`."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,17 @@ from libero_env.tasks.problem import Problem
 
 @dataclass(frozen=True)
 class Task:
-    """One task of a suite. `language` is the default instruction, read from the name as the original does;
-    `bddl_language` is what its task file says."""
+    """One task of a suite.
+
+    Attributes:
+        suite: Name of its suite, such as `libero_object`; `file` for a task that was read from a file on its own.
+        index: Position in the suite, from 0.
+        name: Name that is unique in the benchmark, such as `pick_up_the_milk_and_place_it_in_the_basket`.
+        language: Default instruction. In tasks of the benchmark and of BDDL files it is derived from the name, as in
+            the original.
+        bddl_language: Instruction in `:language` of the task file.
+        problem: Scene, initial conditions and goal.
+    """
 
     suite: str
     index: int
@@ -22,19 +31,26 @@ class Task:
 
     @property
     def id(self) -> str:
-        """`libero_object/3`."""
+        """Suite and index, such as `libero_object/3`; `get_task` accepts it."""
         return f"{self.suite}/{self.index}"
 
     @property
     def bddl_text(self) -> str:
-        """The task file, generated."""
+        """Text of the task file in BDDL, generated from `problem`."""
         return bddl.write(self.problem)
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Tasks in their published order. Those of a suite that consists of others (LIBERO-100 is LIBERO-90 and
-    LIBERO-10) keep the suite and index that they have there, and with them their demonstrations and states."""
+    """Tasks in their published order.
+
+    A suite can consist of others: LIBERO-100 is LIBERO-90 and LIBERO-10. Its tasks keep the suite and index that they
+    have there, and so their demonstrations and initial states.
+
+    Attributes:
+        name: Name of the suite, such as `libero_object`.
+        tasks: Tasks by index.
+    """
 
     name: str
     tasks: tuple[Task, ...]
@@ -43,13 +59,16 @@ class Suite:
         return len(self.tasks)
 
     def order(self, order_index: int = 0) -> tuple[Task, ...]:
-        """The tasks in one of the sequences of the original benchmark.
+        """Return the tasks in one of the sequences of the original benchmark.
 
         Args:
-            order_index: 0 is the order of the indices; the ten-task suites have 21 orders.
+            order_index: Number of the sequence; 0 is the order of the indices. The ten-task suites have 21, others 1.
+
+        Returns:
+            All tasks of the suite in that order.
 
         Raises:
-            UnknownNameError: the suite has no such order.
+            UnknownNameError: The suite has no such order.
         """
         orders = load_data("task_orders.yaml") if len(self) == 10 else [list(range(len(self)))]
         if order_index not in range(len(orders)):

@@ -62,15 +62,15 @@ def embed(
 
     Args:
         texts: N instructions. Case and repeated blanks do not matter to `minilm`.
-        model: one of `MODELS`, or a folder with a model saved by transformers (bert, roberta, gpt2, clip).
-        cache_dir: folder in which embeddings that a model computed are kept, by model and text; None keeps none.
+        model: One of `MODELS`, or a folder with a model saved by transformers (bert, roberta, gpt2, clip).
+        cache_dir: Folder in which embeddings that a model computed are kept, by model and text; None keeps none.
         dim: L for `onehot`: text i becomes row i of the identity. None: N.
 
     Returns:
         (N, L) float32: L is 384 for minilm, 512 for clip, 768 for the others.
 
     Raises:
-        LanguageError: unknown model, a text that cannot be encoded, or weights that cannot be had; names the
+        LanguageError: Unknown model, a text that cannot be encoded, or weights that cannot be had; names the
             remedy.
     """
     if isinstance(texts, str):
@@ -89,7 +89,7 @@ def embed(
 
 @cache
 def shipped() -> dict[str, Tensor]:
-    """The embeddings that come with the package, by `normal_form` of the text; each (384,) float32."""
+    """Return the embeddings that come with the package, by `normal_form` of the text; each (384,) float32."""
     packed = resources.files("lifelong.language") / "minilm.npz"
     with packed.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         vectors = torch.from_numpy(file["embeddings"].astype(np.float32))
@@ -102,7 +102,7 @@ def normal_form(text: str) -> str:
 
 
 def minilm_folder() -> Path | None:
-    """Where the package that carries the sentence encoder keeps it; None when it is not installed."""
+    """Return where the package that carries the sentence encoder keeps it; None when it is not installed."""
     spec = util.find_spec(_MINILM_PACKAGE)
     if spec is None or not spec.submodule_search_locations:
         return None
@@ -114,7 +114,7 @@ def encode_minilm(texts: Sequence[str], folder: Path) -> Tensor:
 
     Args:
         texts: N texts.
-        folder: the saved sentence encoder.
+        folder: The saved sentence encoder.
     """
     means = [output.last_hidden_state.mean(1) for output in _outputs(texts, str(folder))]
     return functional.normalize(torch.cat(means), dim=-1)
@@ -149,7 +149,7 @@ def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
 def _cached(
     texts: Sequence[str], name: str, cache_dir: str | Path | None, encode: Callable[[list[str]], Tensor]
 ) -> Tensor:
-    """Reads what the cache holds, encodes the rest together, and writes it to the cache."""
+    """Read what the cache holds, encodes the rest together, and writes it to the cache."""
     if not len(texts):
         raise LanguageError("no texts to embed; give at least one")
     if cache_dir is None:
@@ -167,7 +167,7 @@ def _cached(
 
 
 def _fingerprint(name: str) -> str:
-    """A hub name as it is; for a folder also its files' sizes and times, so that other weights are other keys."""
+    """Return a key of an encoder: its hub name, or the path of its folder with sizes and times of the files."""
     folder = Path(name)
     if not folder.is_dir():
         return name
@@ -195,7 +195,7 @@ def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
 
 
 def _outputs(texts: Sequence[str], name: str) -> Iterator[Any]:
-    """The model's output for each text by itself: padding would show in the last digits, and with it which texts
+    """Yield the model's output for each text by itself: padding would show in the last digits, and with it which texts
     happened to be encoded together."""
     tokenizer, model = _load(name)
     for text in texts:
@@ -208,7 +208,7 @@ def _load(name: str) -> tuple[Any, Any]:
     """Tokenizer and model of a hub name or a folder, in eval mode.
 
     Raises:
-        LanguageError: transformers is missing, or the weights cannot be had.
+        LanguageError: Transformers is missing, or the weights cannot be had.
     """
     try:
         from transformers import AutoConfig, AutoModel, AutoTokenizer, CLIPTextModelWithProjection

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from libero_env.errors import LiberoError
 from libero_env.tasks import Task, bddl, get_suite, suite_names
+from libero_env.tasks.problem import differences
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 
@@ -30,7 +31,7 @@ def compare(folder: Path) -> Iterator[tuple[Task, list[str]]]:
         except (OSError, LiberoError) as error:
             yield task, [str(error)]
             continue
-        found = bddl.differences(original, bddl.parse(task.bddl_text, f"generated {task.id}"))
+        found = differences(original, bddl.parse(task.bddl_text, f"generated {task.id}"))
         if (
             original.obj_of_interest != task.problem.obj_of_interest
         ):  # their order shows in the drop-in facade

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from libero_env.assets.arena import WORKSPACES, add_arena, add_mount, load_workspace, workspace_of_problem
-from libero_env.assets.styles import load_styles, picture
+from libero_env.assets.styles import load_styles, make_texture
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import bddl
 
@@ -136,11 +136,11 @@ def test_every_style_compiles_and_only_looks_change(category):
 def test_styles_differ_and_repeat_without_a_seam():
     styles = load_styles()
     shown = [s for kind in ("floor", "wall") for s in styles[kind].values() if s["pattern"] != "plain"]
-    pictures = [picture(style) for style in shown]
+    pictures = [make_texture(style) for style in shown]
     for a, b in product(range(len(shown)), repeat=2):
         assert a == b or not np.array_equal(pictures[a], pictures[b])
     for style, image in zip(shown, pictures, strict=True):
-        np.testing.assert_array_equal(image, picture(style))
+        np.testing.assert_array_equal(image, make_texture(style))
         if style["pattern"] in ("plaster", "marble", "linen"):
             step = lambda a, b: np.abs(a.astype(float) - b).mean()  # noqa: E731
             inside = max(step(image[i], image[i + 1]) for i in range(len(image) - 1))

@@ -260,9 +260,9 @@ def test_names_outside_the_folder_are_refused(hub, tmp_path):
     assert not (tmp_path / "elsewhere.xml").exists()
 
 
-def test_without_network_the_message_says_how_to_go_on(hub, tmp_path, monkeypatch):
+def test_without_network_the_message_says_how_to_resume(hub, tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    with pytest.raises(DownloadError, match="failed: .*again to go on"):
+    with pytest.raises(DownloadError, match="failed: .*again to resume"):
         download(tmp_path / "there")
 
 

@@ -82,7 +82,7 @@ def test_a_file_a_call_and_the_bddl_written_are_the_same(tmp_path):
     assert read == task and get_task(str(tmp_path / "bowl.yaml")) == task
     again = read_task(write_task(task, tmp_path / "bowl.bddl"))
     assert differences(again.problem, task.problem) == []
-    with pytest.raises(LiberoError, match="task files are .bddl"):
+    with pytest.raises(LiberoError, match="must end in .bddl"):
         write_task(task, tmp_path / "bowl.txt")
 
 
@@ -178,12 +178,12 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
     ("changes", "message"),
     [
         ({"scene": "kitchn"}, "Did you mean 'kitchen'"),
-        ({"scene": None}, "says no scene; add one of kitchen"),
+        ({"scene": None}, "it has no scene; add one of kitchen"),
         ({"scene": "mine.yaml"}, "mine.yaml is missing"),
         ({"plce": {}}, "Did you mean 'place'"),
         ({"objects": ["akita_black_bowl", "plat"]}, "Did you mean 'plate'"),
-        ({"objects": ["akita_black_bowl", "plate", "milk"]}, "where milk_1 stands.*`milk_1: \\[0, 0\\]`"),
-        ({"place": {"cup_1": [0, 0]}}, "thing to place of task 'cup_1'"),
+        ({"objects": ["akita_black_bowl", "plate", "milk"]}, "milk_1 has no place.*`milk_1: \\[0, 0\\]`"),
+        ({"place": {"cup_1": [0, 0]}}, "object or fixture to place of task 'cup_1'"),
         ({"place": {**FACTS["place"], "plate": 0.1}}, "place of plate_1 is 0.1; expected \\[x, y\\]"),
         ({"goal": "Open wooden_cabinet_1_top_regio"}, "Did you mean 'top_region'"),
         ({"goal": "In plate_1 akita_black_bowl_1_inside"}, "Valid: none"),
@@ -192,16 +192,16 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
         ({"language": None}, "neither a name nor a language"),
     ],
 )
-def test_what_is_wrong_is_said_with_what_is_right(changes, message):
+def test_errors_state_what_is_valid(changes, message):
     with pytest.raises(LiberoError, match=message):
         make_task(**said(**changes))
 
 
-def test_files_that_are_no_tasks_are_named(tmp_path):
+def test_errors_name_the_file(tmp_path):
     for text, message in (
         ("a: [", "not valid YAML"),
         ("- a", "expected keys"),
-        ("tasks: []\n", "holds 0 tasks"),
+        ("tasks: []\n", "contains 0 tasks"),
     ):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(LiberoError, match=f"bad.yaml.*{message}"):
@@ -215,7 +215,7 @@ def test_places_are_the_sites_that_goals_can_name():
     assert {"top_region", "middle_region", "bottom_region", "top_side"} <= set(places_of("wooden_cabinet"))
 
 
-def test_a_suite_of_files_is_numbered_and_named(tmp_path):
+def test_the_tasks_of_files_form_a_suite(tmp_path):
     several = {key: value for key, value in FACTS.items() if key not in ("goal", "language")}
     lifts = {"lift_plate": "Up plate_1", "lift_bowl": "Up akita_black_bowl_1"}
     several["tasks"] = [{"name": name, "goal": goal} for name, goal in lifts.items()]
@@ -225,9 +225,9 @@ def test_a_suite_of_files_is_numbered_and_named(tmp_path):
     assert [task.id for task in suite.tasks] == ["own/0", "own/1", "own/2", "own/3"]
     assert [task.name for task in suite.tasks] == ["b", "lift_plate", "lift_bowl", "c"]
     assert suite.tasks[1].language == "lift plate"
-    with pytest.raises(LiberoError, match="called b; rename"):
+    with pytest.raises(LiberoError, match="named b; rename"):
         read_suite([files[0], files[0]])
-    with pytest.raises(LiberoError, match="holds 2 tasks"):
+    with pytest.raises(LiberoError, match="contains 2 tasks"):
         read_task(files[1])
 
 

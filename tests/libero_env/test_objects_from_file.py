@@ -83,12 +83,14 @@ def cup() -> trimesh.Trimesh:
 def test_a_textured_mesh_becomes_an_object_of_a_scene(tmp_path):
     added = add_object(textured_box(tmp_path / "my box.obj"), size=0.12, density=500.0)
     assert (added.name, added.folder) == ("my_box", tmp_path / "objects" / "my_box")
-    assert added.facts["size"] == pytest.approx([0.08, 0.10, 0.12])
+    assert added.properties["size"] == pytest.approx([0.08, 0.10, 0.12])
     mass = 0.08 * 0.10 * 0.12 * 500
-    assert added.facts["mass"] == pytest.approx(mass, rel=1e-4)
-    assert added.facts["stands"]
-    assert added.facts["collision"] == {"method": "hull", "pieces": 1}
-    assert added.facts["grasp"]["width"] is None and "too far apart" in added.facts["grasp"]["reason"]
+    assert added.properties["mass"] == pytest.approx(mass, rel=1e-4)
+    assert added.properties["stands"]
+    assert added.properties["collision"] == {"method": "hull", "pieces": 1}
+    assert (
+        added.properties["grasp"]["width"] is None and "too far apart" in added.properties["grasp"]["reason"]
+    )
     with Image.open(added.folder / "preview.png") as opened:
         picture = np.asarray(opened)
     assert picture.shape == (2 * 224, 4 * 224, 3) and np.ptp(picture) > 100
@@ -231,8 +233,8 @@ def test_an_open_mesh_weighs_as_much_as_its_hull(tmp_path):
     mesh.export(tmp_path / "open.stl")
     added = add_object(tmp_path / "open.stl", collision="hull", container=True)
     assert any("not watertight" in note for note in added.notes)
-    assert added.facts["mass"] == pytest.approx(1.2e-4 * DENSITY, rel=1e-3)
-    assert added.facts["grasp"]["width"] == pytest.approx(0.04, abs=0.003)
+    assert added.properties["mass"] == pytest.approx(1.2e-4 * DENSITY, rel=1e-3)
+    assert added.properties["grasp"]["width"] == pytest.approx(0.04, abs=0.003)
     assert places_of("open") == ("contain_region",)
 
 
@@ -241,7 +243,7 @@ def test_an_mjcf_file_keeps_its_parts_and_gets_what_scenes_need(tmp_path):
     box(tmp_path / "meshes" / "box.stl")
     (tmp_path / "chest.xml").write_text(DOOR)
     added = add_object(tmp_path / "chest.xml")
-    assert added.facts["mass"] == pytest.approx(0.25) and added.facts["size"][:2] == pytest.approx(
+    assert added.properties["mass"] == pytest.approx(0.25) and added.properties["size"][:2] == pytest.approx(
         [0.06, 0.06]
     )
     assert "1 elements around" in added.notes[0]
@@ -259,8 +261,8 @@ def test_an_mjcf_file_keeps_its_parts_and_gets_what_scenes_need(tmp_path):
 def test_a_file_of_the_originals_kind_is_read(tmp_path):
     (tmp_path / "brick.xml").write_text(ORIGINAL)
     added = add_object(tmp_path / "brick.xml", name="brick")
-    assert added.facts["mass"] == pytest.approx(0.05)
-    assert added.facts["bottom_offset"] == pytest.approx([0, 0, -0.03])
+    assert added.properties["mass"] == pytest.approx(0.05)
+    assert added.properties["bottom_offset"] == pytest.approx([0, 0, -0.03])
     assert get_object("brick").spec.compile().ngeom == 2
 
 
@@ -358,11 +360,11 @@ def test_options_that_contradict_each_other():
         Options(up="x")
 
 
-def test_a_stored_object_that_was_spoilt_is_named(tmp_path):
+def test_a_stored_object_that_is_broken_is_named(tmp_path):
     (tmp_path / "brick.xml").write_text(ORIGINAL)
     place = add_object(tmp_path / "brick.xml").folder
     (place / "object.yaml").write_text("name: brick\n")
-    with pytest.raises(LiberoError, match="does not say bottom_offset"):
+    with pytest.raises(LiberoError, match="has no bottom_offset"):
         get_object("brick")
 
 
@@ -384,7 +386,7 @@ def test_the_command_adds_lists_shows_draws_and_removes(tmp_path, capsys):
     assert main(["objects", "remove", "red_block"]) == 0 and "red_block" not in object_names()
     capsys.readouterr()
     assert main(["objects", "remove", "red_block"]) == 2
-    assert "object of your own" in capsys.readouterr().err
+    assert "user-defined object" in capsys.readouterr().err
 
 
 def test_a_mesh_of_many_triangles_is_simplified(tmp_path):

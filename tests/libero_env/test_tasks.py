@@ -10,8 +10,8 @@ import yaml
 
 from libero_env.errors import BDDLError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, builder, get_suite, get_task, read_task, suite_names, suites
-from libero_env.tasks.bddl import And, Atom, Not, Or
 from libero_env.tasks.builder import build_problem, language_from_name, load_data
+from libero_env.tasks.problem import And, Atom, Not, Or
 from tests.libero_env.compare_bddl import all_tasks, compare
 from tests.libero_env.compare_bddl import main as compare_main
 
@@ -217,11 +217,11 @@ def test_a_task_without_scene_is_refused(monkeypatch):
     monkeypatch.setattr(
         suites, "load_data", lambda name: {"tasks": [TASK]} if name == "mine.yaml" else ["mine"]
     )
-    with pytest.raises(LiberoError, match="task cook_it: neither it nor mine.yaml says 'scene'"):
+    with pytest.raises(LiberoError, match="task cook_it: neither it nor mine.yaml has the key 'scene'"):
         get_suite.__wrapped__("mine")
 
 
 def test_a_task_without_goal_is_refused():
-    with pytest.raises(LiberoError, match="neither it nor its scene says 'goal'"):
+    with pytest.raises(LiberoError, match="neither it nor its scene has the key 'goal'"):
         build_problem(SCENE, {"name": "cook_it", "language": "cook it", "with": {"thing": "plate"}})
     assert build_problem(SCENE, TASK).goal == And((Atom("On", ("plate_1", "stove_1_cook_region")),))

@@ -45,9 +45,9 @@ def lint_task(task: Task, pack: Pack | None = None, *, starts: int = STARTS) -> 
     """Findings about a task; lines count in what `libero tasks show` prints.
 
     Args:
-        task: of a suite.
-        pack: where the models come from; by default as `select_pack` says.
-        starts: number of starts to look at; 0 for none, and nothing is simulated.
+        task: Of a suite.
+        pack: Where the models come from; by default as `select_pack` says.
+        starts: Number of starts to look at; 0 for none, and nothing is simulated.
     """
     return lint_text(task.bddl_text, task.id, task, pack, starts=starts)
 
@@ -104,7 +104,7 @@ def lint_text(
 
 
 def _syntax(error: BDDLError, file: str) -> Finding:
-    """The finding that an error of the parser is."""
+    """Return the finding that an error of the parser is."""
     found = re.fullmatch(r"(\d+): (.*?)(?:; expected (.*))?", str(error).removeprefix(f"{file}:"), re.DOTALL)
     line, what, expected = found.groups() if found else (1, str(error), None)
     return Finding(

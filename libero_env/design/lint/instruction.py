@@ -37,7 +37,7 @@ _SIDES = ({"top", "middle", "bottom"}, {"left", "right"}, {"front", "back"})
 
 
 def check_words(report: Report, task: Task, pack: Pack) -> None:
-    """The instruction of the file, and the one that the task's name spells where it says something else."""
+    """Return the instruction of the file, and the one that the task's name spells where it says something else."""
     line = report.lines.section(":language")
     texts = {task.bddl_language: ""}
     if _words(task.language) != _words(task.bddl_language):
@@ -88,7 +88,7 @@ def _check_scene_has(report: Report, problem: Problem, text: str, line: int, sou
 
 
 def _check_sides(report: Report, problem: Problem, text: str, line: int, source: str) -> None:
-    """The side that the goal asks for is not the opposite of the one that is named."""
+    """Return the side that the goal asks for is not the opposite of the one that is named."""
     words = _words(text)
     told = {word for word, after in zip(words, [*words[1:], ""], strict=True) if after in _PARTS}
     regions = [
@@ -107,7 +107,7 @@ def _words(text: str) -> list[str]:
 
 
 def _tokens(name: str) -> list[str]:
-    """The words of a name that say what it is: `white_yellow_mug` -> [mug]."""
+    """Return the words of a name that say what it is: `white_yellow_mug` -> [mug]."""
     return [word for word in _words(name) if word not in _QUALITIES]
 
 

@@ -28,7 +28,7 @@ class Finding:
 
 
 def spell(atom: Atom) -> str:
-    """The atom as a task file has it."""
+    """Return the atom as a task file has it."""
     return f"({atom.predicate} {' '.join(atom.args)})"
 
 
@@ -36,10 +36,10 @@ class Lines:
     """Where in a task file things are said.
 
     Attributes:
-        entities: name of an object or fixture -> line.
-        regions: address of a region -> line.
-        init: line of each init atom.
-        goal: line of each atom of the goal, in reading order.
+        entities: Name of an object or fixture -> line.
+        regions: Address of a region -> line.
+        init: Line of each init atom.
+        goal: Line of each atom of the goal, in reading order.
     """
 
     def __init__(self, tree: List):
@@ -88,9 +88,9 @@ class Report:
     """Findings about one task file as they come in.
 
     Attributes:
-        lines: where things are said.
-        categories: of the objects that the file declares, as far as it can be read.
-        findings: so far.
+        lines: Where things are said.
+        categories: Of the objects that the file declares, as far as it can be read.
+        findings: So far.
     """
 
     def __init__(self, file: str, tree: List):
@@ -99,7 +99,7 @@ class Report:
         self.findings: list[Finding] = []
 
     def error(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """The task does not work as it is."""
+        """Return the task does not work as it is."""
         self.findings.append(Finding(self.file, line, "error", rule, what, remedy))
 
     def warning(self, line: int, rule: str, what: str, remedy: str) -> None:
@@ -116,11 +116,11 @@ class Report:
         return any(finding.level == "error" for finding in self.findings)
 
     def sorted(self) -> list[Finding]:
-        """The findings by line, the gravest of a line first, each once."""
+        """Return the findings by line, the gravest of a line first, each once."""
         return sorted(set(self.findings), key=lambda f: (f.line, LEVELS.index(f.level), f.rule, f.what))
 
     def suggest(self, name: str, valid: Iterable[str]) -> str:
-        """A remedy for a name that does not exist."""
+        """Return a remedy for a name that does not exist."""
         names = sorted(valid)
         if close := difflib.get_close_matches(name, names, n=3, cutoff=0.5):
             return f"did you mean {' or '.join(close)}?"

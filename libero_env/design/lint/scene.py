@@ -125,7 +125,7 @@ def _check_tables(report: Report, scene: Scene) -> None:
 
 
 def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarray, needed: bool) -> None:
-    """The rectangles are where the arm takes things from above; an error where it cannot in any way."""
+    """Return the rectangles are where the arm takes things from above; an error where it cannot in any way."""
     near, far = reach(scene.workspace)
     base = np.array(scene.workspace.robot_base_pos[:2])
     middle = corners.reshape(-1, 4, 2).mean(axis=1)
@@ -198,7 +198,7 @@ def _put_start(
     Counts the objects that move while it waits as it was first put.
 
     Raises:
-        PlacementError: it cannot be drawn, or does not come to rest.
+        PlacementError: It cannot be drawn, or does not come to rest.
     """
     stored, still = task.suite != "file" and scene.pack.name == BUILTIN, np.zeros((1, scene.model.nv))
     if stored:

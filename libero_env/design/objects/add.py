@@ -37,13 +37,13 @@ class Options:
     """How a file becomes an object.
 
     Attributes:
-        size: longest side, m; None keeps the file's. Of meshes only, as all of these but `container`.
-        mass: kg; None for `density`.
-        density: kg/m^3; None for that of groceries.
-        up: axis of the file that points up, `z` or `y`; None for what the format says.
+        size: Longest side, m; None keeps the file's. Of meshes only, as all of these but `container`.
+        mass: Kg; None for `density`.
+        density: Kg/m^3; None for that of groceries.
+        up: Axis of the file that points up, `z` or `y`; None for what the format says.
         collision: `decompose`, `hull` or `boxes`; see `libero_env.design.objects.collision`.
-        faces: triangles that the look is simplified to where it has more.
-        container: add the place `contain_region`, the inside of its bounds, for goals such as
+        faces: Triangles that the look is simplified to where it has more.
+        container: Add the place `contain_region`, the inside of its bounds, for goals such as
             `In x box_1_contain_region`.
     """
 
@@ -75,11 +75,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Added:
-    """An object that was made. `notes` are guesses and what to look at; `facts` what `object.yaml` says."""
+    """An object that was made. `notes` are guesses and what to look at; `properties` what `object.yaml` says."""
 
     name: str
     folder: Path
-    facts: Mapping[str, Any]
+    properties: Mapping[str, Any]
     notes: tuple[str, ...] = field(default=())
 
 
@@ -94,17 +94,17 @@ def add_object(
     """Make an object of a file and keep it; from then on task files know it by its name.
 
     It is tried: whether it stands as it is put down, and whether the gripper can hold it. What is found is in the
-    facts and notes; it stays either way.
+    properties and notes; it stays either way.
 
     Args:
         path: MJCF (.xml), OBJ, GLB, glTF, STL or PLY.
-        name: of the category; by default the file's.
-        out: folder for the object's folder; by default where `objects_dir` says, where tasks find it.
-        replace: replace one of the user's objects that has this name.
-        options: see `Options`.
+        name: Of the category; by default the file's.
+        out: Folder for the object's folder; by default where `objects_dir` says, where tasks find it.
+        replace: Replace one of the user's objects that has this name.
+        options: See `Options`.
 
     Raises:
-        LiberoError: the file cannot be used, or the name is taken; the message says what to do.
+        LiberoError: The file cannot be used, or the name is taken; the message says what to do.
     """
     path = Path(path)
     name = check_name(name or _name_of(path), taken_by_own=not replace)
@@ -126,7 +126,7 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
         The category's name.
 
     Raises:
-        LiberoError: the file cannot be used.
+        LiberoError: The file cannot be used.
     """
     path, chosen = Path(path), Options(**options)
     if not path.is_file():
@@ -136,7 +136,7 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
         raise LiberoError(f"{name!r} is no valid category; use letters, digits and underscores")
     said = repr((_FORMAT, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), name))
     place = cache_dir() / "objects" / hashlib.sha256(said.encode()).hexdigest()[:16] / name
-    if not (place / folder.FACTS).is_file():
+    if not (place / folder.PROPERTIES).is_file():
         place.parent.mkdir(parents=True, exist_ok=True)
         _make(path, name, place, chosen)
     catalog.register_object(name, lambda: folder.load(place, name))
@@ -144,10 +144,10 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
 
 
 def check_name(name: str, *, taken_by_own: bool = True) -> str:
-    """The name, if an object may be called so.
+    """Return the name, if an object may be called so.
 
     Raises:
-        LiberoError: task files cannot say it, or another object has it.
+        LiberoError: Task files cannot say it, or another object has it.
     """
     if not name.isidentifier() or not name.isascii() or name != name.lower():
         raise LiberoError(
@@ -182,19 +182,19 @@ def _make(path: Path, name: str, place: Path, options: Options) -> Added:
                 raise LiberoError(
                     f"{path}: an MJCF file says {', '.join(options.of_meshes)} itself; leave it out"
                 )
-            facts = store_mjcf(path, name, scratch, container=options.container, notify=notes.append)
+            properties = store_mjcf(path, name, scratch, container=options.container, notify=notes.append)
         else:
-            facts = _from_mesh(path, name, scratch, options, notes)
+            properties = _from_mesh(path, name, scratch, options, notes)
         model = ObjectModel(name, folder.read_spec(scratch / folder.MODEL))
-        facts |= try_object(model, notes.append, scratch / folder.PREVIEW)
-        folder.write_facts(scratch, {"name": name, "source": path.name, **facts})
+        properties |= try_object(model, notes.append, scratch / folder.PREVIEW)
+        folder.write_properties(scratch, {"name": name, "source": path.name, **properties})
         if place.exists():
             shutil.rmtree(place)
         scratch.chmod(0o755)  # others may use it, which a temporary folder does not allow
         scratch.replace(place)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return Added(name, place, folder.read_facts(place), tuple(notes))
+    return Added(name, place, folder.read_properties(place), tuple(notes))
 
 
 def _from_mesh(path: Path, name: str, place: Path, options: Options, notes: list[str]) -> dict[str, Any]:
@@ -232,7 +232,7 @@ def _from_mesh(path: Path, name: str, place: Path, options: Options, notes: list
 def _weigh(
     vertices: np.ndarray, faces: np.ndarray, closed: bool, options: Options, notes: list[str]
 ) -> tuple[Mass, float]:
-    """Where the mass is, its inertia, and the mass in kg."""
+    """Return where the mass is, its inertia, and the mass in kg."""
     mass = solid_mass(vertices, faces, 1.0) if closed else hull_mass(vertices, 1.0)
     kilograms = options.mass or mass.volume * (options.density or DENSITY)
     if kilograms < _LIGHTEST and options.mass is None and options.density is None:

@@ -25,8 +25,8 @@ class Pieces:
     """Collision shapes in the object's frame.
 
     Attributes:
-        method: how they were made.
-        meshes: convex, each (n, 3) vertices, metres.
+        method: How they were made.
+        meshes: Convex, each (n, 3) vertices, metres.
         boxes: (k, 6) centre and half size, metres.
     """
 
@@ -46,10 +46,10 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notif
         faces: (f, 3).
         method: `hull`; `decompose`, by CoACD (Wei et al. 2022, Approximate Convex Decomposition for 3D Meshes with
             Collision-Aware Concavity and Tree Search); or `boxes`. A mesh that is convex anyway is its hull.
-        notify: takes a line where something else had to be done.
+        notify: Takes a line where something else had to be done.
 
     Raises:
-        LiberoError: there is no such method.
+        LiberoError: There is no such method.
     """
     if method not in METHODS:
         raise LiberoError(f"collision {method!r}: valid are {', '.join(METHODS)}")
@@ -198,7 +198,7 @@ def _joined(filled: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def _grown(left: np.ndarray, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest of the boxes that grow from a cell along the axes, in each order of them."""
+    """Return the largest of the boxes that grow from a cell along the axes, in each order of them."""
     best: tuple[np.ndarray, np.ndarray] | None = None
     for order in permutations(range(3)):
         low, high = seed.copy(), seed + 1

@@ -30,8 +30,8 @@ class Surface:
         vertices: (n, 3), metres.
         faces: (f, 3), vertex indices.
         texcoords: (n, 2) with v = 0 at the lower edge of the picture; None for a plain colour.
-        image: the picture; None for a plain colour.
-        rgba: the colour, 0..1; white where there is a picture.
+        image: The picture; None for a plain colour.
+        rgba: The colour, 0..1; white where there is a picture.
     """
 
     vertices: np.ndarray
@@ -42,16 +42,16 @@ class Surface:
 
 
 def read_mesh(path: Path, *, size: float | None, up: str | None, notify: Notify) -> list[Surface]:
-    """The surfaces of a mesh file, z up, the origin in the middle of their bounds.
+    """Return the surfaces of a mesh file, z up, the origin in the middle of their bounds.
 
     Args:
-        path: the file.
-        size: longest side wanted, m; None keeps the file's, after a guess of its unit.
-        up: axis of the file that points up, `z` or `y`; None for what the format says.
-        notify: takes a line about each guess.
+        path: The file.
+        size: Longest side wanted, m; None keeps the file's, after a guess of its unit.
+        up: Axis of the file that points up, `z` or `y`; None for what the format says.
+        notify: Takes a line about each guess.
 
     Raises:
-        LiberoError: not a format that is read, no triangles, or a picture is missing; the message names the file.
+        LiberoError: Not a format that is read, no triangles, or a picture is missing; the message names the file.
     """
     if path.suffix.lower() not in FORMATS:
         raise LiberoError(f"{path}: unknown format {path.suffix!r}; valid: .xml (MJCF), {', '.join(FORMATS)}")
@@ -80,7 +80,7 @@ def bounds(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def welded(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """The whole as one mesh, vertices at one place joined: (n, 3), (f, 3). Seams of textures are none of it."""
+    """Return the whole as one mesh, vertices at one place joined: (n, 3), (f, 3). Seams of textures are none of it."""
     starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     points = np.concatenate([s.vertices for s in surfaces])
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)])
@@ -91,7 +91,7 @@ def welded(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Whether every edge of triangles (f, 3) lies between two that are turned the same way."""
+    """Return whether every edge of triangles (f, 3) lies between two that are turned the same way."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there, back = np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)
     return len(there) == len(edges) and np.array_equal(there, back)
@@ -104,7 +104,7 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def _parts(path: Path) -> list[Any]:
-    """The meshes of a file as trimesh reads it, where they are in its scene."""
+    """Return the meshes of a file as trimesh reads it, where they are in its scene."""
     import trimesh
 
     try:

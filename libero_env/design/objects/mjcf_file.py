@@ -26,13 +26,13 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: N
 
     Args:
         path: MJCF.
-        name: category.
-        place: folder.
-        container: add a place `contain_region` unless it has one.
-        notify: takes a line where something is left out.
+        name: Category.
+        place: Folder.
+        container: Add a place `contain_region` unless it has one.
+        notify: Takes a line where something is left out.
 
     Raises:
-        LiberoError: it cannot be read, names a missing file, or does not hold one object.
+        LiberoError: It cannot be read, names a missing file, or does not hold one object.
     """
     spec = _read(path, name)
     root = _root(spec, path, notify)
@@ -62,7 +62,7 @@ def bounds_of(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of what an object of its own collides with, (3,) and (3,), in its frame, m.
 
     Raises:
-        LiberoError: nothing of it collides.
+        LiberoError: Nothing of it collides.
     """
     from libero_env.geometry import surface_points
 
@@ -93,7 +93,7 @@ def _read(path: Path, name: str) -> mujoco.MjSpec:
 
 
 def _root(spec: mujoco.MjSpec, path: Path, notify: Notify) -> mujoco.MjsBody:
-    """The object's body, alone in the world, at its origin, called `main`, without a joint."""
+    """Return the object's body, alone in the world, at its origin, called `main`, without a joint."""
     bodies = list(spec.worldbody.bodies)
     if len(bodies) != 1:
         raise LiberoError(
@@ -147,7 +147,7 @@ def _add_look(geom: mujoco.MjsGeom) -> None:
 
 
 def _rename(spec: mujoco.MjSpec, name: str) -> None:
-    """The category in front of each asset's name: scenes share one namespace for them."""
+    """Return the category in front of each asset's name: scenes share one namespace for them."""
     for group, users, key in (
         (spec.meshes, spec.geoms, "meshname"),
         (spec.materials, spec.geoms, "material"),

@@ -22,12 +22,12 @@ class Body:
     """What an object is besides its look. SI units, in its frame.
 
     Attributes:
-        name: category.
-        mass: kg.
-        centre: of mass, (3,).
-        inertia: about it: xx, yy, zz, xy, xz, yz.
-        pieces: what it collides with.
-        inside: half size of its `contain_region`, which is in its middle; None for none.
+        name: Category.
+        mass: Kg.
+        centre: Of mass, (3,).
+        inertia: About it: xx, yy, zz, xy, xz, yz.
+        pieces: What it collides with.
+        inside: Half size of its `contain_region`, which is in its middle; None for none.
     """
 
     name: str
@@ -42,11 +42,11 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
     """Write the files of an object.
 
     Args:
-        place: folder.
-        body: what it is.
-        surfaces: what it looks like.
-        faces: triangles that the whole look may have.
-        notify: takes a line where it is simplified.
+        place: Folder.
+        body: What it is.
+        surfaces: What it looks like.
+        faces: Triangles that the whole look may have.
+        notify: Takes a line where it is simplified.
     """
     root = ET.Element("mujoco", {"model": body.name})
     ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})

@@ -30,15 +30,15 @@ def try_object(item: ObjectModel, notify: Notify, picture: Path | None = None) -
     """Put an object down, look for a hold, and draw it from all sides.
 
     Args:
-        item: fresh; its spec is used up.
-        notify: takes a line about what tasks with it would suffer from.
+        item: Fresh; its spec is used up.
+        notify: Takes a line about what tasks with it would suffer from.
         picture: PNG to write; None for none.
 
     Returns:
         `size` (m), placement's figures, `stands`, and `grasp`: the width of the narrowest hold, m, or why none.
 
     Raises:
-        LiberoError: it cannot be compiled, or nothing of it collides.
+        LiberoError: It cannot be compiled, or nothing of it collides.
     """
     model = _stage(item)
     found: dict[str, Any] = {**figures(surface_points(model, model.body(_BODY).id))}
@@ -55,7 +55,7 @@ def draw_object(item: ObjectModel, picture: Path) -> Path:
     """Draw an object from all sides into a PNG file.
 
     Raises:
-        LiberoError: it cannot be compiled, or no picture can be drawn here.
+        LiberoError: It cannot be compiled, or no picture can be drawn here.
     """
     model = _stage(item)
     found, data = figures(surface_points(model, model.body(_BODY).id)), mujoco.MjData(model)
@@ -69,7 +69,7 @@ def figures(points: np.ndarray) -> dict[str, Any]:
     """What placement needs to know of points (n, 3) on an object, m.
 
     Raises:
-        LiberoError: there are none.
+        LiberoError: There are none.
     """
     if not len(points):
         raise LiberoError("nothing of it collides; give it a geom with contype and conaffinity 1")
@@ -83,10 +83,10 @@ def figures(points: np.ndarray) -> dict[str, Any]:
 
 
 def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], picture: Path) -> Path:
-    """A sheet of pictures (two rows) from around the origin, as PNG.
+    """Return a sheet of pictures (two rows) from around the origin, as PNG.
 
     Raises:
-        RenderError: no picture can be drawn here.
+        RenderError: No picture can be drawn here.
     """
     frames = np.zeros((VIEWS, _PIXELS, _PIXELS, 3), np.uint8)
     with Renderer(model, _PIXELS, _PIXELS) as renderer:
@@ -102,7 +102,7 @@ def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], pic
 
 
 def _stage(item: ObjectModel) -> mujoco.MjModel:
-    """The object on a floor, with a free joint and a camera."""
+    """Return the object on a floor, with a free joint and a camera."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.impratio, spec.option.cone = 0.002, 20.0, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.visual.quality.offsamples = 0
@@ -132,7 +132,7 @@ def _aim(model: mujoco.MjModel, middle: np.ndarray, distance: float, yaw: float)
 
 
 def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
-    """Whether it stays as it is put down; the state is left where it came to rest."""
+    """Return whether it stays as it is put down; the state is left where it came to rest."""
     for _ in range(round(_SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
     body = data.body(_BODY)
@@ -148,7 +148,7 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
 
 
 def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify) -> dict[str, Any]:
-    """The narrowest square hold from above that the expert knows where the object lies now, or why there is none."""
+    """Return the narrowest grasp from above of the object where it lies now, or the reason why there is none."""
     body = data.body(_BODY)
     cloud = surface_points(model, body.id, _FINE) @ body.xmat.reshape(3, 3).T + body.xpos
     try:
@@ -170,7 +170,7 @@ def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify
 
 
 def _is_square(cloud: np.ndarray, hold: Grasp) -> bool:
-    """Whether the pads meet faces that stand across the way they close, and not the two sides of an edge."""
+    """Return whether the pads meet faces that stand across the way they close, and not the two sides of an edge."""
     along, across, down = ((cloud - hold.pos_world) @ hold.mat).T
     near = (np.abs(along) < 0.5 * hold.width + _FINE) & (np.abs(across) < FINGER_HALF_WIDTH)
     near &= (down < PAD_BELOW) & (down > -PAD_ABOVE)

@@ -48,7 +48,7 @@ def bbq_sauce() -> Appearance:
 
 
 def new_salad_dressing() -> dict[str, Appearance]:
-    """The same bottle, on a body that stands beside its root."""
+    """Return the same bottle, on a body that stands beside its root."""
     return {"sald_dressing_body": salad_dressing()}
 
 

@@ -35,18 +35,18 @@ class Palette:
     """Tiles side by side in one picture.
 
     Attributes:
-        tiles: name -> (TILE, TILE, 3) uint8, first row on top.
+        tiles: Name -> (TILE, TILE, 3) uint8, first row on top.
     """
 
     tiles: Mapping[str, np.ndarray]
 
     def __getitem__(self, name: str) -> Cell:
-        """Where a tile is, a little inside its border: neighbours do not shine through."""
+        """Return where a tile is, a little inside its border: neighbours do not shine through."""
         index, count, margin = list(self.tiles).index(name), len(self.tiles), 3.0 / TILE
         return ((index + margin) / count, margin, (index + 1 - margin) / count, 1.0 - margin)
 
     def png(self) -> bytes:
-        """The picture, encoded."""
+        """Return the picture, encoded."""
         return png(np.concatenate(list(self.tiles.values()), axis=1))
 
 
@@ -61,10 +61,10 @@ def block(
     """Box between two corners; each face shows the whole cell.
 
     Args:
-        low: corner (3,), metres.
-        high: opposite corner (3,), metres.
-        cell: part of the picture.
-        bevel: width of the chamfer along the edges, metres; it catches the light.
+        low: Corner (3,), metres.
+        high: Opposite corner (3,), metres.
+        cell: Part of the picture.
+        bevel: Width of the chamfer along the edges, metres; it catches the light.
         faces: `x+`, `x-`, ... `z-` -> another part of the picture.
     """
     (bottom, top), cells = np.array([low, high], float), faces or {}
@@ -83,7 +83,7 @@ def block(
 
 
 def prism(outline: Sequence[tuple[float, float]], low: float, high: float, cell: Cell) -> Mesh:
-    """A convex outline of (x, z) points, counter-clockwise seen from -y, from y = low to y = high."""
+    """Return a convex outline of (x, z) points, counter-clockwise seen from -y, from y = low to y = high."""
     points = np.array(outline, float)
     near, far = (np.column_stack([points[:, 0], np.full(len(points), y), points[:, 1]]) for y in (low, high))
     corners = np.concatenate([near, far])
@@ -111,11 +111,11 @@ def turned(
 
     Args:
         profile: (height, radius), metres, going up on the outside; its ends are joined to the axis.
-        cell: part of the picture; its height is the way along the profile.
-        base: where height 0 is, (3,), metres.
-        axis: unit vector (3,) in which the height grows.
-        segments: corners around.
-        smooth: shade without edges.
+        cell: Part of the picture; its height is the way along the profile.
+        base: Where height 0 is, (3,), metres.
+        axis: Unit vector (3,) in which the height grows.
+        segments: Corners around.
+        smooth: Shade without edges.
     """
     points, way = outline_of(profile)
     rings = [Ring(z, r, r, v, crease=not smooth) for (z, r), v in zip(points, way, strict=True)]
@@ -126,7 +126,7 @@ def turned(
 
 
 def outline_of(profile: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """A profile from axis to axis, (n, 2), and how far along it each point lies, (n,) in 0..1."""
+    """Return a profile from axis to axis, (n, 2), and how far along it each point lies, (n,) in 0..1."""
     points = np.array([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return points, way / way[-1]
@@ -156,7 +156,7 @@ def capsule(
 
 
 def in_body(mesh: Mesh, category: str, body: str) -> Mesh:
-    """The mesh, given in the frame of the root body, in that of the body which is to carry it."""
+    """Return the mesh, given in the frame of the root body, in that of the body which is to carry it."""
     parts, chain = load_physics(category).parts, []
     while body != ROOT_BODY:
         chain.append(parts[body])

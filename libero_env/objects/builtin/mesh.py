@@ -28,7 +28,7 @@ class Mesh:
     texcoords: np.ndarray
 
     def rotated(self, quat: np.ndarray) -> "Mesh":
-        """The mesh turned by a quaternion wxyz (4,)."""
+        """Return the mesh turned by a quaternion wxyz (4,)."""
         return Mesh(self.vertices @ quat_to_mat(np.asarray(quat, float)).T, self.faces, self.texcoords)
 
 
@@ -37,12 +37,12 @@ class Ring:
     """One section of a loft: a superellipse in a horizontal plane.
 
     Attributes:
-        z: height, metres.
-        depth: half extent along x, metres.
-        width: half extent along y, metres.
-        v: texture height of the section.
-        round: exponent: 2 is an ellipse, larger is boxier.
-        crease: the surface has an edge here, shaded sharp.
+        z: Height, metres.
+        depth: Half extent along x, metres.
+        width: Half extent along y, metres.
+        v: Texture height of the section.
+        round: Exponent: 2 is an ellipse, larger is boxier.
+        crease: The surface has an edge here, shaded sharp.
     """
 
     z: float
@@ -57,8 +57,8 @@ def loft(rings: Sequence[Ring], segments: int, center: tuple[float, float] = (0.
     """Skin over sections from bottom to top (or inside to outside); ends of size 0 close it.
 
     Args:
-        rings: sections in order; the outside is to the right of the path when the axis is on the left.
-        segments: vertices around.
+        rings: Sections in order; the outside is to the right of the path when the axis is on the left.
+        segments: Vertices around.
         center: (x, y) of the axis, metres.
     """
     rows, coords, quads = [], [], []
@@ -78,9 +78,9 @@ def box(half: Sequence[float], center: Sequence[float], cells: dict[str, tuple[f
     """Box whose faces show rectangles of the picture.
 
     Args:
-        half: half extents (x, y, z), metres.
+        half: Half extents (x, y, z), metres.
         center: (x, y, z), metres.
-        cells: face name (front, back, left, right, top, bottom) -> (u0, v0, u1, v1); faces are seen from
+        cells: Face name (front, back, left, right, top, bottom) -> (u0, v0, u1, v1); faces are seen from
             outside with z up, top and bottom with the front edge below; right is +y.
     """
     frames = {  # face -> (normal, to the right, upwards)
@@ -116,12 +116,12 @@ def sweep(
     """Skin along a path that stays in one plane: handles, cutlery.
 
     Args:
-        path: points of the middle line (n, 3), metres.
-        half: half extents of the section at each point (n, 2): along `across`, in the plane.
-        across: unit normal of the plane (3,).
-        segments: vertices around.
+        path: Points of the middle line (n, 3), metres.
+        half: Half extents of the section at each point (n, 2): along `across`, in the plane.
+        across: Unit normal of the plane (3,).
+        segments: Vertices around.
         cell: (u0, v0, u1, v1) of the picture; u runs around, v along the path.
-        round: exponent of the section's superellipse, as in `Ring`.
+        round: Exponent of the section's superellipse, as in `Ring`.
     """
     points, across, (u0, v0, u1, v1) = np.asarray(path, float), np.asarray(across, float), cell
     along = np.gradient(points, axis=0)
@@ -147,7 +147,7 @@ def sweep(
 
 
 def seamless(mesh: Mesh, segments: int) -> Mesh:
-    """A loft or sweep closed where its picture begins and ends, so that light shows no seam there.
+    """Return a loft or sweep closed where its picture begins and ends, so that light shows no seam there.
 
     The picture then covers each half around, mirrored: u is 0 where the seam was and 1 opposite of it.
     """
@@ -160,13 +160,13 @@ def seamless(mesh: Mesh, segments: int) -> Mesh:
 
 
 def faceted(mesh: Mesh) -> Mesh:
-    """The mesh with flat triangles: none shares a vertex with another."""
+    """Return the mesh with flat triangles: none shares a vertex with another."""
     corners = mesh.faces.ravel()
     return Mesh(mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3), mesh.texcoords[corners])
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
-    """All triangles in one mesh."""
+    """Return all triangles in one mesh."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

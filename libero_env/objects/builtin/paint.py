@@ -15,8 +15,8 @@ class Canvas:
     """A picture to paint on; edges are smoothed by drawing large and shrinking.
 
     Args:
-        color: background, RGB 0..255.
-        size: width and height in pixels.
+        color: Background, RGB 0..255.
+        size: Width and height in pixels.
     """
 
     def __init__(self, color: Color, size: tuple[int, int] = (128, 128)):
@@ -51,12 +51,12 @@ class Canvas:
         self._draw.polygon([self._at(u, v) for u, v in points], fill=color)
 
     def line(self, points: Sequence[tuple[float, float]], width: float, color: Color) -> None:
-        """Draws a line; `width` is a share of the picture's width."""
+        """Draw a line; `width` is a share of the picture's width."""
         pixels = max(1, round(width * self._image.width))
         self._draw.line([self._at(u, v) for u, v in points], fill=color, width=pixels, joint="curve")
 
     def text(self, text: str, cell: tuple[float, float, float, float], color: Color, turn: int = 0) -> None:
-        """Writes text stretched to fill (u0, v0, u1, v1); `turn` rotates it left by 0, 90, 180 or 270 deg."""
+        """Write text stretched to fill (u0, v0, u1, v1); `turn` rotates it left by 0, 90, 180 or 270 deg."""
         font = ImageFont.load_default(64)
         box = font.getbbox(text, stroke_width=2)
         mask = Image.new("L", (round(box[2] - box[0]), round(box[3] - box[1])), 0)
@@ -67,7 +67,7 @@ class Canvas:
         self._image.paste(color, (round(x0), round(y0)), mask)
 
     def png(self) -> bytes:
-        """The picture, encoded."""
+        """Return the picture, encoded."""
         return png(np.asarray(self._image.resize(self._size, Image.Resampling.BOX)))
 
     def _at(self, u: float, v: float) -> tuple[float, float]:
@@ -75,7 +75,7 @@ class Canvas:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """A picture (H, W, 3) uint8, first row on top, encoded for MuJoCo, whose v = 0 is a file's first row."""
+    """Return a picture (H, W, 3) uint8, first row on top, encoded for MuJoCo, whose v = 0 is a file's first row."""
     stream = io.BytesIO()
     Image.fromarray(pixels[::-1]).save(stream, "png", compress_level=1)
     return stream.getvalue()

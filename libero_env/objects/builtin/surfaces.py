@@ -46,14 +46,14 @@ def chrome(color: Color) -> np.ndarray:
 
 
 def edged(tile: np.ndarray, *, width: int = 5, shade: float = 0.72) -> np.ndarray:
-    """A tile with a darker rim: the shadow in which neighbouring fronts lie."""
+    """Return a tile with a darker rim: the shadow in which neighbouring fronts lie."""
     y, x = np.mgrid[:TILE, :TILE]
     rim = np.clip(np.minimum.reduce([x, y, TILE - 1 - x, TILE - 1 - y]) / width, 0.0, 1.0)
     return (tile * (shade + (1.0 - shade) * rim)[..., None]).astype(np.uint8)
 
 
 def panelled(tile: np.ndarray, inset: tuple[float, float], *, shade: float = 0.84) -> np.ndarray:
-    """A tile with a sunken panel painted on; `inset` is its distance from the rim in u and v."""
+    """Return a tile with a sunken panel painted on; `inset` is its distance from the rim in u and v."""
     y, x = np.mgrid[:TILE, :TILE] / TILE
     du, dv = np.minimum(x, 1 - x) - inset[0], np.minimum(y, 1 - y) - inset[1]
     line = np.minimum(du / inset[0], dv / inset[1])

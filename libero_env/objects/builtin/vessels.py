@@ -23,9 +23,9 @@ def vessel(
     back and 1 at the front: both sides show the same.
 
     Args:
-        outside: from the axis below to the rim.
-        inside: from the rim to the axis on the floor.
-        segments: vertices around.
+        outside: From the axis below to the rim.
+        inside: From the rim to the axis on the floor.
+        segments: Vertices around.
         center: (x, y) of the axis, metres.
     """
     points = np.array([*outside, *inside], float)

@@ -9,7 +9,7 @@ COLOR = (0.85, 0.15, 0.15, 0.5)
 
 
 def target_zone() -> ObjectModel:
-    """A flat translucent rectangle; its site `default_site` is the place, a little higher than the picture."""
+    """Return a flat translucent rectangle; its site `default_site` is the place, a little higher than the picture."""
     spec, box = mujoco.MjSpec(), mujoco.mjtGeom.mjGEOM_BOX
     spec.modelname = "target_zone"
     spec.compiler.degree = False
