@@ -25,9 +25,9 @@ class BareMujoco:
     """MuJoCo alone on the model of an environment: no controller, no observations, no copies."""
 
     def __init__(self, env: LiberoEnv):
-        self.model, size = env.world.scene.model, env.world.camera_size
+        self.model, size = env.world.scene.model, env.config.camera_size
         self.data = mujoco.MjData(self.model)
-        self.cameras = [self.model.camera(name).id for name in env.world.cameras]
+        self.cameras = [self.model.camera(name).id for name in env.config.cameras]
         _, self.gl = open_context(*size)
         self.gl.make_current()
         self.context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_50)

@@ -205,8 +205,8 @@ class Comparison:
         """What MuJoCo itself takes, from the same states: 25 steps, and drawing."""
         steps, frames = [], []
         physics, env = self.env(cameras=()), self.env()
-        bare, images = BareMujoco(env), env.world.empty_frames()
-        env.draw = False
+        bare, images = BareMujoco(env), env.world.empty_images()
+        env.render_images = False
         for _ in range(self.rounds):
             self.start(physics)
             with one_core():
@@ -217,8 +217,8 @@ class Comparison:
             frames.append([])
             for action in smooth_actions(CAMERA_STEPS // 2):
                 env.step(action)
-                env.world.draw([0], images)  # from here on its context is the current one
-                mine = best(lambda: env.world.draw([0], images), 2)
+                env.world.render_cameras([0], images)  # from here on its context is the current one
+                mine = best(lambda: env.world.render_cameras([0], images), 2)
                 frames[-1].append((mine, *bare.draw(env)))
         for made in (bare, physics, env):
             made.close()

@@ -72,7 +72,7 @@ def camera_rate(size: int, repeats: int) -> dict[str, float]:
         for _ in range(25):
             env.step(rng.uniform(-0.5, 0.5, 7))
         rates.append(25 / (time.perf_counter() - start))
-    drawing = best(lambda: env.world.draw([0], env.world.empty_frames()), 5 * repeats)
+    drawing = best(lambda: env.world.render_cameras([0], env.world.empty_images()), 5 * repeats)
     env.close()
     median = float(np.median(rates))
     return {"steps_per_s_best": max(rates), "steps_per_s_median": median, "draw_both_ms": 1e3 * drawing}

@@ -12,7 +12,7 @@ from PIL import Image
 
 from libero_env.assets.arena import WORKSPACES, add_arena, add_mount, load_workspace
 from libero_env.assets.robot import add_panda
-from libero_env.sim.render import Renderer
+from libero_env.sim.render import Renderer, RenderTarget
 
 
 def main() -> None:
@@ -47,7 +47,7 @@ def draw(category: str, properties: dict[str, str], camera: str, size: int, robo
     data, frame = mujoco.MjData(model), np.empty((size, size, 3), np.uint8)
     mujoco.mj_forward(model, data)
     with Renderer(model, size, size) as renderer:
-        renderer.render(data, [renderer.camera_id(camera)], [frame])
+        renderer.render(data, [RenderTarget(renderer.camera_id(camera), frame)])
     return frame
 
 

@@ -98,7 +98,7 @@ def first_view(task: Task, size: int = 256) -> np.ndarray:
         else:  # the same state, without the other 49
             qpos, qvel, fixtures = split_row(world.scene.model, generate_init_states(task, world.scene, 1))
             world.simulations.reset([0], qpos, qvel, fixtures=fixtures)
-        picture = world.frame(0, "agentview")
+        picture = world.render(0, "agentview")
     finally:
         world.close()
     return shrunk(picture, size)

@@ -64,7 +64,7 @@ def acted(file: Path, target: Path) -> Path:
             for action in episode.actions:
                 states.append(world.physics_state(0))
                 world.step([0], action[None])
-            success = bool(world.judge(0)[0])
+            success = bool(world.check_goal(0)[0])
             writer.write(int(name[5:]), replace(episode, states=np.array(states), success=success))
     finally:
         renderer.close()

@@ -31,7 +31,7 @@ _PROBE = """
 import json, sys, time
 import mujoco, numpy
 from libero_env.errors import RenderError
-from libero_env.sim.render import Renderer, choose_backend
+from libero_env.sim.render import Renderer, RenderTarget, choose_backend
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 0 2'/><geom type='plane' size='1 1 1' group='1'/>"
     "<camera name='above' pos='0 0 2'/></worldbody></mujoco>")
@@ -41,10 +41,10 @@ picture = numpy.zeros((128, 128, 3), numpy.uint8)
 try:
     found = {"backend": choose_backend()}
     with Renderer(model, 128, 128) as renderer:
-        camera = [renderer.camera_id("above")]
-        renderer.render(data, camera, [picture])
+        target = RenderTarget(renderer.camera_id("above"), picture)
+        renderer.render(data, [target])
         start = time.perf_counter()
-        renderer.render(data, camera, [picture])
+        renderer.render(data, [target])
         found["milliseconds"] = 1e3 * (time.perf_counter() - start)
         try:
             from OpenGL.GL import GL_RENDERER, glGetString

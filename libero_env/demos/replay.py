@@ -14,7 +14,7 @@ from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import BrokenDemoError
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
-from libero_env.sim.observations import entry
+from libero_env.sim.observations import image_name
 from libero_env.sim.scene import Scene
 
 REPLAY_MODES = ("state", "action")
@@ -69,7 +69,7 @@ def replay(
     if by not in REPLAY_MODES:
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
     renderer = StateRenderer(recorded_task(file), RenderConfig(tuple(cameras), size), assets)
-    keys = [entry(camera, "rgb") for camera in cameras]
+    keys = [image_name(camera, "rgb") for camera in cameras]
     found = set()
     try:
         for name, episode in read_episodes(file):

@@ -10,7 +10,7 @@ from libero_env.demos.video import write_video
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert import Expert
 from libero_env.expert.rollout import MAX_STEPS
-from libero_env.sim.observations import entry
+from libero_env.sim.observations import image_name
 from libero_env.tasks.task import Task
 from libero_env.timing import CONTROL_HZ
 
@@ -33,7 +33,8 @@ def contact_sheet(
     env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
     try:
         rows = [
-            np.concatenate([_shown(env, i)[entry(c, "rgb")] for c in cameras], axis=1) for i in range(starts)
+            np.concatenate([_shown(env, i)[image_name(c, "rgb")] for c in cameras], axis=1)
+            for i in range(starts)
         ]
     finally:
         env.close()
@@ -62,14 +63,16 @@ def expert_video(
     """
     env = LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS)
     try:
-        frames = [_shown(env, start)[entry(camera, "rgb")]]
+        frames = [_shown(env, start)[image_name(camera, "rgb")]]
         expert, terminated, truncated, step = Expert(task, np.random.default_rng(start)), False, False, 0
         while not (terminated or truncated or expert.failure_reason):
-            env.draw = step % _EVERY == _EVERY - 1
+            env.render_images = step % _EVERY == _EVERY - 1
             obs, _, terminated, truncated, _ = env.step(expert.act(env.view))
-            if env.draw or terminated:
+            if env.render_images or terminated:
                 frames.append(
-                    env.render_frames()[entry(camera, "rgb")] if terminated else obs[entry(camera, "rgb")]
+                    env.render_cameras()[image_name(camera, "rgb")]
+                    if terminated
+                    else obs[image_name(camera, "rgb")]
                 )
             step += 1
     finally:

@@ -1,13 +1,13 @@
-"""Environments in processes of their own, as one `gymnasium.vector.VectorEnv`: for different tasks side by side.
+"""Environments in worker processes, as one `gymnasium.vector.VectorEnv`: for different tasks side by side.
 
-Workers are spawned, so no OpenGL context and no lock is inherited; each makes its environment and its context itself.
-Observations come back through shared memory. A worker that dies, or does not answer in time, is replaced.
+Workers are spawned, so that no OpenGL context and no lock is inherited; each makes its environment and its context
+itself. Observations are passed in shared memory. A worker that dies, or does not answer in time, is replaced.
 """
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -15,7 +15,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from libero_env.envs.checks import checked_actions
+from libero_env.envs.checks import ResetRequest, checked_actions
+from libero_env.envs.config import EnvConfig, EnvOptions, show_options
 from libero_env.envs.worker import Failure, Worker, checked_space, open_libero, shut_down, wait_for
 from libero_env.errors import LiberoError
 from libero_env.timing import CONTROL_HZ
@@ -25,21 +26,21 @@ Outcome = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[
 
 
 class WorkerError(LiberoError):
-    """Workers died, hung or raised; the message says which, on what task, why, and what to do.
+    """Workers died, hung or raised; the message states which, on what task, why, and what to do.
 
     Attributes:
-        failed: index of each environment that failed -> why. They stand still until they are reset.
-        outcome: what the call would have returned, None if there is nothing; rows of `failed` are zero, and truncated
-            in a step.
+        failed: Reason of failure by index of the environment. These environments do not move until they are reset.
+        outcome: Result that the call would have returned, None if there is none; rows of `failed` are zero, and
+            truncated in a step.
     """
 
     def __init__(self, failed: Mapping[int, str], tasks: Sequence[str], outcome: Any = None):
-        lines = [f"worker {i} ({tasks[i]}): {why.rstrip()}" for i, why in sorted(failed.items())]
+        lines = [f"worker {i} ({tasks[i]}): {reason.rstrip()}" for i, reason in sorted(failed.items())]
         if outcome is None:
-            remedy = "Nothing was started. Mend the arguments above; if the machine was only slow, raise start_timeout="
+            remedy = "Nothing was started. Fix the arguments above; if the machine was only slow, raise start_timeout="
         else:
             remedy = (
-                f"The others work. Reset these, options={{'reset_mask': ...}} with {sorted(failed)}, to go on; "
+                f"The others work. Reset these, options={{'reset_mask': ...}} with {sorted(failed)}, to continue; "
                 "if they were only slow, raise timeout="
             )
         super().__init__("\n".join([*lines, remedy]))
@@ -47,26 +48,45 @@ class WorkerError(LiberoError):
 
 
 class SubprocEnv(gymnasium.vector.VectorEnv):
-    """One worker process for each environment; the same seeds give the same results as `LiberoEnv`.
+    """Environments in worker processes, one in each; the same seeds give the same results as `LiberoEnv`.
 
-    There is no autoreset: an environment whose episode is over stands still and returns reward 0 until it is reset.
-    Entries of observations that differ in shape between environments, such as poses of their objects, are in
+    There is no autoreset: an environment whose episode is over does not move, and returns reward 0 until it is reset.
+    Entries of observations whose shapes differ between environments, such as poses of their objects, are in
     `info["own"]`, one dictionary for each environment; `observation_space` has the others.
 
     Args:
-        specs: for each environment the arguments of its `LiberoEnv`, `{"task": "libero_object/0", ...}`; or a function
-            that makes an environment whose observations are a dictionary of arrays.
-        timeout: seconds that a reset, step or call may take.
-        start_timeout: seconds that workers may take to start and build their scenes.
-        gl_devices: GPUs to draw on, dealt out in turn (`MUJOCO_EGL_DEVICE_ID`); by default as the driver decides.
+        specs: Arguments of the `LiberoEnv` of each environment, `{"task": "libero_object/0", ...}`; or a function that
+            makes an environment whose observations are a dictionary of arrays.
+        timeout: Largest time of a reset, step or call, s.
+        start_timeout: Largest time that workers may take to start and to build their scenes, s.
+        gl_devices: Indices of the GPUs to render on, assigned in turn (`MUJOCO_EGL_DEVICE_ID`); by default the driver
+            chooses.
+        config: Configuration of all environments of `specs` that are no functions.
+        **options: Fields of `EnvConfig` of these environments; arguments in `specs` take precedence.
+
+    Attributes:
+        tasks: Name of the task of each environment.
 
     Raises:
-        WorkerError: a worker could not make its environment.
-        LiberoError: no environments, or their action spaces differ.
+        WorkerError: A worker could not make its environment.
+        UnknownNameError: An option does not exist.
+        LiberoError: There are no environments, or their action spaces differ.
+
+    Example:
+        >>> specs = [{"task": "libero_object/0"}, {"task": "libero_goal/3"}]
+        >>> envs = SubprocEnv(specs, cameras=("agentview",), camera_size=(64, 64))
+        >>> observations, infos = envs.reset(seed=0)
+        >>> observations["agentview_rgb"].shape
+        (2, 64, 64, 3)
+        >>> observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
+        >>> infos["progress"][0]
+        {'(In alphabet_soup_1 basket_1_contain_region)': False}
+        >>> envs.close()
     """
 
     metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
 
+    @show_options
     def __init__(
         self,
         specs: Sequence[EnvSpec],
@@ -74,22 +94,21 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         timeout: float = 60.0,
         start_timeout: float = 300.0,
         gl_devices: Sequence[int] = (),
+        config: EnvConfig | None = None,
+        **options: Unpack[EnvOptions],
     ):
         if not specs:
             raise LiberoError("SubprocEnv needs at least one environment")
-        self.num_envs, self.render_mode, self.timeout, self.start_timeout = (
-            len(specs),
-            None,
-            timeout,
-            start_timeout,
-        )
+        common = {"config": EnvConfig.from_options(config, options)}
+        factories = [spec if callable(spec) else _factory({**common, **spec}) for spec in specs]
+        self.num_envs, self.render_mode = len(specs), None
+        self.timeout, self.start_timeout = timeout, start_timeout
         self.tasks = tuple(_task_name(spec) for spec in specs)
         self._workers: list[Worker] = []
         self._finalizer = weakref.finalize(self, shut_down, self._workers)
-        for i, spec in enumerate(specs):
+        for i, factory in enumerate(factories):
             variables = {"MUJOCO_EGL_DEVICE_ID": str(gl_devices[i % len(gl_devices)])} if gl_devices else {}
-            make = spec if callable(spec) else partial(open_libero, dict(spec))
-            self._workers.append(Worker(self.tasks[i], make, variables))
+            self._workers.append(Worker(self.tasks[i], factory, variables))
         try:
             self._spaces = self._open()
         except LiberoError:
@@ -101,32 +120,33 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
 
     @property
     def running(self) -> np.ndarray:
-        """Which environments are in an episode, (num_envs,) bool."""
+        """Whether each environment is in an episode, (num_envs,) bool."""
         return self._running.copy()
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start episodes; arguments as `BatchEnv.reset`.
+        """Start episodes.
+
+        Args:
+            seed: One seed for each environment, or one number from which they count up.
+            options: `init_state`: index of one stored state, or of one for each environment, (num_envs,).
+                `reset_mask`: which environments to reset, (num_envs,) bool; by default all. Others are passed to the
+                environments.
 
         Raises:
-            WorkerError: some failed; the others have been reset.
-            LiberoError: seeds or mask of the wrong length.
+            WorkerError: Some workers failed; the others have been reset.
+            LiberoError: Seeds, mask or initial states have the wrong length.
         """
-        options = dict(options or {})
-        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
-        if mask.shape != (self.num_envs,):
-            raise LiberoError(f"reset_mask: expected ({self.num_envs},) booleans, got shape {mask.shape}")
-        seeds = self._seeds(seed)
-        wanted = None
-        if "init_state" in options:
-            wanted = np.broadcast_to(np.asarray(options.pop("init_state")), (self.num_envs,))
-        ids = [int(i) for i in np.flatnonzero(mask)]
+        options = options or {}
+        request = ResetRequest.from_arguments(self.num_envs, seed, options)
+        others = {key: value for key, value in options.items() if key not in ("reset_mask", "init_state")}
+        ids = [int(i) for i in request.ids]
         failed = self._reopen([i for i in ids if not self._workers[i].opened])
         ids = [i for i in ids if i not in failed]
         for i in ids:
-            own = options if wanted is None else {**options, "init_state": int(wanted[i])}
-            self._workers[i].send("reset", seeds[i], own)
+            start = {} if request.init_states is None else {"init_state": int(request.init_states[i])}
+            self._workers[i].send("reset", request.seeds[i], {**others, **start})
         answers, more = self._collect(ids, self.timeout)
         for i, info in answers.items():
             self._running[i], self._success[i] = True, bool(info.get("success", False))
@@ -134,11 +154,14 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         return self._checked((self._observe(), self._info()), failed | more)
 
     def step(self, actions: np.ndarray) -> Outcome:
-        """Act; environments that are not in an episode stand still.
+        """Apply actions in every environment that is in an episode.
+
+        Args:
+            actions: Action of each environment, (num_envs, 7) by default.
 
         Raises:
-            ActionError: wrong shape or not finite; nothing has moved.
-            WorkerError: some failed; the others have moved, see `WorkerError.outcome`.
+            ActionError: The shape is wrong, or a value is not finite; no state has changed.
+            WorkerError: Some workers failed; the others have stepped, see `WorkerError.outcome`.
         """
         actions = checked_actions(actions, self.num_envs, self._action_size)
         ids = [int(i) for i in np.flatnonzero(self._running)]
@@ -156,10 +179,16 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         return self._checked((self._observe(), rewards, terminated, truncated, self._info()), failed)
 
     def call(self, name: str, *args: Any, indices: Sequence[int] | None = None, **kwargs: Any) -> list[Any]:
-        """An attribute of each environment, or the result of calling it; for `indices` only, in their order.
+        """Return an attribute of each environment, or the result of calling it.
+
+        Args:
+            name: Name of the attribute.
+            *args: Arguments of the call.
+            indices: Indices of the environments, in this order; by default all.
+            **kwargs: Keyword arguments of the call.
 
         Raises:
-            WorkerError: some failed; `outcome` has None for them.
+            WorkerError: Some workers failed; `outcome` has None for them.
         """
         indices = list(range(self.num_envs)) if indices is None else [int(i) for i in indices]
         failed = self._reopen([i for i in indices if not self._workers[i].opened])
@@ -170,11 +199,11 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         return self._checked([answers.get(i) for i in indices], failed | more)
 
     def get_state(self, i: int) -> np.ndarray:
-        """Environment i as `LiberoEnv.get_state` gives it."""
+        """Return the state of environment i, as `LiberoEnv.get_state`."""
         return self.call("get_state", indices=[i])[0]
 
     def set_state(self, i: int, state: np.ndarray) -> None:
-        """Put environment i into a state of `get_state`."""
+        """Restore a state of `get_state` in environment i."""
         self.call("set_state", np.asarray(state, np.float64), indices=[i])
         self._running[i], self._success[i] = True, False
 
@@ -183,14 +212,16 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         self._finalizer()
 
     def _open(self) -> list[spaces.Dict]:
-        """Wait for all environments, and agree on spaces."""
+        """Wait for all environments, and determine the common spaces; returns the observation space of each."""
         answers, failures = wait_for(dict(enumerate(self._workers)), self.start_timeout)
         if failures:
-            raise WorkerError({i: f.why for i, f in failures.items()}, self.tasks)
+            raise WorkerError({i: f.reason for i, f in failures.items()}, self.tasks)
         observed = [checked_space(answers[i][0], self.tasks[i]) for i in range(self.num_envs)]
         first = answers[0][1]
-        if odd := [self.tasks[i] for i in range(self.num_envs) if answers[i][1] != first]:
-            raise LiberoError(f"the action spaces of {', '.join(odd)} differ from {first} of {self.tasks[0]}")
+        if different := [self.tasks[i] for i in range(self.num_envs) if answers[i][1] != first]:
+            raise LiberoError(
+                f"the action spaces of {', '.join(different)} differ from {first} of {self.tasks[0]}"
+            )
         for worker, space in zip(self._workers, observed, strict=True):
             worker.share(space)
         self._attached(range(self.num_envs))
@@ -202,13 +233,14 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         return observed
 
     def _attached(self, ids: Sequence[int]) -> dict[int, str]:
+        """Wait until workers have attached the shared memory, and return the reasons of those that failed."""
         answers, failed = self._collect(ids, self.timeout)
         for i in answers:
             self._workers[i].opened = True
         return failed
 
     def _reopen(self, ids: Sequence[int]) -> dict[int, str]:
-        """Wait for workers that were replaced; index -> why not."""
+        """Wait for workers that were replaced, and return the reasons of those that failed."""
         if not ids:
             return {}
         answers, failed = self._collect(ids, self.start_timeout)
@@ -219,17 +251,17 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
     def _collect(
         self, ids: Sequence[int], timeout: float, keep_running: bool = False
     ) -> tuple[dict[int, Any], dict[int, str]]:
-        """Answers, and why some gave none; those whose process is lost get a new one."""
+        """Return the answers, and the reasons of workers that gave none; lost processes are replaced."""
         asked = {i: self._workers[i] for i in ids}
         try:
             answers, failures = wait_for(asked, timeout)
         except KeyboardInterrupt:
-            for worker in asked.values():  # their answers would be taken for those to the next question
+            for worker in asked.values():  # or their answers would be taken for those to the next command
                 worker.process.kill()
             raise
         for i, failure in failures.items():
             self._abandon(i, failure, keep_running)
-        return answers, {i: failure.why for i, failure in failures.items()}
+        return answers, {i: failure.reason for i, failure in failures.items()}
 
     def _abandon(self, i: int, failure: Failure, keep_running: bool) -> None:
         worker = self._workers[i]
@@ -263,17 +295,18 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
             raise WorkerError(failed, self.tasks, outcome)
         return outcome
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None or np.isscalar(seed):
-            return [None if seed is None else int(seed) + i for i in range(self.num_envs)]  # type: ignore[arg-type]
-        if len(seed) != self.num_envs:  # type: ignore[arg-type]
-            raise LiberoError(f"seed: expected one or {self.num_envs} seeds, got {len(seed)}")  # type: ignore[arg-type]
-        return [None if s is None else int(s) for s in seed]  # type: ignore[union-attr]
+
+def _factory(arguments: Mapping[str, Any]) -> Callable[[], gymnasium.Env]:
+    """Return a function that makes a `LiberoEnv` in a worker, after a check of the names of its arguments."""
+    if "task" not in arguments:
+        given = ", ".join(name for name in arguments if name != "config") or "none"
+        raise LiberoError(f"each environment needs a 'task'; got the keys {given}")
+    other = ("task", "config", "render_mode")
+    EnvConfig.from_options(arguments["config"], {k: v for k, v in arguments.items() if k not in other})
+    return partial(open_libero, dict(arguments))
 
 
 def _task_name(spec: EnvSpec) -> str:
     if callable(spec):
         return getattr(spec, "__name__", repr(spec))
-    if "task" not in spec:
-        raise LiberoError(f"each environment needs a 'task'; got the keys {', '.join(spec) or 'none'}")
     return getattr(spec["task"], "id", str(spec["task"]))

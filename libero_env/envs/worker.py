@@ -1,4 +1,4 @@
-"""One environment in a process of its own: both ends of the pipe, and the memory they share."""
+"""One environment in a worker process: both ends of the pipe, and the memory they share."""
 
 import contextlib
 import os
@@ -18,15 +18,19 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from libero_env.errors import LiberoError
 
-_JOIN = 5.0  # s, for a worker to end by itself
+_JOIN_TIMEOUT = 5.0  # [s] for a worker to end by itself
 
 
 class Shared:
-    """The observation of one environment in shared memory: `views`, name -> array.
+    """The observation of one environment in shared memory.
 
     Args:
-        layout: For each name something with `shape` and `dtype`: a space, or an array.
+        layout: Space or array, with `shape` and `dtype`, of each entry.
         name: Name of the block to attach to; by default a new block is made.
+
+    Attributes:
+        name: Name of the block.
+        views: Array of each entry.
     """
 
     def __init__(self, layout: Mapping[str, Any], name: str | None = None):
@@ -43,14 +47,14 @@ class Shared:
         }
 
     def write(self, observation: Mapping[str, np.ndarray]) -> None:
-        """Copy an observation in."""
+        """Copy an observation to the shared memory."""
         for key, view in self.views.items():
             view[...] = observation[key]
 
     def close(self) -> None:
-        """Let go of the block; who made it frees it. Idempotent."""
+        """Close the block; the process that made it also frees it."""
         self.views = {}
-        with contextlib.suppress(BufferError):  # somebody still holds a view; it goes with that
+        with contextlib.suppress(BufferError):  # a view is still in use; the memory is closed with it
             self._memory.close()
         if self._owner:
             self._owner = False
@@ -58,14 +62,14 @@ class Shared:
 
 
 def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
-    """A `LiberoEnv` from its arguments; imported here, in the worker."""
+    """Make a `LiberoEnv` from its arguments; it is imported here, in the worker."""
     from libero_env.envs.env import LiberoEnv
 
     return LiberoEnv(**spec)
 
 
 def serve(pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str], host_class: Any) -> None:
-    """Answer commands until `close`, or until the other end is gone."""
+    """Run commands in a worker until `close`, or until the other end of the pipe is gone."""
     os.environ.update(variables)
     host = host_class(make)
     try:
@@ -73,7 +77,7 @@ def serve(pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str
             command, *args = pipe.recv()
             try:
                 pipe.send((True, getattr(host, command)(*args)))
-            except Exception:  # noqa: BLE001 - whatever it is, the other end raises it
+            except Exception:  # noqa: BLE001 - the other end raises it
                 pipe.send((False, traceback.format_exc()))
             if command == "close":
                 return
@@ -82,7 +86,7 @@ def serve(pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str
 
 
 class GymHost:
-    """The commands of a worker with a Gymnasium environment: each method is one."""
+    """A Gymnasium environment in a worker; each method is a command."""
 
     def __init__(self, make: Callable[[], gymnasium.Env]):
         self._make = make
@@ -90,27 +94,33 @@ class GymHost:
         self._shared: Any = None
 
     def open(self) -> tuple[spaces.Space, spaces.Space]:
+        """Make the environment and return its observation and action space."""
         self._env = self._make()
         return self._env.observation_space, self._env.action_space
 
     def attach(self, name: str) -> None:
+        """Attach the shared memory for observations."""
         self._shared = Shared(self._env.observation_space, name)
 
     def reset(self, seed: int | None, options: dict[str, Any]) -> dict[str, Any]:
+        """Reset the environment, write its observation and return its info."""
         observation, info = self._env.reset(seed=seed, options=options)
         self._shared.write(observation)
         return info
 
     def step(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
-        observation, *outcome = self._env.step(action)
+        """Step the environment, write its observation and return reward, terminated, truncated and info."""
+        observation, reward, terminated, truncated, info = self._env.step(action)
         self._shared.write(observation)
-        return tuple(outcome)  # type: ignore[return-value]
+        return reward, terminated, truncated, info
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Return an attribute of the environment, or the result of calling it."""
         value = getattr(self._env.unwrapped, name)
         return value(*args, **kwargs) if callable(value) else value
 
     def close(self) -> None:
+        """Close the environment and the shared memory."""
         if self._env is not None:
             self._env.close()
             self._env = None
@@ -152,7 +162,7 @@ class Worker:
         self.send("open")
 
     def send(self, command: str, *args: Any) -> None:
-        """Ask for something; to a worker that is gone, nothing happens."""
+        """Send a command; nothing happens if the worker is gone."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.pipe.send((command, *args))
 
@@ -164,7 +174,7 @@ class Worker:
     def kill(self) -> None:
         """End the process at once."""
         self.process.kill()
-        self.process.join(_JOIN)
+        self.process.join(_JOIN_TIMEOUT)
         self.pipe.close()
 
     def share(self, space: spaces.Dict) -> None:
@@ -182,30 +192,44 @@ class Worker:
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a worker did not answer; `lost` if its process is of no more use."""
+    """A worker that did not answer.
 
-    why: str
+    Attributes:
+        reason: Reason for the error message.
+        lost: Whether its process has to be replaced.
+    """
+
+    reason: str
     lost: bool
 
 
 def wait_for(
     workers: Mapping[int, Worker], timeout: float | None
 ) -> tuple[dict[int, Any], dict[int, Failure]]:
-    """Return the answers to the last commands, and why other workers gave none within `timeout` seconds (None: any)."""
+    """Wait for the answers to the last commands.
+
+    Args:
+        workers: Workers by index.
+        timeout: Largest time to wait, s; None waits forever.
+
+    Returns:
+        Answers and failures, by index.
+    """
     answers: dict[int, Any] = {}
     failures: dict[int, Failure] = {}
     waiting, end = dict(workers), None if timeout is None else time.monotonic() + timeout
     while waiting:
-        of = {w.pipe: i for i, w in waiting.items()} | {w.process.sentinel: i for i, w in waiting.items()}
-        ready = connection.wait(list(of), None if end is None else max(0.0, end - time.monotonic()))
-        for i in {of[item] for item in ready}:  # type: ignore[index]
+        index: dict[Any, int] = {w.pipe: i for i, w in waiting.items()}
+        index |= {w.process.sentinel: i for i, w in waiting.items()}
+        ready = connection.wait(list(index), None if end is None else max(0.0, end - time.monotonic()))
+        for i in {index[item] for item in ready}:
             worker = waiting.pop(i)
             try:
                 if not worker.pipe.poll():
                     raise EOFError
                 done, value = worker.pipe.recv()
             except (EOFError, ConnectionResetError):
-                worker.process.join(_JOIN)
+                worker.process.join(_JOIN_TIMEOUT)
                 failures[i] = Failure(f"its process ended (exit code {worker.process.exitcode})", True)
                 continue
             if done:
@@ -224,7 +248,7 @@ def shut_down(workers: Sequence[Worker]) -> None:
     for worker in workers:
         if worker.process.is_alive():
             worker.send("close")
-    end = time.monotonic() + _JOIN
+    end = time.monotonic() + _JOIN_TIMEOUT
     for worker in workers:
         worker.process.join(max(0.0, end - time.monotonic()))
         if not worker.pipe.closed:
@@ -233,10 +257,10 @@ def shut_down(workers: Sequence[Worker]) -> None:
 
 
 def checked_space(space: spaces.Space, task: str) -> spaces.Dict:
-    """The observation space, a dictionary of boxes.
+    """Return an observation space if it is a dictionary of boxes.
 
     Raises:
-        LiberoError: it is something else.
+        LiberoError: It is not.
     """
     if not isinstance(space, spaces.Dict) or not all(isinstance(box, spaces.Box) for box in space.values()):
         raise LiberoError(f"{task}: observations must be a dictionary of arrays to be shared, not {space}")

@@ -1,10 +1,11 @@
-"""The fixed initial states of each task: complete, settled, and tied to the model they were made for."""
+"""The fixed initial states of each task: complete, settled, and valid for the model that they were made for."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,81 +22,93 @@ from libero_env.storage import atomic_path
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50
-_RESERVED = 0x1B3E0  # separates the seeds of these states from those of `reset(seed=...)`
+_SEED = 0x1B3E0  # keeps the seeds of these states apart from those of `reset(seed=...)`
 
 
 def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -> np.ndarray:
-    """The initial states of a task, made anew: (num, 1 + nq + nv + 7 nfixtures).
+    """Generate the initial states of a task.
 
-    Rows are [time, qpos, qvel, pos and quat (wxyz) of each fixture]; row i depends on the task's name and i alone.
+    Args:
+        task: Task.
+        scene: Compiled scene of the task.
+        num: Number of states.
+
+    Returns:
+        Rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture], (num, 1 + nq + nv + 7 nfixtures). Row i
+        depends on the task's name and i alone.
     """
     simulations, nv = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies), scene.model.nv
     name = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
     rows = []
     for i in range(num):
-        start = sample_settled(scene, simulations, 0, np.random.default_rng([_RESERVED, name, i]))
+        start = sample_settled(scene, simulations, 0, np.random.default_rng([_SEED, name, i]))
         rows.append(np.concatenate([[0.0], start.qpos, np.zeros(nv), start.fixtures.ravel()]))
     return np.array(rows)
 
 
 def split_row(model: mujoco.MjModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (k, n) of initial states -> qpos (k, nq), qvel (k, nv), fixtures (k, nfixtures, 7)."""
+    """Split rows (k, n) of initial states into qpos (k, nq), qvel (k, nv) and fixtures (k, nfixtures, 7)."""
     _, qpos, qvel, fixtures = np.split(rows, np.cumsum([1, model.nq, model.nv]), axis=1)
     return qpos, qvel, fixtures.reshape(len(rows), -1, 7)
 
 
 def load_init_states(task: Task, scene: Scene) -> np.ndarray:
-    """The task's 50 initial states, rows as of `generate_init_states`: those shipped, else made once and cached.
+    """Return the initial states of a task: those of the package, or else of the cache, where they are generated once.
+
+    Args:
+        task: Task.
+        scene: Compiled scene of the task.
+
+    Returns:
+        Rows as of `generate_init_states`, (50, ...).
 
     Raises:
-        LiberoError: the shipped states were made for another model.
+        LiberoError: The states of the package were made for another model.
     """
     digest = scene_digest(scene)
-    shipped = _shipped(task.suite).get(task.name)
-    if shipped is not None and (shipped[0] == digest or scene.pack.name == BUILTIN):
-        if shipped[0] != digest:
+    packaged = _packaged(task.suite).get(task.name)
+    if packaged is not None and (packaged[0] == digest or scene.pack.name == BUILTIN):
+        if packaged[0] != digest:
             raise LiberoError(
-                f"the initial states of {task.id} were made for another model ({shipped[0]}, this one is {digest}); "
-                f"make them anew: libero tasks init-states {task.suite}"
+                f"the initial states of {task.id} were made for another model ({packaged[0]}, this one is {digest}); "
+                f"generate them again: libero tasks init-states {task.suite}"
             )
-        return shipped[1]
+        return packaged[1]
     path = _cached_path(task, digest)
     if path.exists():
         with np.load(path, allow_pickle=False) as stored:
             return stored["states"]
     states = generate_init_states(task, scene)
-    path.parent.mkdir(parents=True, exist_ok=True)
     _write(path, {"states": states})
     return states
 
 
 def cache_init_states(task: Task) -> Path:
-    """Make the initial states of a task that none are shipped for, unless they are there, and say where."""
+    """Return the file with the initial states of a task that the package has none of; they are generated once."""
     scene = build_scene(task.problem)
     load_init_states(task, scene)
     return _cached_path(task, scene_digest(scene))
 
 
 def _cached_path(task: Task, digest: str) -> Path:
-    said = hashlib.sha256(task.bddl_text.encode()).hexdigest()[
-        :16
-    ]  # regions and atoms, which the digest knows not
-    return cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{said}.npz"
+    # Regions and atoms are part of the text, not of the scene's digest.
+    text_digest = hashlib.sha256(task.bddl_text.encode()).hexdigest()[:16]
+    return cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{text_digest}.npz"
 
 
 def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
-    """Make the initial states of tasks and write them to one npz: `<task>` states, `<task>.digest`.
+    """Generate the initial states of tasks and write them to one file.
 
     Args:
-        path: the file.
-        tasks: of one suite.
-        jobs: processes; the states do not depend on it.
+        path: File to write, npz: for each task `<name>` with the states and `<name>.digest`.
+        tasks: Tasks of a suite.
+        jobs: Number of processes; the states do not depend on it.
     """
     arrays: dict[str, np.ndarray] = {}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)  # fails now, not after the work
     with spawn_pool(jobs) as pool:
-        made = zip(tasks, pool.map(_generate, tasks), strict=True)
-        for task, (states, digest) in tqdm(made, unit="task", desc="initial states", total=len(tasks)):
+        generated = zip(tasks, pool.map(_generate, tasks), strict=True)
+        for task, (states, digest) in tqdm(generated, unit="task", desc="initial states", total=len(tasks)):
             arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
     _write(path, arrays)
 
@@ -106,28 +119,28 @@ def _generate(task: Task) -> tuple[np.ndarray, str]:
 
 
 def shipped_path(suite: str) -> Path:
-    """Where the package keeps the initial states of a suite."""
+    """Return the file of the package with the initial states of a suite."""
     return Path(str(resources.files("libero_env"))) / "tasks" / "init_states" / f"{suite}.npz"
 
 
 def scene_digest(scene: Scene) -> str:
-    """What initial states depend on: joints in order, collision shapes of objects and fixtures; 16 hex digits."""
+    """Return a digest, 16 hex digits, of what initial states depend on: joints, shapes and masses of entities."""
     model = scene.model
-    parts = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
-    for name, thing in scene.entities.items():
-        if thing.digest:
-            parts.append((name, thing.digest))
+    parts: list[tuple] = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
+    for name, item in scene.entities.items():
+        if item.digest:
+            parts.append((name, item.digest))
         for body in scene.bodies[name]:
             for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
                 if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
-                    figures = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
-                    parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in figures)))
+                    values = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
+                    parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in values)))
             parts.append((name, f"{model.body_mass[body]:.6f}"))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
 @lru_cache(maxsize=8)
-def _shipped(suite: str) -> dict[str, tuple[str, np.ndarray]]:
+def _packaged(suite: str) -> dict[str, tuple[str, np.ndarray]]:
     path = shipped_path(suite)
     if not path.exists():
         return {}
@@ -136,6 +149,7 @@ def _shipped(suite: str) -> dict[str, tuple[str, np.ndarray]]:
         return {name: (str(stored[f"{name}.digest"]), stored[name]) for name in names}
 
 
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def _write(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to an npz file in one step."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)

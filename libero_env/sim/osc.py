@@ -19,18 +19,18 @@ from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_Q
 from libero_env.mujoco_compat import MASS_FIELD
 
 ACTION_DIM = 7
-POSITION_SCALE = 0.05  # m at full action
-ROTATION_SCALE = 0.5  # rad at full action
-GRIPPER_SPEED = 0.01  # of the command's range [-1, 1], each substep
+POSITION_SCALE = 0.05  # [m] at full action
+ROTATION_SCALE = 0.5  # [rad] at full action
+GRIPPER_SPEED = 0.01  # change of the command, in [-1, 1], in each substep
 _KP = 150.0
 _KD = 2.0 * np.sqrt(150.0)
 _NULL_KP = 10.0
 _NULL_KD = 2.0 * np.sqrt(10.0)
-REST = np.array(REST_QPOS)  # rad
+REST = np.array(REST_QPOS)  # [rad]
 
 
 def _mass_address(model: mujoco.MjModel) -> np.ndarray:
-    """Index of each entry of the arm's block in the sparse mass matrix, (7, 7)."""
+    """Return the index of each entry of the arm's block in the sparse mass matrix, (7, 7)."""
     address = np.zeros((7, 7), np.int64)
     for i in range(7):
         for j in range(i + 1):
@@ -45,20 +45,27 @@ def _mass_address(model: mujoco.MjModel) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ArmIndex:
-    """Where the arm is in a model's arrays."""
+    """Indices of the arm in a model's arrays.
 
-    joints: np.ndarray  # (7,) joint ids
-    mass_address: (
-        np.ndarray
-    )  # (7, 7) index of each entry of the arm's mass-matrix block in the sparse array M
-    site: int  # grip site
-    torque_limit: np.ndarray  # (7,) N m
-    fingers: np.ndarray  # (2,) joint ids
-    finger_range: np.ndarray  # (2, 2) m, control range of the finger actuators
+    Attributes:
+        joints: Indices of the arm's joints, (7,).
+        mass_address: Index of each entry of the arm's block in the sparse mass matrix, (7, 7).
+        site: Index of the grip site.
+        torque_limit: Largest torque of each joint, (7,), N m.
+        fingers: Indices of the finger joints, (2,).
+        finger_range: Control range of the finger actuators, (2, 2), m.
+    """
+
+    joints: np.ndarray
+    mass_address: np.ndarray
+    site: int
+    torque_limit: np.ndarray
+    fingers: np.ndarray
+    finger_range: np.ndarray
 
     @classmethod
-    def of(cls, model: mujoco.MjModel) -> "ArmIndex":
-        """Look the arm up by its names; it must be the first chain of the model."""
+    def from_model(cls, model: mujoco.MjModel) -> "ArmIndex":
+        """Find the arm by the names of its joints; it must be the first kinematic chain of the model."""
         joints = np.array([model.joint(n).id for n in ARM_JOINTS], np.int64)
         assert (joints == np.arange(7)).all() and (model.jnt_dofadr[:7] == joints).all(), (
             "the arm comes first"
@@ -70,26 +77,39 @@ class ArmIndex:
 
 
 @njit(cache=True, nogil=True)
-def set_goals(ids, actions, site_pos, site_mat, goal_pos, goal_mat):
-    """New goals at the first substep: current pose plus the scaled action; (n, 7), (n, 3), (n, 9) -> in place.
+def goals_from_deltas(ids, actions, qpos, site_pos, site_mat, goal_pos, goal_mat):
+    """Set the goals to the current pose plus the scaled action; see `libero_env.sim.controller.Controller.set_goals`.
 
-    Without a commanded rotation the goal orientation stays what it was.
+    Without a commanded rotation the goal orientation is kept.
     """
     for k in range(ids.shape[0]):
         i = ids[k]
-        rotated = False
+        is_rotated = False
         w = np.empty(3)
         for j in range(3):
             goal_pos[i, j] = site_pos[i, j] + POSITION_SCALE * min(max(actions[i, j], -1.0), 1.0)
             w[j] = ROTATION_SCALE * min(max(actions[i, 3 + j], -1.0), 1.0)
-            rotated = rotated or w[j] != 0.0
-        if rotated:
-            _rotate(w, site_mat[i], goal_mat[i])
+            is_rotated = is_rotated or w[j] != 0.0
+        if is_rotated:
+            rotate(w, site_mat[i], goal_mat[i])
 
 
 @njit(cache=True, nogil=True)
-def _rotate(w, current, out):
-    """out = exp([w]x) current (Rodrigues); (3,), (9,) -> (9,)."""
+def goals_from_poses(ids, poses, goal_pos, goal_mat):
+    """Set the goals to positions and rotation vectors, (n, 6) -> (n, 3), (n, 9) in place."""
+    identity = np.eye(3).ravel()
+    for k in range(ids.shape[0]):
+        i = ids[k]
+        goal_pos[i] = poses[i, :3]
+        if (poses[i, 3:] != 0.0).any():
+            rotate(poses[i, 3:], identity, goal_mat[i])
+        else:
+            goal_mat[i] = identity
+
+
+@njit(cache=True, nogil=True)
+def rotate(w, current, out):
+    """Write exp([w]x) current to `out` by the formula of Rodrigues; (3,), (9,) -> (9,)."""
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
     x, y, z = w[0] / angle, w[1] / angle, w[2] / angle
     c, s = np.cos(angle), np.sin(angle)
@@ -106,7 +126,7 @@ def _rotate(w, current, out):
 
 @njit(cache=True, nogil=True)
 def _solve(a, b, n):
-    """Solve the symmetric positive definite a x = b in place of b by Cholesky; a (n, n), b (n,)."""
+    """Solve a x = b by Cholesky decomposition; x replaces b, the factor replaces a (n, n), symmetric positive definite."""
     for j in range(n):
         for k in range(j):
             a[j, j] -= a[j, k] * a[j, k]
@@ -120,6 +140,7 @@ def _solve(a, b, n):
 
 @njit(cache=True, nogil=True)
 def _substitute(a, b, n):
+    """Solve l l^T x = b for the lower triangle l of a; x replaces b (n,)."""
     for i in range(n):
         for k in range(i):
             b[i] -= a[i, k] * b[k]
@@ -131,14 +152,16 @@ def _substitute(a, b, n):
 
 
 @njit(cache=True, nogil=True)
-def control(
+def osc_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal_pos, goal_mat, gripper, ctrl,
     mass_address, torque_limit, finger_range, rest,
 ):  # fmt: skip
-    """One substep of control for the simulations `ids`: torques and finger commands are written to ctrl.
+    """Compute one substep of control for the simulations `ids`; torques and finger commands are written to ctrl.
 
-    The leading axis of all state arrays is the simulation: qpos (n, nq), qvel (n, nv), xanchor and xaxis (n, njnt, 3),
-    site_pos (n, 3), site_mat (n, 9), mass (n, nM), bias (n, nv), ctrl (n, nu).
+    The leading axis of all state arrays is the simulation: actions (n, action_dim), qpos (n, nq), qvel (n, nv), xanchor
+    and xaxis (n, njnt, 3), site_pos (n, 3), site_mat (n, 9), mass (n, nM), bias (n, nv), goal_pos (n, 3), goal_mat
+    (n, 9), gripper (n, 2), ctrl (n, nu). The constants of the arm: mass_address (7, 7), torque_limit (7,), finger_range
+    (2, 2), rest (7,).
     """
     jac = np.empty((6, 7))
     m = np.empty((7, 7))
@@ -204,12 +227,12 @@ def control(
             for r in range(3):
                 tau += jac[r, j] * (force[r] - task_pull[r]) + jac[3 + r, j] * (torque[r] - task_pull[3 + r])
             ctrl[i, j] = min(max(tau, -torque_limit[j]), torque_limit[j])
-        _move_gripper(actions[i, actions.shape[1] - 1], gripper[i], ctrl[i], finger_range)
+        move_gripper(actions[i, actions.shape[1] - 1], gripper[i], ctrl[i], finger_range)
 
 
 @njit(cache=True, nogil=True)
-def _move_gripper(action, command, ctrl, finger_range):
-    """Ramp the command of both fingers and scale it to the actuators; -1 opens, +1 closes."""
+def move_gripper(action, command, ctrl, finger_range):
+    """Change the command of both fingers by one ramp step and scale it to the actuators; -1 opens, +1 closes."""
     for f in range(2):
         direction = -1.0 if f == 0 else 1.0
         step = GRIPPER_SPEED * direction * np.sign(action)

@@ -1,7 +1,7 @@
 """Predicates: pure functions of a read-only view of one simulation's state.
 
-By default their meaning is the original's: objects are points (the origin of their root body), a box is tested by
-|R size|, and standing in a region of the table needs no contact. `semantics="strict"` asks more; see `STRICT`.
+By default their semantics are the original's: objects are points (the origin of their root body), the half size of a
+box is |R size|, and being on a region of the table needs no contact. `semantics="strict"` requires more; see `STRICT`.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,79 +10,78 @@ import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import GLOW_GROUP, ObjectModel
-from libero_env.sim.regions import BOX_BELOW, contains, is_over, region_boxes, region_of
+from libero_env.sim.regions import BOX_BELOW, Box, contains, is_over, region_boxes, region_of
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or
 
-_ON_XY_DISTANCE = 0.03  # m, between the origins of an object and what it stands on
-_UP_HEIGHT = 1.0  # m, world frame
-_STRICT_MARGIN = 0.005  # m, by how much an object may stick out of a box that holds it
-
+_ON_XY_DISTANCE = 0.03  # [m] between the origins of an object and the object under it
+_UP_HEIGHT = 1.0  # [m] in the world frame
+_STRICT_MARGIN = 0.005  # [m] length by which an object may stick out of the box that contains it
 
 Predicate = Callable[..., bool]
 
 
-def on(view: StateView, thing: str, place: str) -> bool:
-    """`thing` stands on an object (touching, above it, origins within 3 cm) or lies over the box of a region."""
-    if view.is_thing(place):
-        above, below = view.body_pos(thing), view.body_pos(place)
+def on(view: StateView, entity: str, target: str) -> bool:
+    """Return whether `entity` is on an object (touching, above it, origins within 3 cm) or over the box of a region."""
+    if view.is_entity(target):
+        above, below = view.body_pos(entity), view.body_pos(target)
         near = np.linalg.norm(above[:2] - below[:2]) < _ON_XY_DISTANCE
-        return bool(below[2] <= above[2] and near and view.in_contact(thing, place))
-    over = any(is_over(box, view.body_pos(thing)) for box in region_boxes(view, place))
-    region = region_of(view, place)
-    return over and (bool(region.ranges) or view.in_contact(thing, region.target))
+        return bool(below[2] <= above[2] and near and view.in_contact(entity, target))
+    over = any(is_over(box, view.body_pos(entity)) for box in region_boxes(view, target))
+    region = region_of(view, target)
+    return over and (bool(region.ranges) or view.in_contact(entity, region.target))
 
 
-def in_(view: StateView, thing: str, place: str) -> bool:
-    """The origin of `thing` is in the box of a region; contact does not matter."""
-    return any(contains(box, view.body_pos(thing)) for box in region_boxes(view, place))
+def in_(view: StateView, entity: str, region: str) -> bool:
+    """Return whether the origin of `entity` is in the box of a region, with or without contact."""
+    return any(contains(box, view.body_pos(entity)) for box in region_boxes(view, region))
 
 
-def up(view: StateView, thing: str) -> bool:
-    """The origin of `thing` is at least a metre above the floor."""
-    return bool(view.body_pos(thing)[2] >= _UP_HEIGHT)
+def up(view: StateView, entity: str) -> bool:
+    """Return whether the origin of `entity` is at least a metre above the floor."""
+    return bool(view.body_pos(entity)[2] >= _UP_HEIGHT)
 
 
-def in_contact(view: StateView, first: str, second: str) -> bool:
-    """The two touch."""
+def touching(view: StateView, first: str, second: str) -> bool:
+    """Return whether two entities touch."""
     return view.in_contact(first, second)
 
 
-def stack(view: StateView, thing: str, place: str) -> bool:
-    """The two touch, `thing` is over the region or object and inside it."""
-    owner = view.scene.owner(place)
-    touching = owner is not None and view.in_contact(thing, owner)
-    return touching and on(view, thing, place) and (view.is_thing(place) or in_(view, thing, place))
+def stack(view: StateView, entity: str, target: str) -> bool:
+    """Return whether `entity` touches the target, is on it and, for a region, in it."""
+    owner = view.scene.owner(target)
+    contact = owner is not None and view.in_contact(entity, owner)
+    return contact and on(view, entity, target) and (view.is_entity(target) or in_(view, entity, target))
 
 
-def open_(view: StateView, place: str) -> bool:
-    """Any joint of the thing, or of the part that the region is on, is as far out as `open` begins."""
-    return any(_in_state(view, place, "open", "close"))
+def open_(view: StateView, address: str) -> bool:
+    """Return whether any joint of an entity, or of the part that a region is on, is in the range of `open`."""
+    return any(_joints_in_state(view, address, "open", "close"))
 
 
-def close(view: StateView, place: str) -> bool:
-    """All joints of the thing, or of the part that the region is on, are as far in as `close` begins."""
-    return all(_in_state(view, place, "close", "open"))
+def close(view: StateView, address: str) -> bool:
+    """Return whether all joints of an entity, or of the part that a region is on, are in the range of `close`."""
+    return all(_joints_in_state(view, address, "close", "open"))
 
 
-def turn_on(view: StateView, thing: str) -> bool:
-    """Any joint is as far as `turnon` begins."""
-    return any(_in_state(view, thing, "turnon", "turnoff"))
+def turn_on(view: StateView, entity: str) -> bool:
+    """Return whether any joint of an entity is in the range of `turnon`."""
+    return any(_joints_in_state(view, entity, "turnon", "turnoff"))
 
 
-def turn_off(view: StateView, thing: str) -> bool:
-    """All joints are as far back as `turnoff` begins."""
-    return all(_in_state(view, thing, "turnoff", "turnon"))
+def turn_off(view: StateView, entity: str) -> bool:
+    """Return whether all joints of an entity are in the range of `turnoff`."""
+    return all(_joints_in_state(view, entity, "turnoff", "turnon"))
 
 
-def print_joint_state(view: StateView, thing: str) -> bool:
-    """Always true. The original prints the joints here; `view.joint_positions(thing)` has them."""
-    view.joint_positions(thing)
+def print_joint_state(view: StateView, entity: str) -> bool:
+    """Return True. The original prints the joints here; use `view.joint_positions(entity)` to read them."""
+    view.joint_positions(entity)
     return True
 
 
-PREDICATES: Mapping[str, Predicate] = {
+PREDICATES: dict[str, Predicate] = {
     "On": on,
     "In": in_,
     "Up": up,
@@ -90,84 +89,86 @@ PREDICATES: Mapping[str, Predicate] = {
     "Close": close,
     "Turnon": turn_on,
     "Turnoff": turn_off,
-    "Incontact": in_contact,
+    "Incontact": touching,
     "Stack": stack,
     "Printjointstate": print_joint_state,
     "True": lambda view, *args: True,
     "False": lambda view, *args: False,
 }
+"""Predicates of the original by the names of task files."""
 
 
-def strict_on(view: StateView, thing: str, place: str) -> bool:
-    """`thing` rests on the object or in the region: touching what is under it, let go, its origin over the place."""
-    if view.in_contact(thing, ROBOT):
+def strict_on(view: StateView, entity: str, target: str) -> bool:
+    """Return whether `entity` rests on an object or a region: touching it, released, its origin over it."""
+    if view.in_contact(entity, ROBOT):
         return False
-    if view.is_thing(place):
-        low, high = view.bounds(place)
-        over = ((view.body_pos(thing) > low) & (view.body_pos(thing) < high))[:2].all()
-        return bool(
-            over and view.body_pos(thing)[2] > view.body_pos(place)[2] and view.in_contact(thing, place)
-        )
-    region = region_of(view, place)
-    point = view.body_pos(thing)
-    if not view.in_contact(thing, region.target):
+    point = view.body_pos(entity)
+    if view.is_entity(target):
+        low, high = view.bounds(target)
+        over = ((point > low) & (point < high))[:2].all()
+        return bool(over and point[2] > view.body_pos(target)[2] and view.in_contact(entity, target))
+    region = region_of(view, target)
+    if not view.in_contact(entity, region.target):
         return False
-    boxes = region_boxes(view, place)
+    boxes = region_boxes(view, target)
     if region.ranges:
         return any((np.abs(point - centre)[:2] < size[:2]).all() for centre, _, size in boxes)
-    return any(is_over((centre, mat.T, size), point) for centre, mat, size in boxes)
+    return any(is_over(Box(centre, mat.T, size), point) for centre, mat, size in boxes)
 
 
-def strict_in(view: StateView, thing: str, place: str) -> bool:
-    """Footprint and lowest point of `thing` are in the box of the region, in the box's own frame, and it is let go."""
-    if view.in_contact(thing, ROBOT):
+def strict_in(view: StateView, entity: str, region: str) -> bool:
+    """Return whether `entity` is released, with footprint and lowest point in a region's box, in the box's frame."""
+    if view.in_contact(entity, ROBOT):
         return False
-    low, high = view.bounds(thing)
+    low, high = view.bounds(entity)
     middle, half = (low + high) / 2, (high - low) / 2
-    for centre, mat, size in region_boxes(view, place):
-        own_up = np.abs(mat[2])  # share of each axis of the box in the vertical
-        box_half = np.abs(mat) @ size if own_up.max() > 0.999 else size
-        turn = np.eye(3) if own_up.max() > 0.999 else mat.T
-        delta = turn @ (middle - centre)
+    for centre, mat, size in region_boxes(view, region):
+        vertical_share = np.abs(mat[2])  # of each axis of the box
+        is_upright = vertical_share.max() > 0.999
+        box_half = np.abs(mat) @ size if is_upright else size
+        world_to_box = np.eye(3) if is_upright else mat.T
+        delta = world_to_box @ (middle - centre)
         inside = (np.abs(delta[:2]) + half[:2] < box_half[:2] + _STRICT_MARGIN).all()
         if inside and -box_half[2] - BOX_BELOW < delta[2] - half[2] < box_half[2]:
             return True
     return False
 
 
-STRICT: Mapping[str, Predicate] = {**PREDICATES, "On": strict_on, "In": strict_in}
-"""On and In as a person would judge them: at rest, let go, with extent, in the frame of the place."""
+STRICT: dict[str, Predicate] = {**PREDICATES, "On": strict_on, "In": strict_in}
+"""On and In with extent: the object is at rest, released, and in the frame of the region."""
 
-SEMANTICS: Mapping[str, Mapping[str, Predicate]] = {"original": PREDICATES, "strict": STRICT}
+SEMANTICS: dict[str, dict[str, Predicate]] = {"original": PREDICATES, "strict": STRICT}
 
 
 def register_predicate(name: str, predicate: Predicate) -> None:
-    """Adds a predicate, or replaces one, in both semantics, for this process.
+    """Add or replace a predicate, in both semantics, for this process.
 
     Args:
-        name: as task files write it; case does not count.
-        predicate: called with a `StateView` and the atom's names.
+        name: Name in task files; upper and lower case are the same.
+        predicate: Function that takes a `StateView` and the names of the atom, and returns a bool.
 
     Raises:
-        LiberoError: the name cannot stand in a task file.
+        LiberoError: The name is not valid in a task file.
     """
     if not name.isidentifier():
-        raise LiberoError(f"register_predicate: {name!r} is no name; use letters, digits and underscores")
+        raise LiberoError(
+            f"register_predicate: {name!r} is not a valid name; use letters, digits and underscores"
+        )
     for table in SEMANTICS.values():
-        table[name.capitalize()] = predicate  # type: ignore[index]
+        table[name.capitalize()] = predicate
 
 
 def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:
-    """Truth of a goal in a state.
+    """Return the truth of a goal in a state.
 
     Args:
-        expression: goal or atom.
-        view: the state.
+        expression: Goal or atom.
+        view: State to evaluate it in.
         semantics: `original` or `strict`.
 
     Raises:
-        UnknownNameError: a predicate, object or region that does not exist.
-        LiberoError: a predicate that makes no sense for the thing, such as opening a plate.
+        UnknownNameError: A predicate, object or region does not exist.
+        LiberoError: A predicate does not apply to the entity, such as opening a plate.
     """
     match expression:
         case Atom(predicate, args):
@@ -189,17 +190,17 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
 
 
 def glowing_sites(view: StateView) -> set[int]:
-    """Ids of the sites that glow because their object is turned on, such as a stove's burner."""
-    model, found = view.scene.model, set()
+    """Return the indices of the sites that glow because their entity is turned on, such as a stove's burner."""
+    model, sites = view.scene.model, set[int]()
     for name, item in view.scene.entities.items():
         if "turnon" in item.articulation and turn_on(view, name):
-            own = np.isin(model.site_bodyid, view.scene.bodies[name])
-            found |= set(np.flatnonzero(own & (model.site_group == GLOW_GROUP)).tolist())
-    return found
+            of_entity = np.isin(model.site_bodyid, view.scene.bodies[name])
+            sites |= set(np.flatnonzero(of_entity & (model.site_group == GLOW_GROUP)).tolist())
+    return sites
 
 
 def atoms_of(expression: Expression) -> tuple[Atom, ...]:
-    """All atoms of a goal, in reading order."""
+    """Return all atoms of a goal, in reading order."""
     match expression:
         case Atom():
             return (expression,)
@@ -210,15 +211,15 @@ def atoms_of(expression: Expression) -> tuple[Atom, ...]:
     raise TypeError(f"not a goal: {expression!r}")
 
 
-def _in_state(view: StateView, place: str, state: str, opposite: str) -> list[bool]:
+def _joints_in_state(view: StateView, address: str, state: str, opposite: str) -> list[bool]:
     """Return for each joint whether it is in a state, see `reaches_state`.
 
-    A thing without joints has none that is open, and all it has are closed, as in the original.
+    An entity without joints has none that is open, and all it has are closed, as in the original.
     """
-    owner = view.scene.owner(place)
+    owner = view.scene.owner(address)
     if owner is None:
-        raise UnknownNameError("object, fixture or region of one", place, view.scene.joints)
-    values = view.joint_positions(place).values()
+        raise UnknownNameError("object, fixture or region of one", address, view.scene.joints)
+    values = view.joint_positions(address).values()
     return [reaches_state(view.scene.entities[owner], value, state, opposite) for value in values]
 
 
@@ -248,6 +249,7 @@ def reaches_state(model: ObjectModel, qpos: float, state: str, opposite: str) ->
 
 
 def _bindings(variables: tuple[tuple[str, str], ...], view: StateView) -> list[dict[str, str]]:
+    """Return all assignments of objects of the right category to the variables of a quantifier."""
     bindings: list[dict[str, str]] = [{}]
     for variable, category in variables:
         names = [name for name, item in view.scene.objects.items() if item.category == category]
@@ -256,6 +258,7 @@ def _bindings(variables: tuple[tuple[str, str], ...], view: StateView) -> list[d
 
 
 def _bind(expression: Expression, binding: Mapping[str, str]) -> Expression:
+    """Replace variables by the names of objects."""
     match expression:
         case Atom(predicate, args):
             return Atom(predicate, tuple(binding.get(arg, arg) for arg in args))

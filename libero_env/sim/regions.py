@@ -1,4 +1,6 @@
-"""The boxes of regions, and whether a point is in or over one."""
+"""Boxes of regions, and whether a point is in a box or over it."""
+
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -8,16 +10,30 @@ from libero_env.sim.scene import zone_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Region
 
-BOX_BELOW = 0.01  # m, how far below its box a region still holds a point
+BOX_BELOW = 0.01  # [m] depth below its box in which a region still contains a point
+_ON_BELOW, _ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
 
 
-_ON_BELOW, _ON_ABOVE = 0.005, 0.10  # m, how far around the top of a region's box a point lies on it
+class Box(NamedTuple):
+    """A box in the world.
 
+    Attributes:
+        centre: Position of its centre, (3,), m.
+        mat: Orientation, box to world, (3, 3).
+        half_size: Half of its edges, (3,), m.
+    """
 
-Box = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre (3,), orientation to world (3, 3), half size (3,)
+    centre: np.ndarray
+    mat: np.ndarray
+    half_size: np.ndarray
 
 
 def region_of(view: StateView, address: str) -> Region:
+    """Return a region by its address.
+
+    Raises:
+        UnknownNameError: The task has no such region.
+    """
     region = view.scene.problem.region(address)
     if region is None:
         valid = [r.address for r in view.scene.problem.regions] + list(view.scene.objects)
@@ -26,7 +42,12 @@ def region_of(view: StateView, address: str) -> Region:
 
 
 def region_boxes(view: StateView, address: str) -> list[Box]:
-    """The boxes of a region: the site of that name, or a flat box over each rectangle on its surface."""
+    """Return the boxes of a region: the site of that name, or a flat box over each rectangle on its surface.
+
+    Raises:
+        UnknownNameError: The task has no such region.
+        LiberoError: The region has neither ranges nor a site.
+    """
     region = region_of(view, address)
     if not region.ranges:
         site = mujoco.mj_name2id(view.scene.model, mujoco.mjtObj.mjOBJ_SITE, address)
@@ -34,12 +55,13 @@ def region_boxes(view: StateView, address: str) -> list[Box]:
             raise LiberoError(
                 f"region {address}: {region.target} has no site {region.name!r}, and no ranges are given"
             )
-        return [(view.site_pos(address), view.site_mat(address), view.scene.model.site_size[site])]
+        return [Box(view.site_pos(address), view.site_mat(address), view.scene.model.site_size[site])]
     boxes = zone_boxes(region, view.scene.workspace)
-    return [(centre, np.eye(3), half) for centre, half in boxes]
+    return [Box(centre, np.eye(3), half) for centre, half in boxes]
 
 
 def contains(box: Box, point: np.ndarray) -> bool:
+    """Return whether a point (3,) is in a box; as in the original, along the world axes, with half size |R size|."""
     centre, mat, size = box
     half = np.abs(mat @ size)
     low, high = centre - half, centre + half
@@ -48,6 +70,7 @@ def contains(box: Box, point: np.ndarray) -> bool:
 
 
 def is_over(box: Box, point: np.ndarray) -> bool:
+    """Return whether a point (3,) is on top of a box; as in the original, rotated by R instead of its inverse."""
     centre, mat, size = box
     delta = mat @ (point - centre)
     return bool(size[2] - _ON_BELOW < delta[2] < size[2] + _ON_ABOVE and (np.abs(delta[:2]) < size[:2]).all())

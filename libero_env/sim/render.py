@@ -1,6 +1,7 @@
-"""Pictures without a screen: GL backend choice and a renderer that draws upright frames, depth and segmentation.
+"""Offscreen rendering: choice of the OpenGL backend, and a renderer of RGB, depth and segmentation images.
 
-OpenGL contexts are opened lazily, by the thread that draws; nothing is shared between processes.
+OpenGL contexts are opened when an image is first rendered, by the thread that renders it; nothing is shared between
+processes.
 """
 
 import importlib
@@ -8,6 +9,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -21,19 +23,36 @@ REMEDY = (
 )
 
 
-def open_context(width: int, height: int) -> tuple[str, object]:
-    """Open an offscreen OpenGL context: (backend name, context with make_current and free).
+class GLContext(Protocol):
+    """An OpenGL context of `mujoco.egl`, `mujoco.osmesa` or `mujoco.glfw`."""
 
-    `MUJOCO_GL` chooses the backend where it is set; otherwise EGL is tried, then OSMesa.
+    def make_current(self) -> None:
+        """Make this the context that OpenGL calls of the thread refer to."""
+
+    def free(self) -> None:
+        """Free the context."""
+
+
+def open_context(width: int, height: int) -> tuple[str, GLContext]:
+    """Open an offscreen OpenGL context.
+
+    The environment variable `MUJOCO_GL` chooses the backend where it is set; otherwise EGL is tried, then OSMesa.
+
+    Args:
+        width: Width of the framebuffer, pixels.
+        height: Height of the framebuffer, pixels.
+
+    Returns:
+        Name of the backend and the context.
 
     Raises:
-        RenderError: none works here; the message says why and what to install.
+        RenderError: No backend works here; the message states why and what to install.
     """
-    wanted = os.environ.get("MUJOCO_GL", "").lower()
-    if wanted and wanted not in BACKENDS:
-        raise RenderError(f"MUJOCO_GL={wanted} is not a backend; valid: {', '.join(BACKENDS)}. Or unset it")
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen and chosen not in BACKENDS:
+        raise RenderError(f"MUJOCO_GL={chosen} is not a backend; valid: {', '.join(BACKENDS)}. Or unset it")
     failures = []
-    for name in (wanted,) if wanted else ("egl", "osmesa"):
+    for name in (chosen,) if chosen else ("egl", "osmesa"):
         try:
             return name, importlib.import_module(f"mujoco.{name}").GLContext(width, height)
         except Exception as error:  # noqa: BLE001 - each backend fails in its own way (ImportError, AttributeError, GL)
@@ -45,10 +64,10 @@ def open_context(width: int, height: int) -> tuple[str, object]:
 
 @lru_cache(maxsize=1)
 def choose_backend() -> str:
-    """Name of the backend that works here; opens a small context to find out.
+    """Return the name of the backend that works here; a small context is opened to find out.
 
     Raises:
-        RenderError: none does.
+        RenderError: No backend works here.
     """
     name, context = open_context(64, 64)
     context.free()
@@ -56,14 +75,14 @@ def choose_backend() -> str:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Where one camera is drawn to; what is None is not drawn. First row on top.
+class RenderTarget:
+    """Arrays that the image of one camera is written to, first row on top. Arrays that are None are not rendered.
 
     Attributes:
-        camera: index in the model.
-        rgb: (height, width, 3) uint8.
-        depth: (height, width) float32, metres along the optical axis; the far plane where nothing is.
-        segmentation: (height, width) int32: 1 + geom, 1 + ngeom + site, and 0 where nothing is.
+        camera: Index of the camera in the model.
+        rgb: Colours, (height, width, 3) uint8.
+        depth: Distance along the optical axis, (height, width) float32, m; that of the far plane in the background.
+        segmentation: Rendered elements, (height, width) int32: 1 + geom, 1 + ngeom + site, 0 for the background.
     """
 
     camera: int
@@ -73,28 +92,36 @@ class Picture:
 
 
 class Renderer:
-    """Draws a model's cameras.
+    """Renderer of a model's cameras.
 
-    Visual geoms (group 1) are drawn, and the sites that are said to glow. Use from one thread; close it, or use it as
-    a context manager.
+    Visual geoms (group 1) are rendered, and the sites that glow. Use it from one thread only; close it, or use it as a
+    context manager.
+
+    Args:
+        model: Model to render.
+        height: Height of the images, pixels.
+        width: Width of the images, pixels.
+
+    Raises:
+        RenderError: The images are larger than the model's offscreen buffer.
     """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int):
         largest = min(model.vis.global_.offheight, model.vis.global_.offwidth)
         if not (0 < height <= largest and 0 < width <= largest):
             raise RenderError(
-                f"a frame of {height}x{width} pixels is not between 1 and {largest} on each side"
+                f"an image of {height}x{width} pixels is not valid; height and width must be between 1 and {largest}"
             )
         self._model, self._height, self._width = model, height, width
-        self._gl: object | None = None
+        self._gl: GLContext | None = None
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
 
     def camera_id(self, name: str) -> int:
-        """Index of a camera.
+        """Return the index of a camera.
 
         Raises:
-            UnknownNameError: the model has no such camera; the message lists them.
+            UnknownNameError: The model has no such camera; the message lists its cameras.
         """
         index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
         if index < 0:
@@ -103,51 +130,51 @@ class Renderer:
             )
         return index
 
-    def render(self, data: mujoco.MjData, cameras: list[int], out: list[np.ndarray]) -> None:
-        """Draw the cameras of one state into the arrays of `out`, each (height, width, 3) uint8."""
-        self.draw(data, [Picture(camera, frame) for camera, frame in zip(cameras, out, strict=True)])
-
-    def draw(self, data: mujoco.MjData, pictures: Sequence[Picture], glowing: Iterable[int] = ()) -> None:
-        """Draw pictures of one state.
+    def render(
+        self, data: mujoco.MjData, targets: Sequence[RenderTarget], glowing_sites: Iterable[int] = ()
+    ) -> None:
+        """Render images of one state.
 
         Args:
-            data: kinematics, cameras and lights are up to date.
-            pictures: what to draw.
-            glowing: indices of the sites to show.
+            data: State whose kinematics, cameras and lights are up to date.
+            targets: Cameras, and the arrays to write their images to.
+            glowing_sites: Indices of the sites to show.
+
+        Raises:
+            RenderError: No OpenGL backend works here.
         """
         if self._gl is None:
-            self._open()
+            self._gl = self._open()
         self._gl.make_current()
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        for k, picture in enumerate(pictures):
-            self._camera.fixedcamid = picture.camera
+        all_categories = mujoco.mjtCatBit.mjCAT_ALL
+        for k, target in enumerate(targets):
+            self._camera.fixedcamid = target.camera
             if k == 0:
                 mujoco.mjv_updateScene(
-                    self._model, data, self._options, None, self._camera, everything, self._scene
+                    self._model, data, self._options, None, self._camera, all_categories, self._scene
                 )
-                for site in glowing:
+                for site in glowing_sites:
                     self._add_site(data, site)
             else:
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
-            if picture.rgb is not None or picture.depth is not None:
-                self._draw_colours(picture)
-            if picture.segmentation is not None:
-                self._draw_segmentation(picture.segmentation)
+            if target.rgb is not None or target.depth is not None:
+                self._render_rgb_and_depth(target)
+            if target.segmentation is not None:
+                self._render_segmentation(target.segmentation)
 
-    def _draw_colours(self, picture: Picture) -> None:
+    def _render_rgb_and_depth(self, target: RenderTarget) -> None:
         mujoco.mjr_render(self._viewport, self._scene, self._context)
-        depth = None if picture.depth is None else self._depth
-        mujoco.mjr_readPixels(
-            None if picture.rgb is None else self._pixels, depth, self._viewport, self._context
-        )
-        if picture.rgb is not None:
-            picture.rgb[:] = self._pixels[::-1]  # OpenGL's first row is the lowest
-        if picture.depth is not None:
+        pixels = None if target.rgb is None else self._pixels
+        depth = None if target.depth is None else self._depth
+        mujoco.mjr_readPixels(pixels, depth, self._viewport, self._context)
+        if target.rgb is not None:
+            target.rgb[:] = self._pixels[::-1]  # OpenGL's first row is the lowest
+        if target.depth is not None:
             # The buffer holds 1 at the near plane and 0 at the far plane, hyperbolic between them.
             near, far = (getattr(self._model.vis.map, n) * self._model.stat.extent for n in ("znear", "zfar"))
-            picture.depth[:] = near * far / (near + depth[::-1].astype(np.float64) * (far - near))
+            target.depth[:] = near * far / (near + self._depth[::-1].astype(np.float64) * (far - near))
 
-    def _draw_segmentation(self, out: np.ndarray) -> None:
+    def _render_segmentation(self, out: np.ndarray) -> None:
         flags, scene = self._scene.flags, self._scene
         kinds = {int(mujoco.mjtObj.mjOBJ_GEOM): 1, int(mujoco.mjtObj.mjOBJ_SITE): 1 + self._model.ngeom}
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
@@ -156,15 +183,15 @@ class Renderer:
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
         mujoco.mjr_readPixels(self._pixels, None, self._viewport, self._context)
-        names = np.zeros(scene.ngeom + 1, np.int32)  # colour -> name; 0 is the background
+        elements = np.zeros(scene.ngeom + 1, np.int32)  # by colour; 0 is the background
         for geom in scene.geoms[: scene.ngeom]:
             if geom.objtype in kinds:
-                names[geom.segid + 1] = kinds[geom.objtype] + geom.objid
+                elements[geom.segid + 1] = kinds[geom.objtype] + geom.objid
         red, green, blue = np.moveaxis(self._pixels[::-1].astype(np.int32), 2, 0)
-        out[:] = names[red + (green << 8) + (blue << 16)]
+        out[:] = elements[red + (green << 8) + (blue << 16)]
 
     def _add_site(self, data: mujoco.MjData, site: int) -> None:
-        """Append a site to the scene, as it would be drawn if its group were shown."""
+        """Add a site to the scene, as MuJoCo would if its group were shown."""
         model, scene = self._model, self._scene
         geom = scene.geoms[scene.ngeom]
         material = model.site_matid[site]
@@ -183,7 +210,7 @@ class Renderer:
         scene.ngeom += 1
 
     def close(self) -> None:
-        """Free the context. Idempotent."""
+        """Free the OpenGL context; the renderer opens a new one when it is used again."""
         if self._gl is not None:
             self._gl.make_current()
             self._context.free()
@@ -196,15 +223,14 @@ class Renderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self) -> None:
+    def _open(self) -> GLContext:
         backend, gl = open_context(self._width, self._height)
         gl.make_current()
         try:
             self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
         except mujoco.FatalError as error:
             gl.free()
-            raise RenderError(f"{backend} opens, but draws nothing ({error}). Remedy: {REMEDY}") from error
-        self._gl = gl
+            raise RenderError(f"{backend} opens, but renders nothing ({error}). Remedy: {REMEDY}") from error
         mujoco.mjr_resizeOffscreen(self._width, self._height, self._context)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -218,3 +244,4 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._viewport = mujoco.MjrRect(0, 0, self._width, self._height)
+        return gl

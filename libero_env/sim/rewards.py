@@ -1,12 +1,13 @@
-"""What a step is worth, from the truth of the goal and its atoms.
+"""Rewards, from the truth of the goal and of its atoms.
 
-`sparse`: 1 in the step that reaches the goal, else 0. `staged`: with n atoms of which k hold, and progress s towards
-the first that does not,
+`sparse`: 1 in the step that reaches the goal, else 0. `staged`: with n atoms of which k are true, and progress s
+towards the first that is false,
 
     r = (k + s) / n,   s = 0.3 (1 - tanh(5 |ee - x|)) + 0.6 p,
 
-at most 0.99, and 1 where the goal holds. x is what has to be moved, metres. p is 1 - tanh(5 |x - target|) for placing
-it, for joints the share of the way from the opposite state to the wanted one, for lifting the share of the height.
+at most 0.99, and 1 where the goal is true. x is the position of the entity to move, m. p is 1 - tanh(5 |x - target|)
+for placing it, for joints the fraction of the way from the opposite state to the required one, for lifting the
+fraction of the height.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,20 +23,20 @@ from libero_env.tasks.problem import Atom
 
 REWARDS = ("sparse", "staged")
 _OPPOSITE = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}
-_REACH, _MOVE = 0.3, 0.6
+_REACH_WEIGHT, _MOVE_WEIGHT = 0.3, 0.6
 _BEST_WITHOUT_SUCCESS = 0.99
 
 
 @dataclass(frozen=True)
 class Reward:
-    """A reward by name.
+    """A reward function by name.
 
     Attributes:
         kind: `sparse` or `staged`.
-        scale: what success is worth.
+        scale: Reward of success.
 
     Raises:
-        UnknownNameError: no such kind.
+        UnknownNameError: The kind does not exist.
     """
 
     kind: str = "sparse"
@@ -46,40 +47,51 @@ class Reward:
             raise UnknownNameError("reward", self.kind, REWARDS)
 
     def __call__(
-        self, view: StateView, success: bool, atoms: Sequence[Atom] = (), holds: Sequence[bool] = ()
+        self, view: StateView, success: bool, atoms: Sequence[Atom] = (), truth: Sequence[bool] = ()
     ) -> float:
-        """Reward of a state; `holds` says which of the goal's atoms are true."""
+        """Return the reward of a state.
+
+        Args:
+            view: State.
+            success: Whether the goal is true.
+            atoms: Atoms of the goal.
+            truth: Truth of each atom.
+        """
         if success or self.kind == "sparse":
             return self.scale * float(success)
-        return self.scale * staged(view, atoms, holds)
+        return self.scale * staged_reward(view, atoms, truth)
 
 
-def staged(view: StateView, atoms: Sequence[Atom], holds: Sequence[bool]) -> float:
-    """The staged reward of a state that does not reach the goal, in [0, 0.99]."""
-    missing = [atom for atom, true in zip(atoms, holds, strict=True) if not true]
-    towards = approach(view, missing[0]) if missing else 0.0
-    return min((len(atoms) - len(missing) + towards) / max(len(atoms), 1), _BEST_WITHOUT_SUCCESS)
+def staged_reward(view: StateView, atoms: Sequence[Atom], truth: Sequence[bool]) -> float:
+    """Return the staged reward of a state that does not reach the goal, in [0, 0.99]."""
+    missing = [atom for atom, is_true in zip(atoms, truth, strict=True) if not is_true]
+    progress = atom_progress(view, missing[0]) if missing else 0.0
+    return min((len(atoms) - len(missing) + progress) / max(len(atoms), 1), _BEST_WITHOUT_SUCCESS)
 
 
-def approach(view: StateView, atom: Atom) -> float:
-    """Progress towards an atom that does not hold, in [0, 0.9]; 0 for what this module knows nothing of."""
+def atom_progress(view: StateView, atom: Atom) -> float:
+    """Return the progress towards an atom that is false, in [0, 0.9]; 0 for predicates without a known measure."""
     kind = atom.predicate.lower()
     if kind in ("on", "in", "stack", "incontact") and len(atom.args) == 2:
-        moved = place(view, atom.args[0])
-        done = _near(moved, place(view, atom.args[1]))
+        moved = position_of(view, atom.args[0])
+        done = _closeness(moved, position_of(view, atom.args[1]))
     elif kind in _OPPOSITE and len(atom.args) == 1:
-        moved, done = place(view, atom.args[0]), joint_share(view, atom.args[0], kind)
+        moved, done = position_of(view, atom.args[0]), joint_progress(view, atom.args[0], kind)
     elif kind == "up" and len(atom.args) == 1:
-        moved = place(view, atom.args[0])
-        done = float(np.clip(moved[2], 0.0, 1.0))  # it counts from one metre on
+        moved = position_of(view, atom.args[0])
+        done = float(np.clip(moved[2], 0.0, 1.0))  # `up` is true from one metre on
     else:
         return 0.0
-    return _REACH * _near(view.eef_pos, moved) + _MOVE * done
+    return _REACH_WEIGHT * _closeness(view.eef_pos, moved) + _MOVE_WEIGHT * done
 
 
-def place(view: StateView, name: str) -> np.ndarray:
-    """Where an object, fixture or region is, (3,), world frame."""
-    if view.is_thing(name):
+def position_of(view: StateView, name: str) -> np.ndarray:
+    """Return the position of an object, fixture or region, (3,), world frame, m.
+
+    Raises:
+        UnknownNameError: The object, fixture or region does not exist.
+    """
+    if view.is_entity(name):
         return view.body_pos(name)
     region = view.scene.problem.region(name)
     if region is not None and region.ranges:
@@ -89,21 +101,28 @@ def place(view: StateView, name: str) -> np.ndarray:
     return view.site_pos(name)
 
 
-def joint_share(view: StateView, address: str, state: str) -> float:
-    """Share of the way that joints have come to a state such as `open`, in [0, 1]; where all count, of the last one."""
+def joint_progress(view: StateView, address: str, state: str) -> float:
+    """Return the fraction of the way that joints have moved to a state, in [0, 1].
+
+    It is that of the most advanced joint for states that one joint suffices for, else of the least advanced.
+
+    Args:
+        view: State.
+        address: Name of an object or fixture, or address of a region.
+        state: `open`, `close`, `turnon` or `turnoff`.
+    """
     owner = view.scene.owner(address)
     ranges: Mapping[str, tuple[float, float]] = view.scene.entities[owner].articulation if owner else {}
     values = np.array(list(view.joint_positions(address).values()))
     if state not in ranges or _OPPOSITE[state] not in ranges or not values.size:
         return 0.0
-    wanted, opposite = np.array(ranges[state]), np.array(ranges[_OPPOSITE[state]])
-    start = opposite[
-        np.abs(opposite - wanted.mean()).argmax()
-    ]  # the far end of one, the near end of the other
-    end = wanted[np.abs(wanted - opposite.mean()).argmin()]
-    shares = np.clip((values - start) / (end - start), 0.0, 1.0)
-    return float(shares.max() if state in ("open", "turnon") else shares.min())
+    required, opposite = np.array(ranges[state]), np.array(ranges[_OPPOSITE[state]])
+    # The far end of the opposite range, and the near end of the required one.
+    start = opposite[np.abs(opposite - required.mean()).argmax()]
+    end = required[np.abs(required - opposite.mean()).argmin()]
+    fractions = np.clip((values - start) / (end - start), 0.0, 1.0)
+    return float(fractions.max() if state in ("open", "turnon") else fractions.min())
 
 
-def _near(a: np.ndarray, b: np.ndarray) -> float:
+def _closeness(a: np.ndarray, b: np.ndarray) -> float:
     return float(1.0 - np.tanh(5.0 * np.linalg.norm(a - b)))

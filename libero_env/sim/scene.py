@@ -1,7 +1,8 @@
-"""Problem + assets + workspace -> one MuJoCo model.
+"""Scenes: the MuJoCo model of a problem, made of assets and a workspace.
 
-Joint order is the original's: arm, gripper, then the objects and the fixtures in the order of the task file; so states
-of the original have the same layout. Where fixtures stand is state, not model; `Simulations` keeps it.
+The order of joints is the original's: arm, gripper, then the objects and the fixtures in the order of the task file, so
+that states of the original have the same layout. The poses of fixtures belong to the state, not to the model;
+`Simulations` has them.
 """
 
 from collections.abc import Mapping
@@ -20,24 +21,24 @@ from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.tasks.problem import Problem, Region
 from libero_env.timing import TIMESTEP
 
-ROBOT = "robot"  # what contacts call arm and gripper
-_MAX_FRAME = 1024  # pixels, the largest picture the offscreen buffer holds
-_FIXTURE_LIFT = 0.01  # m, the original's height of fixtures over the underside of the table top
-_ZONE_HEIGHT = 0.014  # m, of the box over a flat region
+ROBOT = "robot"  # name of arm and gripper in contacts
+_MAX_IMAGE = 1024  # [pixels] largest edge of an image; size of the offscreen buffer
+_FIXTURE_LIFT = 0.01  # [m] height of fixtures over the underside of the table top, as in the original
+_ZONE_HEIGHT = 0.014  # [m] of the box over a flat region
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled task. The model is shared by all environments of the task: nobody writes to it.
+    """A compiled task. The model is shared by all environments of the task and must not be written to.
 
     Attributes:
-        problem: what the task file says.
-        pack: where the models come from.
-        workspace: table or floor.
-        workspace_name: what the task file calls it, such as `main_table`.
-        model: the compiled model.
-        objects: instance name -> movable object, in the order of the task file.
-        fixtures: instance name -> fixture, without the workspace, in the order of the task file.
+        problem: Content of the task file.
+        pack: Asset pack of the models.
+        workspace: Table or floor.
+        workspace_name: Name of the workspace in the task file, such as `main_table`.
+        model: Compiled model.
+        objects: Movable objects by name, in the order of the task file.
+        fixtures: Fixtures by name, without the workspace, in the order of the task file.
     """
 
     problem: Problem
@@ -55,22 +56,22 @@ class Scene:
 
     @property
     def entities(self) -> dict[str, ObjectModel]:
-        """Objects and fixtures."""
+        """Objects and fixtures by name."""
         return {**self.objects, **self.fixtures}
 
     @cached_property
     def fixture_poses(self) -> np.ndarray:
-        """Where fixtures stand unless a state says otherwise: mid-region, (nfixtures, 7) pos and quat wxyz."""
+        """Default poses of the fixtures, in the middle of their regions, (nfixtures, 7): position, quaternion wxyz."""
         return np.concatenate([self.model.body_pos, self.model.body_quat], axis=1)[self.fixture_bodies]
 
     @property
     def fixture_bodies(self) -> np.ndarray:
-        """Ids of the fixtures' root bodies, (nfixtures,)."""
+        """Indices of the fixtures' root bodies, (nfixtures,)."""
         return np.array([self.model.body(f"{name}_{ROOT_BODY}").id for name in self.fixtures], np.int64)
 
     @cached_property
     def bodies(self) -> Mapping[str, np.ndarray]:
-        """Name of an object, fixture, the workspace or `robot` -> ids of its bodies."""
+        """Indices of the bodies of each object and fixture, of the workspace and of `robot`."""
         model = self.model
         root = {n: model.body(f"{n}_{ROOT_BODY}").id for n in self.entities}
         found = {name: np.flatnonzero(model.body_rootid == body) for name, body in root.items()}
@@ -81,7 +82,7 @@ class Scene:
 
     @cached_property
     def joints(self) -> Mapping[str, tuple[int, ...]]:
-        """Object, fixture or address of a site -> its articulated joints; for a site those of its own body."""
+        """Indices of the articulated joints of each object, fixture and site; for a site those of its own body."""
         model = self.model
         moving = [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
         owners: dict[str, tuple[int, ...]] = {}
@@ -95,7 +96,7 @@ class Scene:
         return owners
 
     def owner(self, address: str) -> str | None:
-        """The object or fixture that a name or the address of one of its regions belongs to."""
+        """Return the object or fixture of a name or of a region's address; None if it belongs to neither."""
         if address in self.entities:
             return address
         region = self.problem.region(address)
@@ -106,11 +107,11 @@ def build_scene(problem: Problem, pack: Pack | None = None) -> Scene:
     """Compile a problem; the result is cached for the process.
 
     Args:
-        problem: what to build.
-        pack: where the models come from; by default as `select_pack` says.
+        problem: Problem to compile.
+        pack: Asset pack of the models; by default that of `select_pack`.
 
     Raises:
-        UnknownNameError: a fixture or object category that has no model.
+        UnknownNameError: A category of objects or fixtures has no model.
     """
     return _build_scene(problem, pack or select_pack())
 
@@ -128,10 +129,15 @@ def _build_scene(problem: Problem, pack: Pack) -> Scene:
 def scene_spec(
     problem: Problem, pack: Pack | None = None, entities: Mapping[str, ObjectModel] | None = None
 ) -> mujoco.MjSpec:
-    """A fresh, editable model of a problem's scene, with these objects and fixtures or with those of the pack.
+    """Return a new, editable model of a problem's scene.
+
+    Args:
+        problem: Problem to build.
+        pack: Asset pack of the models; by default that of `select_pack`.
+        entities: Models of objects and fixtures by name; by default those of the pack.
 
     Raises:
-        UnknownNameError: a fixture or object category that has no model.
+        UnknownNameError: A category of objects or fixtures has no model.
     """
     pack = pack or select_pack()
     name, workspace = workspace_of(problem)
@@ -152,10 +158,10 @@ def scene_spec(
 
 
 def workspace_of(problem: Problem) -> tuple[str, Workspace]:
-    """The fixture of a problem that is its workspace: its name and what it is.
+    """Return the name of the fixture that is the workspace of a problem, and the workspace.
 
     Raises:
-        UnknownNameError: none of the fixtures is one.
+        UnknownNameError: None of the fixtures is a workspace.
     """
     for name, category in problem.fixtures.items():
         if category in WORKSPACES:
@@ -171,7 +177,19 @@ def fixture_pose(
     item: ObjectModel,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Pose of a fixture in the region its init atom names, (7,): pos, quat wxyz; without a generator in its middle."""
+    """Return the pose of a fixture in the region of its init atom.
+
+    Args:
+        problem: Problem that has the fixture.
+        workspace_name: Name of the workspace in the task file.
+        workspace: Table or floor.
+        name: Name of the fixture.
+        item: Model of the fixture.
+        rng: Generator to sample the region with; without it the middle of the region is taken.
+
+    Returns:
+        Position and quaternion wxyz, (7,).
+    """
     region = next(
         (
             problem.region(atom.args[1])
@@ -195,7 +213,7 @@ def fixture_pose(
 
 
 def zone_boxes(region: Region, workspace: Workspace) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The flat box over each rectangle of a region on the workspace: centre (3,), half size (3,), world frame, m."""
+    """Return the flat box over each rectangle of a region: centre (3,) and half size (3,), world frame, m."""
     origin = np.array(workspace.zone_origin)
     return [
         (origin + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.array([x1 - x0, y1 - y0, _ZONE_HEIGHT]) / 2)
@@ -204,7 +222,7 @@ def zone_boxes(region: Region, workspace: Workspace) -> list[tuple[np.ndarray, n
 
 
 def initial_qpos(scene: Scene) -> np.ndarray:
-    """Positions with the arm at rest, the gripper open and every object at its model's origin; (nq,)."""
+    """Return positions (nq,) with the arm at rest, the gripper open and all objects at the origin of their models."""
     qpos = scene.model.qpos0.copy()
     qpos[: scene.nq_robot] = REST_QPOS + OPEN_FINGERS
     return qpos
@@ -219,15 +237,15 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     option.density, option.viscosity = 1.2, 2e-5
     visual = spec.visual
     visual.map.znear = 0.001
-    visual.quality.offsamples = 0  # multisampling doubles the cost of a picture
+    visual.quality.offsamples = 0  # multisampling doubles the cost of an image
     visual.quality.shadowsize = 0
-    visual.global_.offwidth = visual.global_.offheight = _MAX_FRAME
+    visual.global_.offwidth = visual.global_.offheight = _MAX_IMAGE
     visual.headlight.ambient, visual.headlight.diffuse = [0.1] * 3, [0.4] * 3
     visual.headlight.specular = [0.5] * 3
 
 
 def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Workspace) -> None:
-    """A hidden site for each region on the workspace, so that clients find it by its address."""
+    """Add a hidden site for each region on the workspace, so that it can be found by its address."""
     for region in problem.regions:
         if region.target == name and region.ranges:
             centre, half = zone_boxes(region, workspace)[0]

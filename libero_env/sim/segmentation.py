@@ -1,4 +1,4 @@
-"""What the numbers of a segmentation mean."""
+"""Labels of segmentation images."""
 
 from dataclasses import dataclass
 
@@ -13,26 +13,30 @@ ARENA, ARM, GRIPPER = "arena", "robot", "gripper"
 
 @dataclass(frozen=True)
 class Labels:
-    """How drawn elements are labelled, and what the labels are called.
+    """Labels of rendered elements, and the names of the labels.
 
     Attributes:
-        of: (1 + ngeom + nsite,) int32, label of each number that `libero_env.sim.render` draws.
-        names: label -> name.
+        of_element: Label of each number that `libero_env.sim.render` writes, (1 + ngeom + nsite,) int32.
+        names: Name of each label.
     """
 
-    of: np.ndarray
+    of_element: np.ndarray
     names: dict[int, str]
 
 
-def labels(scene: Scene, kind: str) -> Labels:
-    """Labels of a kind of segmentation.
+def segmentation_labels(scene: Scene, kind: str) -> Labels:
+    """Return the labels of a kind of segmentation.
 
-    `instance`: 0 is the arena and all that has no name of its own, 1 the robot with its mount, 2 the gripper, then
-    objects and fixtures in the order of the task file. `class`: the same, one number for each category. `element`:
-    1 + index of the geom, or 1 + number of geoms + index of the site; 0 where nothing is.
+    `instance`: 0 is the arena and everything without a name of its own, 1 the robot with its mount, 2 the gripper, then
+    objects and fixtures in the order of the task file. `class`: the same, with one number for each category.
+    `element`: 1 + index of the geom, or 1 + number of geoms + index of the site; 0 for the background.
+
+    Args:
+        scene: Scene that is rendered.
+        kind: `instance`, `class` or `element`.
 
     Raises:
-        UnknownNameError: no such kind.
+        UnknownNameError: The kind does not exist.
     """
     model = scene.model
     if kind == "element":
@@ -43,11 +47,9 @@ def labels(scene: Scene, kind: str) -> Labels:
         )
     if kind not in SEGMENTATIONS:
         raise UnknownNameError("segmentation", kind, SEGMENTATIONS)
-    things = {**scene.objects, **scene.fixtures}
-    called = {name: name if kind == "instance" else item.category for name, item in things.items()}
-    numbers = {
-        label: number for number, label in enumerate(dict.fromkeys((ARENA, ARM, GRIPPER, *called.values())))
-    }
+    entities = {name: name if kind == "instance" else item.category for name, item in scene.entities.items()}
+    names = dict(enumerate(dict.fromkeys((ARENA, ARM, GRIPPER, *entities.values()))))
+    numbers = {name: number for number, name in names.items()}
     of_body = np.zeros(model.nbody, np.int32)
     for body in range(model.nbody):
         name = model.body(body).name
@@ -55,7 +57,7 @@ def labels(scene: Scene, kind: str) -> Labels:
             of_body[body] = numbers[ARM]
         elif name.startswith("gripper0_"):
             of_body[body] = numbers[GRIPPER]
-    for name, label in called.items():
+    for name, label in entities.items():
         of_body[scene.bodies[name]] = numbers[label]
-    of = np.concatenate([[0], of_body[model.geom_bodyid], of_body[model.site_bodyid]])
-    return Labels(of.astype(np.int32), {number: label for label, number in numbers.items()})
+    of_element = np.concatenate([[0], of_body[model.geom_bodyid], of_body[model.site_bodyid]])
+    return Labels(of_element.astype(np.int32), names)

@@ -1,8 +1,8 @@
-"""Many closed-loop simulations of one model: physics and controller, no tasks, no pictures.
+"""Closed-loop simulations of one model: physics and controller, without tasks and images.
 
-Two ways to step with the same interface and the same bits: `LoopSimulations`, one MjData after another (one simulation,
-or MuJoCo without `mujoco.batch`), and `BatchSimulations` on a thread pool. A control step is 25 substeps, and each
-substep is one pass: controller on the current kinematics, then the rest of the step, then the next kinematics.
+There are two ways to step, with the same interface and the same bits: `LoopSimulations` steps one MjData after another
+(one simulation, or MuJoCo without `mujoco.batch`), `BatchSimulations` steps on a thread pool. A control step has 25
+substeps. Each substep runs the controller on the current kinematics, then the rest of the step, then the kinematics.
 """
 
 from abc import ABC, abstractmethod
@@ -14,7 +14,7 @@ import numpy as np
 
 from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import MASS_FIELD
-from libero_env.sim.controllers import ControllerState
+from libero_env.sim.controller import ControllerState
 from libero_env.sim.osc import REST, ArmIndex
 from libero_env.timing import SUBSTEPS
 
@@ -23,7 +23,7 @@ try:
 except ImportError:  # before MuJoCo 4
     Batch = None
 
-# What the controller and the views of the state read, as arrays (n, ...).
+# Fields of MjData that controllers and state views read.
 _FIELDS = (
     "qpos",
     "qvel",
@@ -39,119 +39,148 @@ _FIELDS = (
 )
 
 
-Tap = Callable[[mujoco.MjData], None]
+Indices = Sequence[int] | np.ndarray
+KinematicsHook = Callable[[mujoco.MjData], None]
 
 
 class Simulations(ABC):
-    """n simulations of one model.
+    """Simulations of one model.
+
+    Args:
+        model: Model to simulate; it is copied.
+        num: Number of simulations.
+        fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
 
     Attributes:
-        model: a copy of the given one; fixtures stand in it where those of the last simulation touched do.
-        num: number of simulations.
-        fixtures: (num, nfixtures, 7) pos, quat wxyz of the fixed bodies whose pose differs between simulations.
-        fields: name of an MjData field -> array (num, ...), for reading. Kinematics are those of the current state.
-        controller: which controller runs, its goals and gripper commands; may be replaced by another.
+        model: The copy; its fixtures have the poses of the simulation that was used last.
+        num: Number of simulations.
+        fixtures: Pose of each fixed body of `fixture_bodies`, (num, nfixtures, 7): position, quaternion wxyz.
+        arm: Indices of the arm in the model.
+        fields: Field of MjData by name, (num, ...), for reading. Kinematics are those of the current state.
+        controller_state: Controller that runs, its goals and gripper commands; may be replaced by another.
     """
 
-    def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Sequence[int] = ()):
+    def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = ()):
         self.model, self.num = copy(model), num
         self.fixture_bodies = np.asarray(fixture_bodies, np.int64)
         poses = np.concatenate([model.body_pos, model.body_quat], axis=1)[self.fixture_bodies]
         self.fixtures = np.tile(poses, (num, 1, 1))
-        self.arm = ArmIndex.of(model)
-        self.controller = ControllerState(num)
+        self.arm = ArmIndex.from_model(model)
+        self.controller_state = ControllerState(num)
         self.fields: dict[str, np.ndarray] = {}
 
     @abstractmethod
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
-        """Clear these simulations, write positions and velocities, and compute all that follows from them."""
+        """Clear simulations, write positions and velocities, and compute everything that depends on them."""
 
     @abstractmethod
-    def _substeps(self, ids: np.ndarray, actions: np.ndarray, tap: Tap | None) -> None:
-        """Run one control period; the goals are set."""
+    def _substeps(
+        self, ids: np.ndarray, actions: np.ndarray, before_last_kinematics: KinematicsHook | None
+    ) -> None:
+        """Run one control period with the goals that are set."""
 
     @abstractmethod
-    def _remembered(self, i: int) -> list[np.ndarray]:
-        """Live views of what a step leaves behind beside positions: [qacc_warmstart (nv,), ctrl (nu,)]."""
+    def _warm_start(self, i: int) -> list[np.ndarray]:
+        """Return views of what the next step depends on beside the state: [qacc_warmstart (nv,), ctrl (nu,)]."""
 
     @abstractmethod
     def time(self, i: int) -> float:
-        """Simulated seconds since the reset of simulation i."""
+        """Return the simulated time since the reset of simulation i, s."""
 
     @abstractmethod
     def data(self, i: int) -> mujoco.MjData:
-        """Simulation i's MjData, for reading what `fields` does not hold, such as contacts."""
+        """Return MjData of simulation i, for reading what `fields` does not have, such as contacts."""
 
     def close(self) -> None:
-        """Let go of the simulations."""
+        """Free the simulations."""
         self.fields = {}
 
     def reset(
         self,
-        ids: Sequence[int],
+        ids: Indices,
         qpos: np.ndarray,
         qvel: np.ndarray,
         time: float = 0.0,
         fixtures: np.ndarray | None = None,
     ) -> None:
-        """Start simulations afresh; the controller holds the pose.
+        """Start simulations from given states; the controller holds the pose.
 
         Args:
-            ids: (k,) which.
-            qpos, qvel: (k, nq), (k, nv).
-            time: simulated seconds.
-            fixtures: (k, nfixtures, 7) pos, quat wxyz; without it they stay where they are.
+            ids: Indices of the simulations, (k,).
+            qpos: Positions, (k, nq).
+            qvel: Velocities, (k, nv).
+            time: Simulated time, s.
+            fixtures: Pose of each fixture, (k, nfixtures, 7): position, quaternion wxyz; None keeps their poses.
         """
         ids = np.asarray(ids, np.int64)
         if fixtures is not None:
             self.fixtures[ids] = fixtures
         self._start(ids, qpos, qvel, time)
-        pos, mat = self._grip()
-        self.controller.restart(ids, pos[ids], mat[ids])
+        pos, mat = self._grip_site()
+        self.controller_state.restart(ids, pos[ids], mat[ids])
 
     def pose_fixtures(self, i: int) -> None:
-        """Put the fixtures of simulation i into the model."""
+        """Write the poses of the fixtures of simulation i to the model."""
         self.model.body_pos[self.fixture_bodies] = self.fixtures[i, :, :3]
         self.model.body_quat[self.fixture_bodies] = self.fixtures[i, :, 3:]
 
-    def step(self, ids: Sequence[int], actions: np.ndarray, tap: Tap | None = None) -> None:
-        """Advance the simulations `ids` by one control period; actions (num, action_dim), rows of others unused.
+    def step(
+        self, ids: Indices, actions: np.ndarray, before_last_kinematics: KinematicsHook | None = None
+    ) -> None:
+        """Advance simulations by one control period.
 
-        `tap` sees each MjData one substep before the end, after that substep's integration and before kinematics follow
-        it: there the original observes (measured). `LoopSimulations` only.
+        Args:
+            ids: Indices of the simulations.
+            actions: Action of each simulation, (num, action_dim); rows of other simulations are not used.
+            before_last_kinematics: Function that is called with each MjData in the last but one substep, after its
+                integration and before its kinematics; there the original LIBERO observes. `LoopSimulations` only.
         """
         ids = np.asarray(ids, np.int64)
-        self.controller.set_goals(ids, actions, self.fields["qpos"], *self._grip())
-        self._substeps(ids, actions, tap)
+        state = self.controller_state
+        state.controller.set_goals(
+            ids, actions, self.fields["qpos"], *self._grip_site(), state.goal, state.memory
+        )
+        self._substeps(ids, actions, before_last_kinematics)
 
     def get_state(self, i: int) -> np.ndarray:
-        """All that the future of i depends on: time, qpos, qvel, fixtures, warm start, controls, controller."""
+        """Return all that the future of simulation i depends on, (state_size,).
+
+        It consists of time, qpos, qvel, fixtures, warm start, controls and the state of the controller.
+        """
         parts = [[self.time(i)], self.fields["qpos"][i], self.fields["qvel"][i], self.fixtures[i].ravel()]
-        return np.concatenate([*parts, *self._remembered(i), self.controller.pack(i)])
+        return np.concatenate([*parts, *self._warm_start(i), self.controller_state.pack(i)])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
-        """Restore what `get_state` gave; the simulation goes on to the same bits."""
+        """Restore a state of `get_state`; the simulation continues from there to the same bits."""
         nq, nv, nu, nfixtures = self.model.nq, self.model.nv, self.model.nu, len(self.fixture_bodies)
         sizes = np.cumsum([1, nq, nv, 7 * nfixtures, nv, nu])
-        time, qpos, qvel, fixtures, *remembered, goal = np.split(state, sizes)
+        time, qpos, qvel, fixtures, *warm_start, controller = np.split(state, sizes)
         self.reset([i], qpos[None], qvel[None], float(time[0]), fixtures.reshape(1, nfixtures, 7))
-        for view, value in zip(self._remembered(i), remembered, strict=True):
+        for view, value in zip(self._warm_start(i), warm_start, strict=True):
             view[:] = value
-        self.controller.unpack(i, goal)
+        self.controller_state.unpack(i, controller)
 
     @property
     def state_size(self) -> int:
         """Length of the vector of `get_state`."""
         model = self.model
-        remembered = model.nv + model.nu + self.controller.kind.state_size
-        return 1 + model.nq + model.nv + 7 * len(self.fixture_bodies) + remembered
+        warm_start = model.nv + model.nu
+        return (
+            1
+            + model.nq
+            + model.nv
+            + 7 * len(self.fixture_bodies)
+            + warm_start
+            + self.controller_state.controller.state_size
+        )
 
-    def _grip(self) -> tuple[np.ndarray, np.ndarray]:
+    def _grip_site(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return position (num, 3) and orientation (num, 9) of the grip site."""
         site = self.arm.site
         return self.fields["site_xpos"][:, site], self.fields["site_xmat"][:, site]
 
     def _inputs(self, fields: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """The kernel's view of MjData."""
+        """Return the fields that the kernel of a controller takes."""
         site = self.arm.site
         names = ("qpos", "qvel", "xanchor", "xaxis")
         return (
@@ -163,13 +192,14 @@ class Simulations(ABC):
         )
 
     def _constants(self) -> tuple[np.ndarray, ...]:
+        """Return the constants that the kernel of a controller takes."""
         return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, REST
 
 
 class LoopSimulations(Simulations):
-    """Simulations stepped one after the other in the calling thread."""
+    """Simulations that are stepped one after the other in the calling thread."""
 
-    def __init__(self, model: mujoco.MjModel, num: int = 1, fixture_bodies: Sequence[int] = ()):
+    def __init__(self, model: mujoco.MjModel, num: int = 1, fixture_bodies: Indices = ()):
         super().__init__(model, num, fixture_bodies)
         self._datas = [mujoco.MjData(self.model) for _ in range(num)]
         self._views = [self._view(data) for data in self._datas]
@@ -199,22 +229,25 @@ class LoopSimulations(Simulations):
             data.qacc_warmstart[:] = 0.0
         self._gather(ids)
 
-    def _substeps(self, ids: np.ndarray, actions: np.ndarray, tap: Tap | None) -> None:
-        model, c, constants, first = self.model, self.controller, self._constants(), np.zeros(1, np.int64)
+    def _substeps(
+        self, ids: np.ndarray, actions: np.ndarray, before_last_kinematics: KinematicsHook | None
+    ) -> None:
+        model, constants, first = self.model, self._constants(), np.zeros(1, np.int64)
+        kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
         for i in ids:
-            data, (inputs, ctrl), own = self._datas[i], self._calls[i], slice(i, i + 1)
+            data, (inputs, ctrl), row = self._datas[i], self._calls[i], slice(i, i + 1)
             if self.num > 1:
                 self.pose_fixtures(i)
-            kernel, state = c.kind.kernel, [array[own] for array in c.arrays]
+            goal, memory, gripper = (array[row] for array in state)
             for substep in range(SUBSTEPS):
-                kernel(first, actions[own], *inputs, *state, ctrl, *constants)
+                kernel(first, actions[row], *inputs, goal, memory, gripper, ctrl, *constants)
                 mujoco.mj_step2(model, data)
-                if tap is not None and substep == SUBSTEPS - 2:
-                    tap(data)
+                if before_last_kinematics is not None and substep == SUBSTEPS - 2:
+                    before_last_kinematics(data)
                 mujoco.mj_step1(model, data)
         self._gather(ids)
 
-    def _remembered(self, i: int) -> list[np.ndarray]:
+    def _warm_start(self, i: int) -> list[np.ndarray]:
         return [self._datas[i].qacc_warmstart, self._datas[i].ctrl]
 
     def time(self, i: int) -> float:
@@ -229,14 +262,21 @@ class LoopSimulations(Simulations):
 
 
 class BatchSimulations(Simulations):
-    """Simulations stepped together on a thread pool; the same bits as the loop, whatever the number of threads."""
+    """Simulations that are stepped together on a thread pool; results do not depend on the number of threads.
 
-    def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Sequence[int] = ()):
+    Args:
+        model: Model to simulate; it is copied.
+        num: Number of simulations.
+        threads: Number of threads; 0 is one for each core.
+        fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Indices = ()):
         super().__init__(model, num, fixture_bodies)
         self._batch = Batch(model, num, nthread=threads, persistent=True)
         self.fields = {name: self._batch.bind(name) for name in _FIELDS}
         self.fields["site_xmat"] = self.fields["site_xmat"].reshape(num, model.nsite, 9)
-        self._time, self._warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
+        self._time, self._qacc_warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
         if self.fixture_bodies.size:  # per-simulation values of the model
             self._body_pos, self._body_quat = self._batch.expand("body_pos"), self._batch.expand("body_quat")
         self._data = mujoco.MjData(model)  # for reading one simulation at a time
@@ -244,24 +284,26 @@ class BatchSimulations(Simulations):
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         if self.fixture_bodies.size:
-            each = np.ix_(ids, self.fixture_bodies)
-            self._body_pos[each], self._body_quat[each] = self.fixtures[ids, :, :3], self.fixtures[ids, :, 3:]
+            rows = np.ix_(ids, self.fixture_bodies)
+            self._body_pos[rows], self._body_quat[rows] = self.fixtures[ids, :, :3], self.fixtures[ids, :, 3:]
         self.fields["qpos"][ids], self.fields["qvel"][ids], self._time[ids] = qpos, qvel, time
         self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self._warmstart[ids] = 0.0
+        self._qacc_warmstart[ids] = 0.0
 
-    def _substeps(self, ids: np.ndarray, actions: np.ndarray, tap: Tap | None) -> None:
-        if tap is not None:
-            raise LiberoError("batched simulations cannot be tapped; use LoopSimulations")
-        c, constants, ctrl = self.controller, self._constants(), self.fields["ctrl"]
-        inputs, kernel = self._inputs(self.fields), c.kind.kernel
+    def _substeps(
+        self, ids: np.ndarray, actions: np.ndarray, before_last_kinematics: KinematicsHook | None
+    ) -> None:
+        if before_last_kinematics is not None:
+            raise LiberoError("batched simulations take no before_last_kinematics hook; use LoopSimulations")
+        kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
+        inputs, ctrl, constants = self._inputs(self.fields), self.fields["ctrl"], self._constants()
         stage = mujoco.mjtStage.mjSTAGE_VEL
         for _ in range(SUBSTEPS):
-            kernel(ids, actions, *inputs, *c.arrays, ctrl, *constants)
+            kernel(ids, actions, *inputs, *state, ctrl, *constants)
             self._batch.step(ids, nstep=1, stage=stage)
 
-    def _remembered(self, i: int) -> list[np.ndarray]:
-        return [self._warmstart[i], self.fields["ctrl"][i]]
+    def _warm_start(self, i: int) -> list[np.ndarray]:
+        return [self._qacc_warmstart[i], self.fields["ctrl"][i]]
 
     def time(self, i: int) -> float:
         return float(np.ravel(self._time[i])[0])
@@ -271,19 +313,19 @@ class BatchSimulations(Simulations):
 
     def close(self) -> None:
         super().close()
-        self._batch = self._time = self._warmstart = self._body_pos = self._body_quat = None
+        self._batch = self._time = self._qacc_warmstart = self._body_pos = self._body_quat = None
 
 
 def make_simulations(
-    model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Sequence[int] = ()
+    model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Indices = ()
 ) -> Simulations:
-    """The fastest way to run `num` simulations here: batched where MuJoCo offers it and there are several.
+    """Return `num` simulations of a model: batched where MuJoCo offers it and there are several.
 
     Args:
-        model: copied.
-        num: number of simulations.
-        threads: of the batch; 0 is one for each core.
-        fixture_bodies: ids of fixed bodies that stand elsewhere in each simulation.
+        model: Model to simulate; it is copied.
+        num: Number of simulations.
+        threads: Number of threads of the batch; 0 is one for each core.
+        fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
     """
     if num > 1 and Batch is not None:
         return BatchSimulations(model, num, threads, fixture_bodies)

@@ -1,4 +1,4 @@
-"""The read-only state of one simulation, which predicates, rewards and experts read."""
+"""The read-only state of one simulation, for predicates, rewards and experts."""
 
 from dataclasses import dataclass
 
@@ -15,41 +15,46 @@ from libero_env.sim.simulation import Simulations
 
 @dataclass(frozen=True)
 class StateView:
-    """What predicates and experts may know of simulation `index`. Positions are in the world frame, metres."""
+    """Read-only view of the state of one simulation. Positions are in the world frame, m.
+
+    Attributes:
+        scene: Scene that is simulated.
+        simulations: Simulations of the scene.
+        index: Index of the simulation.
+    """
 
     scene: Scene
     simulations: Simulations
     index: int = 0
 
-    def is_object(self, name: str) -> bool:
-        """Whether the scene has a movable object of this name."""
-        return name in self.scene.objects
-
-    def is_thing(self, name: str) -> bool:
-        """Whether the scene has an object or a fixture of this name."""
+    def is_entity(self, name: str) -> bool:
+        """Return whether the scene has an object or a fixture of this name."""
         return name in self.scene.objects or name in self.scene.fixtures
 
     def body_pos(self, name: str) -> np.ndarray:
-        """Origin of the root body of an object or fixture, (3,)."""
+        """Return the origin of the root body of an object or fixture, (3,)."""
         return self._field("xpos")[self._body(name)].copy()
 
     def body_quat(self, name: str) -> np.ndarray:
-        """Orientation of the root body of an object or fixture, wxyz (4,)."""
+        """Return the orientation of the root body of an object or fixture, wxyz (4,)."""
         return self._field("xquat")[self._body(name)].copy()
 
     def site_pos(self, name: str) -> np.ndarray:
-        """Position of a site, (3,)."""
+        """Return the position of a site, (3,)."""
         return self._field("site_xpos")[self.scene.model.site(name).id].copy()
 
     def site_mat(self, name: str) -> np.ndarray:
-        """Orientation of a site, site to world (3, 3)."""
+        """Return the orientation of a site, site to world (3, 3)."""
         return self._field("site_xmat")[self.scene.model.site(name).id].reshape(3, 3).copy()
 
     def joint_positions(self, address: str) -> dict[str, float]:
-        """Articulated joints of an object, a fixture or the part that a region is on: name -> rad or m.
+        """Return the positions of articulated joints: name -> rad or m.
+
+        Args:
+            address: Name of an object, a fixture, or a region, which stands for the part that it is on.
 
         Raises:
-            UnknownNameError: no such object, fixture or region.
+            UnknownNameError: The object, fixture or region does not exist.
         """
         scene = self.scene
         if address not in scene.joints:
@@ -76,7 +81,15 @@ class StateView:
         return self._field("qpos")[addresses]
 
     def in_contact(self, first: str, second: str) -> bool:
-        """Whether geoms of two of these touch: objects, fixtures, the workspace (the whole room) or the `robot`."""
+        """Return whether geoms of two entities touch.
+
+        Args:
+            first: Name of an object or fixture, of the workspace (the whole room), or `robot`.
+            second: As `first`.
+
+        Raises:
+            UnknownNameError: A name does not exist.
+        """
         data, model = self.simulations.data(self.index), self.scene.model
         pairs = model.geom_bodyid[data.contact.geom[: data.ncon]]
         bodies = [self._bodies(first), self._bodies(second)]
@@ -86,20 +99,20 @@ class StateView:
         return False
 
     def bounds(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Low and high corner (3,) of the collision shapes of an object or fixture, world axes."""
+        """Return the low and the high corner (3,) of an entity's collision geoms along the world axes."""
         model, corners = self.scene.model, []
         for body in self._bodies(name):
             mat = quat_to_mat(self._field("xquat")[body])
             start = model.body_geomadr[body]
             for geom in range(start, start + model.body_geomnum[body]):
                 if model.geom_contype[geom] or model.geom_conaffinity[geom]:
-                    turn = mat @ quat_to_mat(model.geom_quat[geom])
+                    geom_mat = mat @ quat_to_mat(model.geom_quat[geom])
                     centre = (
                         self._field("xpos")[body]
                         + mat @ model.geom_pos[geom]
-                        + turn @ model.geom_aabb[geom, :3]
+                        + geom_mat @ model.geom_aabb[geom, :3]
                     )
-                    half = np.abs(turn) @ model.geom_aabb[geom, 3:]
+                    half = np.abs(geom_mat) @ model.geom_aabb[geom, 3:]
                     corners.append((centre - half, centre + half))
         low, high = zip(*corners, strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
@@ -117,6 +130,6 @@ class StateView:
         return self.simulations.fields[name][self.index]
 
     def _body(self, name: str) -> int:
-        if not self.is_thing(name):
+        if not self.is_entity(name):
             raise UnknownNameError("object or fixture", name, self.scene.entities)
         return self.scene.model.body(f"{name}_{ROOT_BODY}").id

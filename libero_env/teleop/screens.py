@@ -242,7 +242,7 @@ class Terminal:
         if status.step % _STEPS_PER_IMAGE == 1:
             columns, lines = shutil.get_terminal_size()
             edge = max(min(columns, 2 * (lines - 6)) // 2 * 2, 8)
-            image = Image.fromarray(world.frame(0, self.camera)).resize((edge, edge))
+            image = Image.fromarray(world.render(0, self.camera)).resize((edge, edge))
             print(f"\x1b[4;1H{as_text(np.asarray(image))}\n\x1b[K{status}", flush=True)
         self.clock.wait()
 

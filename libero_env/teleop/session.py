@@ -112,7 +112,7 @@ class Teleop:
             states.append(world.physics_state(0))
             actions.append(action)
             world.step([0], action[None])
-            success, progress = world.judge(0)
+            success, progress = world.check_goal(0)
             held = held + 1 if success else 0
             self.screen.show(world, Status(self.task.language, progress, len(actions), recorded, target))
         return Episode(np.array(actions), np.array(states), fixtures=fixtures)

@@ -9,7 +9,7 @@ import pytest
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
-from libero_env.sim.render import Renderer
+from libero_env.sim.render import Renderer, RenderTarget
 
 pytestmark = pytest.mark.sim
 BLIND = {"use_camera_obs": False}
@@ -37,7 +37,8 @@ def test_pictures_have_opengl_rows(make_env):
     image = env.reset()["agentview_image"]
     upright = np.empty((64, 64, 3), np.uint8)
     with Renderer(env.sim.model._model, 64, 64) as renderer:
-        renderer.render(env.sim.data._data, [env.sim.model.camera_name2id("agentview")], [upright])
+        target = RenderTarget(env.sim.model.camera_name2id("agentview"), upright)
+        renderer.render(env.sim.data._data, [target])
     assert (image == upright[::-1]).all()
 
 

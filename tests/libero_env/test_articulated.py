@@ -9,7 +9,7 @@ import pytest
 from libero_env.objects import get_object, object_names
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import GLOW_GROUP
-from libero_env.sim.render import Picture, Renderer
+from libero_env.sim.render import Renderer, RenderTarget
 
 pytestmark = pytest.mark.sim
 
@@ -198,7 +198,7 @@ def test_a_turned_on_burner_is_red_from_above():
     mujoco.mj_forward(model, data)
     renderer, picture = Renderer(model, 64, 64), np.zeros((64, 64, 3), np.uint8)
     for glowing in ((), (model.site("burner").id,)):
-        renderer.draw(data, [Picture(renderer.camera_id("above"), picture)], glowing)
+        renderer.render(data, [RenderTarget(renderer.camera_id("above"), picture)], glowing)
         rgb = picture.astype(int)
         redness.append(((rgb[..., 0] - rgb[..., 1:].max(axis=-1)) > 60).mean())
     renderer.close()

@@ -8,7 +8,7 @@ import pytest
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
-from libero_env.sim.controllers import (
+from libero_env.sim.controller import (
     CONTROLLERS,
     JOINT_SCALE,
     VELOCITY_SCALE,
@@ -133,7 +133,7 @@ def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summin
     total, last, changes, saturated = np.zeros(7), np.zeros(7), [], False
     for velocity in np.cumsum(rng.normal(scale=0.02, size=(40, 7)), axis=0):
         qvel, unused = np.append(velocity, [0.0, 0.0])[None], np.zeros((1, 9, 3))
-        state.kind.kernel(
+        state.controller.kernel(
             np.zeros(1, np.int64),
             np.zeros((1, 8)),
             np.zeros((1, 9)),

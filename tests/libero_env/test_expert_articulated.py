@@ -90,7 +90,7 @@ def run(env, skills, steps=STEPS):
             break
         actions = [rest if d else s.act(v) for d, s, v in zip(done, skills, views, strict=True)]
         env.world.step(np.arange(len(skills)), np.array(actions))
-        reached |= env.world.goal_reached(np.arange(len(skills)))
+        reached |= [env.world.check_goal(i)[0] for i in range(len(skills))]
         taken.append(actions)
     return np.array(taken), reached
 

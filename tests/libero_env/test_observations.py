@@ -12,7 +12,7 @@ from libero_env.geometry import quat_multiply, quat_rotate
 from libero_env.registration import env_ids
 from libero_env.sim.observations import NAMES, PROPRIOCEPTION
 from libero_env.sim.predicates import glowing_sites
-from libero_env.sim.rewards import Reward, approach, joint_share, staged
+from libero_env.sim.rewards import Reward, atom_progress, joint_progress, staged_reward
 from libero_env.tasks import get_suite, suite_names
 
 pytestmark = pytest.mark.sim
@@ -66,13 +66,13 @@ def test_by_default_nothing_has_changed():
 
 
 def test_depth_and_segmentation_place_every_object_where_it_is(kitchen):
-    seen = kitchen.render_frames()
+    seen = kitchen.render_cameras()
     labels = kitchen.world.observer.labels()
     points = world_points(kitchen, "agentview", seen["agentview_depth"])
     found = 0
     for number, name in labels.items():
         pixels = points[seen["agentview_segmentation"] == number]
-        if kitchen.view.is_thing(name) and len(pixels):
+        if kitchen.view.is_entity(name) and len(pixels):
             low, high = kitchen.view.bounds(name)
             inside = ((pixels > low - 0.02) & (pixels < high + 0.02)).all(1)
             assert inside.mean() > 0.95, name
@@ -92,7 +92,8 @@ def test_the_hands_camera_moves_with_the_hand(kitchen):
 def test_kinds_of_segmentation_agree(kitchen):
     world = kitchen.world
     of = {
-        kind: world.frame(0, "agentview", f"segmentation_{kind}") for kind in ("instance", "class", "element")
+        kind: world.render(0, "agentview", f"segmentation_{kind}")
+        for kind in ("instance", "class", "element")
     }
     names = {kind: world.observer.labels(kind) for kind in of}
     scene = world.scene
@@ -123,7 +124,7 @@ def test_what_glows_is_seen_only_while_it_is_on(kitchen):
     assert glowing_sites(kitchen.view)
     redder = on["agentview_rgb"].astype(int)[..., 0] - off["agentview_rgb"].astype(int)[..., 0]
     assert (redder > 100).sum() > 5
-    element = kitchen.world.frame(0, "agentview", "segmentation_element")
+    element = kitchen.world.render(0, "agentview", "segmentation_element")
     site = 1 + kitchen.world.scene.model.ngeom + next(iter(glowing_sites(kitchen.view)))
     assert (element == site).any()
     again = kitchen.set_state(before)
@@ -155,16 +156,16 @@ def test_frames_are_drawn_only_when_wanted(make, monkeypatch):
     env = make(TASK, camera_size=(16, 16))
     drawn = []
     renderer = env.world.observer.renderer
-    draw = renderer.draw
-    monkeypatch.setattr(renderer, "draw", lambda *args: drawn.append(1) or draw(*args))
-    env.draw = False
+    render = renderer.render
+    monkeypatch.setattr(renderer, "render", lambda *args: drawn.append(1) or render(*args))
+    env.render_images = False
     seen, _ = env.reset(options={"init_state": 0})
     still = np.zeros(env.action_space.shape)
     for _ in range(3):
         seen = env.step(still)[0]
     assert not drawn and not seen["agentview_rgb"].any()
-    frames = env.render_frames()
-    env.draw = True
+    frames = env.render_cameras()
+    env.render_images = True
     state = env.get_state() if make is LiberoEnv else env.get_state(0)
     seen = env.step(still)[0]
     assert drawn and seen["agentview_rgb"].any()
@@ -193,12 +194,12 @@ def test_staged_rewards_rise_towards_the_goal_and_only_success_is_one(kitchen):
     for angle in (0.0, 0.1, 0.3, 0.45):
         state[address] = angle
         env.set_state(state)
-        shares.append((joint_share(env.view, "flat_stove_1", "turnon"), approach(env.view, atom)))
+        shares.append((joint_progress(env.view, "flat_stove_1", "turnon"), atom_progress(env.view, atom)))
     assert shares == sorted(shares) and shares[-1][0] < 1 and shares[0][1] < shares[-1][1] < 0.9
     env.set_state(turned_on(env))
     _, reward, terminated, *_ = env.step(np.zeros(7))
     assert terminated and reward == 2.0
-    assert staged(env.view, [atom], [True]) == 0.99  # atoms hold, the goal does not
+    assert staged_reward(env.view, [atom], [True]) == 0.99  # atoms hold, the goal does not
     with pytest.raises(UnknownNameError, match="staged"):
         Reward("dense")
     env.close()
@@ -211,7 +212,7 @@ def test_every_goal_can_be_approached(suite):
         scene = env.world.scene
         env.world.simulations.reset([0], scene.model.qpos0[None], np.zeros((1, scene.model.nv)))
         for atom in env.world.atoms:
-            assert 0 < approach(env.view, atom) <= 0.9, (task.name, atom)
+            assert 0 < atom_progress(env.view, atom) <= 0.9, (task.name, atom)
         assert len(env.world.atoms) == len(env.world.progress(0)) > 0
         env.close()
 
@@ -239,6 +240,6 @@ def test_wrong_names_list_the_valid_ones(kitchen):
     with pytest.raises(UnknownNameError, match="depth"):
         LiberoEnv(TASK, observations=["deph"])
     with pytest.raises(UnknownNameError, match="segmentation_class"):
-        kitchen.world.frame(0, "agentview", "segmentation")
+        kitchen.world.render(0, "agentview", "segmentation")
     with pytest.raises(UnknownNameError, match="agentview"):
         kitchen.world.observer.camera_to_world(0, "agentveiw")

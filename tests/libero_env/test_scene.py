@@ -9,7 +9,7 @@ import pytest
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import PlacementError, RenderError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
-from libero_env.init_states.placement import lowest_point, sample_qpos
+from libero_env.init_states.placement import lowest_point, sample_start
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.render import Renderer, open_context
 from libero_env.sim.scene import build_scene
@@ -34,7 +34,9 @@ def scene(task):
 @pytest.fixture
 def view(scene):
     simulations = LoopSimulations(scene.model)
-    simulations.reset([0], sample_qpos(scene, np.random.default_rng(0))[None], np.zeros((1, scene.model.nv)))
+    simulations.reset(
+        [0], sample_start(scene, np.random.default_rng(0)).qpos[None], np.zeros((1, scene.model.nv))
+    )
     return StateView(scene, simulations)
 
 
@@ -83,7 +85,7 @@ def test_the_scene_is_light(scene):
 def test_placement_fills_the_regions_and_nothing_touches(scene, task):
     data = mujoco.MjData(scene.model)
     for seed in range(20):
-        data.qpos[:] = sample_qpos(scene, np.random.default_rng(seed))
+        data.qpos[:] = sample_start(scene, np.random.default_rng(seed)).qpos
         mujoco.mj_forward(scene.model, data)
         for atom in task.problem.init:
             (x0, y0, x1, y1), *_ = task.problem.region(atom.args[1]).ranges
@@ -103,13 +105,13 @@ def test_a_full_region_is_an_error_with_remedies(task):
             numbers = " ".join(repr(v) for v in other.ranges[0])
             text = text.replace(f"({numbers})", f"({' '.join(repr(v) for v in region)})")
     with pytest.raises(PlacementError, match="make their regions larger"):
-        sample_qpos(build_scene(bddl.parse(text)), np.random.default_rng(0))
+        sample_start(build_scene(bddl.parse(text)), np.random.default_rng(0))
 
 
 def test_an_object_without_a_place_is_an_error(task):
     text = task.bddl_text.replace("(On milk_1 floor_other_object_region_2)", "")
     with pytest.raises(PlacementError, match="milk_1"):
-        sample_qpos(build_scene(bddl.parse(text)), np.random.default_rng(0))
+        sample_start(build_scene(bddl.parse(text)), np.random.default_rng(0))
 
 
 def test_unknown_names_in_a_task_list_the_valid_ones(task, view):

@@ -115,7 +115,7 @@ def test_zero_action_holds_the_pose_and_the_gripper(scene):
         simulations.step([0], np.zeros((1, 7)))
     now = simulations.fields["site_xpos"][0, simulations.arm.site]
     assert np.linalg.norm(now - grip) < 2e-3
-    assert (simulations.controller.gripper == 0).all()
+    assert (simulations.controller_state.gripper == 0).all()
 
 
 def test_the_gripper_opens_at_minus_one_and_closes_at_plus_one(scene):
@@ -141,7 +141,9 @@ def test_the_mass_matrix_block_is_that_of_mujoco(scene):
     for k in range(scene.model.nv):
         unit = np.eye(scene.model.nv)[k]
         mujoco.mj_mulM(scene.model, data, full[k], unit)
-    np.testing.assert_allclose(data.M[ArmIndex.of(scene.model).mass_address], full[:7, :7], atol=1e-12)
+    np.testing.assert_allclose(
+        data.M[ArmIndex.from_model(scene.model).mass_address], full[:7, :7], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.sim.render import Picture, Renderer
+from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.simulation import LoopSimulations
 
 # Kind of element in robosuite -> kind in MuJoCo.
@@ -254,8 +254,8 @@ class MjSim:
         colours = np.empty((height, width, 3), np.uint8)
         distance = np.empty((height, width), np.float32) if depth else None
         numbers = np.empty((height, width), np.int32) if segmentation else None
-        picture = Picture(camera, None if segmentation else colours, distance, numbers)
-        renderer.draw(self.data._data, [picture], self.glowing())
+        target = RenderTarget(camera, None if segmentation else colours, distance, numbers)
+        renderer.render(self.data._data, [target], self.glowing())
         image = colours if numbers is None else self._elements(numbers)
         if distance is None:
             return image[::-1]

@@ -180,7 +180,7 @@ class SubprocEnvWorker(EnvWorker):
             return answers[0]
         if failures[0].lost or not self._worker.opened:
             self.process.kill()
-        raise WorkerError(f"worker {self.process.pid}, in {request}: {failures[0].why}")
+        raise WorkerError(f"worker {self.process.pid}, in {request}: {failures[0].reason}")
 
     def _unshare(self, observation: dict[str, Any]) -> None:
         """Fill in the arrays that came through shared memory, which the first observation sets up."""

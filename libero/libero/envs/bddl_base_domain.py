@@ -24,7 +24,7 @@ from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
-from libero_env.sim.controllers import ControllerState
+from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import build_scene, scene_spec
 from libero_env.sim.state import StateView
@@ -220,11 +220,11 @@ class BDDLBaseDomain:
 
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
-        own, self.simulations.controller = self.simulations.controller, ControllerState(1)
+        own, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
         try:
             return sample_settled(self.scene, self.simulations, 0, self.rng)
         finally:
-            self.simulations.controller = own
+            self.simulations.controller_state = own
 
     def restart(self, state: np.ndarray) -> None:
         """Start from [time, qpos, qvel], with or without the poses of the fixtures after it; the arm holds its pose.
@@ -262,7 +262,7 @@ class BDDLBaseDomain:
         command = self.robots[0].command(action)
         self.timestep += 1
         mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
-        self.simulations.step([0], command[None], tap=self._observe)
+        self.simulations.step([0], command[None], before_last_kinematics=self._observe)
         self.cur_time += 1.0 / self.control_freq
         reward, self.done, info = self._post_action(action)
         success = self._check_success()

@@ -14,7 +14,7 @@ from libero_env.expert.grasping.grasps import Grasp, GraspError, grasps
 from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
-from libero_env.sim.render import Renderer
+from libero_env.sim.render import Renderer, RenderTarget
 
 _PREFIX = "object_"
 _BODY = _PREFIX + ROOT_BODY
@@ -94,7 +94,7 @@ def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], pic
         for k, frame in enumerate(frames):
             _aim(model, middle, 1.9 * reach, 2 * np.pi * k / VIEWS)
             mujoco.mj_camlight(model, data)
-            renderer.render(data, [0], [frame])
+            renderer.render(data, [RenderTarget(0, frame)])
     rows = np.concatenate(np.split(frames, 2), axis=1)  # (4, 2 H, W, 3)
     picture.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(list(rows), axis=1)).save(picture)

@@ -62,7 +62,7 @@ def places(
         PlaceError: it fits nowhere.
     """
     frame = _directions(view, atom.args[1])
-    crowded = _CROWDED if not view.is_thing(atom.args[1]) else 3 * _CROWDED
+    crowded = _CROWDED if not view.is_entity(atom.args[1]) else 3 * _CROWDED
     square = _square(cloud, frame[0])
     upright = [(turn, 0.1 * abs(angle), None) for angle, turn in _turns(_YAWS)]
     found = _found(view, voxels, cloud, pose, atom, share, upright, frame, crowded)
@@ -158,7 +158,7 @@ def _lean(entry: np.ndarray, angle: float) -> np.ndarray:
 def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, int]):
     """(spots (S, 2), costs (S,), height below which things carry, test of an origin) for each part of a place."""
     target = atom.args[1]
-    if view.is_thing(target):
+    if view.is_entity(target):
         xy = view.body_pos(target)[:2]
         offsets = np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)])
         yield (

@@ -10,8 +10,8 @@ from libero.libero.envs.robots.mounted_panda import MountedPanda
 from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
 from libero_env.envs.checks import checked_actions
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.sim.controllers import CONTROLLERS as KINDS
-from libero_env.sim.controllers import ControllerState, get_controller
+from libero_env.sim.controller import CONTROLLERS as KINDS
+from libero_env.sim.controller import ControllerState, get_controller
 
 CONTROLLERS = tuple(name.upper() for name in KINDS)
 
@@ -41,25 +41,25 @@ class Controller:
     def __init__(self, env: Domain, config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
         delta = bool(config.get("control_delta", config.get("use_delta", True)))
-        env.simulations.controller = ControllerState(1, get_controller(self.name.lower(), delta))
+        env.simulations.controller_state = ControllerState(1, get_controller(self.name.lower(), delta))
 
     @property
     def _state(self) -> ControllerState:
-        return self._env.simulations.controller
+        return self._env.simulations.controller_state
 
     @property
     def use_delta(self) -> bool:
         """Whether actions are relative to the present pose; may be set at any time."""
-        return self._state.kind.control_delta
+        return self._state.controller.control_delta
 
     @use_delta.setter
     def use_delta(self, value: bool) -> None:
-        self._state.kind = get_controller(self.name.lower(), bool(value))
+        self._state.controller = get_controller(self.name.lower(), bool(value))
 
     @property
     def control_dim(self) -> int:
         """Length of an action without the gripper."""
-        return self._state.kind.action_dim - 1
+        return self._state.controller.action_dim - 1
 
     @property
     def ee_pos(self) -> np.ndarray:
@@ -110,11 +110,11 @@ class Gripper:
     @property
     def current_action(self) -> np.ndarray:
         """Command of the two fingers in [-1, 1], (2,)."""
-        return self._env.simulations.controller.gripper[0]
+        return self._env.simulations.controller_state.gripper[0]
 
     @current_action.setter
     def current_action(self, value: Any) -> None:
-        self._env.simulations.controller.gripper[0] = value
+        self._env.simulations.controller_state.gripper[0] = value
 
 
 class SingleArm:
@@ -142,8 +142,8 @@ class SingleArm:
     @property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest action."""
-        kind = self._env.simulations.controller.kind
-        return kind.low.copy(), kind.high.copy()
+        controller = self._env.simulations.controller_state.controller
+        return controller.low.copy(), controller.high.copy()
 
     @property
     def _joint_positions(self) -> np.ndarray:

@@ -1,0 +1,95 @@
+"""Configuration that the environments share."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, TypedDict, TypeVar
+
+from libero_env.assets.pack import Pack
+from libero_env.errors import UnknownNameError
+from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
+from libero_env.sim.predicates import SEMANTICS
+
+Constructor = TypeVar("Constructor", bound=Callable[..., None])
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """Configuration of an environment, the same for one simulation and for many.
+
+    Attributes:
+        cameras: Names of the cameras that are rendered for each observation; empty for none.
+        camera_size: Height and width of the images, pixels.
+        horizon: Number of steps after which an episode is truncated.
+        observations: Names of observations, see `libero_env.sim.observations`.
+        controller: Name of the controller, which defines the action, see `libero_env.sim.controller`.
+        control_delta: Whether actions are relative to the current pose.
+        reward: `sparse` or `staged`, see `libero_env.sim.rewards`.
+        reward_scale: Reward of success.
+        assets: Asset pack of the models: a `Pack`, `builtin`, a folder, or None for the user's choice.
+        semantics: Semantics of the predicates: `original`, or `strict`, see `libero_env.sim.predicates`.
+
+    Raises:
+        UnknownNameError: The semantics do not exist.
+    """
+
+    cameras: Sequence[str] = DEFAULT_CAMERAS
+    camera_size: tuple[int, int] = (128, 128)
+    horizon: int = 600
+    observations: Sequence[str] = DEFAULT_OBSERVATIONS
+    controller: str = "osc_pose"
+    control_delta: bool = True
+    reward: str = "sparse"
+    reward_scale: float = 1.0
+    assets: Pack | str | Path | None = None
+    semantics: str = "original"
+
+    def __post_init__(self) -> None:
+        height, width = self.camera_size
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        object.__setattr__(self, "camera_size", (int(height), int(width)))
+        object.__setattr__(self, "observations", tuple(self.observations))
+        if self.semantics not in SEMANTICS:
+            raise UnknownNameError("semantics", self.semantics, SEMANTICS)
+
+    @classmethod
+    def from_options(cls, config: "EnvConfig | None", options: Mapping[str, Any]) -> "EnvConfig":
+        """Return a configuration with some of its fields replaced.
+
+        Args:
+            config: Configuration to start from; None for the default values.
+            options: Fields to replace, by name.
+
+        Raises:
+            UnknownNameError: An option is not a field; the message lists the fields and names the nearest.
+        """
+        names = [field.name for field in fields(cls)]
+        for name in options:
+            if name not in names:
+                raise UnknownNameError("environment option", name, names)
+        return replace(config or cls(), **options)
+
+
+class EnvOptions(TypedDict, total=False):
+    """Fields of `EnvConfig` as keyword arguments."""
+
+    cameras: Sequence[str]
+    camera_size: tuple[int, int]
+    horizon: int
+    observations: Sequence[str]
+    controller: str
+    control_delta: bool
+    reward: str
+    reward_scale: float
+    assets: Pack | str | Path | None
+    semantics: str
+
+
+def show_options(constructor: Constructor) -> Constructor:
+    """Show the fields of `EnvConfig` in the signature of a constructor that takes them as `**options`."""
+    signature = inspect.signature(constructor)
+    parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    parameters += inspect.signature(EnvConfig).parameters.values()
+    constructor.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return constructor

@@ -1,0 +1,181 @@
+"""Controllers of the arm: the meaning of an action, and the goals that a controller keeps between steps.
+
+Semantics and gains are those of robosuite 1.4 (`controllers/config/*.json` there):
+
+| name | action, `control_delta=True` | `control_delta=False` |
+|---|---|---|
+| `osc_pose` | position (1 is 5 cm), rotation vector (1 is 0.5 rad), gripper | m, rad, gripper |
+| `osc_position` | position (1 is 5 cm), gripper; the hand points down | m, gripper |
+| `joint_position` | seven joints (1 is 0.05 rad), gripper | rad, gripper |
+| `joint_velocity` | seven joints (1 is 0.5 rad/s), gripper | |
+
+Deltas are relative to the pose at the beginning of the step. Poses are those of the grip site in the world frame. The
+last number is the gripper's: -1 opens, +1 closes. Values outside the action space are clipped.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.sim.joint_controllers import VELOCITY_MEMORY, joint_position_torques, joint_velocity_torques
+from libero_env.sim.osc import POSITION_SCALE, goals_from_deltas, goals_from_poses, osc_torques
+
+JOINT_SCALE = 0.05  # [rad] at full action
+VELOCITY_SCALE = 0.5  # [rad/s] at full action
+_POINTING_DOWN = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0])  # rotation matrix
+_WORKSPACE_LIMIT = 3.0  # [m] bound of absolute positions along each axis
+_JOINT_LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # [rad] limits of the Panda
+_JOINT_HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)  # [rad]
+
+SetGoals = Callable[..., None]
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A control law together with the meaning of its actions.
+
+    Attributes:
+        name: Name in the table above.
+        control_delta: Whether actions are relative.
+        low: Lower bounds of an action, (action_dim,); its last number is the gripper's.
+        high: Upper bounds of an action, (action_dim,).
+        goal_sizes: Lengths of the two arrays, goal and memory, that are kept for each simulation.
+        kernel: Compiled control law, called in each substep; see `libero_env.sim.osc.osc_torques`.
+        set_goals: Function that writes new goals at the first substep; called with (ids, actions, qpos, site_pos,
+            site_mat, goal, memory).
+    """
+
+    name: str
+    control_delta: bool
+    low: np.ndarray = field(repr=False, compare=False)
+    high: np.ndarray = field(repr=False, compare=False)
+    goal_sizes: tuple[int, int] = field(repr=False)
+    kernel: Callable[..., None] = field(repr=False)
+    set_goals: SetGoals = field(repr=False)
+
+    @property
+    def action_dim(self) -> int:
+        """Length of an action."""
+        return len(self.low)
+
+    @property
+    def state_size(self) -> int:
+        """Length of the vector of `ControllerState.pack`."""
+        return sum(self.goal_sizes) + 2
+
+
+class ControllerState:
+    """Goals, memory and gripper commands of the simulations of one model; what a controller keeps between steps.
+
+    Args:
+        num: Number of simulations.
+        controller: Controller that runs; by default `osc_pose`.
+
+    Attributes:
+        goal: Goal of each simulation, (num, ...); position (3,) for OSC, 7 joints otherwise.
+        memory: Other state of each simulation, (num, ...); goal orientation (9,) for OSC.
+        gripper: Command of the two fingers, (num, 2), in [-1, 1].
+    """
+
+    def __init__(self, num: int, controller: Controller | None = None):
+        self.controller = controller or get_controller()
+        goal_size, memory_size = self.controller.goal_sizes
+        self.goal, self.memory = np.zeros((num, goal_size)), np.zeros((num, memory_size))
+        self.gripper = np.zeros((num, 2))
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Arrays that the kernel takes, (num, ...) each."""
+        return self.goal, self.memory, self.gripper
+
+    def restart(self, ids: np.ndarray, site_pos: np.ndarray, site_mat: np.ndarray) -> None:
+        """Hold the current pose, with a neutral gripper command.
+
+        Args:
+            ids: Indices of the simulations, (k,).
+            site_pos: Position of the grip site, (k, 3), m.
+            site_mat: Orientation of the grip site, (k, 9).
+        """
+        holds_pose = self.controller.goal_sizes == (3, 9)
+        self.goal[ids], self.memory[ids] = (site_pos, site_mat) if holds_pose else (0.0, 0.0)
+        self.gripper[ids] = 0.0
+
+    def pack(self, i: int) -> np.ndarray:
+        """Return the state of simulation i as a vector, (state_size,)."""
+        return np.concatenate([array[i] for array in self.arrays])
+
+    def unpack(self, i: int, vector: np.ndarray) -> None:
+        """Restore the state of simulation i from a vector of `pack`."""
+        parts = np.split(vector, np.cumsum(self.controller.goal_sizes))
+        for array, part in zip(self.arrays, parts, strict=True):
+            array[i] = part
+
+
+def get_controller(name: str = "osc_pose", control_delta: bool = True) -> Controller:
+    """Return a controller by name.
+
+    Args:
+        name: Name in the table of this module.
+        control_delta: Whether actions are relative.
+
+    Raises:
+        UnknownNameError: No controller has this name.
+        LiberoError: `joint_velocity` is asked for without `control_delta`.
+    """
+    if name not in CONTROLLERS:
+        raise UnknownNameError("controller", name, CONTROLLERS)
+    if name == "joint_velocity" and not control_delta:
+        raise LiberoError("joint_velocity has no absolute mode; leave control_delta=True")
+    return CONTROLLERS[name](control_delta)
+
+
+def _osc_pose(delta: bool) -> Controller:
+    high = np.ones(7) if delta else np.array([*[_WORKSPACE_LIMIT] * 3, *[2 * np.pi] * 3, 1.0])
+
+    def absolute_goals(ids, actions, qpos, site_pos, site_mat, goal, memory):
+        goals_from_poses(ids, np.clip(actions[:, :6], -high[:6], high[:6]), goal, memory)
+
+    set_goals = goals_from_deltas if delta else absolute_goals
+    return Controller("osc_pose", delta, -high, high, (3, 9), osc_torques, set_goals)
+
+
+def _osc_position(delta: bool) -> Controller:
+    high = np.array([*[1.0 if delta else _WORKSPACE_LIMIT] * 3, 1.0])
+
+    def set_goals(ids, actions, qpos, site_pos, site_mat, goal, memory):
+        move = np.clip(actions[ids, :3], -high[:3], high[:3])
+        goal[ids] = site_pos[ids] + POSITION_SCALE * move if delta else move
+        memory[ids] = _POINTING_DOWN
+
+    return Controller("osc_position", delta, -high, high, (3, 9), osc_torques, set_goals)
+
+
+def _joint_position(delta: bool) -> Controller:
+    low = -np.ones(8) if delta else np.array([*_JOINT_LOW, -1.0])
+    high = np.ones(8) if delta else np.array([*_JOINT_HIGH, 1.0])
+
+    def set_goals(ids, actions, qpos, site_pos, site_mat, goal, memory):
+        move = np.clip(actions[ids, :7], low[:7], high[:7])
+        goal[ids] = qpos[ids, :7] + JOINT_SCALE * move if delta else move
+
+    return Controller("joint_position", delta, low, high, (7, 0), joint_position_torques, set_goals)
+
+
+def _joint_velocity(delta: bool) -> Controller:
+    def set_goals(ids, actions, qpos, site_pos, site_mat, goal, memory):
+        goal[ids] = VELOCITY_SCALE * np.clip(actions[ids, :7], -1.0, 1.0)
+
+    sizes = (7, VELOCITY_MEMORY)
+    return Controller(
+        "joint_velocity", delta, -np.ones(8), np.ones(8), sizes, joint_velocity_torques, set_goals
+    )
+
+
+CONTROLLERS: dict[str, Callable[[bool], Controller]] = {
+    "osc_pose": _osc_pose,
+    "osc_position": _osc_position,
+    "joint_position": _joint_position,
+    "joint_velocity": _joint_velocity,
+}

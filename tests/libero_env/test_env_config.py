@@ -1,0 +1,80 @@
+"""One configuration for all environments: as keyword arguments, as an object, or both."""
+
+import dataclasses
+import inspect
+from typing import get_type_hints
+
+import pytest
+
+from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv, SubprocEnv
+from libero_env.envs.config import EnvOptions
+from libero_env.envs.world import World
+from libero_env.errors import UnknownNameError
+
+TASK = "libero_object/0"
+FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
+ENVIRONMENTS = [LiberoEnv, BatchEnv, SubprocEnv, World]
+
+
+@pytest.mark.unit
+def test_options_have_the_names_and_types_of_the_fields():
+    assert get_type_hints(EnvOptions) == get_type_hints(EnvConfig)
+
+
+@pytest.mark.unit
+def test_every_field_is_documented():
+    for name in FIELDS:
+        assert f"\n        {name}: " in EnvConfig.__doc__
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("environment", ENVIRONMENTS, ids=lambda cls: cls.__name__)
+def test_the_signature_shows_the_options_with_their_default_values(environment):
+    parameters = inspect.signature(environment).parameters
+    for field in dataclasses.fields(EnvConfig):
+        assert parameters[field.name].default == field.default
+        assert parameters[field.name].kind is inspect.Parameter.KEYWORD_ONLY
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **options: LiberoEnv(TASK, **options),
+        lambda **options: BatchEnv(TASK, 2, **options),
+        lambda **options: World(TASK, **options),
+        lambda **options: SubprocEnv([{"task": TASK}], **options),
+        lambda **options: SubprocEnv([{"task": TASK, **options}]),
+    ],
+    ids=["LiberoEnv", "BatchEnv", "World", "SubprocEnv", "specs of SubprocEnv"],
+)
+def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
+    with pytest.raises(UnknownNameError, match="camera_siz'.*'camera_size'.*control_delta"):
+        make(camera_siz=(64, 64))
+
+
+@pytest.mark.unit
+def test_values_are_made_plain():
+    config = EnvConfig(cameras=["agentview"], observations=["rgb"], camera_size=[64.0, 32])
+    assert (config.cameras, config.observations, config.camera_size) == (("agentview",), ("rgb",), (64, 32))
+    with pytest.raises(UnknownNameError, match="strict"):
+        EnvConfig(semantics="stric")
+
+
+@pytest.mark.sim
+def test_options_replace_fields_of_the_configuration():
+    config = EnvConfig(cameras=("agentview",), camera_size=(16, 16), horizon=3, reward="staged")
+    env = LiberoEnv(TASK, config=config, horizon=2)
+    assert env.config == dataclasses.replace(config, horizon=2)
+    seen, _ = env.reset(options={"init_state": 0})
+    assert seen["agentview_rgb"].shape == (16, 16, 3) and "eye_in_hand_rgb" not in seen
+    assert [env.step([0.0] * 7)[3] for _ in range(2)] == [False, True]
+    env.close()
+    envs = SubprocEnv(
+        [{"task": TASK}, {"task": TASK, "observations": ["ee_pos"]}],
+        config=config,
+        observations=["rgb", "ee_pos"],
+    )
+    seen, info = envs.reset(options={"init_state": 0})
+    assert list(seen) == ["ee_pos"] and list(info["own"][0]) == ["agentview_rgb"]
+    envs.close()
