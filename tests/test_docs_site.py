@@ -104,14 +104,14 @@ def check_line(line: str) -> None:
     words = shlex.split(line)
     if words[0] == "torchrun":
         words = ["python", *words[words.index("train.py") :]]
-    if words[0].endswith("libero"):
-        build_parser().parse_args(words[1:])
-    elif words[:2] == ["python", "train.py"]:
+    if words[:2] in (["python", "train.py"], ["libero", "train"]):
         overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
         check_choices(overrides, [CONFIGS])
         if "-m" in words:  # Hydra takes lists apart before it composes
             overrides = [re.sub(r"=([^\[,]*),.*", r"=\1", w) for w in overrides]
         composes(*overrides)
+    elif words[0].endswith("libero"):
+        build_parser().parse_args(words[1:])
     elif words[0] == "python":
         assert (ROOT / words[1]).is_file() or words[1] == "-m", line
     else:
