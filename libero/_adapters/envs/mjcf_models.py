@@ -1,8 +1,8 @@
-"""Models from the MJCF files of objects that clients bring along.
+"""Models from the MJCF files of user-defined objects.
 
-A file is laid out as robosuite expects: in the world body an outer body with the sites `bottom_site`, `top_site` and
-`horizontal_radius_site`, in it the body `object`, its collision geoms in group 0 and what is seen in group 1. Plainer
-files do as well: one body is enough, and what is missing is made up from its shape.
+robosuite expects in the world body an outer body with the sites `bottom_site`, `top_site` and `horizontal_radius_site`,
+in it the body `object`, with collision geoms in group 0 and visual geoms in group 1. Plain files are accepted, too: one
+body is enough, and what is missing is derived from its shape.
 """
 
 from collections.abc import Mapping
@@ -20,16 +20,16 @@ from libero_env.objects import ObjectModel
 
 STATES = ("open", "close", "turnon", "turnoff")
 OFFSETS = ("bottom", "top", "horizontal_radius")
-_DAMPING = 0.0005  # of a free joint, as robosuite's objects have it
+_DAMPING = 0.0005  # [N s/m and N m s/rad] damping of a free joint, as in robosuite
 
 Offsets = Mapping[str, tuple[float, ...]]
 
 
 def model_of(item: Any, category: str) -> ObjectModel:
-    """The model of an object that has an MJCF file: ours, or one of a subclass of robosuite's class.
+    """Return the model of an object with an MJCF file: of this package, or of a subclass of robosuite's class.
 
     Raises:
-        LiberoError: the file is missing, no MJCF, or has no body with a geom.
+        LiberoError: The file is missing, is not MJCF, or has no body with a geom.
     """
     xml, offsets = read_object(
         Path(item.file), category, bool(getattr(item, "duplicate_collision_geoms", False))
@@ -58,15 +58,15 @@ def model_of(item: Any, category: str) -> ObjectModel:
 
 
 def read_object(path: Path, category: str, duplicate: bool = False) -> tuple[str, Offsets]:
-    """MJCF that scenes attach, and lowest point, highest point and radius relative to the root, m.
+    """Return the MJCF that scenes attach, and lowest point, highest point and radius relative to the root body, m.
 
     Args:
-        path: the file.
-        category: names its assets.
-        duplicate: show collision geoms too, where other geoms are there to be seen.
+        path: MJCF file.
+        category: Category, the prefix of the names of its assets.
+        duplicate: Whether collision geoms are visible although there are visual geoms.
 
     Raises:
-        LiberoError: the file is missing, no MJCF, or has no body with a geom.
+        LiberoError: The file is missing, is not MJCF, or has no body with a geom.
     """
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
     return _read_object(path.absolute(), category, duplicate, stamp)
@@ -78,11 +78,11 @@ def _read_object(path: Path, category: str, duplicate: bool, _: int) -> tuple[st
     body = lay_out(world, path)
     solid = [geom for geom in body.iter("geom") if geom.get("group") != "1"]
     if duplicate:
-        _show(body, solid)
-    weighing = {geom.get("mesh") for geom in solid}
+        _add_visuals(body, solid)
+    collision_meshes = {geom.get("mesh") for geom in solid}
     for asset in assets:
-        if asset.tag == "mesh" and asset.get("name") in weighing:
-            asset.attrib.setdefault("inertia", "convex")  # by volume, of a shape that need not be closed
+        if asset.tag == "mesh" and asset.get("name") in collision_meshes:
+            asset.attrib.setdefault("inertia", "convex")  # mass by volume; the mesh may be open
     offsets = {
         name: tuple(map(float, site.get("pos", "0 0 0").split()))
         for name in OFFSETS
@@ -96,10 +96,10 @@ def _read_object(path: Path, category: str, duplicate: bool, _: int) -> tuple[st
 
 
 def lay_out(world: Element, path: Path) -> Element:
-    """Arrange a world body as robosuite expects, in place; returns the body `object`.
+    """Arrange a world body in place as robosuite expects, and return the body `object`.
 
     Raises:
-        LiberoError: no body has a geom.
+        LiberoError: No body has a geom.
     """
     body = world.find("body/body[@name='object']")
     if body is None:
@@ -118,12 +118,12 @@ def lay_out(world: Element, path: Path) -> Element:
     for geom in body.iter("geom"):
         geom.attrib.setdefault("group", "0")
     if all(geom.get("group") != "1" for geom in body.iter("geom")):
-        _show(body, list(body.iter("geom")))
+        _add_visuals(body, list(body.iter("geom")))
     return body
 
 
-def _show(body: Element, solid: list[Element]) -> None:
-    """Copies of geoms, to be seen and not to be touched."""
+def _add_visuals(body: Element, solid: list[Element]) -> None:
+    """Add visual copies of collision geoms."""
     for parent in list(body.iter("body")):
         for geom in [geom for geom in parent.findall("geom") if geom in solid]:
             shown = {key: value for key, value in geom.attrib.items() if key != "name"}
@@ -133,7 +133,7 @@ def _show(body: Element, solid: list[Element]) -> None:
 
 
 def _measured(xml: str) -> dict[str, tuple[float, ...]]:
-    """Lowest point, highest point and radius of the collision geoms, joints at zero."""
+    """Return lowest point, highest point and radius of the collision geoms, with joints at zero."""
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -152,7 +152,7 @@ def _measured(xml: str) -> dict[str, tuple[float, ...]]:
 
 
 def accept_plain_files(target_class: Any) -> None:
-    """Let a subclass of robosuite's MujocoXMLObject read files that are not laid out as robosuite expects."""
+    """Let a subclass of robosuite's MujocoXMLObject read plain files."""
     read = target_class._get_object_subtree
 
     def subtree(self: Any) -> Any:

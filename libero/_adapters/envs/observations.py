@@ -1,26 +1,24 @@
-"""What the original's environments observe, under robosuite's names; quaternions xyzw, pictures lowest row first."""
+"""Observations of the original's environments under robosuite's names; quaternions xyzw, pictures lowest row first."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import partial
 
 import mujoco
 import numpy as np
 
+from libero._adapters.envs.sim import MjSim
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.geometry import quat_to_mat
-
-if TYPE_CHECKING:
-    from libero._adapters.envs.sim import MjSim
 
 SEGMENTATIONS = ("instance", "class", "element")
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera of the observations: pixels, whether depth is wanted, which segmentations are."""
+    """One camera of the observations: its size in pixels, and the kinds of picture besides colour."""
 
     name: str
     height: int
@@ -36,11 +34,11 @@ def cameras(
     depths: bool | Sequence[bool],
     segmentations: object,
 ) -> tuple[Camera, ...]:
-    """Cameras from robosuite's arguments, where one value stands for all cameras.
+    """Return the cameras of robosuite's arguments, where one value stands for all cameras.
 
     Raises:
-        LiberoError: lists of different lengths.
-        UnknownNameError: no such segmentation.
+        LiberoError: The lists have different lengths.
+        UnknownNameError: The segmentation does not exist.
     """
     names = [names] if isinstance(names, str) else list(names)
     per_camera = isinstance(segmentations, Sequence) and any(
@@ -50,7 +48,7 @@ def cameras(
     columns = [_each(heights, len(names)), _each(widths, len(names)), _each(depths, len(names)), kinds]
     if any(len(column) != len(names) for column in columns):
         raise LiberoError(
-            f"camera_heights, _widths, _depths, _segmentations: one value, or {len(names)} as camera_names"
+            f"camera_heights, _widths, _depths, _segmentations: expected one value, or {len(names)} as camera_names"
         )
     return tuple(
         Camera(name, h, w, bool(depth), _kinds(kind))
@@ -72,27 +70,27 @@ def _kinds(value: object) -> tuple[str, ...]:
 
 @dataclass
 class Observer:
-    """Turns a simulation's state into the original's dictionary.
+    """Observes a simulation as the original does.
 
     Attributes:
-        sim: what is observed.
-        objects: names of the movable objects.
-        cameras: drawn for each observation; empty for none.
-        segments: kind of segmentation -> (ngeom,) number of each geom, 1 and up, 0 for the background.
+        sim: Simulation to observe.
+        objects: Names of the movable objects.
+        cameras: Cameras that are drawn for each observation.
+        segments: Kind of segmentation -> number of each geom, (ngeom + 1,); the last entry is the background.
     """
 
-    sim: "MjSim"
+    sim: MjSim
     objects: Sequence[str]
     cameras: Sequence[Camera] = ()
     segments: dict[str, np.ndarray] = field(default_factory=dict)
 
     def observe(self) -> "OrderedDict[str, np.ndarray]":
-        """Everything, of the state whose kinematics are computed."""
-        robot, pictures, things = self._robot(), self._pictures(), self._things()
-        found = OrderedDict({**robot, **pictures, **things})
+        """Return all observations of the state whose kinematics are computed."""
+        robot, pictures, objects = self._robot(), self._pictures(), self._objects()
+        found = OrderedDict({**robot, **pictures, **objects})
         found["robot0_proprio-state"] = np.concatenate(list(robot.values()))
-        if things:
-            found["object-state"] = np.concatenate(list(things.values()))
+        if objects:
+            found["object-state"] = np.concatenate(list(objects.values()))
         return found
 
     def _robot(self) -> dict[str, np.ndarray]:
@@ -111,20 +109,18 @@ class Observer:
         }
 
     def _grip(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position of the grip site and orientation of the hand, wxyz."""
+        """Return the position of the grip site and the orientation of the hand, wxyz."""
         return self.sim.data.get_site_xpos(GRIP_SITE), self.sim.data.get_body_xquat("robot0_right_hand")
 
-    def _things(self) -> dict[str, np.ndarray]:
+    def _objects(self) -> dict[str, np.ndarray]:
         found: dict[str, np.ndarray] = {}
         grip_pos, grip_quat = self._grip()
         inverse = np.empty(4)
         mujoco.mju_negQuat(inverse, grip_quat)
         rotation = quat_to_mat(inverse)
         for name in self.objects:
-            pos, quat = (
-                self.sim.data.get_body_xpos(f"{name}_main"),
-                self.sim.data.get_body_xquat(f"{name}_main"),
-            )
+            pos = self.sim.data.get_body_xpos(f"{name}_main")
+            quat = self.sim.data.get_body_xquat(f"{name}_main")
             relative = np.empty(4)
             mujoco.mju_mulQuat(relative, inverse, quat)
             found[f"{name}_pos"], found[f"{name}_quat"] = pos.copy(), np.roll(quat, -1)
@@ -135,20 +131,16 @@ class Observer:
     def _pictures(self) -> dict[str, np.ndarray]:
         found: dict[str, np.ndarray] = {}
         for camera in self.cameras:
-            size: dict[str, Any] = {
-                "width": camera.width,
-                "height": camera.height,
-                "camera_name": camera.name,
-            }
+            render = partial(self.sim.render, camera.width, camera.height, camera_name=camera.name)
             if camera.depth:
-                image, depth = self.sim.render(**size, depth=True)
+                image, depth = render(depth=True)
                 found[f"{camera.name}_image"], found[f"{camera.name}_depth"] = image, depth[..., None]
             else:
-                found[f"{camera.name}_image"] = self.sim.render(**size)
+                found[f"{camera.name}_image"] = render()
             if camera.segmentations:
-                elements = self.sim.render(**size, segmentation=True)[..., 1:]
+                elements = render(segmentation=True)[..., 1:]
                 for kind in camera.segmentations:
-                    # -1, the background, finds the last entry
+                    # the background, -1, is the last entry
                     numbers = elements if kind == "element" else self.segments[kind][elements]
                     found[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
         return {key: np.ascontiguousarray(value) for key, value in found.items()}

@@ -1,4 +1,4 @@
-"""Classes of objects by category, as the original registers them, over the models of `libero_env`."""
+"""Classes of objects by category, as the original registers them, with the models of `libero_env`."""
 
 import re
 from functools import cached_property
@@ -22,12 +22,12 @@ VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
 
 
 def category_of(name: str) -> str:
-    """Category that a class name stands for: `Chefmate8Frypan` is `chefmate_8_frypan`."""
+    """Return the category of a class name: `chefmate_8_frypan` for `Chefmate8Frypan`."""
     return "_".join(re.sub(r"([A-Z0-9])", r" \1", name).split()).lower()
 
 
 def register_object(target_class: Any) -> Any:
-    """Make a class known by its name; a class with an MJCF file of its own also to the scenes built from now on."""
+    """Register a class by its name, and its MJCF file, if it has one, for the scenes that are built from now on."""
     category = category_of(target_class.__name__)
     if hasattr(target_class, "_get_object_subtree"):
         accept_plain_files(target_class)
@@ -38,16 +38,16 @@ def register_object(target_class: Any) -> Any:
 
 
 def register_visual_change_object(target_class: type) -> type:
-    """Say that objects of a class look different in some states."""
+    """Register a class whose objects look different in some states."""
     VISUAL_CHANGE_OBJECTS_DICT[category_of(target_class.__name__)] = target_class
     return target_class
 
 
 def get_object_fn(category_name: str) -> type:
-    """The class of a category; case does not count.
+    """Return the class of a category; case does not matter.
 
     Raises:
-        UnknownNameError: no class has this name.
+        UnknownNameError: The category does not exist.
     """
     if category_name.lower() not in OBJECTS_DICT:
         raise UnknownNameError("object category", category_name, OBJECTS_DICT)
@@ -55,17 +55,17 @@ def get_object_fn(category_name: str) -> type:
 
 
 def get_object_dict() -> dict[str, type]:
-    """All classes."""
+    """Return all classes by category."""
     return OBJECTS_DICT
 
 
 class BaseObject:
-    """An instance of a category in a scene: names of its elements, how it rests, what counts as open.
+    """An instance of a category in a scene: names of its elements, rotation at rest, and joint ranges.
 
     Attributes:
-        name: of the instance, such as `milk_1`.
-        category_name: such as `milk`.
-        rotation: (low, high) rad about `rotation_axis`, or axis -> (low, high), or None.
+        name: Name of the instance, such as `milk_1`.
+        category_name: Category, such as `milk`.
+        rotation: Range (low, high) about `rotation_axis`, rad; or axis -> (low, high); or None.
         object_properties: `articulation` (`default_open_ranges`, ...) and `vis_site_names`.
     """
 
@@ -77,12 +77,12 @@ class BaseObject:
 
     @cached_property
     def model(self) -> ObjectModel:
-        """What scenes attach."""
+        """Model that scenes attach."""
         raise NotImplementedError
 
     @property
     def naming_prefix(self) -> str:
-        """What the names of its elements begin with."""
+        """Prefix of the names of its elements."""
         return f"{self.name}_"
 
     @property
@@ -97,7 +97,7 @@ class BaseObject:
 
     @property
     def joints(self) -> list[str]:
-        """Names of its joints, the free one first where it has one."""
+        """Names of its joints; the free joint, if any, is the first."""
         own = [name for name in self._names(self.model.spec.joints) if name != f"{self.name}_joint0"]
         return own if self._fixed else [f"{self.name}_joint0", *own]
 
@@ -108,27 +108,27 @@ class BaseObject:
 
     @property
     def important_sites(self) -> dict[str, str]:
-        """Site -> its name in the scene."""
+        """Site -> name in the scene."""
         return {name.removeprefix(self.naming_prefix): name for name in self.sites}
 
     @property
     def contact_geoms(self) -> list[str]:
-        """Names of the geoms that things touch."""
+        """Names of its collision geoms."""
         return self._names(g for g in self.model.spec.geoms if g.contype or g.conaffinity)
 
     @property
     def visual_geoms(self) -> list[str]:
-        """Names of the geoms that are seen."""
+        """Names of its visual geoms."""
         return self._names(g for g in self.model.spec.geoms if g.group == 1)
 
     @property
     def bottom_offset(self) -> np.ndarray:
-        """Lowest point relative to the root, (3,) m."""
+        """Lowest point relative to the root body, (3,) m."""
         return np.array(self.model.bottom_offset)
 
     @property
     def top_offset(self) -> np.ndarray:
-        """Highest point relative to the root, (3,) m."""
+        """Highest point relative to the root body, (3,) m."""
         return np.array(self.model.top_offset)
 
     @property
@@ -142,23 +142,23 @@ class BaseObject:
         return self.model.rest_quat()
 
     def get_xml(self) -> str:
-        """The object as MJCF."""
+        """Return the object as MJCF."""
         return self.model.spec.to_xml()
 
     def is_open(self, qpos: float) -> bool:
-        """Whether a joint position counts as open."""
+        """Return whether a joint position is in the open range."""
         return reaches_state(self.model, qpos, "open", "close")
 
     def is_close(self, qpos: float) -> bool:
-        """Whether a joint position counts as closed."""
+        """Return whether a joint position is in the closed range."""
         return reaches_state(self.model, qpos, "close", "open")
 
     def turn_on(self, qpos: float) -> bool:
-        """Whether a joint position counts as on."""
+        """Return whether a joint position is in the range of on."""
         return reaches_state(self.model, qpos, "turnon", "turnoff")
 
     def turn_off(self, qpos: float) -> bool:
-        """Whether a joint position counts as off."""
+        """Return whether a joint position is in the range of off."""
         return reaches_state(self.model, qpos, "turnoff", "turnon")
 
     _fixed = False
@@ -168,17 +168,17 @@ class BaseObject:
 
 
 class BuiltinObject(BaseObject):
-    """A category of the benchmark; its model comes from the pack in use. Or one of your own, from an MJCF file.
+    """A category of the benchmark, with the model of the pack in use; or a user-defined category with an MJCF file.
 
     Args:
-        name: of the instance; the category by default.
-        obj_name: stem of the file of a category of your own in the folder of its family below the assets, or its path.
-        joints: as in `MujocoXMLObject`.
-        model: what a scene has built.
+        name: Name of the instance; by default the category.
+        obj_name: Of a user-defined category the path of its file, or its stem in the folder of the family.
+        joints: Joints, see `MujocoXMLObject`.
+        model: Model that a scene has built.
     """
 
-    family = ""
-    in_folders = True  # whether each object of the family has a folder
+    family = ""  # folder of the family in the assets
+    in_folders = True  # whether each object of the family has a folder of its own
 
     def __init__(
         self,
@@ -216,12 +216,12 @@ class BuiltinObject(BaseObject):
 
     @cached_property
     def model(self) -> ObjectModel:
-        """Its model in the pack in use."""
+        """Model in the pack in use."""
         return select_pack().build(self.category_name)
 
 
 def _parameters(category: str) -> ObjectModel | Physics:
-    """How a category rests and moves; without building its model where figures are kept apart."""
+    """Return rotation and joint ranges of a category, if possible without building its model."""
     try:
         return load_physics(category)
     except KeyError:
@@ -233,13 +233,13 @@ class MujocoXMLObject(BaseObject):
 
     Args:
         fname: MJCF file, see `libero._adapters.envs.mjcf_models`; `custom_path` is another name for it.
-        name: of the instance.
-        joints: `[{"type": "free", "damping": "0.0005"}]`, or None for one that does not move.
-        obj_type: accepted, of no effect.
-        duplicate_collision_geoms: collision geoms are seen, too.
+        name: Name of the instance.
+        joints: Joints, `[{"type": "free", "damping": "0.0005"}]`; None for an object that does not move.
+        obj_type: Accepted without effect.
+        duplicate_collision_geoms: Whether collision geoms are visible, too.
 
     Raises:
-        TypeError: no file is given.
+        TypeError: No file is given.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class MujocoXMLObject(BaseObject):
         custom_path: str | PathLike = "",
     ):
         if not (fname or custom_path):
-            raise TypeError(f"{type(self).__name__}: no MJCF file; give its path as fname")
+            raise TypeError(f"{type(self).__name__}: no MJCF file; pass its path as fname")
         self.file, self.name, self.joint_specs = str(fname or custom_path), name, joints
         self.duplicate_collision_geoms = duplicate_collision_geoms
         self.category_name = category_of(type(self).__name__)
@@ -262,7 +262,7 @@ class MujocoXMLObject(BaseObject):
 
     @cached_property
     def model(self) -> ObjectModel:
-        """The file's model."""
+        """Model of the file."""
         return model_of(self, self.category_name)
 
 

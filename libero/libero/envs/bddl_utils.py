@@ -1,6 +1,7 @@
-"""Task files as the original's dictionaries and lists; names and predicates in lower case."""
+"""Task files as dictionaries and lists of the original; problem names and predicates in lower case."""
 
 import os
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 
 
 def read_problem(problem_filename: str) -> Problem:
-    """A task file, see `libero.libero.envs.bddl_utils.task_file`; read once as long as it does not change.
+    """Read a task file, see `task_file`; it is cached as long as it does not change.
 
     Raises:
-        BDDLError: it is not a task file.
+        BDDLError: The file is not a task file.
     """
     path = task_file(problem_filename)
     stamp = Path(path).stat()
@@ -30,7 +31,7 @@ def _read(path: str, *_: int) -> Problem:
 
 
 def get_problem_info(problem_filename: str) -> dict[str, str]:
-    """Problem class, domain and instruction of a task file."""
+    """Return problem class, domain and instruction of a task file."""
     problem = read_problem(problem_filename)
     return {
         "problem_name": problem.name.lower(),
@@ -40,7 +41,7 @@ def get_problem_info(problem_filename: str) -> dict[str, str]:
 
 
 def robosuite_parse_problem(problem_filename: str) -> dict[str, Any]:
-    """All of a task file."""
+    """Return everything in a task file."""
     problem = read_problem(problem_filename)
     goal = problem.goal.parts if isinstance(problem.goal, And) else (problem.goal,)
     return {
@@ -58,17 +59,17 @@ def robosuite_parse_problem(problem_filename: str) -> dict[str, Any]:
 
 
 def get_regions(problem_filename: str) -> dict[str, dict[str, Any]]:
-    """The regions of a task file by their address."""
+    """Return the regions of a task file by address."""
     return regions(read_problem(problem_filename))
 
 
 def get_scenes(problem_filename: str) -> dict[str, str]:
-    """The scene properties of a task file, such as the styles of floor and wall."""
+    """Return the scene properties of a task file, such as the styles of floor and wall."""
     return dict(read_problem(problem_filename).scene_properties)
 
 
 def regions(problem: Problem) -> dict[str, dict[str, Any]]:
-    """Address of each region -> what it is."""
+    """Return the regions of a problem by address."""
     return {
         region.address: {
             "target": region.target,
@@ -82,7 +83,7 @@ def regions(problem: Problem) -> dict[str, dict[str, Any]]:
 
 
 def as_list(expression: Expression) -> list[Any]:
-    """A goal or atom as nested lists: `["on", "plate_1", "flat_stove_1_cook_region"]`."""
+    """Return a goal or atom as nested lists: `["on", "plate_1", "flat_stove_1_cook_region"]`."""
     match expression:
         case Atom(predicate, args):
             return [predicate.lower(), *args]
@@ -96,7 +97,7 @@ def as_list(expression: Expression) -> list[Any]:
 
 
 def as_expression(state: list[Any]) -> Expression:
-    """The inverse of `as_list`; case does not count."""
+    """Return a goal or atom of nested lists, the inverse of `as_list`; case does not matter."""
     head = str(state[0]).lower()
     if head in ("and", "or"):
         return (And if head == "and" else Or)(tuple(map(as_expression, state[1:])))
@@ -107,20 +108,19 @@ def as_expression(state: list[Any]) -> Expression:
     return Atom(head.capitalize(), tuple(state[1:]))
 
 
-def _by_category(things: Any) -> dict[str, list[str]]:
+def _by_category(names: Mapping[str, str]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for name, category in things.items():
+    for name, category in names.items():
         found.setdefault(category, []).append(name)
     return found
 
 
 def task_file(name: str | os.PathLike) -> str:
-    """A task file's path.
+    """Return the path of a task file.
 
-    What exists is taken as it is. Else a name without a folder, such as `Task.bddl_file`, and a path into a checkout of
-    the original, `.../bddl_files/<suite>/<task>.bddl`, stand for the benchmark's file.
+    A path that exists is returned unchanged. Otherwise a name without a folder, such as `Task.bddl_file`, and a path
+    into a checkout of the original, `.../bddl_files/<suite>/<task>.bddl`, stand for the file of the benchmark.
     """
-
     path = Path(name)
     into_checkout = path.parts[-3:-2] == ("bddl_files",)
     if path.exists() or (path.name != str(name) and not into_checkout):

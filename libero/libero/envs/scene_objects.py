@@ -1,4 +1,4 @@
-"""A compiled task as the original's objects: instances, regions, and which geoms belong to which."""
+"""A compiled task as objects of the original: instances, regions, and the instance of each geom."""
 
 from collections import OrderedDict
 from typing import Any
@@ -16,12 +16,12 @@ _ROBOT_PARTS = OrderedDict(Panda0=("robot0_",), RethinkMount0=("mount0_",), Pand
 
 
 def scene_objects(scene: Scene) -> dict[str, BaseObject]:
-    """Movable objects by name."""
+    """Return the movable objects by name."""
     return {name: _instance(name, model) for name, model in scene.objects.items()}
 
 
 def scene_fixtures(scene: Scene) -> dict[str, Any]:
-    """Fixtures by name."""
+    """Return the fixtures by name."""
     fixtures = {name: _instance(name, model) for name, model in scene.fixtures.items()}
     for fixture in fixtures.values():
         fixture._fixed = True
@@ -37,12 +37,12 @@ def _instance(name: str, model: ObjectModel) -> BaseObject:
 
 
 def _anonymous(model: ObjectModel) -> type[BuiltinObject]:
-    """A class for a category that was registered with `libero_env` only."""
+    """Return a class for a category that is registered only with `libero_env`."""
     return type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
 
 
 def scene_sites(scene: Scene) -> dict[str, SiteObject]:
-    """Regions by address."""
+    """Return the regions by address."""
     model, found = scene.model, {}
     for region in scene.problem.regions:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address)
@@ -61,12 +61,12 @@ def scene_sites(scene: Scene) -> dict[str, SiteObject]:
 
 
 class TaskModel:
-    """Which geoms and sites belong to which instance and class.
+    """Instance and class of each geom and site.
 
     Attributes:
-        instances_to_ids, classes_to_ids: name -> `geom` and `site` -> indices.
-        geom_ids_to_instances, geom_ids_to_classes: index -> name.
-        segments: `instance` and `class` -> (ngeom + 1,) number of each geom from 1 on; 0 is everything else.
+        instances_to_ids, classes_to_ids: Name -> `geom` and `site` -> indices.
+        geom_ids_to_instances, geom_ids_to_classes: Index -> name.
+        segments: `instance` and `class` -> number of each geom, (ngeom + 1,), from 1; 0 is everything else.
     """
 
     def __init__(self, scene: Scene, model: mujoco.MjModel):
@@ -93,7 +93,7 @@ class TaskModel:
 
     @staticmethod
     def _owners(scene: Scene, model: mujoco.MjModel, kind: str) -> dict[str, list[int]]:
-        """Instance -> its geoms or sites."""
+        """Return the geoms or sites of each instance."""
         bodies = getattr(model, f"{kind}_bodyid")
         found = {n: np.flatnonzero(np.isin(bodies, scene.bodies[n])).tolist() for n in scene.entities}
         names = [model.body(b).name for b in range(model.nbody)]

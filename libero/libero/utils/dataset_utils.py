@@ -1,4 +1,4 @@
-"""What a file of demonstrations holds."""
+"""Facts about demonstration files."""
 
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,18 @@ from libero_env.errors import DemoError
 def get_dataset_info(
     dataset_path: str | Path, filter_key: str | None = None, verbose: bool = True
 ) -> dict[str, Any]:
-    """Number and lengths of demonstrations, range of actions, observation keys and attributes of a file.
+    """Return number and lengths of demonstrations, range of actions, observation keys and attributes of a file.
 
     Args:
         dataset_path: HDF5 file.
-        filter_key: name of a subset in `mask`.
-        verbose: whether it is printed, without `structure`.
+        filter_key: Name of a subset in `mask`.
+        verbose: Whether the facts are printed, without `structure`.
 
     Returns:
-        `structure` holds for each demonstration the shapes of its arrays.
+        Facts by name; `structure` holds the shapes of the arrays of each demonstration.
 
     Raises:
-        DemoError: it is no file of demonstrations, or has no such subset.
+        DemoError: The file is not a demonstration file, or does not have the subset.
     """
     path = Path(dataset_path)
     with open_demo_file(path) as file:
@@ -31,7 +31,7 @@ def get_dataset_info(
         if filter_key is not None:
             if (masks := file.get("mask")) is None or filter_key not in masks:
                 known = ", ".join(masks or ()) or "none"
-                raise DemoError(f"{path}: no subset {filter_key!r} in mask; there are: {known}")
+                raise DemoError(f"{path}: no subset {filter_key!r} in mask; valid: {known}")
             names = [name.decode() for name in masks[filter_key][()]]
         lengths = np.array([len(data[name]["actions"]) for name in names])
         actions = np.concatenate([data[name]["actions"][()] for name in names])
@@ -55,7 +55,7 @@ def get_dataset_info(
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
-    """Path below a group -> shape of the array there."""
+    """Return the shapes of the arrays in a group by path."""
     found: dict[str, tuple[int, ...]] = {}
     group.visititems(lambda name, item: found.update({name: item.shape}) if hasattr(item, "shape") else None)
     return found

@@ -1,4 +1,4 @@
-"""Fetching the demonstrations of the original; see `libero_env.demos.download`."""
+"""Download of the demonstrations of the original; see `libero_env.demos.download`."""
 
 import http.client
 import os
@@ -28,17 +28,17 @@ _SUITES = ("libero_object", "libero_goal", "libero_spatial", "libero_10", "liber
 
 
 class DownloadProgressBar(tqdm):
-    """A bar for `urllib.request.urlretrieve(url, file, reporthook=bar.update_to)`."""
+    """Progress bar for `urllib.request.urlretrieve(url, file, reporthook=bar.update_to)`."""
 
     def update_to(self, b: int = 1, bsize: int = 1, tsize: int | None = None) -> None:
-        """Say that `b` blocks of `bsize` bytes of `tsize` in all have arrived."""
+        """Show that `b` blocks of `bsize` bytes, of `tsize` bytes in total, have arrived."""
         if tsize is not None:
             self.total = tsize
         self.update(b * bsize - self.n)
 
 
 def url_is_alive(url: str) -> bool:
-    """Whether a server answers for an address."""
+    """Return whether a server answers for an address."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=30):
             return True
@@ -49,19 +49,18 @@ def url_is_alive(url: str) -> bool:
 def download_url(
     url: str, download_dir: str | os.PathLike, check_overwrite: bool = True, is_zipfile: bool = True
 ) -> Path:
-    """Fetch a file into a folder, going on where an earlier attempt was broken off.
+    """Download a file into a folder, and return the file, or the folder of an unpacked archive.
+
+    An interrupted download is resumed.
 
     Args:
-        url: its address; the last part is the file's name.
-        download_dir: the folder.
-        check_overwrite: keep a file of this name that is there.
-        is_zipfile: unpack it, and remove the archive.
-
-    Returns:
-        The file, or the folder it was unpacked into.
+        url: Address; its last part is the name of the file.
+        download_dir: Folder.
+        check_overwrite: Whether a file that exists is kept.
+        is_zipfile: Whether the file is an archive to unpack and remove.
 
     Raises:
-        DownloadError: it did not arrive, or is no archive.
+        DownloadError: The file did not arrive, or is not an archive.
     """
     folder = Path(download_dir)
     file = folder / url.rpartition("/")[2]
@@ -75,7 +74,7 @@ def download_url(
     except zipfile.BadZipFile as error:
         file.unlink()
         raise DownloadError(
-            f"{url}: what arrived is no intact archive and was removed ({error}); try again"
+            f"{url}: the download is not an intact archive and was removed ({error}); try again"
         ) from error
     file.unlink()
     return folder
@@ -84,16 +83,16 @@ def download_url(
 def download_from_huggingface(
     dataset_name: str, download_dir: str | os.PathLike, check_overwrite: bool = True
 ) -> list[Path]:
-    """Fetch a suite's files one by one, each verified by its checksum.
+    """Download the files of a suite one by one, verify their checksums, and return them.
 
     Args:
-        dataset_name: such as `libero_object`; `libero_100` is `libero_90` and `libero_10`.
-        download_dir: the folder that holds the suites' folders.
-        check_overwrite: do not replace files that are there and are others.
+        dataset_name: Suite, such as `libero_object`; `libero_100` is `libero_90` and `libero_10`.
+        download_dir: Folder of the folders of the suites.
+        check_overwrite: Whether different files of the same names are kept.
 
     Raises:
-        DownloadError: they did not arrive, or other files are in the way.
-        UnknownNameError: no such suite.
+        DownloadError: The files did not arrive, or different files exist.
+        UnknownNameError: The suite does not exist.
     """
     return download_demos([dataset_name], Path(download_dir), overwrite=not check_overwrite)
 
@@ -104,17 +103,17 @@ def libero_dataset_download(
     check_overwrite: bool = True,
     use_huggingface: bool = False,
 ) -> None:
-    """Fetch demonstrations; suites that are complete are left alone.
+    """Download demonstrations; complete suites are skipped.
 
     Args:
-        datasets: `all`, or a name of `DATASET_LINKS`.
-        download_dir: the folder that holds the suites' folders; by default that of `get_libero_path("datasets")`.
-        check_overwrite: keep what is there.
-        use_huggingface: verified file by file from the Hub instead of as archives.
+        datasets: `all`, or a name in `DATASET_LINKS`.
+        download_dir: Folder of the folders of the suites; by default `get_libero_path("datasets")`.
+        check_overwrite: Whether files that exist are kept.
+        use_huggingface: Whether verified files of the Hub are downloaded instead of archives.
 
     Raises:
-        UnknownNameError: no such data set.
-        DownloadError: something did not arrive.
+        UnknownNameError: The data set does not exist.
+        DownloadError: A file did not arrive.
     """
     if datasets not in ("all", *DATASET_LINKS):
         raise UnknownNameError("data set", datasets, ("all", *DATASET_LINKS))
@@ -132,10 +131,10 @@ def libero_dataset_download(
 
 
 def check_libero_dataset(download_dir: str | os.PathLike | None = None) -> bool:
-    """Print for each suite how many of its files are there; whether all are.
+    """Print how many files of each suite exist, and return whether all do.
 
     Args:
-        download_dir: the folder that holds the suites' folders; by default that of `get_libero_path("datasets")`.
+        download_dir: Folder of the folders of the suites; by default `get_libero_path("datasets")`.
     """
     folder = Path(download_dir) if download_dir is not None else datasets_folder()
     absent = {name: _missing(folder, name) for name in _SUITES}
@@ -146,13 +145,12 @@ def check_libero_dataset(download_dir: str | os.PathLike | None = None) -> bool:
 
 
 def datasets_folder() -> Path:
-    """Where demonstrations are kept; it need not exist."""
-
+    """Return the folder of demonstrations; it need not exist."""
     return Path(get_path_dict()["datasets"])
 
 
 def _missing(folder: Path, suite: str) -> list[str]:
-    """Demonstration files of a suite that are not there."""
+    """Return the demonstration files of a suite that do not exist."""
     benchmark = get_benchmark(suite)()
     names = [benchmark.get_task_demonstration(i) for i in range(benchmark.n_tasks)]
     return [name for name in names if not (folder / name).is_file()]

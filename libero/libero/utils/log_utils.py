@@ -1,4 +1,4 @@
-"""A logger that writes to the console and, where a file is given, to it."""
+"""A logger that writes to the console, and to a file."""
 
 import logging
 import sys
@@ -8,7 +8,7 @@ from pathlib import Path
 def get_logger(
     name: str = "libero", path: str | Path | None = None, level: int = logging.INFO
 ) -> logging.Logger:
-    """The logger of this name; handlers are added once."""
+    """Return the logger of this name; handlers are added once."""
     logger = logging.getLogger(name)
     if not logger.handlers:
         handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout)]

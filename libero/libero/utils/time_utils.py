@@ -5,7 +5,7 @@ from types import TracebackType
 
 
 class Timer:
-    """Measures the seconds that its block takes."""
+    """Measures the duration of its block."""
 
     value: float | None = None
 
@@ -19,5 +19,5 @@ class Timer:
         self.value = time.perf_counter() - self.start
 
     def get_elapsed_time(self) -> float | None:
-        """Seconds of the block, None before its end."""
+        """Return the duration of the block in seconds; None before its end."""
         return self.value

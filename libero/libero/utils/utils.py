@@ -1,4 +1,4 @@
-"""Helpers for stored models and pictures."""
+"""Functions for stored models and pictures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
 
 
 def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """A stored model with this machine's paths, and with cameras changed: name -> attributes."""
+    """Return a stored model with the paths of this machine, and with new attributes of cameras by name."""
     root = ElementTree.fromstring(xml_str)
     for element in root.iterfind("asset/*[@file]"):
         file = element.get("file", "")
@@ -29,15 +29,15 @@ def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, 
 
 
 def process_image_input(img_tensor: np.ndarray) -> np.ndarray:
-    """Pixels 0 to 255 -> 0 to 1."""
+    """Return pixels in [0, 1] of pixels in [0, 255]."""
     return img_tensor / 255.0
 
 
 def reconstruct_image_output(img_array: np.ndarray) -> np.ndarray:
-    """Pixels 0 to 1 -> 0 to 255."""
+    """Return pixels in [0, 255] of pixels in [0, 1]."""
     return img_array * 255.0
 
 
 def update_env_kwargs(env_kwargs: dict[str, Any], **kwargs: Any) -> None:
-    """Set arguments of an environment in place."""
+    """Update arguments of an environment in place."""
     env_kwargs.update(kwargs)

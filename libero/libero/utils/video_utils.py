@@ -1,4 +1,4 @@
-"""Films of episodes."""
+"""Videos of episodes."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -10,31 +10,27 @@ import numpy as np
 from libero_env.demos.video import write_video
 from libero_env.errors import LiberoError
 
-_TINT = np.array([0, 255, 0])  # mixed into the pictures after success
-_SHARE = 0.2
+_TINT = np.array([0, 255, 0])  # RGB, mixed into the pictures after success
+_TINT_WEIGHT = 0.2
 
 
 class VideoWriter:
-    """Collects pictures and writes them on `save`, or at the end of its block.
+    """Collects pictures, and writes them as a video on `save` or at the end of its block.
 
-    MP4 where PyAV is installed (`pip install libero-lifelong[export]`), else GIF.
+    The format is MP4 with PyAV (`pip install libero-lifelong[export]`), otherwise GIF.
 
     Args:
-        video_path: folder for the files.
-        save_video: without it nothing is collected.
-        fps: pictures for each second.
-        single_video: all environments in one film, one after the other, instead of `video_<i>`.
+        video_path: Folder of the files.
+        save_video: Whether pictures are collected at all.
+        fps: Pictures per second.
+        single_video: Whether all environments are in one video, one after the other, instead of `video_<i>`.
     """
 
     def __init__(
         self, video_path: str | Path, save_video: bool = False, fps: int = 30, single_video: bool = True
     ):
-        self.video_path, self.save_video, self.fps, self.single_video = (
-            Path(video_path),
-            save_video,
-            fps,
-            single_video,
-        )
+        self.video_path, self.save_video = Path(video_path), save_video
+        self.fps, self.single_video = fps, single_video
         self.image_buffer: dict[int, list[np.ndarray]] = {}
         self.last_images: dict[int, np.ndarray] = {}
 
@@ -47,7 +43,7 @@ class VideoWriter:
         self.save()
 
     def reset(self) -> None:
-        """The next pictures are of a new episode."""
+        """Start a new episode."""
         self.last_images.clear()
 
     def append_image(self, img: np.ndarray, idx: int = 0) -> None:
@@ -58,13 +54,13 @@ class VideoWriter:
     def append_obs(
         self, obs: Mapping[str, np.ndarray], done: bool, idx: int = 0, camera_name: str = "agentview_image"
     ) -> None:
-        """Add the picture of an observation; after success the last one, tinted green."""
+        """Add the picture of an observation; after success the last picture, tinted green."""
         if not done:
             self.last_images[idx] = np.asarray(obs[camera_name])
             self.append_image(self.last_images[idx], idx)
         else:
             last = self.last_images.get(idx, np.asarray(obs[camera_name]))
-            self.append_image((1 - _SHARE) * last + _SHARE * _TINT, idx)
+            self.append_image((1 - _TINT_WEIGHT) * last + _TINT_WEIGHT * _TINT, idx)
 
     def append_vector_obs(
         self,
@@ -77,15 +73,15 @@ class VideoWriter:
             self.append_obs(own, bool(done), i, camera_name)
 
     def save(self) -> list[Path]:
-        """Write the films; their paths."""
+        """Write the videos and return their paths."""
         if not self.save_video or not self.image_buffer:
             return []
         self.video_path.mkdir(parents=True, exist_ok=True)
         if self.single_video:
-            films = {"video": [image for images in self.image_buffer.values() for image in images]}
+            videos = {"video": [image for images in self.image_buffer.values() for image in images]}
         else:
-            films = {f"video_{i}": images for i, images in self.image_buffer.items()}
-        return [_write(self.video_path / name, images, self.fps) for name, images in films.items()]
+            videos = {f"video_{i}": images for i, images in self.image_buffer.items()}
+        return [_write(self.video_path / name, images, self.fps) for name, images in videos.items()]
 
 
 def _write(path: Path, images: Sequence[np.ndarray], fps: int) -> Path:
