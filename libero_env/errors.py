@@ -1,15 +1,23 @@
-"""Every error this package raises on purpose derives from `LiberoError`."""
+"""Errors of the package; all derive from `LiberoError`."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class LiberoError(Exception):
-    """Root of the package's errors: the message says what is wrong, where, and how to mend it."""
+    """Root of the package's errors. The message states what is wrong, where, what is valid, and what to do."""
 
 
 class UnknownNameError(LiberoError, LookupError):
-    """A name (suite, task, category, ...) that does not exist; the message lists the valid ones."""
+    """A name (suite, task, category, option, ...) that does not exist.
+
+    The message lists the valid names and suggests the nearest.
+
+    Args:
+        kind: Kind of the name, such as `task`.
+        name: Name that does not exist.
+        valid: Names that exist.
+    """
 
     def __init__(self, kind: str, name: object, valid: Iterable[object]):
         names = sorted(map(str, valid))
@@ -44,11 +52,11 @@ class PlacementError(LiberoError):
 
 
 class ActionError(LiberoError, ValueError):
-    """An action of the wrong shape or with values that are not finite; the simulation is untouched."""
+    """An action of the wrong shape or with values that are not finite; the simulation has not changed."""
 
 
 class RenderError(LiberoError):
-    """No picture can be drawn; the message names the remedy."""
+    """No image can be rendered; the message names the remedy."""
 
 
 class DemoError(LiberoError, ValueError):

@@ -1,9 +1,9 @@
-"""Gymnasium's names for the tasks, `libero/<suite>-<index>`. Importing this module registers them, and only that.
+"""Names of the tasks in Gymnasium, `libero/<suite>-<index>`. Importing this module registers them.
 
     gymnasium.make("libero_env.registration:libero/libero_object-3")  # the part before the colon is imported
     gymnasium.make_vec("libero/libero_object-3", num_envs=8)  # a `BatchEnv`
 
-Gymnasium 1 has no entry point for packages: whoever wants the names imports this module, or names it as above.
+Gymnasium 1 has no entry point for packages, so this module has to be imported, or named as in the first example.
 """
 
 import gymnasium
@@ -14,7 +14,7 @@ NAMESPACE = "libero"
 
 
 def env_ids() -> dict[str, str]:
-    """Name in Gymnasium -> task, for all tasks of all suites; reads the lists of tasks, builds nothing."""
+    """Return the task of each name in Gymnasium, for all tasks of all suites; only lists of tasks are read."""
     sizes: dict[str, int] = {}
     for suite in load_data("suites.yaml"):
         if isinstance(suite, dict):  # suites that consist of others come after them
@@ -25,7 +25,7 @@ def env_ids() -> dict[str, str]:
 
 
 def register() -> None:
-    """Register every task that is not yet registered."""
+    """Register all tasks that are not registered yet."""
     for name, task in env_ids().items():
         if name not in gymnasium.registry:
             gymnasium.register(

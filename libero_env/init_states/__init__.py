@@ -1,4 +1,4 @@
-"""How an episode starts: sampled and settled placements, the stored states of each task, the original's files."""
+"""Starts of episodes: sampled and settled placements, the stored states of each task, files of the original."""
 
 import lazy_loader
 

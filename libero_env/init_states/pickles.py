@@ -1,7 +1,7 @@
 """Initial states in the original's files: pickled arrays in a zip, read without executing anything.
 
-`torch.load` would run whatever the pickle asks for. Here every name that a pickle may call stands for a small class of
-this module that only takes notes, and any other name is refused.
+`torch.load` would call every function that a pickle names. Here each name that is allowed in a pickle is replaced by a
+small class of this module that only stores its arguments, and any other name is an error.
 """
 
 import io
@@ -15,19 +15,25 @@ import numpy as np
 from libero_env.errors import LiberoError
 from libero_env.storage import atomic_path
 
-_MAX_BYTES = 1 << 28  # of any one part of a file
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of all parts, so that equal states are equal files
+_MAX_BYTES = 1 << 28  # largest part of a file
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # date of all parts, so that equal states give equal files
 
 
 class StateFileError(LiberoError, ValueError):
-    """A file of initial states that is broken or asks for more than arrays; the message names the file."""
+    """A file of initial states that is broken or has other content than arrays; the message names the file."""
 
 
 def read_states(path: str | Path) -> np.ndarray:
-    """The rows of a `.pruned_init` or `.init` file, (n, size) float64: [time, qpos, qvel].
+    """Read a `.pruned_init` or `.init` file.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        Rows [time, qpos, qvel], (n, size) float64.
 
     Raises:
-        StateFileError: no such file, no array of two dimensions in it, or a pickle that wants to call something.
+        StateFileError: The file does not exist, has no array of two dimensions, or its pickle calls other functions.
     """
     try:
         with open(path, "rb") as file:
@@ -40,9 +46,9 @@ def read_states(path: str | Path) -> np.ndarray:
         raise StateFileError(
             f"{path}: {error.strerror or error}; see `init_states` in the config file"
         ) from error
-    except Exception as error:  # noqa: BLE001 - a broken pickle fails in any way it likes
+    except Exception as error:  # noqa: BLE001 - a broken pickle may raise any error
         raise StateFileError(
-            f"{path} is no file of initial states ({type(error).__name__}: {error})"
+            f"{path} is not a file of initial states ({type(error).__name__}: {error})"
         ) from error
     array = found.array() if isinstance(found, _Array) else found
     if not isinstance(array, np.ndarray) or array.ndim != 2 or not np.isfinite(array).all():
@@ -53,7 +59,7 @@ def read_states(path: str | Path) -> np.ndarray:
 def write_states(path: str | Path, rows: np.ndarray) -> None:
     """Write rows (n, size) in the original's format, which `torch.load` and `read_states` read."""
     path = Path(path)
-    # Written as the older NumPy named things, which every version reads.
+    # Names of the older NumPy, which all versions read.
     content = pickle.dumps(np.ascontiguousarray(rows, np.float64), protocol=2)
     content = content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
@@ -76,7 +82,7 @@ def _part(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 class _Dtype:
-    """Stands for `numpy.dtype`."""
+    """Replacement of `numpy.dtype`."""
 
     def __init__(self, code: str, *_: object):
         if code not in ("f8", "f4", "i8", "i4"):
@@ -89,7 +95,7 @@ class _Dtype:
 
 
 class _Array:
-    """Stands for `numpy.ndarray`."""
+    """Replacement of `numpy.ndarray`."""
 
     def __init__(self, *_: object):
         self._state: tuple[object, ...] = ()
@@ -98,29 +104,29 @@ class _Array:
         self._state = state
 
     def array(self) -> np.ndarray:
-        """The array that was described."""
+        """Return the described array."""
         _, shape, dtype, fortran, raw = self._state
         if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes) and isinstance(shape, tuple)):
-            raise StateFileError("an array of something else than numbers")
+            raise StateFileError("an array of other values than numbers")
         return np.frombuffer(raw, dtype.dtype).reshape(shape, order="F" if fortran else "C")
 
 
 class _Storage:
-    """Stands for a torch storage class: the numbers' type."""
+    """Replacement of a storage class of torch: the type of the numbers."""
 
     def __init__(self, code: str):
         self.dtype = np.dtype(code)
 
 
 def _bytes(text: str, encoding: str) -> bytes:
-    """How pickles of the second protocol spell bytes."""
+    """Return the bytes that pickles of the second protocol write as text."""
     if encoding != "latin1":
-        raise StateFileError(f"bytes spelt in {encoding!r}")
+        raise StateFileError(f"bytes in the encoding {encoding!r}; expected latin1")
     return text.encode("latin1")
 
 
 def _tensor(storage: np.ndarray, offset: int, shape: tuple, stride: tuple, *_: object) -> np.ndarray:
-    """A tensor of a storage, in bounds."""
+    """Return a tensor of a storage as an array, after a check of its bounds."""
     last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
     if offset < 0 or min(stride, default=0) < 0 or min(shape, default=1) < 1 or last >= storage.size:
         raise StateFileError("a tensor that is larger than its storage")
@@ -142,20 +148,20 @@ _KNOWN: dict[tuple[str, str], object] = {
 
 
 class _Reader(pickle.Unpickler):
-    """An unpickler that knows the names above and no others."""
+    """An unpickler that accepts the names above and no others."""
 
     def __init__(self, file: Any, archive: zipfile.ZipFile | None = None, root: str = ""):
         super().__init__(file)
         self._archive, self._root = archive, root
 
     def find_class(self, module: str, name: str) -> Any:
-        """What a name in the pickle stands for."""
+        """Return the replacement of a name in the pickle."""
         if (module, name) not in _KNOWN:
             self._refuse(f"{module}.{name}")
         return _KNOWN[module, name]
 
     def persistent_load(self, pid: Any) -> np.ndarray:
-        """The numbers of a tensor, from another part of the zip."""
+        """Return the numbers of a tensor, from another part of the zip."""
         kind, storage, key, *_ = pid
         if kind != "storage" or not isinstance(storage, _Storage) or self._archive is None:
             self._refuse(f"a {kind!r} outside the pickle")

@@ -1,6 +1,6 @@
-"""Where things stand at the start: samples the regions and conditions of a problem's init atoms."""
+"""Placement of objects and fixtures: samples of the regions and conditions of a problem's init atoms."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
 
@@ -8,34 +8,43 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import PlacementError
-from libero_env.geometry import quat_to_mat
+from libero_env.geometry import quat_from_axis_angle, quat_to_mat
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.scene import ROBOT, Scene, fixture_pose, initial_qpos
 from libero_env.tasks.problem import Atom, Region
 
-ARM_NOISE = 0.02  # rad, standard deviation of the arm's start around its rest pose, as in the original
-_CLEARANCE = 0.001  # m, above the surface
+ARM_NOISE = 0.02  # [rad] standard deviation of the arm's joints around the rest pose, as in the original
+_CLEARANCE = 0.001  # [m] above the surface
 _MAX_TRIES = 500
 _CONDITIONS = {"Open": "open", "Close": "close", "Turnon": "turnon", "Turnoff": "turnoff"}
-_OVER_SITE = 0.03  # m, how far over a site's box the surface may be that it marks
-_INWARD = 0.3  # share of a site's box around its middle in which things are put
+_OVER_SITE = 0.03  # [m] height over a site's box at which the surface that it marks may be
+_SITE_FRACTION = 0.3  # of the edges of a site's box, around its middle, in which objects are placed
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where everything stands: `qpos` (nq,), `fixtures` (nfixtures, 7) pos and quat wxyz."""
+    """A start of an episode.
+
+    Attributes:
+        qpos: Positions, (nq,).
+        fixtures: Pose of each fixture, (nfixtures, 7): position, quaternion wxyz.
+    """
 
     qpos: np.ndarray
     fixtures: np.ndarray
 
 
 def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
-    """Fixtures and objects in the regions their init atoms name, joints as the atoms say, nothing touching.
+    """Sample a start: entities in the regions of their init atoms, joints as in the atoms, no contact.
 
-    Objects may hover by a millimetre: settle them before use (`init_states.settle`).
+    Objects hover by a millimetre and are not at rest; see `libero_env.init_states.settle`.
+
+    Args:
+        scene: Scene to sample.
+        rng: Random generator.
 
     Raises:
-        PlacementError: no free placement in 500 tries, or an init atom that cannot be placed.
+        PlacementError: No placement without contact was found in 500 tries, or an init atom cannot be placed.
     """
     places = _places(scene)
     model = copy(scene.model) if scene.fixtures else scene.model
@@ -44,20 +53,18 @@ def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
     data.qpos[:7] += ARM_NOISE * rng.standard_normal(7)
     fixtures = _sample_fixtures(scene, rng)
     if scene.fixtures:
-        model.body_pos[scene.fixture_bodies], model.body_quat[scene.fixture_bodies] = (
-            fixtures[:, :3],
-            fixtures[:, 3:],
-        )
+        model.body_pos[scene.fixture_bodies] = fixtures[:, :3]
+        model.body_quat[scene.fixture_bodies] = fixtures[:, 3:]
     _sample_joints(scene, data, rng)
     touching: set[str] = set()
     for _ in range(_MAX_TRIES):
         for name, place in places.items():
             if not place.flat:
-                mujoco.mj_kinematics(model, data)  # what it stands on has been placed
+                mujoco.mj_kinematics(model, data)  # its carrier has been placed
             _place(scene, data, name, place, rng)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        touching = _touching(scene, data)
+        touching = _touching_entities(scene, data)
         if not touching:
             return Start(data.qpos.copy(), fixtures)
     raise PlacementError(
@@ -66,13 +73,8 @@ def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
     )
 
 
-def sample_qpos(scene: Scene, rng: np.random.Generator) -> np.ndarray:
-    """The positions (nq,) of `sample_start`."""
-    return sample_start(scene, rng).qpos
-
-
 def lowest_point(scene: Scene, name: str, quat: np.ndarray) -> float:
-    """Height of an object's lowest collision point over its origin when turned by `quat` (wxyz), m; negative."""
+    """Return the height of an object's lowest collision point over its origin, m, when rotated by `quat` (wxyz)."""
     model, lowest = scene.model, np.inf
     for body in scene.bodies[name]:
         pos, rotation = _in_root_frame(model, body, quat_to_mat(quat))
@@ -87,22 +89,22 @@ def lowest_point(scene: Scene, name: str, quat: np.ndarray) -> float:
     return float(lowest)
 
 
-def _in_root_frame(model: mujoco.MjModel, body: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) and orientation (3, 3) of a body from its root's origin, joints at zero, turned by `turn`."""
+def _in_root_frame(model: mujoco.MjModel, body: int, root_mat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return position (3,) and orientation (3, 3) of a body relative to its root's origin, with joints at zero."""
     if body == model.body_rootid[body]:
-        return np.zeros(3), turn
-    pos, mat = _in_root_frame(model, model.body_parentid[body], turn)
+        return np.zeros(3), root_mat
+    pos, mat = _in_root_frame(model, model.body_parentid[body], root_mat)
     return pos + mat @ model.body_pos[body], mat @ quat_to_mat(model.body_quat[body])
 
 
 @dataclass(frozen=True)
 class Place:
-    """What an init atom says about where an object goes.
+    """Place of an object, from an init atom.
 
     Attributes:
-        carrier: workspace, object or fixture that it stands on or in.
-        region: rectangle on the workspace or named site of the carrier; None for the carrier itself.
-        inside: rather in the site than on top of it.
+        carrier: Workspace, object or fixture that the object is on or in.
+        region: Rectangle on the workspace or named site of the carrier; None for the carrier itself.
+        inside: Whether the object is in the site and not on top of it.
     """
 
     carrier: str
@@ -111,18 +113,16 @@ class Place:
 
     @property
     def flat(self) -> bool:
-        """On the workspace, so that nothing else has to be placed first."""
+        """Whether it is on the workspace, so that no other object has to be placed first."""
         return self.region is not None and bool(self.region.ranges)
 
 
 def _places(scene: Scene) -> Mapping[str, Place]:
-    """Object -> where it goes; what carries others comes first."""
+    """Return the place of each object, by name; carriers of other objects come first."""
     atoms = [a for a in scene.problem.init if a.args[0] in scene.objects and len(a.args) == 2]
     places = {atom.args[0]: _place_of(scene, atom) for atom in atoms}
     if missing := set(scene.objects) - set(places):
-        raise PlacementError(
-            f"no init atom says where {', '.join(sorted(missing))} stands; add (On object region)"
-        )
+        raise PlacementError(f"no init atom places {', '.join(sorted(missing))}; add (On object region)")
     ordered: dict[str, Place] = {}
     while len(ordered) < len(places):
         waiting = set(places) - set(ordered)
@@ -130,7 +130,9 @@ def _places(scene: Scene) -> Mapping[str, Place]:
             name: place for name, place in places.items() if name in waiting and place.carrier not in waiting
         }
         if not ready:
-            raise PlacementError(f"{', '.join(sorted(waiting))} stand on each other in a circle")
+            raise PlacementError(
+                f"the init atoms place {', '.join(sorted(waiting))} on each other in a circle"
+            )
         ordered.update(ready)
     return ordered
 
@@ -150,6 +152,7 @@ def _place_of(scene: Scene, atom: Atom) -> Place:
 
 
 def _sample_fixtures(scene: Scene, rng: np.random.Generator) -> np.ndarray:
+    """Sample the poses of all fixtures, (nfixtures, 7)."""
     poses = [
         fixture_pose(scene.problem, scene.workspace_name, scene.workspace, name, item, rng)
         for name, item in scene.fixtures.items()
@@ -158,7 +161,7 @@ def _sample_fixtures(scene: Scene, rng: np.random.Generator) -> np.ndarray:
 
 
 def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Joints of what is to be open, closed, turned on or off."""
+    """Sample the joints that init atoms require to be open, closed, turned on or off."""
     for atom in scene.problem.init:
         if (state := _CONDITIONS.get(atom.predicate)) is None:
             continue
@@ -167,7 +170,7 @@ def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) 
         joints = scene.joints.get(atom.args[0], ())
         if state not in ranges or not joints:
             raise PlacementError(
-                f"init atom ({atom.predicate} {atom.args[0]}): it has no joint that can be {state!r}"
+                f"init atom ({atom.predicate} {atom.args[0]}): {atom.args[0]} has no joint with a state {state!r}"
             )
         for joint in joints:
             low, high = np.clip(sorted(ranges[state]), *scene.model.jnt_range[joint])
@@ -175,52 +178,55 @@ def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) 
 
 
 def _place(scene: Scene, data: mujoco.MjData, name: str, place: Place, rng: np.random.Generator) -> None:
+    """Sample the pose of an object and write it to `data.qpos`."""
     if place.flat:
         assert place.region is not None
         x0, y0, x1, y1 = place.region.ranges[rng.integers(len(place.region.ranges))]
-        quat = _turned(scene.objects[name].rest_quat(rng), place.region, rng)
+        quat = _rotate_about_vertical(scene.objects[name].rest_quat(rng), place.region, rng)
         ox, oy, _ = scene.workspace.offset
         surface = scene.workspace.surface_height
         x, y = rng.uniform(x0, x1) + ox, rng.uniform(y0, y1) + oy
     else:
         quat = scene.objects[name].rest_quat(rng)
-        x, y, surface = _on_thing(scene, data, place, rng)
+        x, y, surface = _sample_on_carrier(scene, data, place, rng)
     height = surface - lowest_point(scene, name, quat) + _CLEARANCE
     address = scene.model.joint(f"{name}_joint0").qposadr[0]
     data.qpos[address : address + 7] = (x, y, height, *quat)
 
 
-def _turned(quat: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
+def _rotate_about_vertical(quat: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
+    """Rotate an orientation (4,), wxyz, by an angle in the yaw range of a region."""
     if not region.yaw:
         return quat
-    turn, turned = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), rng.uniform(*region.yaw[0]))
-    mujoco.mju_mulQuat(turned, turn, quat)
-    return turned
+    yaw, rotated = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), rng.uniform(*region.yaw[0])), np.zeros(4)
+    mujoco.mju_mulQuat(rotated, yaw, quat)
+    return rotated
 
 
-def _on_thing(
+def _sample_on_carrier(
     scene: Scene, data: mujoco.MjData, place: Place, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """A point (x, y) over the middle of an object, or around the middle of a site, and the height of what is there."""
+    """Sample a point (x, y) over an object, or around the middle of a site, and return it with the surface's height."""
     if place.region is None:
         x, y = data.xpos[scene.model.body(f"{place.carrier}_{ROOT_BODY}").id][:2]
-        return float(x), float(y), max(top for _, _, top in _solids(scene, data, place.carrier))
+        return float(x), float(y), max(top for _, _, top in _collision_boxes(scene, data, place.carrier))
     site = scene.model.site(place.region.address).id
     mat = data.site_xmat[site].reshape(3, 3)
     half = np.abs(mat @ scene.model.site_size[site])
-    x, y, z = data.site_xpos[site] + (*(_INWARD * half[:2] * rng.uniform(-1.0, 1.0, 2)), 0.0)
+    x, y, z = data.site_xpos[site] + (*(_SITE_FRACTION * half[:2] * rng.uniform(-1.0, 1.0, 2)), 0.0)
     highest = z if place.inside else z + half[2] + _OVER_SITE
     under = [
         top
-        for centre, reach, top in _solids(scene, data, place.carrier)
+        for centre, reach, top in _collision_boxes(scene, data, place.carrier)
         if (np.abs(centre - (x, y)) <= reach).all() and top <= highest
     ]
     return float(x), float(y), max(under, default=float(z - half[2]))
 
 
-def _solids(scene: Scene, data: mujoco.MjData, name: str):
-    """Collision shapes of a thing as seen from above: centre (2,), half extents (2,), height of the top; m."""
+def _collision_boxes(
+    scene: Scene, data: mujoco.MjData, name: str
+) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """Yield the collision geoms of an entity seen from above: centre (2,), half size (2,), height of the top; m."""
     model = scene.model
     for body in scene.bodies[name]:
         start = model.body_geomadr[body]
@@ -232,16 +238,16 @@ def _solids(scene: Scene, data: mujoco.MjData, name: str):
                 yield centre[:2], half[:2], float(centre[2] + half[2])
 
 
-def _touching(scene: Scene, data: mujoco.MjData) -> set[str]:
-    """Objects in contact with another object, a fixture or the robot."""
+def _touching_entities(scene: Scene, data: mujoco.MjData) -> set[str]:
+    """Return the names of objects in contact with other entities or the robot, and of these."""
     model = scene.model
     roots = model.body_rootid[model.geom_bodyid[data.contact.geom[: data.ncon]]]
     owners = {int(scene.bodies[name][0]): name for name in scene.entities} | {
         int(scene.bodies[ROBOT][0]): ROBOT
     }
-    found = set()
+    touching: set[str] = set()
     for a, b in roots:
         names = {owners.get(int(body), "") for body in (a, b)}
         if a != b and (names & set(scene.objects)) and "" not in names:
-            found |= names
-    return found
+            touching |= names
+    return touching

@@ -1,4 +1,4 @@
-"""Starts that are at rest: sampled placements, simulated until nothing moves, and checked against the task."""
+"""Starts at rest: sampled placements, simulated until nothing moves, and checked against the task."""
 
 import numpy as np
 
@@ -10,87 +10,98 @@ from libero_env.sim.simulation import Simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Region
 
-_STILL = 2e-4  # m (or quaternion units): what may change in half a second at rest
-
-
-_MAX_SETTLE = 10  # half seconds
-
-
-_MAX_DRAWS = 20
-
-
-_TOLERANCE = 0.02  # m, how far out of its rectangle a start may have slid
+_STILL_CHANGE = 2e-4  # [m, or quaternion units] largest change of an object at rest in half a second
+_MAX_HALF_SECONDS = 10
+_MAX_SAMPLES = 20
+_TOLERANCE = 0.02  # [m] distance by which an object may slide out of its rectangle
 
 
 def settle(
     simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int, fixtures: np.ndarray | None = None
 ) -> np.ndarray:
-    """Let the objects of one simulation come to rest while the arm holds its pose; (nq,) -> (nq,).
+    """Simulate until the objects of one simulation are at rest, while the arm holds its pose.
 
-    Arm and gripper are as they were before; fixtures (nfixtures, 7) are put where they belong first.
+    Args:
+        simulations: Simulations, with a controller whose zero action holds the pose.
+        i: Index of the simulation.
+        qpos: Positions to start from, (nq,).
+        nq_robot: Number of positions of the robot.
+        fixtures: Poses of the fixtures, (nfixtures, 7); None keeps them.
+
+    Returns:
+        Positions at rest, (nq,), with those of the robot as they were.
 
     Raises:
-        PlacementError: something still moves after five seconds.
+        PlacementError: An object still moves after five seconds.
     """
-    nv, still = simulations.model.nv, np.zeros((simulations.num, 7))
+    hold = np.zeros((simulations.num, 7))
     simulations.reset(
-        [i], qpos[None], np.zeros((1, nv)), fixtures=None if fixtures is None else fixtures[None]
+        [i],
+        qpos[None],
+        np.zeros((1, simulations.model.nv)),
+        fixtures=None if fixtures is None else fixtures[None],
     )
-    for _ in range(_MAX_SETTLE):
+    for _ in range(_MAX_HALF_SECONDS):
         before = simulations.fields["qpos"][i].copy()
         for _ in range(10):
-            simulations.step([i], still)
+            simulations.step([i], hold)
         after = simulations.fields["qpos"][i].copy()
-        if np.abs(after - before)[nq_robot:].max(initial=0.0) < _STILL:
+        if np.abs(after - before)[nq_robot:].max(initial=0.0) < _STILL_CHANGE:
             after[:nq_robot] = qpos[:nq_robot]
             return after
     raise PlacementError(
-        f"objects still move after {_MAX_SETTLE * 0.5:.0f} s; do their regions lie on a surface?"
+        f"objects still move after {_MAX_HALF_SECONDS * 0.5:.0f} s; do their regions lie on a surface?"
     )
 
 
 def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.random.Generator) -> Start:
-    """A start drawn from the task's regions and settled in simulation i; its init atoms hold and its goal does not.
+    """Sample a start that is at rest, where the init atoms are true and the goal is false.
+
+    Args:
+        scene: Scene to sample.
+        simulations: Simulations of the scene.
+        i: Index of the simulation to settle the objects in.
+        rng: Random generator.
 
     Raises:
-        PlacementError: as `sample_start`; or no draw in 20 comes to rest where it should.
+        PlacementError: As `sample_start`; or no sample of 20 comes to rest where it should.
     """
-    view, why = StateView(scene, simulations, i), ""
-    for _ in range(_MAX_DRAWS):
+    view, reason = StateView(scene, simulations, i), ""
+    for _ in range(_MAX_SAMPLES):
         start = sample_start(scene, rng)
         try:
             qpos = settle(simulations, i, start.qpos, scene.nq_robot, start.fixtures)
         except PlacementError as error:
-            why = str(error)
+            reason = str(error)
             continue
         simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)))
-        if not (why := "; ".join(start_faults(view))):
+        if not (reason := "; ".join(start_faults(view))):
             return Start(qpos, start.fixtures)
     raise PlacementError(
-        f"{scene.problem.language!r}: no start in {_MAX_DRAWS} draws is as the task says: {why}"
+        f"{scene.problem.language!r}: none of {_MAX_SAMPLES} sampled starts agrees with the task: {reason}"
     )
 
 
 def start_faults(view: StateView) -> list[str]:
-    """What is wrong with a state as a start: init atoms that do not hold, a goal that does."""
+    """Return the reasons why a state is no valid start: init atoms that are false, a goal that is true."""
     faults = []
     for atom in view.scene.problem.init:
         if atom.args[0] in view.scene.fixtures:
             continue
         region = view.scene.problem.region(atom.args[-1])
         if atom.predicate == "On" and region is not None:
-            holds = _stands_on(view, atom.args[0], region)
+            is_true = _rests_on(view, atom.args[0], region)
         else:
-            holds = evaluate(atom, view)
-        if not holds:
+            is_true = evaluate(atom, view)
+        if not is_true:
             faults.append(f"({atom.predicate} {' '.join(atom.args)}) does not hold")
     if evaluate(view.scene.problem.goal, view):
         faults.append("the goal holds already")
     return faults
 
 
-def _stands_on(view: StateView, name: str, region: Region) -> bool:
-    """Over the region as seen from above, and touching its target; the heights that `On` asks for do not count."""
+def _rests_on(view: StateView, name: str, region: Region) -> bool:
+    """Return whether an object is over a region, seen from above, and touches its target; unlike `On` at any height."""
     if region.ranges:
         point = view.body_pos(name)[:2] - np.asarray(view.scene.workspace.offset)[:2]
         low, high = np.split(np.array(region.ranges), 2, axis=1)

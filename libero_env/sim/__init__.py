@@ -1,1 +1,1 @@
-"""One compiled scene and what is computed on it: stepping, control, state, truth of goals, observations, pictures."""
+"""Simulation of one compiled scene: stepping, control, state, truth of goals, rewards, observations, images."""
