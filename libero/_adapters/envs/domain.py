@@ -2,9 +2,8 @@
 
 from typing import Protocol
 
-from libero._adapters.envs.sim import MjSim
+from libero._adapters.envs.sim import ClientSimulations, MjSim
 from libero_env.sim.scene import Scene
-from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 
 
@@ -12,6 +11,6 @@ class Domain(Protocol):
     """One simulation of a task file; see `libero.libero.envs.bddl_base_domain.BDDLBaseDomain`."""
 
     scene: Scene
-    simulations: LoopSimulations
+    simulations: ClientSimulations
     sim: MjSim
     view: StateView

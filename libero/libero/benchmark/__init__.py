@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from libero._adapters.lookup import lookup
 from libero.libero import get_libero_path
 from libero_env.errors import UnknownNameError
 from libero_env.init_states.pickles import read_states
@@ -60,9 +61,7 @@ def get_benchmark(benchmark_name: str) -> type["Benchmark"]:
     Raises:
         UnknownNameError: The benchmark does not exist.
     """
-    if benchmark_name.lower() not in BENCHMARK_MAPPING:
-        raise UnknownNameError("benchmark", benchmark_name, BENCHMARK_MAPPING)
-    return BENCHMARK_MAPPING[benchmark_name.lower()]
+    return lookup(BENCHMARK_MAPPING, "benchmark", benchmark_name)
 
 
 def print_benchmark() -> None:

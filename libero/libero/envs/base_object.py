@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from libero._adapters.envs.mjcf_models import STATES, accept_plain_files, model_of
+from libero._adapters.lookup import lookup
 from libero_env.assets.pack import chosen_assets, select_pack
-from libero_env.errors import UnknownNameError
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin import BUILDERS
@@ -49,9 +49,7 @@ def get_object_fn(category_name: str) -> type:
     Raises:
         UnknownNameError: The category does not exist.
     """
-    if category_name.lower() not in OBJECTS_DICT:
-        raise UnknownNameError("object category", category_name, OBJECTS_DICT)
-    return OBJECTS_DICT[category_name.lower()]
+    return lookup(OBJECTS_DICT, "object category", category_name)
 
 
 def get_object_dict() -> dict[str, type]:

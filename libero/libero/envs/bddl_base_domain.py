@@ -13,6 +13,7 @@ from libero._adapters.envs.observations import Observer, cameras
 from libero._adapters.envs.sim import ClientSimulations, MjSim
 from libero._adapters.envs.stored_model import fixtures_of, write_model
 from libero._adapters.envs.window import Window
+from libero._adapters.lookup import lookup
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs.bddl_utils import task_file
 from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState
@@ -294,9 +295,7 @@ class BDDLBaseDomain:
         return bool(eval_predicate_fn(state[0], *(self._state(name) for name in state[1:])))
 
     def _state(self, name: str) -> BaseObjectState:
-        if name not in self.object_states_dict:
-            raise UnknownNameError("object, fixture or region", name, self.object_states_dict)
-        return self.object_states_dict[name]
+        return lookup(self.object_states_dict, "object, fixture or region", name)
 
     # Observations -------------------------------------------------------------------------------------------
 
@@ -333,9 +332,7 @@ class BDDLBaseDomain:
             UnknownNameError: The name does not exist.
         """
         known = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
-        if object_name not in known:
-            raise UnknownNameError("object, fixture or region", object_name, known)
-        return known[object_name]
+        return lookup(known, "object, fixture or region", object_name)
 
     @property
     def language_instruction(self) -> str:

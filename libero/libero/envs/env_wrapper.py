@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from libero._adapters.envs.sim import MjSim
+from libero._adapters.lookup import lookup
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs import problems  # noqa: F401 - registers the problem classes
 from libero.libero.envs.bddl_base_domain import TASK_MAPPING, BDDLBaseDomain
 from libero.libero.envs.robots.single_arm import SingleArm
-from libero_env.errors import PlacementError, UnknownNameError
+from libero_env.errors import PlacementError
 
 _RESETS = 5
 DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
@@ -49,9 +50,7 @@ class ControlEnv:
         info = BDDLUtils.get_problem_info(bddl_file_name)
         self.problem_name, self.domain_name = info["problem_name"], info["domain_name"]
         self.language_instruction = info["language_instruction"]
-        if self.problem_name not in TASK_MAPPING:
-            raise UnknownNameError("problem", self.problem_name, TASK_MAPPING)
-        self.env: BDDLBaseDomain = TASK_MAPPING[self.problem_name](
+        self.env: BDDLBaseDomain = lookup(TASK_MAPPING, "problem", self.problem_name)(
             bddl_file_name,
             robots=robots,
             controller_configs={"type": controller} if isinstance(controller, str) else controller,

@@ -1,6 +1,6 @@
 """A compiled task as objects of the original: instances, regions, and the instance of each geom."""
 
-from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -12,7 +12,7 @@ from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.model import ObjectModel
 from libero_env.sim.scene import Scene
 
-_ROBOT_PARTS = OrderedDict(Panda0=("robot0_",), RethinkMount0=("mount0_",), PandaGripper0=("gripper0_",))
+_ROBOT_PARTS = {"Panda0": "robot0_", "RethinkMount0": "mount0_", "PandaGripper0": "gripper0_"}
 
 
 def scene_objects(scene: Scene) -> dict[str, BaseObject]:
@@ -71,19 +71,15 @@ class TaskModel:
 
     def __init__(self, scene: Scene, model: mujoco.MjModel):
         self.mujoco_model = model
-        geoms, sites = self._owners(scene, model, "geom"), self._owners(scene, model, "site")
-        robot = [name for name in _ROBOT_PARTS if name in geoms]
-        names = [*scene.entities, *robot]
-        categories = {
-            **{n: _class_name(m.category) for n, m in scene.entities.items()},
-            **{n: n[:-1] for n in robot},
-        }
-        self.instances_to_ids = {n: {"geom": geoms.get(n, []), "site": sites.get(n, [])} for n in names}
+        bodies, robot = {name: scene.bodies[name] for name in scene.entities}, _robot_bodies(model)
+        classes = {name: _class_name(item.category) for name, item in scene.entities.items()}
+        classes |= {name: name.removesuffix("0") for name in robot}
+        self.instances_to_ids = {name: _ids(model, own) for name, own in (bodies | robot).items()}
         self.classes_to_ids: dict[str, dict[str, list[int]]] = {}
-        for name in names:
-            ids = self.classes_to_ids.setdefault(categories[name], {"geom": [], "site": []})
+        for name, ids in self.instances_to_ids.items():
+            of_class = self.classes_to_ids.setdefault(classes[name], {"geom": [], "site": []})
             for kind in ids:
-                ids[kind] += self.instances_to_ids[name][kind]
+                of_class[kind] += ids[kind]
         self.geom_ids_to_instances = _inverse(self.instances_to_ids)
         self.geom_ids_to_classes = _inverse(self.classes_to_ids)
         self.segments = {
@@ -91,22 +87,25 @@ class TaskModel:
             "class": _numbers(self.classes_to_ids, model.ngeom),
         }
 
-    @staticmethod
-    def _owners(scene: Scene, model: mujoco.MjModel, kind: str) -> dict[str, list[int]]:
-        """Return the geoms or sites of each instance."""
-        bodies = getattr(model, f"{kind}_bodyid")
-        found = {n: np.flatnonzero(np.isin(bodies, scene.bodies[n])).tolist() for n in scene.entities}
-        names = [model.body(b).name for b in range(model.nbody)]
-        for part, prefixes in _ROBOT_PARTS.items():
-            own = [b for b in range(model.nbody) if names[b].startswith(prefixes)]
-            if ids := np.flatnonzero(np.isin(bodies, own)).tolist():
-                found[part] = ids
-        return found
+
+def _robot_bodies(model: mujoco.MjModel) -> dict[str, list[int]]:
+    """Return the bodies of each part of the robot that has geoms."""
+    names = [model.body(b).name for b in range(model.nbody)]
+    parts = {
+        part: [b for b in range(model.nbody) if names[b].startswith(prefix)]
+        for part, prefix in _ROBOT_PARTS.items()
+    }
+    return {part: bodies for part, bodies in parts.items() if np.isin(model.geom_bodyid, bodies).any()}
+
+
+def _ids(model: mujoco.MjModel, bodies: Sequence[int] | np.ndarray) -> dict[str, list[int]]:
+    """Return the geoms and sites of bodies."""
+    owners = {"geom": model.geom_bodyid, "site": model.site_bodyid}
+    return {kind: np.flatnonzero(np.isin(owner, bodies)).tolist() for kind, owner in owners.items()}
 
 
 def _class_name(category: str) -> str:
-    found = OBJECTS_DICT.get(category)
-    return found.__name__ if found is not None else category
+    return OBJECTS_DICT[category].__name__ if category in OBJECTS_DICT else category
 
 
 def _inverse(ids: dict[str, dict[str, list[int]]]) -> dict[int, str]:

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from libero._adapters.lookup import lookup
 from libero.libero.envs.bddl_utils import as_expression
 from libero.libero.utils.object_utils import get_affordance_regions
 from libero_env.assets.arena import load_workspace
-from libero_env.errors import UnknownNameError
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import And, Atom, Expression, Problem, Region
 
@@ -243,9 +243,7 @@ def get_suite_generator_func(workspace_name: str) -> Callable[..., str]:
     Raises:
         UnknownNameError: The workspace does not exist.
     """
-    if workspace_name not in SUITE_GENERATORS:
-        raise UnknownNameError("workspace", workspace_name, SUITE_GENERATORS)
-    return SUITE_GENERATORS[workspace_name]
+    return lookup(SUITE_GENERATORS, "workspace", workspace_name)
 
 
 def print_result(result: str) -> None:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
+from libero._adapters.lookup import lookup
 from libero.libero.utils.bddl_generation_utils import (
     WORKSPACE_CATEGORIES,
     get_affordance_region_kwargs_list_from_fixture_info,
@@ -55,11 +56,7 @@ def get_scene_dict(scene_type: str | None = None) -> Any:
     Raises:
         UnknownNameError: The scene type does not exist.
     """
-    if scene_type is None:
-        return SCENE_DICT
-    if scene_type.lower() not in SCENE_DICT:
-        raise UnknownNameError("scene type", scene_type, SCENE_DICT)
-    return SCENE_DICT[scene_type.lower()]
+    return SCENE_DICT if scene_type is None else lookup(SCENE_DICT, "scene type", scene_type)
 
 
 def get_scene_class(scene_name: str) -> Callable[[], "InitialSceneTemplates"]:
@@ -68,9 +65,7 @@ def get_scene_class(scene_name: str) -> Callable[[], "InitialSceneTemplates"]:
     Raises:
         UnknownNameError: The scene does not exist.
     """
-    if scene_key(scene_name) not in MU_DICT:
-        raise UnknownNameError("scene", scene_name, MU_DICT)
-    return MU_DICT[scene_key(scene_name)]
+    return lookup(MU_DICT, "scene", scene_key(scene_name))
 
 
 class InitialSceneTemplates:

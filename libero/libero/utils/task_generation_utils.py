@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from libero._adapters.lookup import lookup
 from libero.libero.envs.predicates import get_predicate_fn
 from libero.libero.utils.bddl_generation_utils import (
     get_goal_state,
@@ -94,9 +95,7 @@ def get_task_info(scene_name: str | None = None) -> Any:
     """
     if scene_name is None:
         return TASK_INFO
-    if scene_key(scene_name) not in TASK_INFO:
-        raise UnknownNameError("scene with tasks", scene_name, TASK_INFO)
-    return TASK_INFO[scene_key(scene_name)]
+    return lookup(TASK_INFO, "scene with tasks", scene_key(scene_name))
 
 
 def generate_bddl_from_task_info(

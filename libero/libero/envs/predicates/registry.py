@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from libero._adapters.lookup import lookup
 from libero.libero.envs.predicates import base_predicates as known
 from libero_env.errors import UnknownNameError
 
@@ -48,9 +49,7 @@ def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
     Raises:
         UnknownNameError: The predicate does not exist.
     """
-    if predicate_fn_name.lower() not in VALIDATE_PREDICATE_FN_DICT:
-        raise UnknownNameError("predicate", predicate_fn_name, VALIDATE_PREDICATE_FN_DICT)
-    return VALIDATE_PREDICATE_FN_DICT[predicate_fn_name.lower()]
+    return lookup(VALIDATE_PREDICATE_FN_DICT, "predicate", predicate_fn_name)
 
 
 def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:

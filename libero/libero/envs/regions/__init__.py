@@ -1,5 +1,6 @@
 """Samplers of positions and of joint positions, by problem and region."""
 
+from libero._adapters.lookup import lookup
 from libero.libero.envs.regions.object_property_sampler import (
     ObjectPropertySampler,
     OpenCloseSampler,
@@ -14,7 +15,6 @@ from libero.libero.envs.regions.samplers import (
     SiteSequentialCompositeSampler,
     TableRegionSampler,
 )
-from libero_env.errors import UnknownNameError
 
 _TABLES = {
     "libero_tabletop_manipulation": ("table", TableRegionSampler),
@@ -36,12 +36,8 @@ def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
     Raises:
         UnknownNameError: The problem or workspace does not exist.
     """
-    if problem_name not in REGION_SAMPLERS:
-        raise UnknownNameError("problem", problem_name, REGION_SAMPLERS)
-    known = REGION_SAMPLERS[problem_name]
-    if region_sampler_name not in known:
-        raise UnknownNameError(f"region sampler of {problem_name}", region_sampler_name, known)
-    return known[region_sampler_name]
+    samplers = lookup(REGION_SAMPLERS, "problem", problem_name)
+    return lookup(samplers, f"region sampler of {problem_name}", region_sampler_name)
 
 
 def update_region_samplers(problem_name: str, region_sampler_name: str, region_sampler: type) -> None:

@@ -1,0 +1,18 @@
+"""Entries of the original's registries by name."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from libero_env.errors import UnknownNameError
+
+
+def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
+    """Return the entry of a name; case does not matter.
+
+    Raises:
+        UnknownNameError: The name does not exist; the message lists the valid names.
+    """
+    for key, value in table.items():
+        if key.lower() == str(name).lower():
+            return value
+    raise UnknownNameError(kind, name, table)
