@@ -61,6 +61,29 @@ class Shared:
             self._memory.unlink()
 
 
+class Host:
+    """An environment in a worker; each method of a subclass is a command.
+
+    Attributes:
+        env: The environment, which the command `open` makes with `make`.
+        shared: Shared memory for observations.
+    """
+
+    def __init__(self, make: Callable[[], Any]):
+        self.make = make
+        self.env: Any = None
+        self.shared: Shared | None = None
+
+    def close(self) -> None:
+        """Close the environment and the shared memory. Idempotent."""
+        if self.env is not None:
+            self.env.close()
+            self.env = None
+        if self.shared is not None:
+            self.shared.close()
+            self.shared = None
+
+
 def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
     """Make a `LiberoEnv` from its arguments; it is imported here, in the worker."""
     from libero_env.envs.env import LiberoEnv
@@ -68,7 +91,9 @@ def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
     return LiberoEnv(**spec)
 
 
-def serve(pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str], host_class: Any) -> None:
+def serve(
+    pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str], host_class: type[Host]
+) -> None:
     """Run commands in a worker until `close`, or until the other end of the pipe is gone."""
     os.environ.update(variables)
     host = host_class(make)
@@ -85,48 +110,38 @@ def serve(pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str
         host.close()
 
 
-class GymHost:
-    """A Gymnasium environment in a worker; each method is a command."""
-
-    def __init__(self, make: Callable[[], gymnasium.Env]):
-        self._make = make
-        self._env: Any = None
-        self._shared: Any = None
+class GymHost(Host):
+    """A Gymnasium environment in a worker."""
 
     def open(self) -> tuple[spaces.Space, spaces.Space]:
         """Make the environment and return its observation and action space."""
-        self._env = self._make()
-        return self._env.observation_space, self._env.action_space
+        self.env = self.make()
+        return self.env.observation_space, self.env.action_space
 
     def attach(self, name: str) -> None:
         """Attach the shared memory for observations."""
-        self._shared = Shared(self._env.observation_space, name)
+        self.shared = Shared(self.env.observation_space, name)
 
     def reset(self, seed: int | None, options: dict[str, Any]) -> dict[str, Any]:
         """Reset the environment, write its observation and return its info."""
-        observation, info = self._env.reset(seed=seed, options=options)
-        self._shared.write(observation)
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._write(observation)
         return info
 
     def step(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
         """Step the environment, write its observation and return reward, terminated, truncated and info."""
-        observation, reward, terminated, truncated, info = self._env.step(action)
-        self._shared.write(observation)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._write(observation)
         return reward, terminated, truncated, info
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Return an attribute of the environment, or the result of calling it."""
-        value = getattr(self._env.unwrapped, name)
+        value = getattr(self.env.unwrapped, name)
         return value(*args, **kwargs) if callable(value) else value
 
-    def close(self) -> None:
-        """Close the environment and the shared memory."""
-        if self._env is not None:
-            self._env.close()
-            self._env = None
-        if self._shared is not None:
-            self._shared.close()
-            self._shared = None
+    def _write(self, observation: Mapping[str, np.ndarray]) -> None:
+        assert self.shared is not None, "the shared memory is attached before the first reset"
+        self.shared.write(observation)
 
 
 @dataclass
@@ -137,13 +152,13 @@ class Worker:
         task: Name of the environment in messages.
         make: Factory of the environment, called in the worker.
         variables: Environment variables of the worker, such as the GPU to draw on.
-        host: Class whose methods are the commands; it is built with `make`, and needs `open` and `close`.
+        host: Class whose methods are the commands; it is built with `make`, and has a command `open`.
     """
 
     task: str
     make: Callable[[], Any]
     variables: Mapping[str, str] = field(default_factory=dict)
-    host: type = GymHost
+    host: type[Host] = GymHost
 
     def __post_init__(self) -> None:
         self.shared: Shared | None = None

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import utils
 
-from libero_env.envs.worker import Shared, Worker, shut_down, wait_for
+from libero_env.envs.worker import Host, Shared, Worker, shut_down, wait_for
 from libero_env.errors import LiberoError
 
 # Methods of the environment that a worker has, too: each sends the call and waits for the answer.
@@ -211,31 +211,25 @@ class SubprocEnvWorker(EnvWorker):
         return ready
 
 
-class VectorHost:
-    """The commands of a worker, see `libero_env.envs.worker`: calls and attributes of any environment."""
+class VectorHost(Host):
+    """The commands of a worker: calls and attributes of any environment."""
 
-    def __init__(self, make: Callable[[], Any]):
-        self._make = make
-        self.env: Any = None
-        self._shared: Shared | None = None
-        self._layout: dict[str, np.ndarray] = {}
+    layout: Mapping[str, np.ndarray] = {}  # arrays of the first observation
 
     def open(self) -> None:
         """Make the environment."""
-        self.env = self._make()
+        self.env = self.make()
 
     def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Call a method; None stands for arrays of an observation that are in shared memory."""
         result = getattr(self.env, method)(*args, **kwargs)
-        observation = _observation(result)
-        if observation is None:
-            return result
-        arrays = _arrays(observation)
-        self._layout = self._layout or arrays
-        for key, view in self._shared.views.items() if self._shared else ():
-            if key in arrays and arrays[key].shape == view.shape:
-                view[...] = arrays[key]
-                observation[key] = None
+        if observation := _observation(result):
+            arrays = _arrays(observation)
+            self.layout = self.layout or arrays
+            for key, view in self.shared.views.items() if self.shared else ():
+                if key in arrays and arrays[key].shape == view.shape:
+                    view[...] = arrays[key]
+                    observation[key] = None
         return result
 
     def get(self, key: str) -> Any:
@@ -249,14 +243,7 @@ class VectorHost:
 
     def attach(self, name: str) -> None:
         """Write observations to shared memory, laid out as the first observation was."""
-        self._shared = Shared(self._layout, name)
-
-    def close(self) -> None:
-        """Close the environment and release the shared memory."""
-        if self.env is not None:
-            self.env.close()
-        if self._shared is not None:
-            self._shared.close()
+        self.shared = Shared(self.layout, name)
 
 
 def _observation(result: Any) -> dict[str, Any] | None:
@@ -272,12 +259,10 @@ def _arrays(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
 @contextmanager
 def _without_main() -> Iterator[None]:
     """Keep a spawned process from running the script again: what it needs comes with the factory."""
-    main: Any = sys.modules["__main__"]
-    hidden: dict[str, Any] = {
-        name: main.__dict__.pop(name) for name in ("__file__", "__spec__") if name in main.__dict__
-    }
-    main.__spec__ = None
+    main = vars(sys.modules["__main__"])
+    hidden = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
+    main["__spec__"] = None
     try:
         yield
     finally:
-        main.__dict__.update(hidden)
+        main.update(hidden)
