@@ -1,7 +1,7 @@
-"""Certificates: can the expert reach a task's goal, from which starts, how fast, and why not where it cannot.
+"""Certificates: from which initial states of a task the expert reaches the goal, how fast, or why not.
 
-Work is cut into (task, 16 starts); what is done is on disk after each, so a stopped run goes on where it was. What
-happens from a start depends on the task and the start's number alone.
+Work is split into chunks of one task and 16 initial states. Results are on disk after each, so that a stopped run
+resumes. The result from an initial state depends on the task and its number alone.
 """
 
 import hashlib
@@ -29,22 +29,22 @@ from libero_env.parallel import spawn_pool
 from libero_env.sim.scene import build_scene
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
+from libero_env.tasks.authoring import FILE
 
-BATCH = 16  # starts simulated together
-NO_HORIZON = 1_000_000  # steps; the driver says when an attempt is over
-FILE_SUITE = "file"  # tasks read from a file have no stored starts: theirs are drawn
+BATCH = 16  # initial states simulated together
+NO_HORIZON = 1_000_000  # [steps] `run_experts` ends the attempts
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One attempt.
+    """Result of one attempt.
 
     Attributes:
-        state: Number of the start.
+        state: Number of the initial state.
         success: Whether the goal was reached.
-        steps: Control steps until then, or until the expert was stopped.
-        retries: How often it had to start over.
-        reason: Why it did not succeed, or "".
+        steps: Number of control steps until the goal, or until the expert was stopped.
+        retries: Number of times that the expert started again.
+        reason: Reason of failure; "" after a success.
     """
 
     state: int
@@ -56,30 +56,37 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is known of a task; `outcomes` in the order of their starts. `digest` is what they depend on."""
+    """Results of one task.
 
-    task: str  # `libero_object/3`
+    Attributes:
+        task: Suite and index, such as `libero_object/3`.
+        name: Name of the task.
+        digest: Digest of what the outcomes depend on.
+        outcomes: Outcomes in the order of the initial states.
+    """
+
+    task: str
     name: str
     digest: str
     outcomes: tuple[Outcome, ...] = ()
 
     @property
     def rate(self) -> float:
-        """Share of starts from which the goal was reached."""
+        """Share of initial states from which the goal was reached."""
         return sum(o.success for o in self.outcomes) / max(len(self.outcomes), 1)
 
     @property
     def lengths(self) -> list[int]:
-        """Steps of the successful attempts."""
+        """Numbers of steps of the successful attempts."""
         return [o.steps for o in self.outcomes if o.success]
 
     @property
     def retries(self) -> int:
-        """Times that an expert started over, in all attempts."""
+        """Number of times that the expert started again, over all attempts."""
         return sum(o.retries for o in self.outcomes)
 
     def summary(self) -> dict:
-        """Plain figures of the task, for JSON."""
+        """Return the results of the task as plain values, for JSON."""
         lengths = self.lengths
         return {
             "id": self.task,
@@ -105,21 +112,27 @@ def certify(
     again: bool = False,
     progress: bool | None = None,
 ) -> list[Certificate]:
-    """Let the expert try the first starts of each task.
+    """Run the expert from the first initial states of each task.
 
     Args:
-        tasks: With stored starts, or read from a file (starts are then drawn, number i from seed i).
-        states: Number of starts, at most the 50 that are stored.
-        jobs: Processes; the outcomes do not depend on it. 1 stays in this one, with the objects registered in it.
-        out: Folder with a JSON file for each task; what is there for the same scene and expert is not run again.
-        assets: Where the models come from, as for `select_pack`.
-        disturb: Disturb the actions as demonstrations do.
-        again: Run what is there too.
-        progress: Show a bar; None where stderr is a terminal.
+        tasks: Tasks of suites, whose initial states are stored, or of files, whose initial state i is sampled with
+            seed i.
+        states: Number of initial states of each task, at most the 50 that are stored.
+        jobs: Number of processes; the outcomes do not depend on it. 1 runs in this process, which knows the objects
+            that are registered in it.
+        out: Folder with a JSON file for each task; outcomes there of the same scene and expert are not run again.
+        assets: Models to use, as for `select_pack`.
+        disturb: Whether to add noise to the actions, as demonstrations do.
+        again: Whether to run again what is in `out`.
+        progress: Whether to show a bar; None shows it where stderr is a terminal.
 
     Returns:
-        One certificate for each task, in order. A task that cannot be built, or whose goal the expert has no skill
-        for, fails from every start with that reason.
+        One certificate for each task, in order. A task that cannot be built, or whose goal needs a skill that the
+        expert does not have, fails from every initial state with that reason.
+
+    Raises:
+        MissingPackageError: robosuite, which supplies the robot's model, is not installed.
+        LiberoError: A file in `out` is not a certificate.
     """
     pack = select_pack(assets)
     found = [Certificate(task.id, task.name, _digest(task, pack, disturb)) for task in tasks]
@@ -142,7 +155,7 @@ def certify(
 def results(
     certificates: Sequence[Certificate], *, assets: str | Path | None = None, disturb: bool = False
 ) -> dict:
-    """Return all figures of a run with what they depend on, for `results.json`."""
+    """Return all results of a run and what they depend on, for `results.json`."""
     return {
         "mujoco": mujoco.__version__,
         "generator": GENERATOR,
@@ -155,7 +168,7 @@ def results(
 
 
 def markdown_table(certificates: Sequence[Certificate]) -> str:
-    """Return a table: success, lengths, retries and the commonest reasons of failure of each task."""
+    """Return a table with success, lengths, retries and the most common reasons of failure of each task."""
     lines = [
         "| task | success | steps, median (max) | retries | failures |",
         "| --- | ---: | ---: | ---: | --- |",
@@ -174,15 +187,15 @@ def markdown_table(certificates: Sequence[Certificate]) -> str:
 
 def _missing(certificate: Certificate, states: int) -> Iterator[list[int]]:
     done = {o.state for o in certificate.outcomes}
-    wanted = [i for i in range(states) if i not in done]
-    for i in range(0, len(wanted), BATCH):
-        yield wanted[i : i + BATCH]
+    missing = [i for i in range(states) if i not in done]
+    for i in range(0, len(missing), BATCH):
+        yield missing[i : i + BATCH]
 
 
 def _run(
     chunks: Iterable[tuple[int, list[int]]], tasks: Sequence[Task], jobs: int, pack: Pack, disturb: bool
 ) -> Iterator[tuple[int, list[Outcome]]]:
-    """Outcomes of (index of a task, starts) as each is done."""
+    """Yield the index of a task and the outcomes of a chunk, as each is done."""
     if jobs <= 1:
         for k, states in chunks:
             yield k, attempt(tasks[k], states, pack, disturb)
@@ -199,19 +212,19 @@ def _run(
 
 
 def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> list[Outcome]:
-    """Try some starts of a task, all at the same time. What cannot be tried fails with the reason."""
+    """Return the outcomes from some initial states, simulated together; an error is a failure with its message."""
     try:
-        env, shapes = _stage(task, pack)
+        env, shapes = _environment(task, pack)
         number = np.resize(states, env.num_envs)
-        drawn = task.suite == FILE_SUITE
+        drawn = task.suite == FILE
         env.reset(
             seed=number.tolist() if drawn else None,
             options={"reset_mask": np.arange(env.num_envs) < len(states)}
             | ({} if drawn else {"init_state": number}),
         )
         seeds = [np.random.SeedSequence([task.index, i]).spawn(2) for i in states]
-        experts = [Expert(task, np.random.default_rng(manner), shapes=shapes) for manner, _ in seeds]
-        noise = [ActionNoise(np.random.default_rng(pushes)) for _, pushes in seeds] if disturb else None
+        experts = [Expert(task, np.random.default_rng(seed), shapes=shapes) for seed, _ in seeds]
+        noise = [ActionNoise(np.random.default_rng(seed)) for _, seed in seeds] if disturb else None
         attempts = run_experts(env, experts, noise)
     except PlacementError as error:
         if len(states) > 1:
@@ -223,17 +236,17 @@ def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> lis
 
 
 @lru_cache(maxsize=1)
-def _stage(task: Task, pack: Pack) -> tuple[BatchEnv, Shapes]:
+def _environment(task: Task, pack: Pack) -> tuple[BatchEnv, Shapes]:
     env = BatchEnv(task, BATCH, num_threads=1, cameras=(), horizon=NO_HORIZON, assets=pack)
     return env, Shapes(env.world.scene)
 
 
 def _digest(task: Task, pack: Pack, disturb: bool) -> str:
-    """Changes with the task, its scene, the expert's version and MuJoCo's; 16 hex digits."""
+    """Return a digest of the task, its scene, and the versions of expert and MuJoCo, 16 hexadecimal digits."""
     try:
         scene = scene_digest(build_scene(task.problem, pack))
     except MissingPackageError:
-        raise  # no task can be tried
+        raise  # it concerns all tasks
     except LiberoError as error:
         scene = str(error)
     parts = (task.bddl_text, scene, pack.name, GENERATOR, mujoco.__version__, disturb)
@@ -252,7 +265,7 @@ def _stored(path: Path, empty: Certificate) -> Certificate:
         found = json.loads(path.read_text(encoding="utf-8"))
         outcomes = tuple(Outcome(**row) for row in found["outcomes"])
     except (ValueError, KeyError, TypeError) as error:
-        raise LiberoError(f"{path} is no certificate ({error}); remove it, or run with --again") from error
+        raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
     return replace(empty, outcomes=outcomes) if found.get("digest") == empty.digest else empty
 
 

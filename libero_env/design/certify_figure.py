@@ -1,4 +1,4 @@
-"""Certificates as files: a table, the results as JSON, and a picture of each suite."""
+"""Files of certificates: a table, the results as JSON, and a figure of each suite."""
 
 import json
 from collections.abc import Sequence
@@ -8,14 +8,21 @@ import numpy as np
 
 from libero_env.design.certify import Certificate, markdown_table, results
 
-_COLOURS = ("#f4f6ec", "#8fcfc3", "#2379ab", "#14265e")  # few steps to many; prints in grey too
+_COLOURS = ("#f4f6ec", "#8fcfc3", "#2379ab", "#14265e")  # from few steps to many; distinct in greyscale too
 _FAILED = "#b03024"
 
 
 def write_results(
     certificates: Sequence[Certificate], out: Path, *, assets: str | None = None, disturb: bool = False
 ) -> None:
-    """`results.json`, `results.md` and, where matplotlib is installed, a picture for each suite; says what it wrote."""
+    """Write `results.json`, `results.md` and, where matplotlib is installed, a figure of each suite; print their paths.
+
+    Args:
+        certificates: Results of the tasks.
+        out: Folder to write to.
+        assets: Models that were used, as for `select_pack`.
+        disturb: Whether the actions had noise; the names of the files state it.
+    """
     out.mkdir(parents=True, exist_ok=True)
     ending = "-disturbed" if disturb else ""
     written = [out / f"results{ending}.json", out / f"results{ending}.md"]
@@ -27,19 +34,19 @@ def write_results(
     for suite, own in suites.items():
         path = out / f"{suite}{ending}.png"
         try:
-            draw(own, path, f"{suite}: steps of the expert from each start")
+            draw_figure(own, path, f"{suite}: steps of the expert from each start")
         except ModuleNotFoundError as error:
-            print(f"no picture of {suite}: {error.name} is not installed (it is in the extra `train`)")
+            print(f"no figure of {suite}: {error.name} is not installed (it is in the extra `train`)")
         else:
             written.append(path)
     print("\n".join(map(str, written)))
 
 
-def draw(certificates: Sequence[Certificate], path: Path, title: str) -> None:
-    """Return a picture of a suite: a row for each task, a column for each start, coloured by length; failures red.
+def draw_figure(certificates: Sequence[Certificate], path: Path, title: str) -> None:
+    """Draw the figure of a suite: a row per task, a column per initial state, coloured by length; failures red.
 
     Raises:
-        ModuleNotFoundError: Matplotlib is not installed.
+        ModuleNotFoundError: matplotlib is not installed.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LinearSegmentedColormap

@@ -1,4 +1,4 @@
-"""What a task looks like: its starts through several cameras, and how the expert does it."""
+"""Pictures of a task: its initial states through several cameras, and a video of the expert."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,25 +15,33 @@ from libero_env.tasks.task import Task
 from libero_env.timing import CONTROL_HZ
 
 CAMERAS = ("agentview", "robot0_eye_in_hand", "birdview")
-_EVERY = 2  # control steps between frames of a video
-_BAND = 14  # pixels of writing over a picture
+_EVERY = 2  # [control steps] between frames of a video
+_BAND = 14  # [pixels] height of the caption above a picture
 
 
 def contact_sheet(
     task: Task, path: Path, *, starts: int = 3, cameras: Sequence[str] = CAMERAS, size: int = 256
 ) -> Path:
-    """Return a PNG of the first starts of a task, a row for each, a column for each camera.
+    """Write a PNG of the first initial states of a task, a row for each, a column for each camera.
 
-    A task of a suite shows its stored starts, one of a file those of the seeds 0, 1, ...
+    Args:
+        task: Task of a suite, whose initial states are stored, or of a file, whose initial state i is that of seed i.
+        path: File to write; its folder is created.
+        starts: Number of initial states.
+        cameras: Names of cameras.
+        size: Height and width of a picture, [pixels].
+
+    Returns:
+        `path`.
 
     Raises:
-        PlacementError: There is no room for what the task places.
-        UnknownNameError: There is no such camera.
+        PlacementError: There is no collision-free placement of the objects.
+        UnknownNameError: A camera does not exist.
     """
     env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
     try:
         rows = [
-            np.concatenate([_shown(env, i)[image_name(c, "rgb")] for c in cameras], axis=1)
+            np.concatenate([_reset(env, i)[image_name(c, "rgb")] for c in cameras], axis=1)
             for i in range(starts)
         ]
     finally:
@@ -53,17 +61,24 @@ def contact_sheet(
 def expert_video(
     task: Task, path: Path, *, start: int = 0, camera: str = "agentview", size: int = 256
 ) -> tuple[bool, str]:
-    """Return a video (.webp, .gif or .mp4) of the expert at a task.
+    """Write a video of the expert performing a task.
+
+    Args:
+        task: Task to perform.
+        path: File to write, whose name ends in .webp, .gif or .mp4.
+        start: Number of the initial state.
+        camera: Name of a camera.
+        size: Height and width of the video, [pixels].
 
     Returns:
-        Whether it reached the goal, and why not.
+        Whether the goal was reached, and the reason of failure ("" after a success).
 
     Raises:
         UnsupportedGoalError: The goal needs a skill that the expert does not have.
     """
     env = LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS)
     try:
-        frames = [_shown(env, start)[image_name(camera, "rgb")]]
+        frames = [_reset(env, start)[image_name(camera, "rgb")]]
         expert, terminated, truncated, step = Expert(task, np.random.default_rng(start)), False, False, 0
         while not (terminated or truncated or expert.failure_reason):
             env.render_images = step % _EVERY == _EVERY - 1
@@ -82,8 +97,8 @@ def expert_video(
     return terminated, "" if terminated else reason
 
 
-def _shown(env: LiberoEnv, start: int) -> dict[str, np.ndarray]:
-    """Observations of a start."""
+def _reset(env: LiberoEnv, start: int) -> dict[str, np.ndarray]:
+    """Reset the environment to an initial state and return the observations."""
     if env.task.suite == "file":
         return env.reset(seed=start)[0]
     return env.reset(options={"init_state": start})[0]

@@ -1,4 +1,4 @@
-"""A first version of a task of one's own: a YAML file that works at once and says what can be changed."""
+"""Template of a user-defined task: a valid YAML file with comments on what can be changed."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import hypot
@@ -10,11 +10,11 @@ from libero_env.tasks.authoring import EMPTY, make_task, places_of
 from libero_env.tasks.builder import load_scene, scene_names
 from libero_env.tasks.task import Task
 
-# Where things stand in the original's scenes: (x, y), m; furniture with its yaw.
+# Places of objects (x, y) [m] in the original's scenes, and of furniture (x, y, yaw).
 _SLOTS = ((-0.05, 0.0), (0.05, 0.2), (-0.2, 0.15), (0.1, -0.02), (-0.18, -0.12), (-0.05, 0.3))
 _FURNITURE = ((0.02, -0.28, "pi"), (-0.41, 0.21, "0"), (-0.26, -0.26, "pi"))
-_APART = 0.13  # m, of what stands beside each other
-_USUAL = ("akita_black_bowl", "plate")
+_APART = 0.13  # [m] smallest distance of neighbours
+_DEFAULT_OBJECTS = ("akita_black_bowl", "plate")
 _INSIDE = "contain_region"
 
 
@@ -25,66 +25,66 @@ def task_template(
     goal: Sequence[str] = (),
     language: str | None = None,
 ) -> tuple[str, Task]:
-    """Return a task file, and the task that it is.
+    """Return the text of a task file, and its task.
 
     Args:
-        scene: Of the benchmark, or an empty one.
-        objects: Categories; by default, in an empty scene, a bowl and a plate. A plate comes to one that is alone.
-        furniture: Categories.
-        goal: Atoms; by default the first object on, or in, the last.
-        language: The instruction; by default that of the goal.
+        scene: Scene of the benchmark, or an empty one.
+        objects: Categories; by default, in an empty scene, a bowl and a plate. A single object gets a plate.
+        furniture: Categories of fixtures.
+        goal: Atoms that must all hold; by default the first object on, or in, the last.
+        language: Instruction; by default it describes the goal.
 
     Raises:
-        LiberoError: A name that does not exist, or no room for so many.
+        LiberoError: A name does not exist, or there are more objects than places.
     """
     objects = list(objects)
     if scene in EMPTY and len(objects) < 2 and not goal:
-        objects = [*objects, "plate"] if objects else list(_USUAL)
-    names = _numbered(objects)
-    goal = list(goal) or _usual_goal(names)
+        objects = [*objects, "plate"] if objects else list(_DEFAULT_OBJECTS)
+    names = _number(objects)
+    goal = list(goal) or _default_goal(names)
     language = language or _words(goal, names)
-    taken = _taken(scene)
+    taken = _occupied(scene)
     places: dict[str, object] = {}
-    for name, (x, y, yaw) in _given(_numbered(furniture), _FURNITURE, taken, "furniture"):
+    for name, (x, y, yaw) in _assign_slots(_number(furniture), _FURNITURE, taken, "furniture"):
         places[name] = f"{{at: [{x}, {y}], yaw: {yaw}}}"
-    for name, (x, y) in _given(names, _SLOTS, taken, "objects"):
+    for name, (x, y) in _assign_slots(names, _SLOTS, taken, "objects"):
         places[name] = f"{{at: [{x}, {y}], half: 0.025}}"
     text = _text(scene, objects, furniture, places, goal, language)
     return text, make_task(**yaml.safe_load(text))
 
 
-def _usual_goal(names: Mapping[str, str]) -> list[str]:
+def _default_goal(names: Mapping[str, str]) -> list[str]:
     if len(names) < 2:
-        raise LiberoError("a goal is needed: --goal 'On red_cup_1 plate_1'; or name two objects")
+        raise LiberoError("a goal is required: --goal 'On red_cup_1 plate_1'; or give two objects")
     first, *_, last = names
     inside = _INSIDE in places_of(names[last])
     return [f"In {first} {last}_{_INSIDE}" if inside else f"On {first} {last}"]
 
 
 def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
-    """Return an instruction, where goals are as plain as those of `_usual_goal`."""
-    said = []
+    """Return an instruction for a goal; it is correct for atoms like those of `_default_goal`."""
+    phrases = []
     for atom in goal:
         predicate, *args = atom.strip("()").split()
         plain = [names.get(arg, arg).replace("_", " ").replace(" 1", "") for arg in args]
         if predicate in ("On", "In") and len(plain) == 2:
-            said.append(
+            phrases.append(
                 f"put the {plain[0]} {predicate.lower()} the {plain[1].removesuffix(' contain region')}"
             )
         else:
-            said.append(f"{predicate.lower()} the {' and the '.join(plain)}")
-    return " and ".join(said)
+            phrases.append(f"{predicate.lower()} the {' and the '.join(plain)}")
+    return " and ".join(phrases)
 
 
-def _numbered(categories: Iterable[str]) -> dict[str, str]:
+def _number(categories: Iterable[str]) -> dict[str, str]:
     named: dict[str, str] = {}
     for category in categories:
         named[f"{category}_{1 + list(named.values()).count(category)}"] = category
     return named
 
 
-def _taken(scene: str) -> list[tuple[float, float]]:
-    """Return where things stand in a scene of the benchmark already."""
+def _occupied(scene: str) -> list[tuple[float, float]]:
+    """Return the places that are occupied in a scene of the benchmark, (x, y) [m]."""
     if scene not in scene_names():
         return []
     regions = [facts for target in load_scene(scene).get("regions", {}).values() for facts in _values(target)]
@@ -95,12 +95,14 @@ def _values(regions: object) -> list[dict]:
     return list(regions.values()) if isinstance(regions, Mapping) else []
 
 
-def _given(names: Iterable[str], slots: Sequence[tuple], taken: list[tuple[float, float]], kind: str):
-    """Yield each name with the first slot that is free; slots are taken as they are given."""
+def _assign_slots(names: Iterable[str], slots: Sequence[tuple], taken: list[tuple[float, float]], kind: str):
+    """Yield each name with the first free slot; slots become occupied as they are assigned."""
     for name in names:
         free = [slot for slot in slots if all(hypot(slot[0] - x, slot[1] - y) >= _APART for x, y in taken)]
         if not free:
-            raise LiberoError(f"there is no room for so many {kind}; leave {name} out and add it in the file")
+            raise LiberoError(
+                f"there are not enough places for the {kind}; leave {name} out and add it in the file"
+            )
         taken.append((free[0][0], free[0][1]))
         yield name, free[0]
 
@@ -117,7 +119,7 @@ def _text(
     lines += [f"furniture: [{', '.join(furniture)}]"] if furniture else []
     lines += [f"objects: [{', '.join(objects)}]"] if objects else []
     lines += [
-        "# the middle (x away from the robot, y to its left, m), how far around it, and the angle of furniture"
+        "# centre (x away from the robot, y to its left) and distance around it, m; angle of furniture, rad"
     ]
     lines += ["place:", *(f"  {name}: {place}" for name, place in places.items())] if places else []
     lines += ["# all of these must hold: On, In, Open, Close, Turnon, Turnoff, Up, Stack, ...", "goal:"]

@@ -279,9 +279,9 @@ def test_templates_are_tasks_with_room_between_things(options):
 
 
 def test_templates_that_cannot_be_are_refused():
-    with pytest.raises(LiberoError, match="a goal is needed"):
+    with pytest.raises(LiberoError, match="a goal is required"):
         task_template("kitchen_scene1", ["butter"])
-    with pytest.raises(LiberoError, match="no room for so many objects"):
+    with pytest.raises(LiberoError, match="not enough places for the objects"):
         task_template("kitchen", ["butter"] * 9)
 
 

@@ -75,7 +75,7 @@ def test_a_broken_certificate_is_named(tried, tmp_path):
     certify(TASKS[:1], 4, out=tmp_path, progress=False)
     (path,) = tmp_path.rglob("*.json")
     path.write_text('{"outcomes": [1]}')
-    with pytest.raises(LiberoError, match=f"{path.name} is no certificate.*--again"):
+    with pytest.raises(LiberoError, match=f"{path.name} is not a certificate.*--again"):
         certify(TASKS[:1], 4, out=tmp_path, progress=False)
 
 
@@ -109,7 +109,7 @@ def test_without_matplotlib_there_is_no_picture_and_no_error(tried, tmp_path, ca
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     argv = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--states", "2", "--out", str(tmp_path)]
     assert cli.main(argv) == 0
-    assert "no picture of libero_object" in capsys.readouterr().out
+    assert "no figure of libero_object" in capsys.readouterr().out
     assert not list(tmp_path.glob("*.png"))
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from libero_env.assets.arena import WORKSPACES, load_workspace
 from libero_env.design.lint.checks import KINDS, Finding, lint_file, lint_task, lint_text
-from libero_env.design.lint.scene import reach, stretched
+from libero_env.design.lint.scene import furthest_reach, reach
 from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
@@ -46,7 +46,7 @@ FAULTS = [
     ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plat_region)", "unknown-name", "error",
      "did you mean main_table_plate_region"),
     ("    (On plate_1 main_table_plate_region)\n", "", "not-placed", "error", r"\(On plate_1 REGION\)"),
-    ("    (On flat_stove_1 main_table_stove_region)\n", "", "not-placed", "warning", "middle of the workspace"),
+    ("    (On flat_stove_1 main_table_stove_region)\n", "", "not-placed", "warning", "centre of the workspace"),
     ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plate_region) (On plate_1 flat_stove_1)",
      "placed-twice", "error", "plate_1 is placed 2 times"),
     ("(On flat_stove_1 main_table_stove_region)", "(On flat_stove_1 plate_1)", "kind", "error", "workspace"),
@@ -64,9 +64,9 @@ FAULTS = [
     ("Open the top layer of the drawer and put the bowl inside", "put the cream cheese in the top drawer",
      "instruction", "warning", "names akita_black_bowl_1"),
     ("Open the top layer of the drawer and put the bowl inside", "put the bowl with the ketchup in the top drawer",
-     "instruction", "warning", "names a ketchup, and there is none"),
+     "instruction", "warning", "names a ketchup, but there is none"),
     ("Open the top layer of the drawer and put the bowl inside", "put the bowl in the bottom drawer",
-     "instruction", "warning", "says bottom, and the goal top"),
+     "instruction", "warning", "says bottom, but the goal top"),
     ("main_table - table", "main_table - table\n    other_table - table", "workspace", "error", "2 workspaces"),
     ("(:init", "(:inti", "syntax", "error", "unknown section ':inti'"),
 ]  # fmt: skip
@@ -131,7 +131,7 @@ def test_the_texts_of_the_benchmark_have_neither_errors_nor_warnings(task):
 def test_the_reach_is_a_ring_before_the_robot(category):
     workspace = load_workspace(category)
     near, far = reach(workspace)
-    assert 0.2 < near < 0.32 and 0.74 < far < 0.82 and far < stretched(workspace) < 1.0
+    assert 0.2 < near < 0.32 and 0.74 < far < 0.82 and far < furthest_reach(workspace) < 1.0
 
 
 @pytest.mark.sim
@@ -140,7 +140,15 @@ def test_the_figures_of_the_arm_are_those_of_its_model():
 
     model = build_scene(get_task("libero_object/0").problem).model
     data = mujoco.MjData(model)
-    data.qpos[:7] = [0, 0, 0, -lint_scene._BEND, 0, 1.0, 0]  # any bend of the elbow, by the law of cosines
+    data.qpos[:7] = [
+        0,
+        0,
+        0,
+        -lint_scene._MAX_BEND,
+        0,
+        1.0,
+        0,
+    ]  # any bend of the elbow, by the law of cosines
     mujoco.mj_kinematics(model, data)
     shoulder, wrist, hand = data.xanchor[1], data.xanchor[5], data.xanchor[6]
     assert shoulder[2] == pytest.approx(lint_scene._SHOULDER, abs=1e-3)
@@ -152,7 +160,7 @@ def test_the_figures_of_the_arm_are_those_of_its_model():
         expected = math.sqrt(upper**2 + forearm**2 - 2 * upper * forearm * math.cos(at_elbow))
         assert np.linalg.norm(wrist - shoulder) == pytest.approx(expected, abs=1e-3)
         if angle == -3.0718:
-            assert at_elbow == pytest.approx(lint_scene._BEND)
+            assert at_elbow == pytest.approx(lint_scene._MAX_BEND)
     axis = data.xaxis[6]
     offset = hand - wrist
     assert np.linalg.norm(offset - axis * (axis @ offset)) == pytest.approx(lint_scene._WRIST_OUT, abs=1e-3)

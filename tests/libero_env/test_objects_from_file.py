@@ -19,7 +19,7 @@ from libero_env.design.objects.collision import (
     solid_mass,
     volume_filled,
 )
-from libero_env.design.objects.mesh_file import bounds, is_closed, read_mesh, signed_volume, welded
+from libero_env.design.objects.mesh_file import bounds, is_closed, merge_vertices, read_mesh, signed_volume
 from libero_env.errors import LiberoError
 from libero_env.init_states.store import scene_digest
 from libero_env.objects import catalog, folder, get_object, object_names
@@ -125,7 +125,7 @@ def test_every_format_gives_the_same_shape(tmp_path, ending):
     assert high - low == pytest.approx([0.04, 0.05, 0.06]) and low + high == pytest.approx(
         [0, 0, 0], abs=1e-9
     )
-    vertices, faces = welded(surfaces)
+    vertices, faces = merge_vertices(surfaces)
     assert (len(vertices), len(faces), notes) == (8, 12, [])
     assert signed_volume(vertices, faces) == pytest.approx(1.2e-4)
 
@@ -333,14 +333,14 @@ def broken(tmp_path: Path, kind: str) -> Path:
         ("flat", {}, "it is flat"),
         ("empty", {}, "empty.obj: "),
         ("two", {}, "2 bodies"),
-        ("weightless", {}, "weighs nothing"),
+        ("weightless", {}, "has no mass"),
         ("xml", {}, "xml.xml: "),
-        ("two", {"size": 0.1}, "says size itself"),
+        ("two", {"size": 0.1}, "defines size itself"),
         ("fbx", {}, "unknown format '.fbx'; valid: .xml"),
         ("large", {"size": 3.0}, "too large"),
         ("large", {"name": "milk"}, "--name my_milk"),
-        ("large", {"name": "Red Cup"}, "small letters"),
-        ("large", {"collision": "cubes"}, "valid are decompose, hull, boxes"),
+        ("large", {"name": "Red Cup"}, "lower-case letters"),
+        ("large", {"collision": "cubes"}, "valid: decompose, hull, boxes"),
         ("absent", {}, "no such file"),
     ],
 )
@@ -352,7 +352,7 @@ def test_what_cannot_be_used_is_named_with_its_remedy(tmp_path, kind, options, m
 
 
 def test_options_that_contradict_each_other():
-    with pytest.raises(LiberoError, match="say one of them"):
+    with pytest.raises(LiberoError, match="give only one of them"):
         Options(mass=1.0, density=2.0)
     with pytest.raises(LiberoError, match="above 0"):
         Options(size=0.0)

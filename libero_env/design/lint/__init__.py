@@ -1,1 +1,1 @@
-"""Checks of task files: what they say, whether the scene can be built, whether the instruction fits the goal."""
+"""Linter of task files: their content, whether the scene can be built, whether the instruction fits the goal."""

@@ -1,11 +1,11 @@
-"""Linter of task design: what is wrong or doubtful in a task file, where, and how to mend it.
+"""Linter of task files: what is wrong or doubtful, where, and how to fix it.
 
-Names and atoms are judged here, the instruction in `lint_words`, what needs the simulator in `lint_scene`.
+Names and atoms are checked here, the instruction in `lint.instruction`, what needs the simulator in `lint.scene`.
 """
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from libero_env.assets.arena import WORKSPACES, workspace_of_problem
@@ -16,21 +16,22 @@ from libero_env.design.lint.scene import check_scene
 from libero_env.errors import BDDLError, UnknownNameError
 from libero_env.sim.predicates import PREDICATES, atoms_of
 from libero_env.tasks import Task, bddl
+from libero_env.tasks.authoring import FILE
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem
 from libero_env.tasks.sexpr import List, Word, parse_tree
 
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
 
-_THING = frozenset({"object", "fixture"})
-_PLACE = _THING | {"region"}
+_ENTITY = frozenset({"object", "fixture"})
+_PLACE = _ENTITY | {"region"}
 _ANY = _PLACE | {"workspace"}
-# Predicate -> what may stand at each place of its atoms; those that users register are not checked.
+# Predicate -> kinds that each of its arguments may have; predicates that users register are not checked.
 KINDS: dict[str, tuple[frozenset[str], ...]] = {
-    "On": (_THING, _PLACE),
-    "In": (_THING, frozenset({"region"})),
-    "Stack": (_THING, _PLACE),
-    "Up": (_THING,),
+    "On": (_ENTITY, _PLACE),
+    "In": (_ENTITY, frozenset({"region"})),
+    "Stack": (_ENTITY, _PLACE),
+    "Up": (_ENTITY,),
     "Open": (_PLACE,),
     "Close": (_PLACE,),
     "Turnon": (_PLACE,),
@@ -38,22 +39,26 @@ KINDS: dict[str, tuple[frozenset[str], ...]] = {
     "Incontact": (_ANY - {"region"}, _ANY - {"region"}),
     "Printjointstate": (_PLACE,),
 }
-STARTS = 5  # starts that are looked at
+STARTS = 5  # initial states that are checked by default
 
 
 def lint_task(task: Task, pack: Pack | None = None, *, starts: int = STARTS) -> list[Finding]:
-    """Findings about a task; lines count in what `libero tasks show` prints.
+    """Return the findings about a task; lines are those of the text that `libero tasks show` prints.
 
     Args:
-        task: Of a suite.
-        pack: Where the models come from; by default as `select_pack` says.
-        starts: Number of starts to look at; 0 for none, and nothing is simulated.
+        task: Task to check.
+        pack: Models to use; None is `select_pack()`.
+        starts: Number of initial states to check; 0 simulates nothing.
     """
     return lint_text(task.bddl_text, task.id, task, pack, starts=starts)
 
 
 def lint_file(path: str | Path, pack: Pack | None = None, *, starts: int = STARTS) -> list[Finding]:
-    """Findings about a task file; see `lint_task`."""
+    """Return the findings about a task file; see `lint_task`.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -68,7 +73,15 @@ def lint_file(path: str | Path, pack: Pack | None = None, *, starts: int = START
 def lint_text(
     text: str, file: str, task: Task | None = None, pack: Pack | None = None, *, starts: int = STARTS
 ) -> list[Finding]:
-    """Findings about a task, by line; `task` is that of the suite which the text belongs to, if it does."""
+    """Return the findings about the text of a task file, by line.
+
+    Args:
+        text: Content of the task file.
+        file: Name of the file in the findings.
+        task: Task of the suite that the text belongs to; None for a user-defined task.
+        pack: Models to use; None is `select_pack()`.
+        starts: Number of initial states to check; 0 simulates nothing.
+    """
     pack = pack or select_pack()
     try:
         tree = parse_tree(text, file)
@@ -85,7 +98,7 @@ def lint_text(
         return report.sorted()
     if task is None:
         name = Path(file).stem
-        task = Task("file", 0, name, language_from_name(name), problem.language, problem)
+        task = Task(FILE, 0, name, language_from_name(name), problem.language, problem)
     report.categories = set(problem.objects.values())
     _check_categories(report, problem, pack)
     for kind, atoms, lines in (
@@ -104,16 +117,16 @@ def lint_text(
 
 
 def _syntax(error: BDDLError, file: str) -> Finding:
-    """Return the finding that an error of the parser is."""
+    """Return the finding of an error of the parser."""
     found = re.fullmatch(r"(\d+): (.*?)(?:; expected (.*))?", str(error).removeprefix(f"{file}:"), re.DOTALL)
     line, what, expected = found.groups() if found else (1, str(error), None)
     return Finding(
-        file, int(line), "error", "syntax", what, f"write {expected}" if expected else "mend the file"
+        file, int(line), "error", "syntax", what, f"write {expected}" if expected else "fix the file"
     )
 
 
 def _check_declared(report: Report, tree: List) -> None:
-    """Every name of an atom that nothing declares, where the parser stops at the first."""
+    """Report every name in an atom that is not declared; the parser stops at the first."""
     lines = report.lines
     known = {*lines.entities, *lines.regions}
 
@@ -148,7 +161,7 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
     for name, category in {**problem.objects, **problem.fixtures}.items():
         if category not in categories and name not in workspaces:
             valid = categories | set(WORKSPACES) if name in problem.fixtures else categories
-            what = f"{name}: there is no model of {category!r}"
+            what = f"{name}: no model of {category!r} exists"
             report.error(report.lines.of(name), "unknown-category", what, report.suggest(category, valid))
     at = report.lines.section(":fixtures")
     if len(workspaces) != 1:
@@ -159,16 +172,16 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
         expected = workspace_of_problem(problem.name).name
     except UnknownNameError as error:
         report.warning(
-            1, "problem-name", f"no environment is called {problem.name}", str(error).split("Valid: ")[-1]
+            1, "problem-name", f"no problem class is named {problem.name}", str(error).split("Valid: ")[-1]
         )
         return
     if expected != (own := problem.fixtures[workspaces[0]]):
-        what = f"{problem.name} happens on a {expected}, and the workspace is a {own}"
-        report.warning(1, "problem-name", what, "change one of them; only the workspace counts here")
+        what = f"{problem.name} takes place on a {expected}, but the workspace is a {own}"
+        report.warning(1, "problem-name", what, "change one of them; only the workspace has an effect here")
 
 
 def kind_of(problem: Problem, name: str) -> str:
-    """`object`, `fixture`, `workspace` or `region`; a variable of a quantifier stands for an object."""
+    """Return `object`, `fixture`, `workspace` or `region`; a variable of a quantifier is an object."""
     if name in problem.objects or name.startswith("?"):
         return "object"
     if category := problem.fixtures.get(name):
@@ -178,13 +191,13 @@ def kind_of(problem: Problem, name: str) -> str:
 
 def _check_atom(report: Report, problem: Problem, atom: Atom, line: int, section: str) -> None:
     if atom.predicate not in PREDICATES:
-        what = f"nothing says when {spell(atom)} is true"
+        what = f"the predicate of {spell(atom)} does not exist"
         report.error(line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
         return
     if (kinds := KINDS.get(atom.predicate)) is None:
         return
     if len(atom.args) != len(kinds):
-        what = f"{spell(atom)} has {len(atom.args)} names"
+        what = f"{spell(atom)} has {len(atom.args)} arguments"
         report.error(line, "arity", what, f"{atom.predicate} takes {len(kinds)}")
         return
     for name, allowed in zip(atom.args, kinds, strict=True):
@@ -209,7 +222,10 @@ def _check_goal(report: Report, goal: Expression) -> None:
         case (And(()) | Or(())) as node:
             truth = "always" if isinstance(node, And) else "never"
             report.error(
-                line, "empty-goal", f"an empty {type(node).__name__} is {truth} true", "name what must hold"
+                line,
+                "empty-goal",
+                f"an empty {type(node).__name__} is {truth} true",
+                "add the conditions that must hold",
             )
         case And(parts) | Or(parts):
             for part in parts:
@@ -219,7 +235,7 @@ def _check_goal(report: Report, goal: Expression) -> None:
         case ForAll(variables, body):
             for variable, category in variables:
                 if category not in report.categories:
-                    what = f"no object is a {category}, so that {variable} stands for nothing and the part is true"
+                    what = f"no object is a {category}: {variable} has no values and the part is always true"
                     report.error(line, "empty-goal", what, report.suggest(category, report.categories))
             _check_goal(report, body)
 
@@ -242,15 +258,20 @@ def _check_regions(report: Report, problem: Problem) -> None:
                 line, "region-ranges", f"{address} has no extent", "add (:ranges ((X0 Y0 X1 Y1))), metres"
             )
         elif kind != "workspace" and region.ranges:
-            what = f"{address}: ranges count on the workspace only, and {region.target} is {_article(kind)}"
+            what = f"{address}: ranges are for the workspace only, but {region.target} is {_article(kind)}"
             report.error(
-                line, "region-ranges", what, "leave :ranges out; the site of that name is meant then"
+                line, "region-ranges", what, "remove :ranges; the region is then the site of that name"
             )
         for x0, y0, x1, y1 in region.ranges:
             if x1 < x0 or y1 < y0 or (address in goal and (x0 == x1 or y0 == y1)):
-                tell = report.error if address in goal else report.warning
+                add = report.error if address in goal else report.warning
                 remedy = "write (X0 Y0 X1 Y1) with X0 < X1 and Y0 < Y1"
-                tell(line, "region-ranges", f"{address}: nothing is in ({x0:g} {y0:g} {x1:g} {y1:g})", remedy)
+                add(
+                    line,
+                    "region-ranges",
+                    f"{address}: the rectangle ({x0:g} {y0:g} {x1:g} {y1:g}) is empty",
+                    remedy,
+                )
         key = (region.target, region.ranges, region.yaw)
         if region.ranges and address in used and (first := seen.setdefault(key, address)) != address:
             report.warning(
@@ -259,7 +280,7 @@ def _check_regions(report: Report, problem: Problem) -> None:
 
 
 def _check_places(report: Report, problem: Problem) -> None:
-    """Everything is placed once."""
+    """Check that every object and fixture is placed once."""
     placed = Counter(
         atom.args[0] for atom in problem.init if atom.predicate in ("On", "In") and len(atom.args) == 2
     )
@@ -268,10 +289,10 @@ def _check_places(report: Report, problem: Problem) -> None:
             what = f"{name} is placed {placed[name]} times"
             report.error(report.lines.section(":init"), "placed-twice", what, "keep one of the atoms")
         elif not placed[name] and kind_of(problem, name) != "workspace":
-            tell = report.error if name in problem.objects else report.warning
-            where = "" if name in problem.objects else "; it stands in the middle of the workspace"
+            add = report.error if name in problem.objects else report.warning
+            where = "" if name in problem.objects else "; it stands in the centre of the workspace"
             remedy = f"add (On {name} REGION) to :init"
-            tell(report.lines.of(name), "not-placed", f"no init atom places {name}{where}", remedy)
+            add(report.lines.of(name), "not-placed", f"no init atom places {name}{where}", remedy)
     known: Iterable[str] = {*report.lines.entities, *report.lines.regions}
     for name in problem.obj_of_interest:
         if name not in known:
@@ -279,9 +300,4 @@ def _check_places(report: Report, problem: Problem) -> None:
             report.warning(line, "unknown-name", f"{name} is not declared", report.suggest(name, known))
     if not problem.obj_of_interest:
         what = "there is no object of interest"
-        report.info(1, "interest", what, "name the things of the goal in :obj_of_interest")
-
-
-def count_levels(findings: Sequence[Finding]) -> Counter[str]:
-    """Level -> number of findings."""
-    return Counter(finding.level for finding in findings)
+        report.info(1, "interest", what, "list the objects of the goal in :obj_of_interest")

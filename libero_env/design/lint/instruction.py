@@ -1,4 +1,4 @@
-"""Whether the instruction and the goal speak of the same things."""
+"""Check that the instruction and the goal name the same objects."""
 
 import re
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from libero_env.sim.predicates import atoms_of
 from libero_env.tasks import Task
 from libero_env.tasks.problem import Problem
 
-# words of names that do not say what a thing is
+# words of categories that do not name the object
 _QUALITIES = {
     "and",
     "of",
@@ -31,22 +31,30 @@ _QUALITIES = {
     "contain",
     "init",
 }
-_ALSO = {"shelf": "cabinet", "cabinet": "drawer"}  # what people call it too
-_PARTS = {"drawer", "compartment", "layer", "side", "shelf", "region", "of"}  # what a side is said of
+_ALSO = {"shelf": "cabinet", "cabinet": "drawer"}  # other words in common use
+_PARTS = {
+    "drawer",
+    "compartment",
+    "layer",
+    "side",
+    "shelf",
+    "region",
+    "of",
+}  # parts of objects that have sides
 _SIDES = ({"top", "middle", "bottom"}, {"left", "right"}, {"front", "back"})
 
 
 def check_words(report: Report, task: Task, pack: Pack) -> None:
-    """Return the instruction of the file, and the one that the task's name spells where it says something else."""
+    """Check the instruction of the file, and that of the task's name where they differ."""
     line = report.lines.section(":language")
     texts = {task.bddl_language: ""}
     if _words(task.language) != _words(task.bddl_language):
-        what = f"policies are told {task.language!r}, as the task's name spells it, and not {task.bddl_language!r}"
-        report.info(line, "language", what, "name the task by its instruction, words joined by _")
+        what = f"policies receive {task.language!r}, which is the task's name, and not {task.bddl_language!r}"
+        report.info(line, "language", what, "use the instruction as the task's name, words joined by _")
         if task.suite != "file":
             texts[task.language] = " (of the task's name)"
     if not _words(task.bddl_language):
-        report.error(line, "language", "the instruction is empty", "say what is to be done")
+        report.error(line, "language", "the instruction is empty", "add it to :language")
         return
     for text, source in texts.items():
         _check_goal_named(report, task.problem, text, line, source)
@@ -55,7 +63,7 @@ def check_words(report: Report, task: Task, pack: Pack) -> None:
 
 
 def _check_goal_named(report: Report, problem: Problem, text: str, line: int, source: str) -> None:
-    """Everything that the goal is about is named."""
+    """Check that the instruction names everything in the goal."""
     words = set(_words(text))
     for atom in atoms_of(problem.goal):
         for name in atom.args:
@@ -64,31 +72,31 @@ def _check_goal_named(report: Report, problem: Problem, text: str, line: int, so
             category = {**problem.objects, **problem.fixtures}.get(thing)
             if category is None or category in WORKSPACES:
                 continue
-            said = [*_calls(category), *(_tokens(region.name) if region is not None else ())]
+            said = [*_words_for(category), *(_tokens(region.name) if region is not None else ())]
             if not any(_same(token, word) for token in said for word in words):
                 what = f"no word of the instruction{source} names {name} of the goal's {spell(atom)}"
                 report.warning(
-                    line, "instruction", what, f"call it {' '.join(_tokens(category))}, or mend the goal"
+                    line, "instruction", what, f"name it {' '.join(_tokens(category))}, or fix the goal"
                 )
 
 
 def _check_scene_has(report: Report, problem: Problem, text: str, line: int, source: str, pack: Pack) -> None:
-    """Everything that is named is there."""
-    here = [t for c in (*problem.objects.values(), *problem.fixtures.values()) for t in _calls(c)]
+    """Check that everything that the instruction names exists."""
+    here = [t for c in (*problem.objects.values(), *problem.fixtures.values()) for t in _words_for(c)]
     here += [token for region in problem.regions for token in _tokens(region.name)]
     heads = {tokens[-1] for c in pack.categories() if (tokens := _tokens(c))}
     there = lambda word: any(_same(token, word) for token in here)  # noqa: E731
     words = _words(text)
     for word, before in zip(words, ["", *words], strict=False):
-        if word in heads and not there(word) and not there(before):  # "cream cheese box" is no box
-            what = f"the instruction{source} names a {word}, and there is none"
+        if word in heads and not there(word) and not there(before):  # "cream cheese box" is not a box
+            what = f"the instruction{source} names a {word}, but there is none"
             report.warning(
-                line, "instruction", what, "add one to :objects or :fixtures, or say something else"
+                line, "instruction", what, "add one to :objects or :fixtures, or change the instruction"
             )
 
 
 def _check_sides(report: Report, problem: Problem, text: str, line: int, source: str) -> None:
-    """Return the side that the goal asks for is not the opposite of the one that is named."""
+    """Check that the goal does not require another side than the one that the instruction names."""
     words = _words(text)
     told = {word for word, after in zip(words, [*words[1:], ""], strict=True) if after in _PARTS}
     regions = [
@@ -98,8 +106,8 @@ def _check_sides(report: Report, problem: Problem, text: str, line: int, source:
         asked = {token for region in regions for token in _tokens(region.name)} & sides
         named = told & sides
         if asked and named and not asked & named:
-            what = f"the instruction{source} says {_list(named)}, and the goal {_list(asked)}"
-            report.warning(line, "instruction", what, "mend one of them")
+            what = f"the instruction{source} says {_list(named)}, but the goal {_list(asked)}"
+            report.warning(line, "instruction", what, "fix one of them")
 
 
 def _words(text: str) -> list[str]:
@@ -107,12 +115,12 @@ def _words(text: str) -> list[str]:
 
 
 def _tokens(name: str) -> list[str]:
-    """Return the words of a name that say what it is: `white_yellow_mug` -> [mug]."""
+    """Return the words of a name that name the object: `white_yellow_mug` -> [mug]."""
     return [word for word in _words(name) if word not in _QUALITIES]
 
 
-def _calls(category: str) -> list[str]:
-    """What an instruction may call a thing of a category."""
+def _words_for(category: str) -> list[str]:
+    """Return the words that an instruction may use for an object of a category."""
     return [name for token in _tokens(category) for name in (token, _ALSO.get(token, token))]
 
 
@@ -121,7 +129,7 @@ def _singular(word: str) -> str:
 
 
 def _same(token: str, word: str) -> bool:
-    """Equal, or one is the end of the other: a frypan is a pan."""
+    """Return whether the words are equal or one is the end of the other: a frypan is a pan."""
     short, long = sorted((token, word), key=len)
     return token == word or (len(short) >= 3 and long.endswith(short))
 

@@ -1,4 +1,4 @@
-"""What a linter says: findings, and the lines of a task file that they are about."""
+"""Findings of the linter, and the lines of a task file that they refer to."""
 
 import difflib
 from collections.abc import Iterable, Iterator
@@ -9,17 +9,26 @@ from libero_env.tasks.problem import Atom
 from libero_env.tasks.sexpr import List, Word
 
 Level = Literal["error", "warning", "info"]
-LEVELS: tuple[Level, ...] = ("error", "warning", "info")  # the gravest first
+LEVELS: tuple[Level, ...] = ("error", "warning", "info")  # the most severe first
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong (`error`), doubtful (`warning`) or worth knowing (`info`) about a task."""
+    """One finding about a task.
+
+    Attributes:
+        file: Name of the file or id of the task.
+        line: Line, from 1.
+        level: `error` (the task does not work), `warning` (it is doubtful) or `info`.
+        rule: Name of the rule, such as `unknown-name`.
+        what: What is wrong.
+        remedy: How to fix it.
+    """
 
     file: str
     line: int
     level: Level
-    rule: str  # `unknown-name`
+    rule: str
     what: str
     remedy: str
 
@@ -28,12 +37,12 @@ class Finding:
 
 
 def spell(atom: Atom) -> str:
-    """Return the atom as a task file has it."""
+    """Return an atom as task files contain it."""
     return f"({atom.predicate} {' '.join(atom.args)})"
 
 
 class Lines:
-    """Where in a task file things are said.
+    """Line numbers of the parts of a task file.
 
     Attributes:
         entities: Name of an object or fixture -> line.
@@ -50,11 +59,11 @@ class Lines:
         self.goal = [line for item in self._items(":goal") for line in _atom_lines(item)]
 
     def section(self, head: str) -> int:
-        """Line of a section, such as `:goal`; 1 where there is none."""
+        """Return the line of a section such as `:goal`; 1 where there is none."""
         return self._sections[head].line if head in self._sections else 1
 
     def of(self, name: str) -> int:
-        """Line of the declaration of an object, fixture or region."""
+        """Return the line of the declaration of an object, fixture or region."""
         return self.entities.get(name, self.regions.get(name, 1))
 
     def _items(self, head: str) -> tuple[Word | List, ...]:
@@ -85,12 +94,12 @@ def _atom_lines(node: Word | List) -> Iterator[int]:
 
 
 class Report:
-    """Findings about one task file as they come in.
+    """Collection of the findings about one task file.
 
     Attributes:
-        lines: Where things are said.
-        categories: Of the objects that the file declares, as far as it can be read.
-        findings: So far.
+        lines: Line numbers of the parts of the file.
+        categories: Categories of the declared objects; empty until the file is parsed.
+        findings: Findings so far.
     """
 
     def __init__(self, file: str, tree: List):
@@ -99,15 +108,15 @@ class Report:
         self.findings: list[Finding] = []
 
     def error(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """Return the task does not work as it is."""
+        """Add a finding because of which the task does not work."""
         self.findings.append(Finding(self.file, line, "error", rule, what, remedy))
 
     def warning(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """It works, and probably not as it was meant."""
+        """Add a finding because of which the task probably does not work as intended."""
         self.findings.append(Finding(self.file, line, "warning", rule, what, remedy))
 
     def info(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """Worth knowing."""
+        """Add a finding that is good to know."""
         self.findings.append(Finding(self.file, line, "info", rule, what, remedy))
 
     @property
@@ -116,11 +125,11 @@ class Report:
         return any(finding.level == "error" for finding in self.findings)
 
     def sorted(self) -> list[Finding]:
-        """Return the findings by line, the gravest of a line first, each once."""
+        """Return the findings by line, the most severe of a line first, without duplicates."""
         return sorted(set(self.findings), key=lambda f: (f.line, LEVELS.index(f.level), f.rule, f.what))
 
     def suggest(self, name: str, valid: Iterable[str]) -> str:
-        """Return a remedy for a name that does not exist."""
+        """Return the remedy for a name that does not exist."""
         names = sorted(valid)
         if close := difflib.get_close_matches(name, names, n=3, cutoff=0.5):
             return f"did you mean {' or '.join(close)}?"

@@ -1,4 +1,4 @@
-"""What only the built scene tells: sites, joints, reach, and what the starts are like."""
+"""Checks that need the built scene: sites, joints, reach, and initial states."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -19,46 +19,47 @@ from libero_env.sim.scene import Scene, build_scene, initial_qpos
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
+from libero_env.tasks.authoring import FILE
 from libero_env.tasks.problem import And, Atom, Region
 from libero_env.timing import CONTROL_HZ
 
-# The Panda's figures, m and rad: height of the shoulder over the base, upper arm and forearm (both offset by 82.5 mm
-# at the elbow), the elbow's furthest bend, axis of the wrist to the hand's, wrist to the point between the fingertips.
+# The Panda's dimensions, [m] and [rad]: height of the shoulder above the base, upper arm and forearm (both offset by
+# 82.5 mm at the elbow), largest bend of the elbow, distance of wrist and hand axes, wrist to grip point.
 _SHOULDER, _UPPER, _FOREARM = 0.333, hypot(0.316, 0.0825), hypot(0.384, 0.0825)
-_BEND = 2 * np.pi - (np.pi - np.arctan2(0.0825, 0.316) - np.arctan2(0.0825, 0.384) + 3.0718)
+_MAX_BEND = 2 * np.pi - (np.pi - np.arctan2(0.0825, 0.316) - np.arctan2(0.0825, 0.384) + 3.0718)
 _WRIST_OUT, _HAND = 0.088, 0.205
-_GRIP_HEIGHT = 0.02  # m over the surface, of the point between the fingertips where things are taken
-_MARGIN = 0.02  # m, kept from the limits of the joints
-_LENGTH = _UPPER + _FOREARM + hypot(_WRIST_OUT, _HAND) - _MARGIN  # m, shoulder to fingertips
-_MOVED = 0.005  # m, in half a second of waiting
-_IDLE = 10  # control steps
-_LEVEL = 0.03  # m, how far from the surface's height a shape still is the surface
+_GRIP_HEIGHT = 0.02  # [m] grip point above the surface when it grasps an object
+_MARGIN = 0.02  # [m] distance kept from the limits of the workspace
+_ARM_LENGTH = _UPPER + _FOREARM + hypot(_WRIST_OUT, _HAND) - _MARGIN  # [m] shoulder to fingertips
+_MAX_MOVE = 0.005  # [m] motion of an object at rest during the idle steps
+_IDLE_STEPS = 10  # [control steps]
+_LEVEL_TOLERANCE = 0.03  # [m] height difference up to which a shape belongs to the surface
 
 _STATES = {"Open": "open", "Close": "close", "Turnon": "turnon", "Turnoff": "turnoff"}
 
 
 def reach(workspace: Workspace) -> tuple[float, float]:
-    """Nearest and furthest distance from the base's axis at which a hand that points down takes things, m."""
+    """Return the smallest and largest distance from the base's axis at which a hand that points down can grasp, [m]."""
     shoulder = workspace.robot_base_pos[2] + _SHOULDER
     drop = shoulder - (workspace.surface_height + _GRIP_HEIGHT + _HAND)
     furthest = _UPPER + _FOREARM - _MARGIN
-    nearest = sqrt(_UPPER**2 + _FOREARM**2 - 2 * _UPPER * _FOREARM * np.cos(_BEND)) + _MARGIN
+    nearest = sqrt(_UPPER**2 + _FOREARM**2 - 2 * _UPPER * _FOREARM * np.cos(_MAX_BEND)) + _MARGIN
     across = [sqrt(max(length**2 - drop**2, 0.0)) + _WRIST_OUT for length in (nearest, furthest)]
     return across[0], across[1]
 
 
-def stretched(workspace: Workspace) -> float:
-    """Furthest distance from the base's axis at which a hand that points anywhere reaches the surface, m."""
+def furthest_reach(workspace: Workspace) -> float:
+    """Return the largest distance from the base's axis at which a hand in any orientation reaches the surface, [m]."""
     drop = workspace.robot_base_pos[2] + _SHOULDER - workspace.surface_height - _GRIP_HEIGHT
-    return sqrt(_LENGTH**2 - drop**2)
+    return sqrt(_ARM_LENGTH**2 - drop**2)
 
 
 def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
-    """Build the scene, look at its places, then at some of its starts."""
+    """Build the scene, check its places, then some of its initial states."""
     try:
         scene = build_scene(task.problem, pack)
     except (LiberoError, ValueError) as error:
-        report.error(1, "scene", f"the scene cannot be built: {error}", "mend what it names")
+        report.error(1, "scene", f"the scene cannot be built: {error}", "fix what it names")
         return
     _check_addresses(report, scene)
     _check_tables(report, scene)
@@ -67,7 +68,7 @@ def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
 
 
 def _check_addresses(report: Report, scene: Scene) -> None:
-    """Regions that atoms name have a site, and what is opened or turned on has a joint for it."""
+    """Check that regions in atoms have a site, and that what is opened or turned on has a joint."""
     for atom, line in _atoms(report, scene):
         for name in atom.args:
             _check_site(report, scene, name)
@@ -78,11 +79,11 @@ def _check_addresses(report: Report, scene: Scene) -> None:
         if not scene.joints.get(atom.args[0]):
             what, remedy = (
                 f"{spell(atom)}: it has no joint",
-                "name something with one, or a region on its moving part",
+                "use an object with a joint, or a region on its moving part",
             )
             report.error(line, "no-joint", what, remedy)
         elif state not in known:
-            what = f"{spell(atom)}: nothing says when a {scene.entities[owner].category} is {state!r}"
+            what = f"{spell(atom)}: the state {state!r} of a {scene.entities[owner].category} is not defined"
             remedy = f"it can be {', '.join(sorted(known)) or 'in no such state'}"
             report.error(line, "no-joint", what, remedy)
 
@@ -94,7 +95,9 @@ def _check_site(report: Report, scene: Scene, name: str) -> None:
     prefix = f"{region.target}_"
     sites = [scene.model.site(s).name for s in range(scene.model.nsite)]
     own = [site.removeprefix(prefix) for site in sites if site.startswith(prefix)]
-    remedy = report.suggest(region.name, own) if own else "name the thing itself; it has no such places"
+    remedy = (
+        report.suggest(region.name, own) if own else "use the name of the object itself; it has no places"
+    )
     report.error(
         report.lines.of(name), "no-site", f"{region.target} has no place called {region.name!r}", remedy
     )
@@ -106,7 +109,7 @@ def _atoms(report: Report, scene: Scene) -> Iterator[tuple[Atom, int]]:
 
 
 def _check_tables(report: Report, scene: Scene) -> None:
-    """Regions of the workspace are on it, and what the goal needs of them is in reach."""
+    """Check that regions of the workspace are on it, and that those of the goal are within reach."""
     init = {atom.args[1]: atom.args[0] for atom in scene.problem.init if len(atom.args) == 2}
     goal = {name for atom in atoms_of(scene.problem.goal) for name in atom.args}
     surfaces = _surfaces(scene)
@@ -125,7 +128,7 @@ def _check_tables(report: Report, scene: Scene) -> None:
 
 
 def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarray, needed: bool) -> None:
-    """Return the rectangles are where the arm takes things from above; an error where it cannot in any way."""
+    """Check that the arm can grasp from above in all of a region; it is an error where it cannot reach any of it."""
     near, far = reach(scene.workspace)
     base = np.array(scene.workspace.robot_base_pos[:2])
     middle = corners.reshape(-1, 4, 2).mean(axis=1)
@@ -136,7 +139,7 @@ def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarr
         report.info
         if not needed
         else report.error
-        if away.min() > stretched(scene.workspace)
+        if away.min() > furthest_reach(scene.workspace)
         else report.warning
     )
     x, y = base - np.array(scene.workspace.offset[:2])
@@ -146,13 +149,13 @@ def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarr
 
 
 def _corners(region: Region, workspace: Workspace) -> np.ndarray:
-    """Corners of all rectangles, world frame, (4n, 2)."""
+    """Return the corners of all rectangles in the world frame, (4n, 2) [m]."""
     corners = [(x, y) for x0, y0, x1, y1 in region.ranges for x in (x0, x1) for y in (y0, y1)]
     return np.array(corners) + np.array(workspace.offset[:2])
 
 
 def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
-    """What of the workspace things stand on, seen from above: centre (2,) and half extents (2,), world frame."""
+    """Return the top surfaces of the workspace: centre (2,) and half extents (2,) in the world frame, [m]."""
     model, data, found = scene.model, mujoco.MjData(scene.model), []
     data.qpos[:] = initial_qpos(scene)
     mujoco.mj_kinematics(model, data)
@@ -161,46 +164,46 @@ def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
         if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
             half = np.abs(data.geom_xmat[geom].reshape(3, 3)) @ model.geom_aabb[geom, 3:]
         touchable = model.geom_contype[geom] or model.geom_conaffinity[geom]
-        if touchable and abs(centre[2] + half[2] - scene.workspace.surface_height) < _LEVEL:
+        if touchable and abs(centre[2] + half[2] - scene.workspace.surface_height) < _LEVEL_TOLERANCE:
             found.append((centre[:2].copy(), half[:2]))
     return found
 
 
 def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None:
-    """Some starts: they can be made, they rest, their atoms hold, and the goal does not."""
+    """Check initial states: they exist, are at rest, their atoms hold, and the goal does not."""
     simulations = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies.tolist())
-    view, faults, looked = StateView(scene, simulations), Counter[tuple[str, str]](), False
+    view, faults, checked = StateView(scene, simulations), Counter[tuple[str, str]](), False
     try:
         for i in range(starts):
             try:
-                _put_start(task, scene, simulations, i, faults)
+                _set_start(task, scene, simulations, i, faults)
             except PlacementError as error:
                 faults["placement", str(error)] += 1
                 continue
             faults.update(("start", fault) for fault in start_faults(view))
-            if not looked:
+            if not checked:
                 _check_parts(report, scene, view)
                 _check_goal_reach(report, scene, view)
-            looked = True
+            checked = True
     except LiberoError as error:
-        report.error(report.lines.section(":init"), "start", str(error), "mend what it names")
+        report.error(report.lines.section(":init"), "start", str(error), "fix what it names")
     finally:
         simulations.close()
     for (rule, what), count in faults.items():
-        _tell_start(report, scene, rule, what, count, starts)
+        _report_start(report, scene, rule, what, count, starts)
 
 
-def _put_start(
+def _set_start(
     task: Task, scene: Scene, simulations: LoopSimulations, i: int, faults: Counter[tuple[str, str]]
 ) -> None:
-    """Put start i into the simulation: a stored one of a suite's task, else a newly drawn one after it came to rest.
+    """Set the simulation to initial state i: a stored one for a task of a suite, else a sampled one after settling.
 
-    Counts the objects that move while it waits as it was first put.
+    Objects that move at first are counted in `faults`.
 
     Raises:
-        PlacementError: It cannot be drawn, or does not come to rest.
+        PlacementError: No state can be sampled, or it does not come to rest.
     """
-    stored, still = task.suite != "file" and scene.pack.name == BUILTIN, np.zeros((1, scene.model.nv))
+    stored, still = task.suite != FILE and scene.pack.name == BUILTIN, np.zeros((1, scene.model.nv))
     if stored:
         qpos, _, (fixtures,) = split_row(scene.model, load_init_states(task, scene)[i : i + 1])
     else:
@@ -214,32 +217,34 @@ def _put_start(
 
 
 def _moving(scene: Scene, simulations: LoopSimulations) -> list[str]:
-    """Objects that move while the arm waits."""
+    """Return the names of objects that move while the arm is idle."""
     view = StateView(scene, simulations)
     before = {name: view.body_pos(name) for name in scene.objects}
-    for _ in range(_IDLE):
+    for _ in range(_IDLE_STEPS):
         simulations.step([0], np.zeros((1, 7)))
-    return [name for name, pos in before.items() if np.linalg.norm(view.body_pos(name) - pos) > _MOVED]
+    return [name for name, pos in before.items() if np.linalg.norm(view.body_pos(name) - pos) > _MAX_MOVE]
 
 
-def _tell_start(report: Report, scene: Scene, rule: str, what: str, count: int, starts: int) -> None:
-    """One fault of the starts: an error where all have it; they are drawn again where some have."""
-    tell = report.error if count == starts else report.warning
+def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int, starts: int) -> None:
+    """Report a fault of initial states: an error if all have it, a warning if only some have (they are resampled)."""
+    add = report.error if count == starts else report.warning
     atoms = list(zip(scene.problem.init, report.lines.init, strict=True))
     line = next((at for atom, at in atoms if spell(atom) in what), report.lines.section(":init"))
     if rule == "unstable-start":
-        tell = report.warning
+        add = report.warning
         line = next((at for atom, at in atoms if atom.args[0] == what), line)
-        what = f"{what} moves by more than {1000 * _MOVED:.0f} mm in the first {_IDLE / CONTROL_HZ:g} s"
+        what = (
+            f"{what} moves by more than {1000 * _MAX_MOVE:.0f} mm in the first {_IDLE_STEPS / CONTROL_HZ:g} s"
+        )
         remedy = "place it where it is flat and wide enough to carry it"
     elif rule == "placement":
-        remedy = "do what it says"
+        remedy = "see the message"
     elif "goal" in what:
-        tell, rule, line = report.error, "goal-at-start", report.lines.section(":goal")
-        remedy = "start from where something is left to do"
+        add, rule, line = report.error, "goal-at-start", report.lines.section(":goal")
+        remedy = "change the initial conditions so that the goal does not hold"
     else:
-        remedy = "place it where it stays, or leave the atom out"
-    tell(line, rule, f"{what}, in {count} of {starts} starts", remedy)
+        remedy = "place it where it stays, or remove the atom"
+    add(line, rule, f"{what}, in {count} of {starts} starts", remedy)
 
 
 def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
@@ -250,12 +255,12 @@ def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
         if isinstance(part, Atom) and evaluate(part, view):
             what = f"{spell(part)} holds from the beginning"
             report.info(
-                report.lines.section(":goal"), "goal-at-start", what, "fine if it is meant to stay so"
+                report.lines.section(":goal"), "goal-at-start", what, "correct if it is intended to stay so"
             )
 
 
 def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
-    """Objects and places of the goal are within the arm's length, whichever way the hand points."""
+    """Check that objects and places of the goal are within the arm's length, in any orientation of the hand."""
     shoulder = np.array(scene.workspace.robot_base_pos) + (0.0, 0.0, _SHOULDER)
     for atom, line in zip(atoms_of(scene.problem.goal), report.lines.goal, strict=True):
         for name in atom.args:
@@ -265,6 +270,6 @@ def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
                 pos = view.site_pos(name)
             else:
                 continue
-            if (away := float(np.linalg.norm(pos - shoulder))) > _LENGTH:
-                what = f"{name} is {away:.2f} m from the arm's shoulder, which reaches {_LENGTH:.2f} m"
+            if (away := float(np.linalg.norm(pos - shoulder))) > _ARM_LENGTH:
+                what = f"{name} is {away:.2f} m from the arm's shoulder, which reaches {_ARM_LENGTH:.2f} m"
                 report.warning(line, "out-of-reach", what, "move it towards the robot")

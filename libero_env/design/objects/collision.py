@@ -1,4 +1,4 @@
-"""What an object collides with: its convex hull, convex pieces of it, or boxes."""
+"""Collision geometry of a mesh: its convex hull, a convex decomposition, or boxes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,21 +13,21 @@ from libero_env.geometry import quat_to_mat
 
 METHODS = ("decompose", "hull", "boxes")
 INSTALL = "pip install 'libero-lifelong[objects]'"
-_CONCAVITY = 0.05  # of CoACD, what a piece may be off its hull
+_CONCAVITY = 0.05  # CoACD's threshold: deviation of a piece from its hull
 _MAX_PIECES = 24
-_CONVEX = 0.95  # share of the hull that is filled by what counts as convex
-_CELLS = 16  # of boxes, along the longest side
+_CONVEX = 0.95  # share of its hull that a convex mesh fills
+_CELLS = 16  # grid cells along the longest side, from which boxes are made
 _MAX_BOXES = 60
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """Collision shapes in the object's frame.
+    """Collision geometry in the frame of the object.
 
     Attributes:
-        method: How they were made.
-        meshes: Convex, each (n, 3) vertices, metres.
-        boxes: (k, 6) centre and half size, metres.
+        method: Method that was used, one of `METHODS`.
+        meshes: Vertices (n, 3) [m] of each convex mesh.
+        boxes: Centre and half size of each box, (k, 6) [m].
     """
 
     method: str
@@ -39,20 +39,20 @@ class Pieces:
 
 
 def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notify: Notify) -> Pieces:
-    """Collision shapes of a mesh.
+    """Return the collision geometry of a mesh.
 
     Args:
-        vertices: (n, 3), metres, joined where they are at one place.
-        faces: (f, 3).
-        method: `hull`; `decompose`, by CoACD (Wei et al. 2022, Approximate Convex Decomposition for 3D Meshes with
-            Collision-Aware Concavity and Tree Search); or `boxes`. A mesh that is convex anyway is its hull.
-        notify: Takes a line where something else had to be done.
+        vertices: Vertices, (n, 3) [m], without duplicates.
+        faces: Vertex indices, (f, 3).
+        method: `hull`, `boxes`, or `decompose`, which uses CoACD (Wei et al. 2022, Approximate Convex Decomposition for
+            3D Meshes with Collision-Aware Concavity and Tree Search). A convex mesh is replaced by its hull.
+        notify: Function that receives a message where another method had to be used.
 
     Raises:
-        LiberoError: There is no such method.
+        LiberoError: The method does not exist.
     """
     if method not in METHODS:
-        raise LiberoError(f"collision {method!r}: valid are {', '.join(METHODS)}")
+        raise LiberoError(f"collision {method!r} does not exist; valid: {', '.join(METHODS)}")
     filled = volume_filled(vertices, faces)
     if method == "hull" or (method == "decompose" and filled >= _CONVEX):
         return Pieces("hull", (vertices,))
@@ -61,7 +61,7 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notif
             import coacd
         except ImportError:
             notify(
-                f"CoACD is not installed, so that it collides as boxes; finer: {INSTALL}, and add it again"
+                f"CoACD is not installed: boxes are used for collisions; for a finer shape: {INSTALL}, and add it again"
             )
             return Pieces("boxes", boxes=boxes_of(vertices, faces))
         return Pieces("decompose", _decomposed(coacd, vertices, faces))
@@ -69,7 +69,7 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notif
 
 
 def volume_filled(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Share of the convex hull that a mesh fills, 0..1; 0 where it is open and has no inside."""
+    """Return the share of its convex hull that a mesh fills, in [0, 1]; 0 for an open mesh."""
     if not is_closed(faces):
         return 0.0
     return min(abs(signed_volume(vertices, faces)) / hull_mass(vertices, 1.0).volume, 1.0)
@@ -77,7 +77,13 @@ def volume_filled(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Mass:
-    """Volume (m^3), centre (3,), and the inertia about it in the object's axes (xx, yy, zz, xy, xz, yz), kg m^2."""
+    """Mass distribution of a homogeneous solid.
+
+    Attributes:
+        volume: Volume, [m^3].
+        centre: Centre of mass, (3,) [m].
+        inertia: Inertia about the centre in the object's axes: xx, yy, zz, xy, xz, yz, [kg m^2].
+    """
 
     volume: float
     centre: np.ndarray
@@ -85,12 +91,12 @@ class Mass:
 
 
 def hull_mass(vertices: np.ndarray, density: float) -> Mass:
-    """Of the convex hull of points (n, 3), filled evenly with so many kg/m^3."""
+    """Return the mass distribution of the convex hull of points (n, 3) with a density in kg/m^3."""
     return _mass(vertices, None, density, mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
 
 
 def solid_mass(vertices: np.ndarray, faces: np.ndarray, density: float) -> Mass:
-    """Of a closed mesh, filled evenly with so many kg/m^3."""
+    """Return the mass distribution of a closed mesh with a density in kg/m^3."""
     if signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1]
     return _mass(vertices, faces, density, mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT)
@@ -99,7 +105,7 @@ def solid_mass(vertices: np.ndarray, faces: np.ndarray, density: float) -> Mass:
 def _mass(
     vertices: np.ndarray, faces: np.ndarray | None, density: float, kind: mujoco.mjtMeshInertia
 ) -> Mass:
-    scale = 1.0 / np.ptp(vertices, axis=0).max()  # MuJoCo calls very small volumes none
+    scale = 1.0 / np.ptp(vertices, axis=0).max()  # MuJoCo rejects very small volumes
     spec = mujoco.MjSpec()
     mesh = spec.add_mesh(name="mesh", uservert=(vertices * scale).ravel(), inertia=kind)
     if faces is not None:
@@ -110,7 +116,7 @@ def _mass(
     try:
         model = spec.compile()
     except ValueError as error:
-        raise LiberoError(f"the mesh has no inside that could weigh something ({error}); mend it") from error
+        raise LiberoError(f"the mesh has no volume ({error}); fix it") from error
     index = model.body("body").id
     axes = quat_to_mat(model.body_iquat[index])
     inertia = density / scale**5 * axes @ np.diag(model.body_inertia[index]) @ axes.T
@@ -133,9 +139,9 @@ def _decomposed(coacd, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
 
 
 def boxes_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Boxes that cover a mesh: cells of a grid, joined as far as they can be; (k, 6) centre, half size, m.
+    """Return boxes that cover a mesh, made of the cells of a grid: centre and half size, (k, 6) [m].
 
-    Walls that are thinner than a cell are as thick as one; a mesh that is open has walls only.
+    Walls that are thinner than a cell become as thick as one; an open mesh has walls only.
     """
     low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)
     cells = _CELLS
@@ -144,7 +150,7 @@ def boxes_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         filled = _walls(vertices, faces, low, extent, count)
         if is_closed(faces):
             filled |= _inside(vertices, faces, low, extent, count)
-        found = list(_joined(filled))
+        found = list(_merge_cells(filled))
         if len(found) <= _MAX_BOXES or cells <= 6:
             break
         cells -= 2
@@ -153,7 +159,7 @@ def boxes_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _walls(vertices, faces, low, extent, count) -> np.ndarray:
-    """Cells that the surface goes through, by points on it a third of a cell apart."""
+    """Return the cells that contain a part of the surface, found with points on it a third of a cell apart."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     steps = np.clip(np.ceil(3 * longest / (extent / count).min()), 1, 64).astype(int)
@@ -161,7 +167,7 @@ def _walls(vertices, faces, low, extent, count) -> np.ndarray:
     for n in np.unique(steps):
         grid = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
         points = (grid @ corners[steps == n]).reshape(-1, 3)
-        # towards the middle by a little: a point on the border belongs to the cell that it closes
+        # slightly towards the centre: a point on the border belongs to the inner cell
         inward = low + extent / 2 + (points - low - extent / 2) * (1 - 1e-6)
         cell = np.clip(((inward - low) / extent * count).astype(int), 0, count - 1)
         filled[tuple(cell.T)] = True
@@ -169,9 +175,11 @@ def _walls(vertices, faces, low, extent, count) -> np.ndarray:
 
 
 def _inside(vertices, faces, low, extent, count) -> np.ndarray:
-    """Cells whose middle is inside a closed mesh: an odd number of surfaces lies below."""
+    """Return the cells whose centre is inside a closed mesh: those with an odd number of surfaces below."""
     step = extent / count
-    x, y, z = (low[k] + step[k] * (np.arange(count[k]) + 0.5013) for k in range(3))  # not through vertices
+    x, y, z = (
+        low[k] + step[k] * (np.arange(count[k]) + 0.5013) for k in range(3)
+    )  # off-centre, so as not to meet vertices
     below = np.zeros(count, int)
     for a, b, c in vertices[faces]:
         (ux, uy), (vx, vy) = b[:2] - a[:2], c[:2] - a[:2]
@@ -186,18 +194,20 @@ def _inside(vertices, faces, low, extent, count) -> np.ndarray:
     return below % 2 == 1
 
 
-def _joined(filled: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Boxes (first cell, one after the last) that cover the cells which are True; each the largest that begins at the
-    first cell not yet covered."""
+def _merge_cells(filled: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield boxes (first cell, one after the last cell) that cover the cells which are True.
+
+    Each is the largest that starts at the first cell that is not covered yet.
+    """
     left = filled.copy()
     while left.any():
         seed = np.array(np.unravel_index(int(left.argmax()), left.shape))
-        low, high = _grown(left, seed)
+        low, high = _largest_box(left, seed)
         left[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = False
         yield low, high
 
 
-def _grown(left: np.ndarray, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _largest_box(left: np.ndarray, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest of the boxes that grow from a cell along the axes, in each order of them."""
     best: tuple[np.ndarray, np.ndarray] | None = None
     for order in permutations(range(3)):

@@ -1,4 +1,4 @@
-"""Mesh files (OBJ, GLB, glTF, STL, PLY) -> what an object looks like, upright, in metres, around its middle."""
+"""Reading of mesh files (OBJ, GLB, glTF, STL, PLY) as surfaces: upright, in metres, centred at the origin."""
 
 import shlex
 from collections.abc import Callable, Iterator
@@ -13,10 +13,10 @@ from PIL import Image
 from libero_env.errors import LiberoError
 
 FORMATS = (".obj", ".glb", ".gltf", ".stl", ".ply")
-_Y_UP = (".glb", ".gltf")  # by their specification
+_Y_UP = (".glb", ".gltf")  # formats whose specification says so
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001}
-_METRES = (0.01, 0.6)  # m, longest side of what is taken to be in metres
-_TYPICAL = 0.1  # m, the side that a guess of the unit comes nearest to
+_PLAUSIBLE_METRES = (0.01, 0.6)  # longest side of files that are assumed to be in metres
+_TYPICAL = 0.1  # [m] longest side that a guess of the unit should give
 _GREY = (0.7, 0.7, 0.7, 1.0)
 
 Notify = Callable[[str], None]
@@ -27,11 +27,11 @@ class Surface:
     """A part of an object that has one material.
 
     Attributes:
-        vertices: (n, 3), metres.
-        faces: (f, 3), vertex indices.
-        texcoords: (n, 2) with v = 0 at the lower edge of the picture; None for a plain colour.
-        image: The picture; None for a plain colour.
-        rgba: The colour, 0..1; white where there is a picture.
+        vertices: Vertices, (n, 3) [m].
+        faces: Vertex indices, (f, 3).
+        texcoords: Texture coordinates, (n, 2), v = 0 at the lower edge of the image; None for a plain colour.
+        image: Texture; None for a plain colour.
+        rgba: Colour, in [0, 1]; white where there is a texture.
     """
 
     vertices: np.ndarray
@@ -42,45 +42,46 @@ class Surface:
 
 
 def read_mesh(path: Path, *, size: float | None, up: str | None, notify: Notify) -> list[Surface]:
-    """Return the surfaces of a mesh file, z up, the origin in the middle of their bounds.
+    """Return the surfaces of a mesh file, z up, the origin at the centre of their bounds.
 
     Args:
-        path: The file.
-        size: Longest side wanted, m; None keeps the file's, after a guess of its unit.
-        up: Axis of the file that points up, `z` or `y`; None for what the format says.
-        notify: Takes a line about each guess.
+        path: File to read.
+        size: Desired longest side, [m]; None keeps that of the file, whose unit is guessed.
+        up: Axis of the file that points up, `z` or `y`; None is the convention of the format.
+        notify: Function that receives a message about each assumption.
 
     Raises:
-        LiberoError: Not a format that is read, no triangles, or a picture is missing; the message names the file.
+        LiberoError: The format is not supported, there are no triangles, or a texture is missing; the message names the
+            file.
     """
     if path.suffix.lower() not in FORMATS:
         raise LiberoError(f"{path}: unknown format {path.suffix!r}; valid: .xml (MJCF), {', '.join(FORMATS)}")
     if not path.is_file():
         raise LiberoError(f"{path}: no such file")
-    _check_pictures(path)
+    _check_textures(path)
     surfaces = [_surface(part) for part in _parts(path)]
     if not surfaces:
-        raise LiberoError(f"{path}: there are no triangles in it; export the object as a mesh")
+        raise LiberoError(f"{path}: it contains no triangles; export the object as a mesh")
     if up is None:
         up = "y" if path.suffix.lower() in _Y_UP else "z"
     if up == "y":
         surfaces = [replace(s, vertices=s.vertices[:, [0, 2, 1]] * (1, -1, 1)) for s in surfaces]
     low, high = bounds(surfaces)
     if min(high - low) <= 1e-4 * max(high - low):
-        raise LiberoError(f"{path}: it is flat, and nothing can be taken hold of; give it a thickness")
+        raise LiberoError(f"{path}: it is flat and cannot be grasped; give it a thickness")
     scale = size / max(high - low) if size else _unit(float(max(high - low)), path, notify)
-    middle = (low + high) / 2
-    return [replace(s, vertices=(s.vertices - middle) * scale) for s in surfaces]
+    centre = (low + high) / 2
+    return [replace(s, vertices=(s.vertices - centre) * scale) for s in surfaces]
 
 
 def bounds(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner, (3,) and (3,)."""
+    """Return the lowest and the highest corner, (3,) and (3,)."""
     points = np.concatenate([s.vertices for s in surfaces])
     return points.min(axis=0), points.max(axis=0)
 
 
-def welded(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the whole as one mesh, vertices at one place joined: (n, 3), (f, 3). Seams of textures are none of it."""
+def merge_vertices(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
+    """Return all surfaces as one mesh, (n, 3) and (f, 3); vertices at the same place are merged, also at seams."""
     starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     points = np.concatenate([s.vertices for s in surfaces])
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)])
@@ -91,26 +92,26 @@ def welded(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Return whether every edge of triangles (f, 3) lies between two that are turned the same way."""
+    """Return whether every edge of the triangles (f, 3) belongs to two triangles of consistent orientation."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there, back = np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)
     return len(there) == len(edges) and np.array_equal(there, back)
 
 
 def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Of a closed mesh, m^3; negative where it is inside out."""
+    """Return the volume of a closed mesh, [m^3]; it is negative if the mesh is inside out."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
 def _parts(path: Path) -> list[Any]:
-    """Return the meshes of a file as trimesh reads it, where they are in its scene."""
+    """Return the meshes of a file as trimesh reads them, transformed into the frame of the scene."""
     import trimesh
 
     try:
         found = trimesh.load(str(path), force="scene").dump()
-    except Exception as error:  # noqa: BLE001 - each format's reader fails in its own way
-        raise LiberoError(f"{path}: it cannot be read ({error}); export it anew") from error
+    except Exception as error:  # noqa: BLE001 - readers of formats raise errors of many types
+        raise LiberoError(f"{path}: it cannot be read ({error}); export it again") from error
     return [part for part in found if len(getattr(part, "faces", ()))]
 
 
@@ -128,40 +129,40 @@ def _surface(part: Any) -> Surface:
 
 
 def _unit(longest: float, path: Path, notify: Notify) -> float:
-    """Metres for one unit of the file, guessed from its longest side."""
-    if _METRES[0] <= longest <= _METRES[1]:
+    """Return the length of one unit of the file, [m], guessed from its longest side."""
+    if _PLAUSIBLE_METRES[0] <= longest <= _PLAUSIBLE_METRES[1]:
         return 1.0
-    if longest < _METRES[0]:
-        notify(f"{path.name} is {1000 * longest:.3g} mm long in metres; if that is wrong, say --size (m)")
+    if longest < _PLAUSIBLE_METRES[0]:
+        notify(f"{path.name} is {1000 * longest:.3g} mm long in metres; if that is wrong, give --size (m)")
         return 1.0
     name, unit = min(_UNITS.items(), key=lambda item: abs(log(longest * item[1] / _TYPICAL)))
     notify(
-        f"{path.name} is {longest:.4g} units long: taken for {name}, so that it is {100 * longest * unit:.3g} cm; "
-        "if that is wrong, say --size (m)"
+        f"{path.name} is {longest:.4g} units long: assuming {name}, it is {100 * longest * unit:.3g} cm; "
+        "if that is wrong, give --size (m)"
     )
     return unit
 
 
-def _check_pictures(path: Path) -> None:
-    """Every picture that an OBJ file's materials name is there; trimesh would leave it out without a word."""
+def _check_textures(path: Path) -> None:
+    """Check that the textures of an OBJ file's materials exist; trimesh would omit them silently."""
     if path.suffix.lower() != ".obj":
         return
-    for library in _named(path, ("mtllib",)):
+    for library in _referenced_files(path, ("mtllib",)):
         if not library.is_file():
             raise LiberoError(
                 f"{path}: its material file {library.name} is missing; put it beside it, or remove the line mtllib"
             )
-        for picture in _named(library, ("map_Kd",)):
+        for picture in _referenced_files(library, ("map_Kd",)):
             if not picture.is_file():
                 raise LiberoError(
                     f"{library}: its texture {picture.name} is missing; put it at {picture}, or remove the line map_Kd"
                 )
 
 
-def _named(path: Path, keys: tuple[str, ...]) -> Iterator[Path]:
+def _referenced_files(path: Path, keys: tuple[str, ...]) -> Iterator[Path]:
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         word, _, rest = line.strip().partition(" ")
         if word in keys and rest.strip():
             whole = path.parent / rest.strip()
-            # options may come before the name, and names may hold blanks
+            # options may come before the name, and names may contain blanks
             yield whole if whole.is_file() else path.parent / shlex.split(rest)[-1].replace("\\", "/")

@@ -1,4 +1,4 @@
-"""MJCF files of the user's, whatever their conventions -> the files of an object that scenes can attach."""
+"""Conversion of a user's MJCF file, of any convention, into the files of an object that scenes can attach."""
 
 import shutil
 from pathlib import Path
@@ -8,31 +8,36 @@ from xml.etree import ElementTree as ET
 import mujoco
 import numpy as np
 
+from libero_env.assets.original_mjcf import attachable_xml, read_file
 from libero_env.design.objects.mesh_file import Notify
 from libero_env.errors import LiberoError
+from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import delete
 from libero_env.objects.folder import MODEL, read_spec
 from libero_env.objects.model import ROOT_BODY
 
-INSIDE = 0.8  # share of the bounds that `contain_region` takes
-_HIDDEN = 3  # group of geoms that no viewer shows at first
+INSIDE = 0.8  # size of `contain_region`, as a share of the bounds
+_HIDDEN = 3  # first geom group that viewers hide by default
 
 
 def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
-    """Write an object's MJCF file, with the meshes and pictures that it names; its mass and collision shapes.
+    """Write the MJCF file of an object, with its meshes and textures; return its mass and collision geometry.
 
-    The object is the one body of the file's world or, where that has a body `object` in it as the original's files
-    do, that one. What collides goes to group 0 and what only is seen to group 1; what would not be seen gets a look.
+    The object is the one body of the file's world or, as in the original's files, the body `object` within it.
+    Collision geoms become group 0, visual geoms group 1; without visual geoms, copies of the collision geoms are added.
 
     Args:
-        path: MJCF.
+        path: MJCF file to read.
         name: Category.
-        place: Folder.
-        container: Add a place `contain_region` unless it has one.
-        notify: Takes a line where something is left out.
+        place: Folder to write to.
+        container: Whether to add a place `contain_region` if the object has none.
+        notify: Function that receives a message about omitted elements.
+
+    Returns:
+        `mass` [kg] and `collision`, for `object.yaml`.
 
     Raises:
-        LiberoError: It cannot be read, names a missing file, or does not hold one object.
+        LiberoError: The file cannot be read, refers to a missing file, or does not contain exactly one object.
     """
     spec = _read(path, name)
     root = _root(spec, path, notify)
@@ -51,7 +56,7 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: N
     model = _compiled(spec, path)
     kilograms = float(model.body_subtreemass[model.body(ROOT_BODY).id])
     if kilograms < 1e-6:
-        raise LiberoError(f"{path}: it weighs nothing; give its collision geoms a mass or density")
+        raise LiberoError(f"{path}: it has no mass; give its collision geoms a mass or density")
     text = spec.to_xml().replace(f"{place.absolute()}/", "")
     (place / MODEL).write_text(text, encoding="utf-8")
     solid = int(((model.geom_contype | model.geom_conaffinity) > 0).sum())
@@ -59,22 +64,18 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: N
 
 
 def bounds_of(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner of what an object of its own collides with, (3,) and (3,), in its frame, m.
+    """Return the lowest and highest corner of the collision geoms of an object, (3,) and (3,), in its frame [m].
 
     Raises:
-        LiberoError: Nothing of it collides.
+        LiberoError: The object has no collision geoms.
     """
-    from libero_env.geometry import surface_points
-
     points = surface_points(model, model.body(ROOT_BODY).id)
     if not len(points):
-        raise LiberoError("nothing of it collides; give it a geom with contype and conaffinity 1")
+        raise LiberoError("it has no collision geoms; give it a geom with contype and conaffinity 1")
     return points.min(axis=0), points.max(axis=0)
 
 
 def _read(path: Path, name: str) -> mujoco.MjSpec:
-    from libero_env.assets.original_mjcf import attachable_xml, read_file
-
     try:
         inner = ET.parse(path).getroot().find("worldbody/body/body[@name='object']")
     except (OSError, ET.ParseError) as error:
@@ -93,43 +94,43 @@ def _read(path: Path, name: str) -> mujoco.MjSpec:
 
 
 def _root(spec: mujoco.MjSpec, path: Path, notify: Notify) -> mujoco.MjsBody:
-    """Return the object's body, alone in the world, at its origin, called `main`, without a joint."""
+    """Return the body of the object, renamed to `main`, without a joint, at the origin and alone in the world."""
     bodies = list(spec.worldbody.bodies)
     if len(bodies) != 1:
         raise LiberoError(
-            f"{path}: its world has {len(bodies)} bodies, and an object is one; move all its parts below one body"
+            f"{path}: its world has {len(bodies)} bodies, but an object has one; move all its parts below one body"
         )
     body = bodies[0]
     body.name, body.pos, body.quat = ROOT_BODY, (0, 0, 0), (1, 0, 0, 0)
     around = (spec.worldbody.geoms, spec.worldbody.sites, spec.cameras, spec.lights)
     about = (spec.actuators, spec.sensors, spec.keys)
-    left_out = [element for group in (*around, *about) for element in group]
+    omitted = [element for group in (*around, *about) for element in group]
     moving = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
-    if left_out or moving:
+    if omitted or moving:
         notify(
-            f"{path.name}: left out are {len(left_out)} elements around the object (lights, cameras, actuators, ...) "
-            f"and {len(moving)} joints of its outermost body, which scenes give a free one"
+            f"{path.name}: omitted are {len(omitted)} elements around the object (lights, cameras, actuators, ...) "
+            f"and {len(moving)} joints of its root body, to which scenes add a free joint"
         )
-    for element in [*left_out, *body.joints]:
+    for element in [*omitted, *body.joints]:
         delete(spec, element)
     return body
 
 
 def _sort_geoms(spec: mujoco.MjSpec) -> None:
-    """Groups as scenes expect them: 0 collides, 1 is seen. What collides gets a look where nothing else has one."""
+    """Assign the groups of collision (0) and visual (1) geoms; without visuals, add copies of the collision geoms."""
     geoms = list(spec.geoms)
     solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
-    looks = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]
+    visuals = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]
     for number, geom in enumerate(solid):
-        if not looks:
-            _add_look(geom)
+        if not visuals:
+            _add_visual(geom)
         geom.group, geom.name = 0, geom.name or f"g{number}"
-    for geom in looks:
+    for geom in visuals:
         geom.group = 1
 
 
-def _add_look(geom: mujoco.MjsGeom) -> None:
-    look = geom.parent.add_geom(
+def _add_visual(geom: mujoco.MjsGeom) -> None:
+    visual = geom.parent.add_geom(
         type=geom.type,
         size=geom.size,
         pos=geom.pos,
@@ -143,11 +144,11 @@ def _add_look(geom: mujoco.MjsGeom) -> None:
         conaffinity=0,
         mass=0.0,
     )
-    look.alt = geom.alt
+    visual.alt = geom.alt
 
 
 def _rename(spec: mujoco.MjSpec, name: str) -> None:
-    """Return the category in front of each asset's name: scenes share one namespace for them."""
+    """Prefix the names of assets with the category: scenes share one namespace for them."""
     for group, users, key in (
         (spec.meshes, spec.geoms, "meshname"),
         (spec.materials, spec.geoms, "material"),
@@ -172,7 +173,7 @@ def _gather_files(spec: mujoco.MjSpec, name: str, place: Path) -> None:
                 continue
             source = Path(element.file)
             if not source.is_file():
-                raise LiberoError(f"{kind} {source} is missing; put it there, or mend the file's path")
+                raise LiberoError(f"{kind} {source} is missing; put it there, or fix the path in the file")
             target = place / f"{element.name.removeprefix(f'{name}_') or kind}_{source.name}"
             shutil.copyfile(source, target)
             element.file = str(target.absolute())

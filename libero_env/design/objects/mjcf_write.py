@@ -1,4 +1,4 @@
-"""The MJCF file of an object made of a mesh, with its OBJ and PNG files beside it."""
+"""Writing of the MJCF file of an object that is made from a mesh, with its OBJ and PNG files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,27 +7,28 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from libero_env.assets.simplify import decimate
 from libero_env.design.objects.collision import Pieces
 from libero_env.design.objects.mesh_file import Notify, Surface
 from libero_env.objects.builtin.physics import FRICTION, SOLIMP, SOLREF
 from libero_env.objects.folder import MODEL
 from libero_env.objects.model import ROOT_BODY
 
-_LARGEST_PICTURE = 1024  # pixels
-_SMALLEST = 0.0005  # m, half a side of a box
+_MAX_TEXTURE = 1024  # [pixels] longest side of a texture
+_SMALLEST = 0.0005  # [m] half the side of a box
 
 
 @dataclass(frozen=True)
 class Body:
-    """What an object is besides its look. SI units, in its frame.
+    """Physical properties of an object, in its frame.
 
     Attributes:
         name: Category.
-        mass: Kg.
-        centre: Of mass, (3,).
-        inertia: About it: xx, yy, zz, xy, xz, yz.
-        pieces: What it collides with.
-        inside: Half size of its `contain_region`, which is in its middle; None for none.
+        mass: Mass, [kg].
+        centre: Centre of mass, (3,) [m].
+        inertia: Inertia about the centre of mass: xx, yy, zz, xy, xz, yz, [kg m^2].
+        pieces: Collision geometry.
+        inside: Half size of `contain_region`, which is at the origin, (3,) [m]; None where there is none.
     """
 
     name: str
@@ -42,11 +43,11 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
     """Write the files of an object.
 
     Args:
-        place: Folder.
-        body: What it is.
-        surfaces: What it looks like.
-        faces: Triangles that the whole look may have.
-        notify: Takes a line where it is simplified.
+        place: Folder to write to.
+        body: Physical properties.
+        surfaces: Visual geometry.
+        faces: Approximate largest number of triangles of all surfaces together.
+        notify: Function that receives a message if the surfaces are simplified.
     """
     root = ET.Element("mujoco", {"model": body.name})
     ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
@@ -60,10 +61,10 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
     _add_collision(place, body, assets, main)
     total = sum(len(surface.faces) for surface in surfaces)
     if total > faces:
-        notify(f"its look has {total} triangles and is simplified to about {faces}; --faces keeps more")
+        notify(f"its {total} triangles are simplified to about {faces} for display; --faces keeps more")
     for number, surface in enumerate(surfaces):
         share = max(faces * len(surface.faces) // total, 50)
-        _add_look(place, f"{body.name}_visual{number}", surface, share, assets, main, number)
+        _add_visual(place, f"{body.name}_visual{number}", surface, share, assets, main, number)
     if body.inside is not None:
         inside = {"type": "box", "size": _text(body.inside), "rgba": "0 0 0 0", "group": "3"}
         ET.SubElement(main, "site", {"name": "contain_region", **inside})
@@ -72,7 +73,7 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
 
 
 def _add_collision(place: Path, body: Body, assets: ET.Element, main: ET.Element) -> None:
-    touch = {
+    contact = {
         "group": "0",
         "condim": "3",
         "rgba": "0.8 0.8 0.8 0.3",
@@ -83,15 +84,15 @@ def _add_collision(place: Path, body: Body, assets: ET.Element, main: ET.Element
     }
     for number, points in enumerate(body.pieces.meshes):
         name = f"{body.name}_collision{number}"
-        # the hull is made of the points by MuJoCo, and no triangles are needed
+        # MuJoCo computes the hull of the points; no triangles are needed
         ET.SubElement(assets, "mesh", {"name": name, "vertex": _text(points.ravel()), "inertia": "convex"})
-        ET.SubElement(main, "geom", {"name": f"g{number}", "type": "mesh", "mesh": name, **touch})
+        ET.SubElement(main, "geom", {"name": f"g{number}", "type": "mesh", "mesh": name, **contact})
     for number, box in enumerate(body.pieces.boxes):
-        where = {"pos": _text(box[:3]), "size": _text(np.maximum(box[3:], _SMALLEST))}
-        ET.SubElement(main, "geom", {"name": f"g{number}", "type": "box", **where, **touch})
+        pose = {"pos": _text(box[:3]), "size": _text(np.maximum(box[3:], _SMALLEST))}
+        ET.SubElement(main, "geom", {"name": f"g{number}", "type": "box", **pose, **contact})
 
 
-def _add_look(
+def _add_visual(
     place: Path, name: str, surface: Surface, faces: int, assets: ET.Element, main: ET.Element, number: int
 ) -> None:
     vertices, triangles, texcoords, corners = _simplified(surface, faces)
@@ -103,9 +104,9 @@ def _add_look(
         "shininess": "0.4",
     }
     if surface.image is not None:
-        picture = surface.image.copy()
-        picture.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
-        picture.save(place / f"{name}.png")
+        texture = surface.image.copy()
+        texture.thumbnail((_MAX_TEXTURE, _MAX_TEXTURE))
+        texture.save(place / f"{name}.png")
         ET.SubElement(assets, "texture", {"name": f"{name}_texture", "type": "2d", "file": f"{name}.png"})
         material["texture"] = f"{name}_texture"
     ET.SubElement(assets, "material", material)
@@ -127,9 +128,7 @@ def _add_look(
 
 
 def _simplified(surface: Surface, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, triangles, texture coordinates and their indices, with about so many triangles where it has more."""
-    from libero_env.assets.simplify import decimate
-
+    """Return vertices, triangles, texture coordinates and their indices, with at most about `faces` triangles."""
     texcoords = np.zeros((0, 2)) if surface.texcoords is None else surface.texcoords
     corners = surface.faces if len(texcoords) else np.zeros((0, 3), np.int64)
     if len(surface.faces) <= faces:

@@ -1,4 +1,4 @@
-"""What an object is like before any task has it: does it stand, can the gripper hold it, what does it look like."""
+"""Test of a new object: whether it stays where it is put down, whether it can be grasped, and a picture of it."""
 
 from pathlib import Path
 from typing import Any
@@ -18,30 +18,31 @@ from libero_env.sim.render import Renderer, RenderTarget
 
 _PREFIX = "object_"
 _BODY = _PREFIX + ROOT_BODY
-_FINE = 0.004  # m between points that widths are measured by
-_SECONDS = 1.5  # of standing
-_TILTED, _SHIFTED = 10.0, 0.02  # degrees and m that say it fell over or slid away
-_ASLANT = 0.006  # m, from one half of a pad to the other
-VIEWS = 8
-_PIXELS = 224
+_SPACING = 0.004  # [m] between the points that widths are measured with
+_SECONDS = 1.5  # simulated time in which it must not move
+_MAX_TILT, _MAX_SHIFT = 10.0, 0.02  # [deg] and [m] up to which it counts as standing
+_MAX_SLANT = 0.006  # [m] of a face, between the two halves of a finger pad
+VIEWS = 8  # pictures around the object
+_PIXELS = 224  # side of a picture
 
 
 def try_object(item: ObjectModel, notify: Notify, picture: Path | None = None) -> dict[str, Any]:
-    """Put an object down, look for a hold, and draw it from all sides.
+    """Put an object down, search for a grasp, and render it from all sides.
 
     Args:
-        item: Fresh; its spec is used up.
-        notify: Takes a line about what tasks with it would suffer from.
-        picture: PNG to write; None for none.
+        item: Object to test; its spec cannot be used afterwards.
+        notify: Function that receives a message about each problem for tasks with it.
+        picture: PNG file to write; None writes none.
 
     Returns:
-        `size` (m), placement's figures, `stands`, and `grasp`: the width of the narrowest hold, m, or why none.
+        `size` [m], the parameters of placement, `stands`, and `grasp`: the width of the narrowest grasp [m], or the
+        reason why there is none.
 
     Raises:
-        LiberoError: It cannot be compiled, or nothing of it collides.
+        LiberoError: The model cannot be compiled, or it has no collision geoms.
     """
-    model = _stage(item)
-    found: dict[str, Any] = {**figures(surface_points(model, model.body(_BODY).id))}
+    model = _scene(item)
+    found: dict[str, Any] = {**placement_parameters(surface_points(model, model.body(_BODY).id))}
     data = mujoco.MjData(model)
     data.qpos[:3] = (0.0, 0.0, 0.001 - found["bottom_offset"][2])
     mujoco.mj_forward(model, data)
@@ -52,27 +53,34 @@ def try_object(item: ObjectModel, notify: Notify, picture: Path | None = None) -
 
 
 def draw_object(item: ObjectModel, picture: Path) -> Path:
-    """Draw an object from all sides into a PNG file.
+    """Render an object from all sides into a PNG file.
+
+    Args:
+        item: Object to render; its spec cannot be used afterwards.
+        picture: File to write.
+
+    Returns:
+        `picture`.
 
     Raises:
-        LiberoError: It cannot be compiled, or no picture can be drawn here.
+        LiberoError: The model cannot be compiled, or nothing can be rendered on this machine.
     """
-    model = _stage(item)
-    found, data = figures(surface_points(model, model.body(_BODY).id)), mujoco.MjData(model)
+    model = _scene(item)
+    found, data = placement_parameters(surface_points(model, model.body(_BODY).id)), mujoco.MjData(model)
     data.qpos[:3] = (0.0, 0.0, 0.001 - found["bottom_offset"][2])
     data.qpos[3:7] = item.rest_quat()
     mujoco.mj_forward(model, data)
     return turntable(model, data, found["size"], picture)
 
 
-def figures(points: np.ndarray) -> dict[str, Any]:
-    """What placement needs to know of points (n, 3) on an object, m.
+def placement_parameters(points: np.ndarray) -> dict[str, Any]:
+    """Return the parameters that placement needs, from points (n, 3) [m] on the collision geoms of an object.
 
     Raises:
-        LiberoError: There are none.
+        LiberoError: There are no points.
     """
     if not len(points):
-        raise LiberoError("nothing of it collides; give it a geom with contype and conaffinity 1")
+        raise LiberoError("it has no collision geoms; give it a geom with contype and conaffinity 1")
     low, high = points.min(axis=0), points.max(axis=0)
     return {
         "size": [round(float(value), 5) for value in high - low],
@@ -83,16 +91,25 @@ def figures(points: np.ndarray) -> dict[str, Any]:
 
 
 def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], picture: Path) -> Path:
-    """Return a sheet of pictures (two rows) from around the origin, as PNG.
+    """Write a PNG with two rows of pictures from around the object.
+
+    Args:
+        model: Scene of `_scene`.
+        data: State to render.
+        size: Extents of the object, (3,) [m].
+        picture: File to write; its folder is created.
+
+    Returns:
+        `picture`.
 
     Raises:
-        RenderError: No picture can be drawn here.
+        RenderError: Nothing can be rendered on this machine.
     """
     frames = np.zeros((VIEWS, _PIXELS, _PIXELS, 3), np.uint8)
     with Renderer(model, _PIXELS, _PIXELS) as renderer:
-        reach, middle = float(np.linalg.norm(size)), data.body(_BODY).xpos
+        reach, centre = float(np.linalg.norm(size)), data.body(_BODY).xpos
         for k, frame in enumerate(frames):
-            _aim(model, middle, 1.9 * reach, 2 * np.pi * k / VIEWS)
+            _aim(model, centre, 1.9 * reach, 2 * np.pi * k / VIEWS)
             mujoco.mj_camlight(model, data)
             renderer.render(data, [RenderTarget(0, frame)])
     rows = np.concatenate(np.split(frames, 2), axis=1)  # (4, 2 H, W, 3)
@@ -101,8 +118,8 @@ def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], pic
     return picture
 
 
-def _stage(item: ObjectModel) -> mujoco.MjModel:
-    """Return the object on a floor, with a free joint and a camera."""
+def _scene(item: ObjectModel) -> mujoco.MjModel:
+    """Return a scene of the object on a floor, with a free joint and a camera."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.impratio, spec.option.cone = 0.002, 20.0, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.visual.quality.offsamples = 0
@@ -122,27 +139,27 @@ def _stage(item: ObjectModel) -> mujoco.MjModel:
         raise LiberoError(f"{item.category}: {error}") from error
 
 
-def _aim(model: mujoco.MjModel, middle: np.ndarray, distance: float, yaw: float) -> None:
-    """Put the camera so far from the middle, 30 degrees above it."""
+def _aim(model: mujoco.MjModel, centre: np.ndarray, distance: float, yaw: float) -> None:
+    """Place the camera at a distance from the centre, 30 degrees above it."""
     back = np.array([np.cos(yaw) * np.cos(0.52), np.sin(yaw) * np.cos(0.52), np.sin(0.52)])
     right = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     axes = np.stack([right, np.cross(back, right), back], axis=1)
-    model.cam_pos[0] = middle + distance * back
+    model.cam_pos[0] = centre + distance * back
     mujoco.mju_mat2Quat(model.cam_quat[0], axes.ravel())
 
 
 def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
-    """Return whether it stays as it is put down; the state is left where it came to rest."""
+    """Return whether the object stays where it is put down; `data` ends in the state at rest."""
     for _ in range(round(_SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
     body = data.body(_BODY)
     tilt = float(np.degrees(np.arccos(np.clip(body.xmat.reshape(3, 3)[2, 2], -1.0, 1.0))))
     slid = float(np.linalg.norm(body.xpos[:2]))
-    stands = tilt < _TILTED and slid < _SHIFTED
+    stands = tilt < _MAX_TILT and slid < _MAX_SHIFT
     if not stands:
         notify(
-            f"it does not stay as it is put down: it tilts by {tilt:.0f} degrees and moves by {100 * slid:.0f} cm. "
-            "Say which axis is up (--up), or give it a level bottom (--collision hull)"
+            f"it does not stay where it is put down: it tilts by {tilt:.0f} degrees and moves by {100 * slid:.0f} cm. "
+            "Set the axis that points up (--up), or give it a level bottom (--collision hull)"
         )
     return stands
 
@@ -150,12 +167,10 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
 def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify) -> dict[str, Any]:
     """Return the narrowest grasp from above of the object where it lies now, or the reason why there is none."""
     body = data.body(_BODY)
-    cloud = surface_points(model, body.id, _FINE) @ body.xmat.reshape(3, 3).T + body.xpos
+    cloud = surface_points(model, body.id, _SPACING) @ body.xmat.reshape(3, 3).T + body.xpos
     try:
         found = grasps(cloud, 0.0, np.array([0.0, 1.0, 0.0]), name=name, number=400, apart=0.01)
-        reason = (
-            f"{name}: only its edges fit between the fingers, which slip off; its faces are too far apart"
-        )
+        reason = f"{name}: only its edges fit between the fingers, which would slip off; its faces are too far apart"
     except GraspError as error:
         found, reason = [], str(error)
     square = [hold for hold in found if _is_square(cloud, hold)]
@@ -163,19 +178,19 @@ def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify
         best = min(square, key=lambda hold: (round(float(hold.width), 3), hold.cost))
         return {"width": round(float(best.width), 4), "height": round(float(best.pos_world[2]), 4)}
     notify(
-        f"{reason}. It can carry or hold other things; to be picked up, a part of it must be at most "
+        f"{reason}. It can support or contain other objects; to be picked up, a part of it must be at most "
         f"{100 * WIDEST:.1f} cm wide (--size)"
     )
     return {"width": None, "reason": reason}
 
 
 def _is_square(cloud: np.ndarray, hold: Grasp) -> bool:
-    """Return whether the pads meet faces that stand across the way they close, and not the two sides of an edge."""
+    """Return whether the finger pads touch faces across the closing direction, and not the two sides of an edge."""
     along, across, down = ((cloud - hold.pos_world) @ hold.mat).T
-    near = (np.abs(along) < 0.5 * hold.width + _FINE) & (np.abs(across) < FINGER_HALF_WIDTH)
+    near = (np.abs(along) < 0.5 * hold.width + _SPACING) & (np.abs(across) < FINGER_HALF_WIDTH)
     near &= (down < PAD_BELOW) & (down > -PAD_ABOVE)
     for side in (along, -along):
         halves = [side[near & half] for half in (across < 0, across >= 0)]
-        if not all(map(len, halves)) or abs(halves[0].max() - halves[1].max()) > _ASLANT:
+        if not all(map(len, halves)) or abs(halves[0].max() - halves[1].max()) > _MAX_SLANT:
             return False
     return True
