@@ -151,7 +151,7 @@ class Worker:
     Attributes:
         task: Name of the environment in messages.
         make: Factory of the environment, called in the worker.
-        variables: Environment variables of the worker, such as the GPU to draw on.
+        variables: Environment variables of the worker, such as the GPU to render on.
         host: Class whose methods are the commands; it is built with `make`, and has a command `open`.
     """
 

@@ -168,6 +168,4 @@ class _Reader(pickle.Unpickler):
         return np.frombuffer(_part(self._archive, f"{self._root}data/{key}"), storage.dtype)
 
     def _refuse(self, what: str) -> NoReturn:
-        raise StateFileError(
-            f"the pickle asks for {what}; only arrays of numbers are read, nothing is executed"
-        )
+        raise StateFileError(f"the pickle names {what}; only arrays of numbers are read, nothing is executed")

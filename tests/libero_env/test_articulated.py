@@ -1,4 +1,4 @@
-"""Fixtures with drawers, doors and knobs: figures of their joints, and that each moves as far as it should."""
+"""Fixtures with drawers, doors and knobs: parameters of their joints, and their range of motion."""
 
 import json
 
@@ -30,18 +30,18 @@ FIRM = 1e-3  # kg, kg m^2: what a part has at least, so that a force moves it at
 
 @pytest.fixture(params=ARTICULATED)
 def category(request) -> str:
-    """Each articulated category in turn."""
+    """Articulated category, each in turn."""
     return request.param
 
 
 @pytest.fixture(scope="module")
 def measured(shared) -> dict:
-    """The original's figures, category -> record."""
+    """Measurements of the original, category -> record."""
     return json.loads((shared / "official" / "objects.json").read_text())
 
 
 def fixture_spec(category: str) -> mujoco.MjSpec:
-    """The object alone, its root fixed at 1 m, under the options of the benchmark's scenes."""
+    """Compile the object alone, its root fixed at 1 m, with the options of the benchmark's scenes."""
     spec = get_object(category).spec
     spec.option.timestep = 0.002
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -51,7 +51,7 @@ def fixture_spec(category: str) -> mujoco.MjSpec:
 
 
 def push(model: mujoco.MjModel, data: mujoco.MjData, joint: int, way: float, seconds: float) -> None:
-    """Drives a joint by a force that holds a speed and never exceeds what a hand can."""
+    """Drive a joint by a force that keeps a speed and never exceeds that of a hand."""
     dof = model.jnt_dofadr[joint]
     speed = way * SPEED[mujoco.mjtJoint(model.jnt_type[joint])]
     limit = model.dof_damping[dof] * abs(speed) + 3.0
@@ -63,7 +63,7 @@ def push(model: mujoco.MjModel, data: mujoco.MjData, joint: int, way: float, sec
 
 
 def extremes(category: str, model: mujoco.MjModel, joint: int) -> tuple[float, float]:
-    """How far a joint can be moved, rad or m."""
+    """Return the range of motion of a joint, rad or m."""
     return STOPPED.get(category, tuple(model.jnt_range[joint]))
 
 
@@ -126,8 +126,8 @@ def test_each_moving_part_carries_a_visual(category):
         assert (model.geom_group[of_body] == 1).any() and (model.geom_group[of_body] == 0).any()
 
 
-def test_visual_parts_coincide_with_what_collides(category):
-    """The box around what is seen of a moving part is that around its collision shapes."""
+def test_visual_geoms_coincide_with_collision_geoms(category):
+    """The box around the visual geoms of a moving part is that around its collision geoms."""
     model = fixture_spec(category).compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -139,7 +139,7 @@ def test_visual_parts_coincide_with_what_collides(category):
 
 
 def around(model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int]) -> np.ndarray:
-    """Axis-aligned box around geoms in the world, (2, 3): low, high."""
+    """Return the axis-aligned box around geoms in the world, (2, 3): low, high."""
     corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     points = []
     for geom in geoms:
@@ -205,7 +205,7 @@ def test_a_turned_on_burner_is_red_from_above():
     assert redness[0] == 0.0 and redness[1] > 0.03
 
 
-def test_target_zone_is_seen_and_never_felt():
+def test_target_zone_is_visible_and_has_no_contacts():
     zone = get_object("target_zone")
     model = zone.spec.compile()
     assert model.nbody == 2 and model.njnt == 0 and model.body("main").mass[0] == 0

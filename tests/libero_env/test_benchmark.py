@@ -1,4 +1,4 @@
-"""All 130 tasks: they build, start as they say, and hold the states of the original."""
+"""All 130 tasks can be built, start as their files state, and accept the states of the original."""
 
 import json
 
@@ -50,7 +50,7 @@ FARTHER = 0.02  # m, what may move farther than with the original's models
 
 @pytest.fixture(scope="module")
 def settling(shared) -> dict:
-    """How far things move in the original, task -> record."""
+    """Motion of objects in the original, task -> record."""
     return json.loads((shared / "official" / "settling.json").read_text())
 
 
@@ -68,7 +68,7 @@ def test_there_are_130_tasks():
 
 
 @pytest.mark.parametrize("key", TASKS)
-def test_init_states_are_at_rest_where_the_task_says(key):
+def test_init_states_are_at_rest_in_the_regions_of_the_task(key):
     task = get_task(key)
     scene = build_scene(task.problem)
     rows = load_init_states(task, scene)
@@ -107,8 +107,8 @@ def test_states_of_the_original_fit(shared, settling, key):
 
 @pytest.mark.parametrize("original", [False, True], ids=["builtin", "original"])
 @pytest.mark.parametrize("recording", PREDICATE_RECORDINGS)
-def test_predicates_tell_the_recorded_truth(shared, recording, original):
-    """At least 999 of 1,000; what differs are touches that the two versions of MuJoCo judge differently."""
+def test_predicates_agree_with_recordings(shared, recording, original):
+    """At least 999 of 1,000 agree; the others are contacts that differ between versions of MuJoCo."""
     with np.load(shared / "parity" / f"{recording}-predicates.npz") as z:
         states, atoms, truth = z["qpos"], json.loads(str(z["atoms"])), z["truth"]
         poses, key = json.loads(str(z["fixtures"])), f"{z['suite']}/{int(z['task_id'])}"
@@ -126,7 +126,7 @@ def test_predicates_tell_the_recorded_truth(shared, recording, original):
 
 
 @pytest.mark.parametrize("recording", MOTION_RECORDINGS)
-def test_free_motion_is_that_of_the_recordings(shared, recording):
+def test_free_motion_agrees_with_recordings(shared, recording):
     with np.load(shared / "parity" / f"{recording}.npz") as z:
         states, commands, touch = z["states"], z["actions"], z["robot_contact"]
         poses, key = json.loads(str(z["fixtures"])), f"{z['suite']}/{int(z['task_id'])}"
@@ -144,7 +144,7 @@ def test_free_motion_is_that_of_the_recordings(shared, recording):
 
 
 def test_starts_of_a_file_follow_its_regions(tmp_path, monkeypatch):
-    """States that are made on demand are kept for the text they were made for."""
+    """States that are generated on demand are cached for the text of the task."""
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
     monkeypatch.setattr(init_states, "NUM_INIT_STATES", 2)
     monkeypatch.setattr(init_states.generate_init_states, "__defaults__", (2,))

@@ -1,4 +1,4 @@
-"""Each way to command the arm: it goes where it is told, in one simulation and in many, and from a state on."""
+"""Each controller reaches its goals, with the same bits in one simulation, in many, and from a restored state."""
 
 import itertools
 
@@ -27,7 +27,7 @@ def make(mode, cls=LiberoEnv, *args, **kwargs):
 
 
 def commands(env, steps, num, seed=0):
-    """Actions that move a little, whatever they mean."""
+    """Return actions that move the arm a little with any controller."""
     rng, controller = np.random.default_rng(seed), env.world.controller
     small = rng.uniform(-1, 1, (steps, num, controller.action_dim))
     if controller.control_delta:
@@ -63,7 +63,7 @@ def test_batch_and_states_give_the_same_bits(mode):
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
-def test_the_action_space_is_the_controllers(mode):
+def test_the_action_space_is_that_of_the_controller(mode):
     env = make(mode)
     assert env.action_space.shape == (env.world.controller.action_dim,)
     env.reset(options={"init_state": 0})
@@ -101,7 +101,7 @@ def test_an_absolute_pose_is_reached(name):
     env.close()
 
 
-def test_absolute_joints_are_reached_and_steps_count_from_the_present():
+def test_absolute_joints_are_reached_and_deltas_are_relative_to_the_present():
     for delta in (True, False):
         env = make(("joint_position", delta))
         env.reset(options={"init_state": 0})
@@ -115,7 +115,7 @@ def test_absolute_joints_are_reached_and_steps_count_from_the_present():
         env.close()
 
 
-def test_joint_velocities_are_held():
+def test_joint_velocities_are_reached():
     env = make(("joint_velocity", True), observations=["joint_velocities"])
     env.reset(options={"init_state": 0})
     command = np.array([0.4, -0.2, 0.2, 0.3, -0.4, 0.3, 0.5, 0.0])
@@ -159,7 +159,7 @@ def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summin
         saturated = bool((np.abs(wanted) > limit).any())
 
 
-def test_unknown_controllers_are_refused():
+def test_unknown_controllers_are_errors():
     with pytest.raises(UnknownNameError, match="osc_pose"):
         get_controller("osc_pos")
     with pytest.raises(LiberoError, match="no absolute mode"):

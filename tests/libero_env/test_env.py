@@ -1,4 +1,4 @@
-"""The environment's contract, and that one simulation and many are the same."""
+"""The contract of environments; one simulation and many give the same results."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def same(a, b):
         np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
-def test_gymnasium_accepts_it():
+def test_gymnasium_checks_pass():
     env = LiberoEnv(TASK, **SMALL, render_mode="rgb_array")
     check_env(env, skip_render_check=True)
     env.close()
@@ -49,7 +49,7 @@ def test_observations_are_in_their_space():
     env.close()
 
 
-def test_a_seed_says_it_all(env):
+def test_the_same_seed_gives_the_same_episode(env):
     first, _ = env.reset(seed=11)
     env.step(np.ones(7))
     same(env.reset(seed=11)[0], first)
@@ -67,7 +67,7 @@ def test_an_init_state_depends_on_nothing_else(env):
     np.testing.assert_array_equal(env.get_state(), expected)
 
 
-def test_set_state_goes_on_to_the_same_bits(env):
+def test_an_episode_continues_from_a_state_to_the_same_bits(env):
     env.reset(options={"init_state": 3})
     commands = np.random.default_rng(0).uniform(-1, 1, (20, 7))
     for command in commands[:10]:
@@ -81,7 +81,7 @@ def test_set_state_goes_on_to_the_same_bits(env):
         assert rest_again == rest
 
 
-def test_the_originals_state_layout_is_taken(env, shared):
+def test_states_of_the_original_are_accepted(env, shared):
     with np.load(shared / "parity" / "libero_object-00-random.npz") as z:
         state = z["states"][0]
     env0 = LiberoEnv("libero_object/0", cameras=())
@@ -102,7 +102,7 @@ def test_the_horizon_truncates():
 
 
 def test_reaching_the_goal_terminates(env):
-    """Put the target into the basket by hand; the goal holds and the episode ends."""
+    """With the target moved into the basket, the goal is true and the episode ends."""
     env.reset(options={"init_state": 0})
     state, scene = env.world.physics_state(0), env.world.scene
     target = env.task.problem.goal.parts[0].args[0] if hasattr(env.task.problem.goal, "parts") else None
@@ -116,7 +116,7 @@ def test_reaching_the_goal_terminates(env):
 
 
 @pytest.mark.parametrize("bad", [np.zeros(6), np.full(7, np.nan)])
-def test_a_bad_action_leaves_the_simulation_untouched(env, bad):
+def test_an_invalid_action_does_not_change_the_simulation(env, bad):
     env.reset(options={"init_state": 0})
     before = env.get_state()
     with pytest.raises(ActionError):
@@ -136,7 +136,7 @@ def test_wrong_names_list_the_valid_ones(env):
 
 
 @pytest.mark.parametrize(("num", "threads"), [(1, 1), (3, 2)])
-def test_the_batch_is_the_single_environment_many_times(num, threads):
+def test_a_batch_gives_the_bits_of_single_environments(num, threads):
     batch = BatchEnv(TASK, num, num_threads=threads, horizon=8, **SMALL)
     env = LiberoEnv(TASK, horizon=8, **SMALL)
     commands = np.random.default_rng(1).uniform(-1, 1, (8, num, 7))
@@ -156,7 +156,7 @@ def test_the_batch_is_the_single_environment_many_times(num, threads):
     env.close()
 
 
-def test_finished_simulations_stand_still_until_reset():
+def test_finished_simulations_do_not_move_until_reset():
     batch = BatchEnv(TASK, 3, cameras=(), horizon=4)
     batch.reset(options={"init_state": 0})
     for _ in range(2):
@@ -172,7 +172,7 @@ def test_finished_simulations_stand_still_until_reset():
     batch.close()
 
 
-def test_it_is_a_gymnasium_vector_environment():
+def test_a_batch_is_a_gymnasium_vector_environment():
     batch = BatchEnv(TASK, 2, **SMALL)
     assert isinstance(batch, gymnasium.vector.VectorEnv)
     observation, _ = batch.reset(options={"init_state": 0})
@@ -183,7 +183,7 @@ def test_it_is_a_gymnasium_vector_environment():
 
 
 @pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.id)
-def test_initial_states_are_settled_and_stand_where_they_should(task):
+def test_initial_states_are_at_rest_in_their_regions(task):
     env = LiberoEnv(task, cameras=())
     world, nq = env.world, env.world.scene.model.nq
     states = world.init_states
@@ -203,13 +203,13 @@ def test_initial_states_are_settled_and_stand_where_they_should(task):
     env.close()
 
 
-def test_stored_initial_states_can_be_made_again():
+def test_stored_initial_states_are_reproducible():
     task = get_suite("libero_object").tasks[4]
     scene = build_scene(task.problem)
     np.testing.assert_array_equal(generate_init_states(task, scene, 2), load_init_states(task, scene)[:2])
 
 
-def test_initial_states_of_another_model_are_refused(monkeypatch):
+def test_initial_states_of_another_model_are_an_error(monkeypatch):
     task = get_suite("libero_object").tasks[4]
     scene = build_scene(task.problem)
     monkeypatch.setattr(init_states, "scene_digest", lambda scene: "0" * 16)
@@ -217,7 +217,7 @@ def test_initial_states_of_another_model_are_refused(monkeypatch):
         load_init_states(task, scene)
 
 
-def test_a_task_of_ones_own_gets_initial_states_of_its_own(tmp_path, monkeypatch):
+def test_a_user_defined_task_gets_initial_states(tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
     task = dataclasses.replace(get_suite("libero_object").tasks[0], suite="mine", name="my_task")
     scene = build_scene(task.problem)
@@ -229,7 +229,7 @@ def test_a_task_of_ones_own_gets_initial_states_of_its_own(tmp_path, monkeypatch
     np.testing.assert_array_equal(load_init_states(task, scene), made)
 
 
-def test_a_batch_tells_the_progress_of_each_atom():
+def test_a_batch_reports_the_progress_of_each_atom():
     env = BatchEnv("libero_10/3", 2, cameras=())
     _, info = env.reset(options={"init_state": [0, 1]})
     drawer = "white_cabinet_1_bottom_region"

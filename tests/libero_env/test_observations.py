@@ -1,4 +1,4 @@
-"""What can be observed: pictures that agree with each other and with the state, and drawing on request only."""
+"""Observations: images agree with each other and with the state, and are rendered only on request."""
 
 import gymnasium
 import numpy as np
@@ -30,7 +30,7 @@ def kitchen():
 
 
 def world_points(env, camera, depth):
-    """Where each pixel's surface is in the world, (H, W, 3), from depth and the camera's figures."""
+    """Return the world position of each pixel's surface, (H, W, 3), from depth and camera parameters."""
     observer = env.world.observer
     rows, cols = np.indices(depth.shape)
     rays = (
@@ -47,7 +47,7 @@ def turned_on(env):
     return state
 
 
-def test_names_give_what_the_table_says(kitchen):
+def test_each_name_gives_the_documented_entries(kitchen):
     seen = kitchen.set_state(kitchen.get_state())
     assert kitchen.observation_space.contains(seen)
     assert seen["agentview_depth"].dtype == np.float32 and seen["agentview_segmentation"].dtype == np.int32
@@ -59,13 +59,13 @@ def test_names_give_what_the_table_says(kitchen):
     few.close()
 
 
-def test_by_default_nothing_has_changed():
+def test_default_observations_are_images_and_proprioception():
     env = LiberoEnv(TASK, camera_size=(8, 8))
     assert list(env.reset(seed=0)[0]) == ["agentview_rgb", "eye_in_hand_rgb", *PROPRIOCEPTION]
     env.close()
 
 
-def test_depth_and_segmentation_place_every_object_where_it_is(kitchen):
+def test_depth_and_segmentation_agree_with_object_positions(kitchen):
     seen = kitchen.render_cameras()
     labels = kitchen.world.observer.labels()
     points = world_points(kitchen, "agentview", seen["agentview_depth"])
@@ -107,7 +107,7 @@ def test_kinds_of_segmentation_agree(kitchen):
         LiberoEnv(TASK, observations=["segmentation_class", "segmentation_element"])
 
 
-def test_poses_seen_from_the_hand_lead_back_to_the_world(kitchen):
+def test_poses_in_the_hand_frame_transform_back_to_the_world(kitchen):
     seen = kitchen.set_state(kitchen.get_state())
     for name in kitchen.world.scene.entities:
         back = quat_rotate(seen["ee_quat"][None], seen[f"{name}_to_ee_pos"][None])[0] + seen["ee_pos"]
@@ -116,7 +116,7 @@ def test_poses_seen_from_the_hand_lead_back_to_the_world(kitchen):
         assert abs(quat @ seen[f"{name}_quat"]) == pytest.approx(1.0)
 
 
-def test_what_glows_is_seen_only_while_it_is_on(kitchen):
+def test_a_glowing_site_is_visible_only_while_turned_on(kitchen):
     before = kitchen.get_state()
     off = kitchen.set_state(before)
     assert not glowing_sites(kitchen.view)
@@ -131,7 +131,7 @@ def test_what_glows_is_seen_only_while_it_is_on(kitchen):
     np.testing.assert_array_equal(again["agentview_rgb"], off["agentview_rgb"])
 
 
-def test_one_and_many_observe_the_same():
+def test_one_simulation_and_many_have_the_same_observations():
     kwargs = {"camera_size": (24, 32), "observations": EVERYTHING, "reward": "staged"}
     batch, env = BatchEnv(STOVE, 2, num_threads=2, **kwargs), LiberoEnv(STOVE, **kwargs)
     moves = np.random.default_rng(1).uniform(-1, 1, (3, 2, 7))
@@ -152,7 +152,7 @@ def test_one_and_many_observe_the_same():
 
 
 @pytest.mark.parametrize("make", [LiberoEnv, lambda *args, **kwargs: BatchEnv(*args, 2, **kwargs)])
-def test_frames_are_drawn_only_when_wanted(make, monkeypatch):
+def test_images_are_rendered_only_on_request(make, monkeypatch):
     env = make(TASK, camera_size=(16, 16))
     drawn = []
     renderer = env.world.observer.renderer
@@ -174,7 +174,7 @@ def test_frames_are_drawn_only_when_wanted(make, monkeypatch):
     env.close()
 
 
-def test_observations_are_the_callers_own():
+def test_observations_are_copies():
     env = LiberoEnv(TASK, camera_size=(8, 8))
     first, _ = env.reset(seed=0)
     copy = {key: value.copy() for key, value in first.items()}
@@ -184,7 +184,7 @@ def test_observations_are_the_callers_own():
     env.close()
 
 
-def test_staged_rewards_rise_towards_the_goal_and_only_success_is_one(kitchen):
+def test_staged_rewards_increase_towards_the_goal_and_only_success_gives_one(kitchen):
     env = LiberoEnv(STOVE, cameras=(), reward="staged", reward_scale=2.0)
     env.reset(seed=0)
     _, reward, *_ = env.step(np.zeros(7))
@@ -206,7 +206,7 @@ def test_staged_rewards_rise_towards_the_goal_and_only_success_is_one(kitchen):
 
 
 @pytest.mark.parametrize("suite", suite_names())
-def test_every_goal_can_be_approached(suite):
+def test_every_goal_has_a_staged_reward(suite):
     for task in get_suite(suite).tasks[:: max(1, len(get_suite(suite)) // 3)]:
         env = LiberoEnv(task, cameras=(), reward="staged", observations=["ee_pos"])
         scene = env.world.scene

@@ -1,4 +1,4 @@
-"""Files of initial states: every original one is read, and none can run anything."""
+"""Files of initial states: all files of the original can be read, and no file can execute code."""
 
 import os
 import pickle
@@ -43,7 +43,7 @@ def test_torch_reads_what_we_write_and_we_what_torch_writes(tmp_path):
 
 
 class Malice:
-    """Makes a folder when unpickled."""
+    """An object that makes a folder when it is unpickled."""
 
     def __init__(self, path):
         self.path = str(path)
@@ -53,7 +53,7 @@ class Malice:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_malice_is_refused(tmp_path, zipped):
+def test_pickles_that_call_functions_are_errors(tmp_path, zipped):
     content = pickle.dumps(Malice(tmp_path / "pwned"), protocol=2)
     file = tmp_path / "evil"
     if zipped:
@@ -61,12 +61,12 @@ def test_malice_is_refused(tmp_path, zipped):
             archive.writestr("evil/data.pkl", content)
     else:
         file.write_bytes(content)
-    with pytest.raises(StateFileError, match=r"evil: the pickle asks for posix.mkdir"):
+    with pytest.raises(StateFileError, match=r"evil: the pickle names posix.mkdir"):
         read_states(file)
     assert not (tmp_path / "pwned").exists()
 
 
-def test_broken_files_are_named(tmp_path):
+def test_errors_name_the_broken_file(tmp_path):
     write_states(tmp_path / "good", np.zeros((3, 4)))
     whole = (tmp_path / "good").read_bytes()
     rng = np.random.default_rng(2)

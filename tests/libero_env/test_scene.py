@@ -1,4 +1,4 @@
-"""Scene, placement, predicates and pictures."""
+"""Scene, placement, predicates and images."""
 
 import json
 
@@ -48,7 +48,7 @@ def test_joints_are_robot_gripper_objects_in_file_order(task):
     assert names[9:] == [f"{name}_joint0" for name in task.problem.objects]
 
 
-def test_the_workspace_has_the_measured_figures(scene, shared):
+def test_the_workspace_has_the_measured_parameters(scene, shared):
     figures = json.loads((shared / "official/workspaces.json").read_text())["libero_floor_manipulation"]
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:9] = figures["arm_qpos"]
@@ -77,7 +77,7 @@ def test_the_workspace_has_the_measured_figures(scene, shared):
         np.testing.assert_allclose(model.actuator_ctrlrange[i], actuator["ctrlrange"])
 
 
-def test_the_scene_is_light(scene):
+def test_the_scene_has_few_faces(scene):
     drawn = scene.model.geom_dataid[(scene.model.geom_group == 1) & (scene.model.geom_dataid >= 0)]
     assert scene.model.mesh_facenum[drawn].sum() < 10_000
 
@@ -123,7 +123,7 @@ def test_unknown_names_in_a_task_list_the_valid_ones(task, view):
         evaluate(Atom("In", ("milk_1", "basket_1_contian_region")), view)
 
 
-def test_predicates_are_those_of_the_recordings(scene, shared):
+def test_predicates_agree_with_recordings_of_the_original(scene, shared):
     """Regions agree exactly; objects on objects need contact, and builtin shapes touch a little differently."""
     with np.load(shared / "parity/libero_object-00-predicates.npz") as z:
         qpos, truth, atoms = z["qpos"], z["truth"], json.loads(str(z["atoms"]))
@@ -144,7 +144,7 @@ def test_predicates_are_those_of_the_recordings(scene, shared):
     assert wrong["contact"] <= 0.001 * checked
 
 
-def test_predicates_do_not_touch_the_state(view, task):
+def test_predicates_do_not_change_the_state(view, task):
     before = view.simulations.get_state(0)
     evaluate(task.problem.goal, view)
     view.body_pos("milk_1")[:] = 9.0
@@ -152,7 +152,7 @@ def test_predicates_do_not_touch_the_state(view, task):
     np.testing.assert_array_equal(view.simulations.get_state(0), before)
 
 
-def test_goals_combine(view):
+def test_goals_can_be_nested(view):
     yes, no = (
         Atom("In", ("milk_1", "floor_other_object_region_2")),
         Atom("In", ("milk_1", "basket_1_contain_region")),
@@ -166,7 +166,7 @@ def test_goals_combine(view):
     assert not evaluate(ForAll((("?x", "milk"),), body), view)
 
 
-def test_pictures_are_upright_and_repeat():
+def test_images_are_upright_and_reproducible():
     env = LiberoEnv("libero_object/0", camera_size=(64, 64))
     frame = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
     again = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
@@ -180,7 +180,7 @@ def test_pictures_are_upright_and_repeat():
 
 
 def test_contexts_are_freed():
-    """Opening and closing again and again keeps memory where it is."""
+    """Memory does not grow when environments are opened and closed repeatedly."""
     import resource
 
     def cycle(times):
@@ -195,7 +195,7 @@ def test_contexts_are_freed():
     assert cycle(12) - before < 60_000  # kB
 
 
-def test_frames_too_large_and_backends_unknown_are_named(scene, monkeypatch):
+def test_too_large_images_and_unknown_backends_are_errors(scene, monkeypatch):
     with pytest.raises(RenderError, match="1024"):
         Renderer(scene.model, 2000, 64)
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
@@ -203,7 +203,7 @@ def test_frames_too_large_and_backends_unknown_are_named(scene, monkeypatch):
         open_context(8, 8)
 
 
-def test_no_gl_says_what_to_install(monkeypatch):
+def test_without_opengl_the_error_names_what_to_install(monkeypatch):
     import importlib
 
     def fail(name):

@@ -1,4 +1,4 @@
-"""Motion: the original's recordings, and the same bits however the simulations are run."""
+"""Motion agrees with recordings of the original, and has the same bits in one simulation and in many."""
 
 import json
 
@@ -35,7 +35,7 @@ def actions(num, steps, seed=0):
 
 
 @pytest.mark.parametrize("recording", ["libero_object-00-random", "libero_object-03-grasp"])
-def test_free_motion_is_that_of_the_recordings(shared, recording):
+def test_free_motion_agrees_with_recordings_of_the_original(shared, recording):
     with np.load(shared / "parity" / f"{recording}.npz") as z:
         states, commands, touch = z["states"], z["actions"], z["robot_contact"]
         task = get_task(f"libero_object/{int(z['task_id'])}")
@@ -79,7 +79,7 @@ def test_a_batch_gives_the_bits_of_single_simulations(scene, num, threads):
 
 
 @pytest.mark.parametrize("kind", [LoopSimulations, BatchSimulations])
-def test_a_restored_state_goes_on_to_the_same_bits(scene, kind):
+def test_a_restored_state_continues_to_the_same_bits(scene, kind):
     simulations = kind(scene.model, 2)
     simulations.reset(range(2), *start(scene, 2))
     commands = actions(2, 24)
@@ -131,7 +131,7 @@ def test_the_gripper_opens_at_minus_one_and_closes_at_plus_one(scene):
     assert widths[1] < 0.005
 
 
-def test_the_mass_matrix_block_is_that_of_mujoco(scene):
+def test_the_block_of_the_mass_matrix_agrees_with_mujoco(scene):
     import mujoco
 
     data = mujoco.MjData(scene.model)
@@ -149,6 +149,6 @@ def test_the_mass_matrix_block_is_that_of_mujoco(scene):
 @pytest.mark.parametrize(
     "bad", [np.zeros(6), np.zeros((1, 7)), [0, 0, 0, np.nan, 0, 0, 0], [0, 0, 0, 0, 0, 0, np.inf], "up", None]
 )
-def test_bad_actions_are_named(bad):
+def test_invalid_actions_are_errors(bad):
     with pytest.raises(ActionError):
         checked_actions(bad)

@@ -1,4 +1,4 @@
-"""Environments in processes of their own: the same results, and what happens when a worker fails."""
+"""Environments in worker processes: the same results, and recovery when a worker fails."""
 
 import multiprocessing as mp
 import os
@@ -14,7 +14,7 @@ from libero_env.errors import ActionError, LiberoError
 
 
 def counter(fault="", at=3, size=2):
-    """Makes an environment that counts its steps and, at one of them, misbehaves."""
+    """Factory of an environment that counts its steps and fails at one of them."""
 
     def make():
         import gymnasium
@@ -100,7 +100,7 @@ def test_workers_give_the_results_of_single_environments(envs):
 
 
 @pytest.mark.unit
-def test_finished_environments_stand_still_until_reset(envs):
+def test_finished_environments_do_not_move_until_reset(envs):
     env = envs([counter(), counter()])
     env.reset()
     for _ in range(3):
@@ -121,7 +121,7 @@ def test_finished_environments_stand_still_until_reset(envs):
 @pytest.mark.parametrize(
     ("fault", "says"), [("die", "exit code 3"), ("hang", "no answer within 1 s"), ("raise", "a step too far")]
 )
-def test_the_others_go_on_when_a_worker_fails(envs, fault, says):
+def test_the_others_continue_when_a_worker_fails(envs, fault, says):
     env = envs([counter(), counter(fault), counter()])
     env.reset()
     env.step(np.zeros((3, 2)))
@@ -157,7 +157,7 @@ def test_a_worker_killed_from_outside_is_replaced(envs):
 
 
 @pytest.mark.unit
-def test_entries_of_different_shape_come_apart(envs):
+def test_entries_of_different_shapes_are_in_the_info(envs):
     env = envs([counter(size=2), counter(size=3)])
     seen, info = env.reset()
     assert list(seen) == ["count"] and env.observation_space.contains(seen)
@@ -165,7 +165,7 @@ def test_entries_of_different_shape_come_apart(envs):
 
 
 @pytest.mark.unit
-def test_what_cannot_be_made_says_so():
+def test_environments_that_cannot_be_made_are_errors():
     def broken():
         raise RuntimeError("no such thing")
 
@@ -178,7 +178,7 @@ def test_what_cannot_be_made_says_so():
 
 
 @pytest.mark.unit
-def test_nothing_is_left_behind():
+def test_no_process_and_no_memory_is_left():
     processes, memory = set(mp.active_children()), blocks()
     env = SubprocEnv([counter(), counter("hang", at=1)], timeout=1.0)
     env.reset()
