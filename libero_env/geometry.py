@@ -28,6 +28,14 @@ class Pose:
         """Transform a point (3,) from the world to the frame."""
         return self.mat.T @ (point_world - self.pos)
 
+    def to_world(self, pose: "Pose") -> "Pose":
+        """Transform a pose from the frame to the world."""
+        return Pose(self.mat @ pose.pos + self.pos, self.mat @ pose.mat)
+
+    def to_local(self, pose: "Pose") -> "Pose":
+        """Transform a pose from the world to the frame."""
+        return Pose(self.invert(pose.pos), self.mat.T @ pose.mat)
+
 
 def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -> np.ndarray:
     """Return points on the collision geoms of a body and its descendants.
@@ -196,3 +204,16 @@ def rotation_between(mat: np.ndarray, goal_mat: np.ndarray) -> np.ndarray:
     mujoco.mju_mat2Quat(quat, (goal_mat @ mat.T).ravel())
     mujoco.mju_quat2Vel(rotation, quat, 1.0)
     return rotation
+
+
+def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the rotation (3, 3) by an angle, rad, about a unit axis (3,), by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def rotation_about_z(angle: float) -> np.ndarray:
+    """Return the rotation (3, 3) by an angle, rad, about the vertical."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

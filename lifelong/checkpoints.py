@@ -1,7 +1,7 @@
 """Checkpoints: nested dictionaries of tensors and plain values, in one safetensors file.
 
-The tensors are stored under their path in the tree; everything else is JSON in the file's header. Nothing is
-executed on load, and a file is either complete or not there at all.
+Tensors are stored under their path in the tree; everything else is JSON in the file's header. Nothing is executed on
+load, and a file is either complete or does not exist.
 """
 
 import json
@@ -21,15 +21,15 @@ _FORMAT = "lifelong-1"
 
 
 def save(path: Path, tree: dict[str, Any]) -> None:
-    """Write a tree to a file, replacing an older one in a single step.
+    """Write a tree to a file, which replaces an older one in one step.
 
     Args:
-        path: Where to; the folder is made if need be.
-        tree: Dictionaries (keys str or int), lists and tuples with tensors, str, int, float, bool or None as
-            leaves.
+        path: File to write; its folder is created.
+        tree: Nested dictionaries (with keys of type str or int), lists and tuples. Leaves are tensors, str, int,
+            float, bool or None.
 
     Raises:
-        CheckpointError: A leaf of another kind, or the disk is full.
+        CheckpointError: A leaf is of another type, or the file cannot be written.
     """
     tensors: dict[str, Tensor] = {}
     plain = _encode(tree, "", tensors)
@@ -38,15 +38,19 @@ def save(path: Path, tree: dict[str, Any]) -> None:
         with atomic_path(path) as temporary:
             save_file(tensors, temporary, metadata={"format": _FORMAT, "tree": json.dumps(plain)})
     except (OSError, SafetensorError) as error:
-        message = f"cannot write {path}: {error}. Free some space; the older file is intact"
+        message = f"cannot write {path}: {error}. Free some space; an older file is intact"
         raise CheckpointError(message) from error
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """The tree a file holds.
+    """Return the tree in a file.
+
+    Args:
+        path: File to read.
+        device: Device of the tensors.
 
     Raises:
-        CheckpointError: The file is missing, truncated, or not one of ours.
+        CheckpointError: The file is missing, truncated, or was not written by `save`.
     """
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
@@ -62,27 +66,32 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         return _decode(json.loads(metadata["tree"]), tensors)
     except (OSError, SafetensorError, KeyError, json.JSONDecodeError) as error:
         raise CheckpointError(
-            f"{path} is broken ({error}). Delete it: the run goes on from what was saved before"
+            f"{path} is broken ({error}). Delete it: the run resumes from the checkpoint before it"
         ) from error
 
 
 def load_weights(module: torch.nn.Module, state: dict[str, Tensor], source: Path | str) -> None:
-    """Put weights into a module.
+    """Load weights into a module.
+
+    Args:
+        module: Module to load into.
+        state: Weights by name.
+        source: Where they come from, for error messages.
 
     Raises:
-        CheckpointError: Names or shapes differ; the message names the first of them. The module is untouched.
+        CheckpointError: Names or shapes differ; the message names the first difference. The module is unchanged.
     """
     own = module.state_dict()
     for name, tensor in own.items():
         if name not in state:
-            raise CheckpointError(f"{source} has no {name}: it was made with another policy configuration")
+            raise CheckpointError(f"{source} has no {name}: it was written with another policy configuration")
         if state[name].shape != tensor.shape:
             raise CheckpointError(
-                f"{source}: {name} has shape {tuple(state[name].shape)}, the policy's {tuple(tensor.shape)}"
+                f"{source}: {name} has shape {tuple(state[name].shape)}; the policy expects {tuple(tensor.shape)}"
             )
     extra = sorted(set(state) - set(own))
     if extra:
-        raise CheckpointError(f"{source} has {extra[0]}, which the policy has not")
+        raise CheckpointError(f"{source} has {extra[0]}, which the policy does not have")
     module.load_state_dict(state)
 
 

@@ -1,35 +1,35 @@
-"""Every error this package raises on purpose derives from `LifelongError`."""
+"""Errors of the learning side; all derive from `LifelongError`."""
 
 from libero_env.errors import LiberoError
 
 
 class LifelongError(LiberoError):
-    """Root of the learning side's errors: the message says what is wrong, where, and how to mend it."""
+    """Base class of the errors of this package; the message states what is wrong, where, and how to fix it."""
 
 
 class ConfigError(LifelongError, ValueError):
-    """A configuration that cannot be run, or that is not the one a run directory was made with."""
+    """Raised for a configuration that is invalid, or differs from the one of the run directory."""
 
 
 class CheckpointError(LifelongError, ValueError):
-    """A checkpoint that is missing, broken, or does not fit the model it is loaded into."""
+    """Raised for a checkpoint that is missing, broken, or does not fit the model."""
 
 
 class TrainingError(LifelongError, RuntimeError):
-    """Training that cannot go on: the loss is not finite, the dataset is empty."""
+    """Raised when training cannot continue: the loss is not finite, or the dataset is empty."""
 
 
 class LanguageError(LifelongError, ValueError):
-    """An instruction that cannot be embedded; the message names the remedy."""
+    """Raised when an instruction cannot be embedded; the message states the remedy."""
 
 
 class DataError(LifelongError, ValueError):
-    """Demonstrations that do not fit the policy's spec; the message names file, key, and what was expected."""
+    """Raised for demonstrations that do not fit the policy's spec; the message names file, key and expected value."""
 
 
 class PolicyError(LifelongError, ValueError):
-    """A policy built or used in a way it cannot work; the message says what would be valid."""
+    """Raised when a policy is built or used in an invalid way; the message states what is valid."""
 
 
 class ResultsError(LifelongError):
-    """Results that cannot be read or written; the message names the file and what is missing."""
+    """Raised when results cannot be read or written; the message names the file and what is missing."""

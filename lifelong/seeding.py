@@ -1,4 +1,4 @@
-"""Random generators from lists of whole numbers; the global generators stay as they are."""
+"""Random generators from lists of integers; the global generators are left unchanged."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -8,18 +8,19 @@ import torch
 
 
 def generator(*seed: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A torch generator for a list of whole numbers."""
-    return torch.Generator(device).manual_seed(_word(seed))
+    """Return a generator that is seeded with a list of integers."""
+    return torch.Generator(device).manual_seed(_to_word(seed))
 
 
 @contextmanager
 def seeded(*seed: int, device: torch.device | str = "cpu") -> Iterator[None]:
-    """Within the context, torch's global generators start from a seed; afterwards they are as before."""
+    """Seed torch's global generators with a list of integers; restore them when the context ends."""
     device = torch.device(device)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        torch.manual_seed(_word(seed))
+        torch.manual_seed(_to_word(seed))
         yield
 
 
-def _word(seed: Sequence[int]) -> int:
+def _to_word(seed: Sequence[int]) -> int:
+    """Return a seed of 63 bits; lists that differ give independent seeds."""
     return int(np.random.SeedSequence(list(seed)).generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm, JoinedWindows, WindowDataset
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import JoinedWindows, WindowDataset, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from lifelong.types import Batch
@@ -122,26 +123,6 @@ class StageWindows(JoinedWindows):
         batch = batch.rows(places.to(batch.window_ids.device))
         task_ids = torch.full_like(batch.task_ids, self.task_id)
         return replace(batch, task_ids=task_ids, window_ids=indices.to(batch.window_ids))
-
-
-@dataclass(frozen=True, eq=False)
-class WindowSubset:
-    """A subset of a dataset's windows.
-
-    Attributes:
-        dataset: Dataset of the windows.
-        chosen: (n,) int64 indices of the windows in it.
-    """
-
-    dataset: WindowDataset
-    chosen: Tensor
-
-    def __len__(self) -> int:
-        return len(self.chosen)
-
-    def batch(self, indices: Tensor) -> Batch:
-        """Return the windows with these indices ((B,) int64 in [0, n)) as one batch."""
-        return self.dataset.batch(self.chosen[indices])
 
 
 @dataclass(frozen=True)

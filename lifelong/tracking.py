@@ -1,4 +1,4 @@
-"""Optional mirror of a run's numbers to Weights & Biases."""
+"""Optional copy of a run's metrics on Weights & Biases."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -7,9 +7,16 @@ from lifelong.errors import ConfigError, LifelongError
 
 
 class Tracker:
-    """Sends numbers to W&B; does nothing where `mode` is `disabled`.
+    """Logs metrics to Weights & Biases (W&B).
 
-    `offline` writes beside the run and needs no login; `wandb sync` uploads it later.
+    Args:
+        mode: `disabled` does nothing. `offline` writes into the run directory without a login; `wandb sync` uploads
+            it later. `online` uploads at once.
+        project: W&B project.
+        entity: W&B user or team; None for the default of the login.
+
+    Raises:
+        ConfigError: The mode is unknown.
     """
 
     def __init__(
@@ -25,10 +32,15 @@ class Tracker:
         self._run: Any = None
 
     def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
-        """Begin a run, or go on with the one of the same name.
+        """Start a run, or resume the run of the same name.
+
+        Args:
+            name: Name of the run.
+            directory: Folder for the files of W&B.
+            config: Configuration of the run.
 
         Raises:
-            LifelongError: The package wandb is not there, or refuses to start.
+            LifelongError: The package wandb is not installed, or W&B does not start.
         """
         if self.mode == "disabled":
             return
@@ -51,16 +63,16 @@ class Tracker:
             )
         except (wandb.Error, OSError) as error:
             raise LifelongError(
-                f"W&B does not start ({error}); `wandb login`, or wandb.mode=offline"
+                f"W&B does not start ({error}); log in with `wandb login`, or set wandb.mode=offline"
             ) from error
 
     def log(self, values: Mapping[str, float]) -> None:
-        """Send numbers."""
+        """Log metrics by name."""
         if self._run is not None:
             self._run.log(dict(values))
 
     def finish(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Send what the run came to, and end it."""
+        """Log the summary of the run, and end it."""
         if self._run is not None:
             self._run.summary.update(dict(summary or {}))
             self._run.finish()

@@ -1,6 +1,6 @@
-"""The values that travel between the parts of the learning side.
+"""The values that are passed between the parts of the learning side.
 
-Shape legend: B batch, T time, V views, H W C image, A action, L language embedding, K tasks.
+Shape legend: B batch, T time, V views, H W C image, A action, D size of a reading, L language embedding.
 """
 
 from collections.abc import Mapping
@@ -12,13 +12,20 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """What a policy sees and does; enough to build one and to make fake data for it."""
+    """Inputs and outputs of a policy; enough to build one and to make fake data for it.
+
+    Attributes:
+        views: Names of the images.
+        image_size: (H, W), pixels.
+        proprio: Names of the proprioceptive readings, with their sizes, in order.
+        action_dim: Number of entries of an action, A.
+        language_dim: Size of the embedding of an instruction, L.
+        seq_len: Number of steps in a window of training data, T.
+    """
 
     views: tuple[str, ...] = ("agentview_rgb", "eye_in_hand_rgb")
     image_size: tuple[int, int] = (128, 128)
-    proprio: Mapping[str, int] = field(  # name -> dimension, in order
-        default_factory=lambda: {"joint_states": 7, "gripper_states": 2}
-    )
+    proprio: Mapping[str, int] = field(default_factory=lambda: {"joint_states": 7, "gripper_states": 2})
     action_dim: int = 7
     language_dim: int = 384
     seq_len: int = 10
@@ -26,27 +33,40 @@ class PolicySpec:
 
 @dataclass(frozen=True)
 class Observation:
-    """What the policy sees: a window of frames (or T = 1 when acting)."""
+    """What a policy sees: a window of frames, or T = 1 when it acts.
 
-    images: Tensor  # (B, T, V, H, W, C) uint8, upright
-    proprio: Mapping[str, Tensor]  # name -> (B, T, D) float32
-    language: Tensor  # (B, L) float32
+    Attributes:
+        images: (B, T, V, H, W, C) uint8, upright.
+        proprio: Name to (B, T, D) float32.
+        language: Embedding of the instruction, (B, L) float32.
+    """
+
+    images: Tensor
+    proprio: Mapping[str, Tensor]
+    language: Tensor
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Windows of demonstrations, as the loss takes them."""
+    """Windows of demonstrations, as the loss takes them.
+
+    Attributes:
+        observation: What the policy sees.
+        actions: What it should do, (B, T, A) float32.
+        task_ids: Position of each window's task in the task sequence, (B,) int64.
+        window_ids: Index of each window in its task's dataset, (B,) int64.
+    """
 
     observation: Observation
-    actions: Tensor  # (B, T, A) float32
-    task_ids: Tensor  # (B,) int64, position in the task sequence
-    window_ids: Tensor  # (B,) int64, index of the window in its task's dataset
+    actions: Tensor
+    task_ids: Tensor
+    window_ids: Tensor
 
     def __len__(self) -> int:
         return self.actions.shape[0]
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The same batch on another device."""
+        """Return the batch on another device."""
         move = lambda x: x.to(device, non_blocking=True)  # noqa: E731
         obs = self.observation
         moved = Observation(
@@ -55,13 +75,13 @@ class Batch:
         return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids))
 
     def rows(self, rows: slice | Tensor) -> "Batch":
-        """Some of the windows: of a slice as views, of indices as copies in their order."""
+        """Return some of the windows: those of a slice as views, those of indices as copies in the given order."""
         obs = self.observation
         part = Observation(obs.images[rows], {k: v[rows] for k, v in obs.proprio.items()}, obs.language[rows])
         return Batch(part, self.actions[rows], self.task_ids[rows], self.window_ids[rows])
 
     def join(self, other: "Batch") -> "Batch":
-        """This batch followed by another, on the batch axis."""
+        """Return this batch followed by another one."""
         a, b = self.observation, other.observation
         joined = Observation(
             torch.cat([a.images, b.images]),

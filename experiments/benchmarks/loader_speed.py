@@ -45,7 +45,7 @@ def write_noise(path: Path, demos: int, steps: int) -> Path:
             group["actions"] = rng.uniform(-1, 1, (steps, SPEC.action_dim))
             for view in SPEC.views:
                 group[f"obs/{view}"] = rng.integers(0, 256, (steps, *SPEC.image_size, 3), dtype=np.uint8)
-            for key, size in (SPEC.proprio or {}).items():
+            for key, size in SPEC.proprio.items():
                 group[f"obs/{key}"] = rng.normal(size=(steps, size))
     return path
 
@@ -91,7 +91,7 @@ def measure_here(path: Path, repeats: int) -> list[Row]:
 
 def measure_robomimic(python: str, path: Path, repeats: int) -> list[Row]:
     """robomimic's dataset, by another interpreter; no rows where that has none."""
-    keys = [json.dumps(list(names)) for names in (SPEC.views, SPEC.proprio or ())]
+    keys = [json.dumps(list(names)) for names in (SPEC.views, SPEC.proprio)]
     command = [python, str(WORKER), str(path), *keys, str(SPEC.seq_len), str(BATCH), str(repeats)]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     if done.returncode:

@@ -5,7 +5,7 @@ Shape legend: T time, C H W image, D dimension of a proprioceptive input, A acti
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -99,8 +99,8 @@ def get_dataset(
     filter_key: str | None = None,
     hdf5_cache_mode: str | None = "low_dim",
     *,
-    pairing: str = "stored",
-    labels: str = "expert",
+    pairing: Literal["stored", "aligned"] = "stored",
+    labels: Literal["expert", "executed"] = "expert",
 ) -> tuple[SequenceDataset, dict[str, Any]]:
     """Read the windows of a demonstration file.
 
@@ -168,7 +168,13 @@ def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
         return {key: tuple(obs[key].shape[1:]) for key in keys}
 
 
-def _read(path: Path, spec: PolicySpec, filter_key: str | None, pairing: str, labels: str) -> Windows:
+def _read(
+    path: Path,
+    spec: PolicySpec,
+    filter_key: str | None,
+    pairing: Literal["stored", "aligned"],
+    labels: Literal["expert", "executed"],
+) -> Windows:
     language = torch.zeros(1)
     if filter_key is None:
         return Windows.from_file(path, spec=spec, language=language, pairing=pairing, labels=labels)
@@ -177,7 +183,7 @@ def _read(path: Path, spec: PolicySpec, filter_key: str | None, pairing: str, la
             known = ", ".join(handle.get("mask", {})) or "none"
             raise DemoError(f"{path}: no subset {filter_key!r}; there is {known}")
         names = {name.decode() for name in handle["mask"][filter_key][()]}
-    keys = [*spec.views, *(spec.proprio or ())]
-    demos = read_demos(path, keys, pairing=pairing, labels=labels)  # type: ignore[arg-type]
+    keys = [*spec.views, *spec.proprio]
+    demos = read_demos(path, keys, pairing=pairing, labels=labels)
     kept = [demo for demo in demos if demo.name in names]
     return Windows.from_demos(kept, spec=spec, language=language, source=str(path))

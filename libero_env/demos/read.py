@@ -229,8 +229,8 @@ def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]
     for key in obs_keys:
         dataset = _dataset(group, f"obs/{key}", file, name)
         if is_image(key):
-            shape, kinds = _image_shape(key, steps, dataset.ndim), _image_kinds(key)
-            _check_shape(dataset, f"obs/{key}", file, name, shape, kinds)
+            image_shape = _image_shape(key, steps, dataset.ndim)
+            _check_shape(dataset, f"obs/{key}", file, name, image_shape, _image_kinds(key))
         else:
             _check_shape(dataset, f"obs/{key}", file, name, (steps, LOW_DIM_KEYS.get(key)), "f")
 

@@ -1,4 +1,7 @@
-"""The scripted expert that makes demonstrations: a goal becomes skills, skills become actions."""
+"""The scripted expert that makes demonstrations: a goal becomes skills, skills become actions.
+
+The names below are loaded when they are first used.
+"""
 
 import lazy_loader
 

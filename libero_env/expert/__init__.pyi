@@ -1,13 +1,18 @@
 from .expert import Expert
 from .planning.goal_plan import UnsupportedGoalError, plan_goal
+from .rollout import Attempt, run_experts
 from .shapes import Shapes
+from .skills.skill import Skill
 from .variation import ActionNoise, MotionStyle
 
 __all__ = [
     "ActionNoise",
+    "Attempt",
     "Expert",
-    "Shapes",
     "MotionStyle",
+    "Shapes",
+    "Skill",
     "UnsupportedGoalError",
     "plan_goal",
+    "run_experts",
 ]

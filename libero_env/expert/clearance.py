@@ -1,182 +1,208 @@
-"""What is in the way: voxels of the scene, the volume of the hand, and how high things reach."""
+"""Collision checks: voxels of the scene, points on the hand, and the height of obstacles on a path."""
 
 import numpy as np
 from numba import njit
 
-from libero_env.expert.arm.gripper import (
-    FINGER_HALF_WIDTH,
-    FINGER_THICKNESS,
-    HAND_HALF_LENGTH,
-    HAND_HALF_WIDTH,
-    MAX_OPENING,
-    PALM_ABOVE,
-    TIP_BELOW,
-)
+from libero_env.expert.arm.gripper import GRIPPER
 
-_CELL, _COARSE = 0.006, 0.012  # m, for what stands close to others, and for the hand
-_WALL = 0.01  # m, between points of what stands and does not hang
-_HALF = np.array([0.75, 0.9, 0.5])  # m, of the space that is looked at
+_CELL, _COARSE_CELL = 0.006, 0.012  # [m] voxels for objects, and for the hand
+_WALL_HEIGHT = 0.01  # [m] between the lowest points of what stands on a surface; more is an overhang
+_HALF_SIZE = np.array([0.75, 0.9, 0.5])  # [m] of the space that is covered
 
 
 class Voxels:
-    """Occupied cells, from points on surfaces; below the floor everything is occupied."""
+    """Occupied cells of a scene. Everything below the table's surface is occupied.
 
-    def __init__(self, points: np.ndarray, floor: float, centre: np.ndarray):
-        self.points, self.floor = points, floor
-        self._low = np.array([*centre[:2], floor + _HALF[2] - 0.05]) - _HALF
-        self._shape = np.ceil(2 * _HALF / _CELL).astype(int)
-        self._full = np.zeros(self._shape, bool)
+    Args:
+        points: Points on the surfaces of objects and fixtures, (N, 3), [m].
+        surface_height: Height of the table, [m].
+        centre: Middle of the space that is covered, (3,); only x and y count.
+    """
+
+    def __init__(self, points: np.ndarray, surface_height: float, centre: np.ndarray):
+        self.points, self.surface_height = points, surface_height
+        self._low = np.array([*centre[:2], surface_height + _HALF_SIZE[2] - 0.05]) - _HALF_SIZE
+        self._shape = np.ceil(2 * _HALF_SIZE / _CELL).astype(int)
+        self._occupied = np.zeros(self._shape, bool)
         cells, inside = self._cells(points)
-        self._full[tuple(cells[inside].T)] = True
+        self._occupied[tuple(cells[inside].T)] = True
         self._coarse = np.zeros(self._shape // 2 + 1, bool)
         self._coarse[tuple(cells[inside].T // 2)] = True
-        self._tops: dict[float, np.ndarray] = {}  # heights by what lies below
-        self._roofs: dict[float, np.ndarray] = {}  # and by what lies above
+        self._tops: dict[float, np.ndarray] = {}  # height limit -> highest points below it, for each column
+        self._undersides: dict[float, np.ndarray] = {}  # height limit -> lowest points above it
 
-    def hits(self, points: np.ndarray) -> np.ndarray:
-        """How many of the points (..., N, 3) lie in something, (...)."""
+    def count_occupied(self, points: np.ndarray) -> np.ndarray:
+        """Return how many of the points (..., N, 3) are in occupied cells, (...)."""
         cells, inside = self._cells(points)
         cells = np.where(inside[..., None], cells, 0)
-        full = self._full[cells[..., 0], cells[..., 1], cells[..., 2]] & inside
-        return (full | (points[..., 2] < self.floor)).sum(axis=-1)
+        occupied = self._occupied[cells[..., 0], cells[..., 1], cells[..., 2]] & inside
+        return (occupied | (points[..., 2] < self.surface_height)).sum(axis=-1)
 
-    def touched(self, hand: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-        """How many of a hand's points (N, 3), a centimetre apart, come near something; at P poses, (P,)."""
-        low = self._low + np.zeros(3)
-        return _touched(self._coarse, low, self.floor, hand, pos, np.ascontiguousarray(mat))
-
-    def drop(self, profile: np.ndarray, xy: np.ndarray, below: float) -> np.ndarray:
-        """Height at which a body's origin comes to stand, over each of the spots xy (S, 2); (S,).
+    def count_hand_collisions(self, hand: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+        """Return how many of a hand's points collide at each of P poses, (P,).
 
         Args:
-            profile: points of the underside relative to the origin, (N, 3).
-            xy: spots.
-            below: only what lies lower than this carries, m.
+            hand: Points on the hand in the frame of the grip site, about 1 cm apart, (N, 3).
+            pos: Positions of the grip site, (P, 3).
+            mat: Orientations of the grip site, (P, 3, 3).
         """
-        heights = self._heights(below)
+        low = self._low + np.zeros(3)
+        return _count_hand_collisions(
+            self._coarse, low, self.surface_height, hand, pos, np.ascontiguousarray(mat)
+        )
+
+    def resting_heights(self, profile: np.ndarray, xy: np.ndarray, below: float) -> np.ndarray:
+        """Return the heights at which the origin of a body comes to rest over each spot, (S,).
+
+        Args:
+            profile: Points of the body's underside relative to its origin, (N, 3).
+            xy: Spots, (S, 2).
+            below: Height above which nothing supports the body, [m].
+        """
+        heights = self._top_heights(below)
         where = xy[:, None] + profile[None, :, :2]  # (S, N, 2)
         cells = np.clip(((where - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
         return (heights[cells[..., 0], cells[..., 1]] - profile[:, 2]).max(axis=1)
 
-    def overhead(self, profile: np.ndarray, origins: np.ndarray, above: float) -> np.ndarray:
-        """Share of a body's columns that reach into what hangs over them, for origins (S, 3); (S,).
+    def overhang_overlap(self, profile: np.ndarray, origins: np.ndarray, above: float) -> np.ndarray:
+        """Return the share of a body's columns that reach into an overhang, (S,).
 
         Args:
-            profile: points of the upper side relative to the origin, (N, 3).
-            origins: where the body's origin is.
-            above: what lies higher than this hangs, m.
+            profile: Points of the body's upper side relative to its origin, (N, 3).
+            origins: Positions of the body's origin, (S, 3).
+            above: Height from which on something counts as an overhang, [m].
         """
-        if above not in self._roofs:
+        if above not in self._undersides:
             cells, inside = self._cells(self.points)
             keep = inside & (self.points[:, 2] >= above)
             heights = np.full(self._shape[:2], np.inf)
             np.minimum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
-            heights[heights < above + _WALL] = np.inf  # a wall that stands there
-            self._roofs[above] = heights
+            heights[heights < above + _WALL_HEIGHT] = np.inf  # a wall that stands there
+            self._undersides[above] = heights
         where = origins[:, None] + profile
         cells = np.clip(((where[..., :2] - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
-        return (self._roofs[above][cells[..., 0], cells[..., 1]] < where[..., 2]).mean(axis=1)
+        return (self._undersides[above][cells[..., 0], cells[..., 1]] < where[..., 2]).mean(axis=1)
 
-    def roofed(self, points: np.ndarray) -> np.ndarray:
-        """Which of the points (..., 3) have something over them, (...) bool."""
+    def is_covered(self, points: np.ndarray) -> np.ndarray:
+        """Return which of the points (..., 3) have something above them, (...) bool."""
         cells = np.clip(np.floor((points - self._low) / _CELL).astype(int), 0, self._shape - 1)
-        return self._heights(np.inf)[cells[..., 0], cells[..., 1]] > points[..., 2] + 2 * _CELL
+        return self._top_heights(np.inf)[cells[..., 0], cells[..., 1]] > points[..., 2] + 2 * _CELL
 
-    def _heights(self, below: float) -> np.ndarray:
+    def _top_heights(self, below: float) -> np.ndarray:
+        """Return the height of the highest point below a limit in each column, (X, Y)."""
         if below not in self._tops:
             cells, inside = self._cells(self.points)
             keep = inside & (self.points[:, 2] < below)
-            heights = np.full(self._shape[:2], self.floor)
+            heights = np.full(self._shape[:2], self.surface_height)
             np.maximum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
             self._tops[below] = heights
         return self._tops[below]
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cells of points, and which of the points are inside the space."""
         cells = np.floor((points - self._low) / _CELL).astype(int)
         return cells, ((cells >= 0) & (cells < self._shape)).all(axis=-1)
 
 
 @njit(cache=True, nogil=True)
-def _touched(
-    full: np.ndarray, low: np.ndarray, floor: float, points: np.ndarray, pos: np.ndarray, mat: np.ndarray
+def _count_hand_collisions(
+    occupied: np.ndarray,
+    low: np.ndarray,
+    surface_height: float,
+    hand: np.ndarray,
+    pos: np.ndarray,
+    mat: np.ndarray,
 ) -> np.ndarray:
-    found = np.zeros(len(pos), np.int64)
-    nx, ny, nz = full.shape
+    counts = np.zeros(len(pos), np.int64)
+    nx, ny, nz = occupied.shape
     for p in range(len(pos)):
         m, o = mat[p], pos[p]
-        for i in range(len(points)):
-            a, b, c = points[i]
+        for i in range(len(hand)):
+            a, b, c = hand[i]
             z = o[2] + m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
-            if z < floor:
-                found[p] += 1
+            if z < surface_height:
+                counts[p] += 1
                 continue
-            x = int(np.floor((o[0] + m[0, 0] * a + m[0, 1] * b + m[0, 2] * c - low[0]) / _COARSE))
-            y = int(np.floor((o[1] + m[1, 0] * a + m[1, 1] * b + m[1, 2] * c - low[1]) / _COARSE))
-            k = int(np.floor((z - low[2]) / _COARSE))
-            if 0 <= x < nx and 0 <= y < ny and 0 <= k < nz and full[x, y, k]:
-                found[p] += 1
-    return found
+            x = int(np.floor((o[0] + m[0, 0] * a + m[0, 1] * b + m[0, 2] * c - low[0]) / _COARSE_CELL))
+            y = int(np.floor((o[1] + m[1, 0] * a + m[1, 1] * b + m[1, 2] * c - low[1]) / _COARSE_CELL))
+            k = int(np.floor((z - low[2]) / _COARSE_CELL))
+            if 0 <= x < nx and 0 <= y < ny and 0 <= k < nz and occupied[x, y, k]:
+                counts[p] += 1
+    return counts
 
 
-def underside(points: np.ndarray) -> np.ndarray:
-    """The lowest point in each cell of the ground plan; (N, 3) -> (M, 3)."""
+def lower_surface(points: np.ndarray) -> np.ndarray:
+    """Return the lowest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
     order = points[np.argsort(points[:, 2])]
     x, y = np.floor(order[:, :2] / _CELL).astype(int).T
     _, first = np.unique((x << 32) + y, return_index=True)  # one number for a cell: far faster than rows
     return order[first]
 
 
-def upper_side(points: np.ndarray) -> np.ndarray:
-    """The highest point in each cell of the ground plan; (N, 3) -> (M, 3)."""
-    return underside(points * [1, 1, -1]) * [1, 1, -1]
+def upper_surface(points: np.ndarray) -> np.ndarray:
+    """Return the highest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
+    return lower_surface(points * [1, 1, -1]) * [1, 1, -1]
 
 
-def hand_points(opening: float = MAX_OPENING) -> np.ndarray:
-    """Points in and on fingers, hand and wrist, in the frame of the grip site, (N, 3), m."""
-    inner, outer = 0.5 * opening, 0.5 * opening + FINGER_THICKNESS
-    finger = _block((inner + 0.002, outer), (-FINGER_HALF_WIDTH, FINGER_HALF_WIDTH), (-0.044, TIP_BELOW))
+def hand_points(opening: float = GRIPPER.max_opening) -> np.ndarray:
+    """Return points in and on fingers, hand and wrist, in the frame of the grip site, (N, 3), [m].
+
+    Args:
+        opening: Distance between the fingers, [m].
+    """
+    inner, outer = 0.5 * opening, 0.5 * opening + GRIPPER.finger_thickness
+    across, along = GRIPPER.finger_half_width, GRIPPER.palm_half_length
+    finger = _box_points((inner + 0.002, outer), (-across, across), (-0.044, GRIPPER.tip_below))
+    width = GRIPPER.palm_half_width
     blocks = [
         finger,
         finger * [-1, 1, 1],
-        _block(
-            (-HAND_HALF_LENGTH, HAND_HALF_LENGTH), (-HAND_HALF_WIDTH, HAND_HALF_WIDTH), (-0.12, -PALM_ABOVE)
-        ),
-        _block((-0.06, 0.06), (-0.06, 0.06), (-0.28, -0.13), 0.03),
+        _box_points((-along, along), (-width, width), (-0.12, -GRIPPER.palm_above)),
+        _box_points((-0.06, 0.06), (-0.06, 0.06), (-0.28, -0.13), 0.03),
     ]
     return np.concatenate(blocks)
 
 
-def lowest(mat: np.ndarray) -> float:
-    """How far fingers and palm of a hand turned by (3, 3) reach below its grip site, m."""
+def hand_extent_below(mat: np.ndarray) -> float:
+    """Return how far fingers and palm of a hand with orientation (3, 3) reach below its grip site, [m]."""
     return float(-(_CORNERS @ mat[2]).min())
 
 
-def _block(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE) -> np.ndarray:
+def obstacle_height(
+    points: np.ndarray, start: np.ndarray, goal: np.ndarray, radius: float, default: float
+) -> float:
+    """Return the height of the highest obstacle near the next 10 cm of a straight path over the table, [m].
+
+    Args:
+        points: Points on obstacles, (N, 3).
+        start: Start of the path; x and y count.
+        goal: End of the path; x and y count.
+        radius: Distance from the path that counts as near, [m].
+        default: Height where there is no obstacle, such as that of the table, [m].
+    """
+    path = goal[:2] - start[:2]
+    path = path * min(1.0, 0.10 / max(float(np.linalg.norm(path)), 1e-9))
+    along = np.clip((points[:, :2] - start[:2]) @ path / max(path @ path, 1e-12), 0.0, 1.0)
+    near = np.linalg.norm(points[:, :2] - start[:2] - along[:, None] * path, axis=1) < radius
+    return float(points[near, 2].max(initial=default))
+
+
+def _box_points(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE_CELL) -> np.ndarray:
+    """Return points on the surface of a box with these (low, high) coordinates, (N, 3)."""
     axes = [np.linspace(a, b, max(2, int(np.ceil((b - a) / spacing)) + 1)) for a, b in (x, y, z)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     low, high = np.array([x, y, z], float).T
     return points[(np.isclose(points, low) | np.isclose(points, high)).any(axis=1)]
 
 
-def obstacle_height(
-    points: np.ndarray, start: np.ndarray, goal: np.ndarray, radius: float, floor: float
-) -> float:
-    """Height of the highest point near the next decimetre of the straight way over the ground, m."""
-    way = goal[:2] - start[:2]
-    way = way * min(1.0, 0.10 / max(float(np.linalg.norm(way)), 1e-9))
-    along = np.clip((points[:, :2] - start[:2]) @ way / max(way @ way, 1e-12), 0.0, 1.0)
-    near = np.linalg.norm(points[:, :2] - start[:2] - along[:, None] * way, axis=1) < radius
-    return float(points[near, 2].max(initial=floor))
-
-
-_CORNERS = np.array(
+_CORNERS = np.array(  # of fingers and palm in the frame of the grip site, (8, 3), [m]
     [
         (x, y, z)
         for half, width, z in (
-            (0.5 * MAX_OPENING + FINGER_THICKNESS, FINGER_HALF_WIDTH, TIP_BELOW),
-            (HAND_HALF_LENGTH, HAND_HALF_WIDTH, -PALM_ABOVE),
+            (GRIPPER.half_opening + GRIPPER.finger_thickness, GRIPPER.finger_half_width, GRIPPER.tip_below),
+            (GRIPPER.palm_half_length, GRIPPER.palm_half_width, -GRIPPER.palm_above),
         )
         for x in (-half, half)
         for y in (-width, width)
     ]
-)  # of fingers and palm, in the frame of the grip site, m
+)

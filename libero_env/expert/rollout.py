@@ -1,4 +1,4 @@
-"""Experts beside a batch of simulations: one attempt in each, recorded as it goes."""
+"""Experts in a batch of simulations: one attempt in each, recorded as it proceeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,20 +9,30 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.expert.expert import Expert
 from libero_env.expert.variation import ActionNoise
 
-MAX_STEPS = 600
+MAX_STEPS = 600  # control steps of an attempt
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """What happened in one simulation."""
+    """What happened in one simulation.
+
+    Attributes:
+        success: Whether the goal was reached.
+        states: [time, qpos, qvel] before each action and at the end, (T + 1, 1 + nq + nv).
+        actions: Executed actions, (T, 7).
+        expert_actions: Actions of the expert, without noise, (T, 7).
+        retries: Number of times that the expert began again.
+        reason: Why the attempt did not succeed, or "".
+        fixtures: Poses of the fixtures, (nfixtures, 7): position, [m], and quaternion wxyz.
+    """
 
     success: bool
-    states: np.ndarray  # (T + 1, 1 + nq + nv) [time, qpos, qvel] before each action, and at the end
-    actions: np.ndarray  # (T, 7) executed
-    expert_actions: np.ndarray  # (T, 7) wanted
+    states: np.ndarray
+    actions: np.ndarray
+    expert_actions: np.ndarray
     retries: int
-    reason: str  # why it did not succeed, or ""
-    fixtures: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))  # (nfixtures, 7) pos, quat wxyz
+    reason: str
+    fixtures: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -31,54 +41,59 @@ class Attempt:
 def run_experts(
     env: BatchEnv,
     experts: Sequence[Expert],
-    disturbances: Sequence[ActionNoise | None] | None = None,
+    noise: Sequence[ActionNoise | None] | None = None,
     *,
     max_steps: int = MAX_STEPS,
 ) -> list[Attempt]:
-    """Let each expert act in the simulation of the same index until the goal holds, it gives up or the steps are over.
+    """Let experts act in a batch of simulations.
 
-    What happens in a simulation depends on its own start, expert and disturbance alone.
+    An attempt ends when the goal holds, when the expert gives up, or after the largest number of steps. It depends on
+    the start, the expert and the noise of its own simulation only.
 
     Args:
-        env: after `reset`; simulations beyond the number of experts stand still.
-        experts: one for each of the first simulations.
-        disturbances: of the executed actions; None for none.
-        max_steps: of each attempt.
+        env: Environment after `reset`; simulations beyond the number of experts stand still.
+        experts: Experts of the first simulations, one each.
+        noise: Noise on the executed actions of each expert, or None; no noise at all if None.
+        max_steps: Largest number of steps of an attempt.
+
+    Returns:
+        One attempt for each expert, in order.
     """
-    disturbances = disturbances or [None] * len(experts)
+    noise = noise or [None] * len(experts)
     world = env.world
     states: list[list[np.ndarray]] = [[] for _ in experts]
     executed: list[list[np.ndarray]] = [[] for _ in experts]
-    wanted: list[list[np.ndarray]] = [[] for _ in experts]
+    intended: list[list[np.ndarray]] = [[] for _ in experts]
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
-        live = [i for i in np.flatnonzero(env.running) if i < len(experts) and not experts[i].failure_reason]
+        running = map(int, np.flatnonzero(env.running[: len(experts)]))
+        live = [i for i in running if not experts[i].failure_reason]
         if not live:
             break
         actions = np.zeros((env.num_envs, 7))
         for i in live:
-            label = experts[i].act(world.views[i])
-            noise = disturbances[i]
-            actions[i] = label if noise is None else noise.apply(label, experts[i].noise_scale)
+            action = experts[i].act(world.views[i])
+            own_noise = noise[i]
+            actions[i] = action if own_noise is None else own_noise.apply(action, experts[i].noise_scale)
             states[i].append(world.physics_state(i))
             executed[i].append(actions[i].copy())
-            wanted[i].append(label)
+            intended[i].append(action)
         success = env.step(actions)[-1]["success"][: len(experts)]
     for i, rows in enumerate(states):
         rows.append(world.physics_state(i))
     return [
         Attempt(
-            bool(success[i]),
-            np.array(states[i]),
-            np.array(executed[i]),
-            np.array(wanted[i]),
-            expert.retries,
-            "" if success[i] else _reason(expert, len(executed[i])),
-            world.simulations.fixtures[i].copy(),
+            success=bool(success[i]),
+            states=np.array(states[i]),
+            actions=np.array(executed[i]),
+            expert_actions=np.array(intended[i]),
+            retries=expert.retries,
+            reason="" if success[i] else _failure(expert, len(executed[i])),
+            fixtures=world.simulations.fixtures[i].copy(),
         )
         for i, expert in enumerate(experts)
     ]
 
 
-def _reason(expert: Expert, steps: int) -> str:
+def _failure(expert: Expert, steps: int) -> str:
     return expert.failure_reason or f"in phase {expert.phase} after {steps} steps, {expert.retries} retries"

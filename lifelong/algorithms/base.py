@@ -11,48 +11,18 @@ stage of `stages`):
     policy_for                                  around every rollout
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import reduce
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from lifelong.data.windows import WindowDataset
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
-
-
-class WindowDataset(Protocol):
-    """The windows of one task's demonstrations."""
-
-    def __len__(self) -> int: ...
-
-    def batch(self, indices: Tensor) -> Batch:
-        """The windows of these indices ((B,) int64), as one batch."""
-        ...
-
-
-class JoinedWindows:
-    """The windows of several tasks as one dataset."""
-
-    def __init__(self, datasets: Sequence[WindowDataset]):
-        self.datasets = tuple(datasets)
-
-    def __len__(self) -> int:
-        return sum(len(d) for d in self.datasets)
-
-    def batch(self, indices: Tensor) -> Batch:
-        """The windows of these indices ((B,) int64, counted through all datasets), one task's after another's."""
-        parts, start = [], 0
-        for dataset in self.datasets:
-            mine = indices[(indices >= start) & (indices < start + len(dataset))] - start
-            start += len(dataset)
-            if len(mine):
-                parts.append(dataset.batch(mine))
-        return reduce(Batch.join, parts)
 
 
 @dataclass(frozen=True)

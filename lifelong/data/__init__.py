@@ -1,4 +1,4 @@
-"""Demonstrations as windows in memory, and the memory of past tasks."""
+"""Demonstrations as windows of training data, and the memory of past tasks."""
 
 from lifelong.data.dataset import SequenceVLDataset, batches
 from lifelong.data.fake import fake_batch, fake_observation

@@ -1,18 +1,26 @@
 """Windows over the demonstrations of one task, held in memory.
 
-Shape legend: F frames of all demonstrations, W = F windows, B batch, T time, V views, H W C image, A action,
-L language embedding.
+Shape legend: F frames of all demonstrations, W = F windows, B batch, T time, V views, H W C image, D size of a reading,
+A action, L language embedding.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from libero_env.demos.read import Demo
-from lifelong.data.source import DemoArrays, DemoSource, check_fits, check_language, last_frames
+from lifelong.data.source import (
+    DemoSource,
+    check_fits,
+    check_indices,
+    check_language,
+    demo_tensors,
+    last_frames,
+)
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation, PolicySpec
 
@@ -26,17 +34,29 @@ class SequenceVLDataset:
     once: windows are indices, and a batch is one gather per array.
 
     Build one with `from_file` or `from_demos`.
+
+    Attributes:
+        images: (F, V, H, W, C) uint8, upright.
+        proprio: Name to (F, D) float32.
+        actions: (F, A) float32.
+        last: Index of the last frame of each frame's demonstration, (F,) int64.
+        language: Embedding of the instruction, (L,) float32.
+        task_id: Position in the task sequence.
+        seq_len: Number of steps in a window, T.
+        batch_device: Device of the batches; None for the device of the frames.
+        pin_memory: Whether batches are gathered in page-locked memory first, so that they are copied to a GPU
+            asynchronously.
     """
 
-    images: Tensor  # (F, V, H, W, C) uint8, upright
-    proprio: Mapping[str, Tensor]  # name -> (F, D) float32
-    actions: Tensor  # (F, A) float32
-    last: Tensor  # (F,) int64, last frame of the demonstration that frame belongs to
-    language: Tensor  # (L,) float32
+    images: Tensor
+    proprio: Mapping[str, Tensor]
+    actions: Tensor
+    last: Tensor
+    language: Tensor
     task_id: int
     seq_len: int
-    target: torch.device | None = None  # where batches are wanted; None: where the frames are
-    pin: bool = False  # gather them in page-locked memory first, so that the copy to a GPU is asynchronous
+    batch_device: torch.device | None = None
+    pin_memory: bool = False
 
     def __post_init__(self) -> None:
         if not len(self.actions):
@@ -51,24 +71,23 @@ class SequenceVLDataset:
         language: Tensor,
         task_id: int = 0,
         limit: int | None = None,
-        pairing: str = "aligned",
-        labels: str = "expert",
+        pairing: Literal["aligned", "stored"] = "aligned",
+        labels: Literal["expert", "executed"] = "expert",
     ) -> "SequenceVLDataset":
-        """Reads a demonstration file whole.
+        """Read all frames of a demonstration file into memory.
 
         Args:
-            path: HDF5 in the original's layout.
-            spec: which views and readings, their sizes, and `seq_len`.
-            language: (L,) embedding of the instruction.
-            task_id: position in the task sequence.
-            limit: the first so many demonstrations only.
-            pairing: `aligned` pairs each action with the observation before it; `stored` takes the file as it
-                is, which in the original's files is the observation after it.
-            labels: `expert` or `executed`, see `libero_env.demos.read.read_demos`.
+            path: HDF5 file in the original's layout.
+            spec: Views, readings, their sizes, and `seq_len`.
+            language: Embedding of the instruction, (L,).
+            task_id: Position in the task sequence.
+            limit: As for `DemoSource`.
+            pairing: As for `DemoSource`.
+            labels: As for `DemoSource`.
 
         Raises:
-            DemoError: the file is broken; names file, demonstration, key and what was expected.
-            DataError: the file is sound but does not fit the spec.
+            DemoError: The file is broken; the message names file, demonstration, key and what was expected.
+            DataError: The file is valid but does not fit the spec.
         """
         source = DemoSource(Path(path), spec, limit, pairing, labels)
         language, lengths = check_language(language, spec), source.lengths()
@@ -84,10 +103,17 @@ class SequenceVLDataset:
         task_id: int = 0,
         source: str = "demonstrations",
     ) -> "SequenceVLDataset":
-        """Joins demonstrations that are in memory already; see `from_file`.
+        """Copy demonstrations that are in memory already.
+
+        Args:
+            demos: The demonstrations.
+            spec: As for `from_file`.
+            language: As for `from_file`.
+            task_id: As for `from_file`.
+            source: Where they come from, for error messages.
 
         Raises:
-            DataError: they do not fit the spec; names source, demonstration, key and what was expected.
+            DataError: They do not fit the spec; the message names source, demonstration, key and what was expected.
         """
         language = check_language(language, spec)
         for demo in demos:
@@ -98,16 +124,17 @@ class SequenceVLDataset:
     def _filled(
         cls, demos: Iterable[Demo], lengths: list[int], spec: PolicySpec, language: Tensor, task_id: int
     ) -> "SequenceVLDataset":
-        """Arrays of the right size, filled one demonstration after the other."""
+        """Return a dataset whose tensors are filled one demonstration after the other."""
         frames, end = sum(lengths), 0
         images = torch.empty(frames, len(spec.views), *spec.image_size, 3, dtype=torch.uint8)
         proprio = {name: torch.empty(frames, size) for name, size in spec.proprio.items()}
         actions = torch.empty(frames, spec.action_dim)
         for demo in demos:
-            arrays, rows = DemoArrays.of(demo, spec), slice(end, end + len(demo))
-            images[rows], actions[rows], end = arrays.images, arrays.actions, rows.stop
-            for name, array in proprio.items():
-                array[rows] = arrays.proprio[name]
+            rows = slice(end, end + len(demo))
+            images[rows], readings, actions[rows] = demo_tensors(demo, spec)
+            for name, reading in readings.items():
+                proprio[name][rows] = reading
+            end = rows.stop
         return cls(images, proprio, actions, last_frames(lengths), language, task_id, spec.seq_len)
 
     def __len__(self) -> int:
@@ -120,21 +147,18 @@ class SequenceVLDataset:
         return len(self.last.unique())
 
     def frames(self, indices: Tensor) -> Tensor:
-        """Windows (B,) to the frames they cover, (B, T)."""
+        """Return the indices of the frames, (B, T), that the given windows (B,) cover."""
         steps = torch.arange(self.seq_len, device=self.last.device)
         return torch.minimum(indices[:, None] + steps, self.last[indices][:, None])
 
     def batch(self, indices: Tensor) -> Batch:
-        """The windows of these indices, (B,) int64 in [0, W), as one batch.
+        """Return the windows of the given indices, (B,) int64 in [0, W), as one batch.
 
         Raises:
-            DataError: an index out of range.
+            DataError: An index is out of range.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64, device=self.last.device)
-        if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
-            raise DataError(
-                f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
-            )
+        check_indices(indices, len(self))
         frames = self.frames(indices)
         gather = lambda x: self._gather(x, frames)  # noqa: E731
         language = self.language.expand(len(indices), -1)
@@ -142,27 +166,27 @@ class SequenceVLDataset:
             gather(self.images), {k: gather(v) for k, v in self.proprio.items()}, language
         )
         batch = Batch(observation, gather(self.actions), torch.full_like(indices, self.task_id), indices)
-        return batch if self.target is None else batch.to(self.target)
+        return batch if self.batch_device is None else batch.to(self.batch_device)
 
     def _gather(self, array: Tensor, frames: Tensor) -> Tensor:
-        """(F, ...) and (B, T) to (B, T, ...)."""
+        """Return the rows (B, T, ...) of an array (F, ...) at frames (B, T)."""
         shape = (frames.numel(), *array.shape[1:])
-        out = torch.empty(shape, dtype=array.dtype, pin_memory=True) if self.pin else None
+        out = torch.empty(shape, dtype=array.dtype, pin_memory=True) if self.pin_memory else None
         return torch.index_select(array, 0, frames.flatten(), out=out).view(*frames.shape, *array.shape[1:])
 
     def to(self, device: torch.device | str) -> "SequenceVLDataset":
-        """The same windows held on another device."""
+        """Return the same windows, held on another device."""
         proprio = {k: v.to(device) for k, v in self.proprio.items()}
         names = ("images", "actions", "last", "language")
         arrays = {name: getattr(self, name).to(device) for name in names}
-        return replace(self, proprio=proprio, target=None, pin=False, **arrays)
+        return replace(self, proprio=proprio, batch_device=None, pin_memory=False, **arrays)
 
-    def delivering(self, device: torch.device | str, *, pin: bool = False) -> "SequenceVLDataset":
-        """The same windows held where they are, with batches given on another device."""
-        return replace(self, target=torch.device(device), pin=pin)
+    def with_batches_on(self, device: torch.device | str, *, pin_memory: bool = False) -> "SequenceVLDataset":
+        """Return the same windows, held where they are, with batches on another device."""
+        return replace(self, batch_device=torch.device(device), pin_memory=pin_memory)
 
     def nbytes(self) -> int:
-        """Bytes of memory the frames take."""
+        """Return the number of bytes of the frames."""
         return sum(x.nbytes for x in (self.images, self.actions, self.last, *self.proprio.values()))
 
 
@@ -172,13 +196,13 @@ def batches(
     generator: torch.Generator | None = None,
     drop_last: bool = False,
 ) -> Iterator[Batch]:
-    """One pass over all windows.
+    """Yield all windows once, in batches.
 
     Args:
-        dataset: the windows.
-        batch_size: B; the last batch may be smaller.
-        generator: shuffles; drawn from once, when iteration starts. None: in order.
-        drop_last: leave a smaller last batch out.
+        dataset: The windows.
+        batch_size: Number of windows in a batch, B; the last batch may be smaller.
+        generator: Shuffles the windows; used once, when iteration starts. None keeps their order.
+        drop_last: Whether to leave out a smaller last batch.
     """
     order = (
         torch.arange(len(dataset)) if generator is None else torch.randperm(len(dataset), generator=generator)

@@ -1,4 +1,4 @@
-"""Demonstrations of a run's tasks: made where there are none, read when asked for."""
+"""Demonstrations of a run's tasks: recorded if there are none, read when they are needed."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,8 +11,8 @@ from libero_env.demos.generate import ensure_demos
 from libero_env.demos.read import demo_lengths
 from libero_env.tasks import Task
 from lifelong.data import DemoSource, open_windows
-from lifelong.data.memory import TaskWindows
 from lifelong.data.settings import DataSettings
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
@@ -20,52 +20,64 @@ from lifelong.types import PolicySpec
 def find_demos(
     tasks: Sequence[Task], counts: Sequence[int], data: DataSettings, progress: bool
 ) -> list[Path]:
-    """The demonstration file of each task; recorded now where there is none.
+    """Return the demonstration file of each task; missing demonstrations are recorded.
 
-    A file `<folder>/<suite>/<task>_demo.hdf5`, as the original's are laid out, goes before ours where the folder is
-    named.
+    If `data.folder` is set and has a file `<suite>/<task>_demo.hdf5`, the layout of the original's data sets, that file
+    is used.
 
     Args:
-        tasks: In learning order.
-        counts: Demonstrations needed of each.
-        data: Size of the pictures, and the folder of the files.
-        progress: Show a bar.
+        tasks: Tasks in learning order.
+        counts: Number of demonstrations required of each task.
+        data: Image size, and the folder of the files.
+        progress: Whether to show a progress bar.
 
     Raises:
-        DataError: A file laid out like that has fewer.
+        DataError: A file in the original's layout has fewer demonstrations than required.
+        DemoError: A file is broken, or demonstrations cannot be recorded.
     """
-    found = dict(_laid_out(tasks, counts, data))
+    found = dict(_existing_files(tasks, counts, data))
     for count in sorted(set(counts), reverse=True):
-        wanted = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in found]
-        if not wanted:
+        missing = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in found]
+        if not missing:
             continue
         size = (data.image_size, data.image_size)
-        paths = ensure_demos(wanted, count, camera_size=size, root=data.folder, progress=progress)
-        found |= zip([task.id for task in wanted], paths, strict=True)
+        paths = ensure_demos(missing, count, camera_size=size, root=data.folder, progress=progress)
+        found |= zip([task.id for task in missing], paths, strict=True)
     return [found[task.id] for task in tasks]
 
 
-def _laid_out(tasks: Sequence[Task], counts: Sequence[int], data: DataSettings) -> Iterator[tuple[str, Path]]:
-    """Files in the original's layout, by task."""
+def _existing_files(
+    tasks: Sequence[Task], counts: Sequence[int], data: DataSettings
+) -> Iterator[tuple[str, Path]]:
+    """Yield the files in the original's layout, with the ids of their tasks."""
     for task, count in zip(tasks, counts, strict=True) if data.folder else ():
         file = Path(data.folder or "").expanduser() / task.suite / f"{task.name}_demo.hdf5"
         if file.is_file():
-            there = len(demo_lengths(file, count))
-            if there < count:
+            available = len(demo_lengths(file, count))
+            if available < count:
                 raise DataError(
-                    f"{file} has {there} demonstrations and {count} are wanted; use data.demos={there}"
+                    f"{file} has {available} demonstrations and {count} are required; use data.demos={available}"
                 )
             yield task.id, file
 
 
 @dataclass(frozen=True)
 class DemoDatasets(Mapping[int, TaskWindows]):
-    """The tasks' windows by position; read when asked for, and kept for as long as somebody holds them."""
+    """The windows of each task, by position; they are read when requested and kept while something refers to them.
+
+    Attributes:
+        paths: Demonstration file of each task.
+        counts: Number of demonstrations of each task.
+        spec: Views, readings and their sizes.
+        languages: Embeddings of the instructions, (K, L) for K tasks.
+        data: How the files are read, and where frames are held.
+        device: Device of the batches.
+    """
 
     paths: Sequence[Path]
-    counts: Sequence[int]  # demonstrations of each
+    counts: Sequence[int]
     spec: PolicySpec
-    languages: torch.Tensor  # (K, L)
+    languages: torch.Tensor
     data: DataSettings
     device: torch.device
     _held: WeakValueDictionary[int, TaskWindows] = field(default_factory=WeakValueDictionary)

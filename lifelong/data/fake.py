@@ -1,4 +1,4 @@
-"""Random data from a policy's spec, for tests and speed measurements that need no files."""
+"""Random data that fit a policy's spec, for tests and speed measurements without files."""
 
 import torch
 from torch import Tensor
@@ -9,13 +9,13 @@ from lifelong.types import Batch, Observation, PolicySpec
 def fake_observation(
     spec: PolicySpec, batch_size: int, generator: torch.Generator, steps: int | None = None
 ) -> Observation:
-    """A random observation.
+    """Return a random observation.
 
     Args:
-        spec: what the policy sees.
-        batch_size: B.
-        generator: a CPU generator.
-        steps: T; None: the spec's `seq_len`.
+        spec: Views, readings and their sizes.
+        batch_size: Number of windows, B.
+        generator: Draws all values, on the CPU.
+        steps: Number of steps, T; None for the spec's `seq_len`.
     """
     steps = spec.seq_len if steps is None else steps
     shape = (batch_size, steps, len(spec.views), *spec.image_size, 3)
@@ -28,7 +28,7 @@ def fake_observation(
 def fake_batch(
     spec: PolicySpec, batch_size: int, generator: torch.Generator, steps: int | None = None
 ) -> Batch:
-    """A random batch: see `fake_observation`; actions are uniform in [-1, 1], task ids 0."""
+    """Return a random batch of task 0 with actions in [-1, 1]; for the arguments see `fake_observation`."""
     observation = fake_observation(spec, batch_size, generator, steps)
     actions: Tensor = 2 * torch.rand(*observation.images.shape[:2], spec.action_dim, generator=generator) - 1
     ids = torch.arange(batch_size)

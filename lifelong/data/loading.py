@@ -1,13 +1,14 @@
-"""A task's windows, read by the backend and held in the memory that the settings name.
+"""A task's windows, read by the chosen backend and held in the chosen kind of memory.
 
-    device   all frames in the GPU's memory: nothing is copied while training
+    device   all frames in GPU memory; nothing is copied while training
     pinned   in host memory; batches are gathered in page-locked memory and copied while the GPU computes
-    host     in host memory; batches are copied when they are asked for
-    mmap     on disk, see `lifelong.data.frame_cache`; batches go the way of `pinned`
-    auto     device if the GPU has the room, else pinned; without a GPU host; mmap if memory has no room
+    host     in host memory; batches are copied when they are requested
+    mmap     on disk, see `lifelong.data.frame_cache`; batches are gathered and copied as for `pinned`
+    auto     `device` if the frames fit into GPU memory, else `pinned`; without a GPU `host`; `mmap` if they do not
+             fit into host memory
 
-Batches are the same to the bit. `auto` decides for each task when it is read, so that tasks held for rehearsal
-fill the GPU first, then the memory, then the disk.
+The batches are bitwise the same. `auto` decides for each task when its windows are read, so tasks that are held for
+rehearsal fill the GPU first, then host memory, then the disk.
 """
 
 import os
@@ -25,9 +26,9 @@ from lifelong.errors import DataError
 MEMORY = ("auto", "host", "pinned", "device", "mmap")
 BACKENDS = ("native", "robomimic")
 
-_GPU_RESERVE = 0.4  # of the GPU's memory is left to training
-_HOST_RESERVE = 0.25  # of the machine's memory, or
-_HOST_LEAST = 2**30  # so many bytes, are left to everything else
+_GPU_RESERVE = 0.4  # [share of GPU memory] kept free for training
+_HOST_RESERVE = 0.25  # [share of host memory] kept free for everything else
+_HOST_RESERVE_BYTES = 2**30  # [bytes] of host memory that are kept free at least
 
 
 def open_windows(
@@ -39,20 +40,20 @@ def open_windows(
     memory: str = "auto",
     backend: str = "native",
 ) -> SequenceVLDataset | RobomimicWindows:
-    """The windows of a demonstration file.
+    """Return the windows of a demonstration file.
 
     Args:
         source: What is read.
-        language: (L,) embedding of the instruction.
+        language: Embedding of the instruction, (L,).
         task_id: Position in the task sequence.
-        device: Where batches are wanted.
+        device: Device of the batches.
         memory: One of `MEMORY`.
-        backend: `native`, or `robomimic`: each window is read through robomimic's SequenceDataset, for those who
-            want to be sure that it is the same data; slow.
+        backend: `native`, or `robomimic` to read each window through robomimic's SequenceDataset, which is slow and
+            shows that the data are the same.
 
     Raises:
         DemoError: The file is broken.
-        DataError: It does not fit the spec, an unknown memory or backend, or one that is not there.
+        DataError: The file does not fit the spec, or the memory or backend is unknown or not available.
     """
     device = torch.device(device)
     for key, value, valid in (("memory", memory, MEMORY), ("backend", backend, BACKENDS)):
@@ -61,11 +62,11 @@ def open_windows(
     if backend == "robomimic":
         return RobomimicWindows(source, language=language, task_id=task_id, device=device)
     if memory == "auto":
-        memory = choose(source.nbytes(), device)
+        memory = choose_memory(source.nbytes(), device)
     if memory == "pinned" and device.type != "cuda":
-        raise DataError(f"data.memory=pinned is for a GPU, and device={device}; valid: auto, host, mmap")
+        raise DataError(f"data.memory=pinned needs a GPU, and device={device}; valid: auto, host, mmap")
     if memory == "mmap":
-        dataset = frame_cache.mapped(source, language=language, task_id=task_id)
+        dataset = frame_cache.open_mapped(source, language=language, task_id=task_id)
     else:
         dataset = SequenceVLDataset.from_file(
             source.path,
@@ -79,25 +80,25 @@ def open_windows(
     if memory == "device":
         return dataset.to(device)
     pin = device.type == "cuda" and memory in ("pinned", "mmap")
-    return dataset.delivering(device, pin=pin) if device.type != "cpu" else dataset
+    return dataset.with_batches_on(device, pin_memory=pin) if device.type != "cpu" else dataset
 
 
-def choose(nbytes: int, device: torch.device) -> str:
-    """The memory for so many bytes of frames, by what is free now."""
+def choose_memory(nbytes: int, device: torch.device) -> str:
+    """Return the kind of memory for the given number of bytes of frames, by what is free now."""
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         if nbytes <= free - _GPU_RESERVE * total:
             return "device"
     free, total = host_memory()
-    if nbytes > free - max(_HOST_RESERVE * total, _HOST_LEAST):
+    if nbytes > free - max(_HOST_RESERVE * total, _HOST_RESERVE_BYTES):
         return "mmap"
     return "pinned" if device.type == "cuda" else "host"
 
 
 def host_memory() -> tuple[int, int]:
-    """Bytes of memory that are available and that there are; those of the container, where one sets a limit."""
+    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    free = total // 2  # where the system does not say
+    free = total // 2  # where the system does not report it
     meminfo = Path("/proc/meminfo")
     if meminfo.exists():
         lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
@@ -109,7 +110,7 @@ def host_memory() -> tuple[int, int]:
 
 
 def _cgroup(name: str) -> int | None:
-    """A figure of this process's container (cgroup v2); None where there is none."""
+    """Return a value of this process's container (cgroup v2); None where there is none."""
     try:
         text = (Path("/sys/fs/cgroup") / name).read_text().strip()
     except OSError:

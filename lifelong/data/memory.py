@@ -1,38 +1,28 @@
 """Memory of past tasks for rehearsal."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset
 from lifelong.errors import DataError
 from lifelong.types import Batch
 
 
-class TaskWindows(Protocol):
-    """What the memory needs of a task's windows, whatever reads and holds them."""
-
-    @property
-    def task_id(self) -> int: ...
-
-    def __len__(self) -> int: ...
-
-    def batch(self, indices: Tensor) -> Batch: ...
-
-
 class ReplayMemory:
-    """A uniform sample of windows of each past task, within one budget.
+    """A uniform sample of the windows of each past task, within one budget.
 
-    The budget is split evenly over the tasks: when one arrives, the others shrink. What a task keeps is a
-    prefix of one random order of its windows, so a smaller share is again a uniform sample without
-    replacement. Only indices are kept; frames stay in the datasets.
+    The budget is split evenly over the tasks: when a task is added, the shares of the others shrink. A task keeps a
+    prefix of one random permutation of its windows, so a smaller share is again a uniform sample without replacement.
+    Only indices are kept; frames stay in the datasets.
 
     Args:
-        budget: largest number of windows over all tasks.
+        budget: Largest number of windows over all tasks.
 
     Raises:
-        DataError: a budget below one.
+        DataError: The budget is below one.
     """
 
     def __init__(self, budget: int) -> None:
@@ -43,19 +33,23 @@ class ReplayMemory:
         self._indices: dict[int, Tensor] = {}  # task id -> (n,) window indices
 
     def __len__(self) -> int:
-        """Windows held; never more than the budget."""
+        """Number of windows in the memory; never more than the budget."""
         return sum(len(indices) for indices in self._indices.values())
 
     @property
     def shares(self) -> dict[int, int]:
-        """Windows held of each task, by task id."""
+        """Number of windows of each task, by task id."""
         return {task: len(indices) for task, indices in self._indices.items()}
 
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
-        """Takes a task in; its windows are drawn with the generator.
+        """Add a task.
+
+        Args:
+            dataset: Windows of the task.
+            generator: Draws which of its windows are kept.
 
         Raises:
-            DataError: the task is in the memory already.
+            DataError: The task is in the memory already.
         """
         task = dataset.task_id
         if task in self._indices:
@@ -65,7 +59,7 @@ class ReplayMemory:
         self._shrink()
 
     def _shrink(self) -> None:
-        """Cuts every task to its share; what small tasks leave unused goes to the others."""
+        """Reduce every task to its share; what small tasks do not need is given to the others."""
         left, tasks = self.budget, sorted(self._indices, key=lambda t: (len(self._indices[t]), t))
         for position, task in enumerate(tasks):
             share = min(len(self._indices[task]), left // (len(tasks) - position))
@@ -73,39 +67,35 @@ class ReplayMemory:
             left -= share
 
     def sample(self, n: int, generator: torch.Generator) -> Batch:
-        """`n` windows drawn uniformly over all that are held, without repeats while `n` allows.
+        """Return windows drawn uniformly over all that are held, those of one task after those of another.
+
+        Args:
+            n: Number of windows. Beyond the number that are held, windows repeat.
+            generator: Draws the windows.
 
         Raises:
-            DataError: the memory is empty.
+            DataError: The memory is empty.
         """
         size = len(self)
         if not size:
             raise DataError("nothing to sample: the memory is empty. Add a task first")
         rounds = [torch.randperm(size, generator=generator) for _ in range(-(-n // size))]
-        chosen, offset, parts = torch.cat(rounds)[:n], 0, []
-        for task, indices in self._indices.items():
-            mine = chosen[(chosen >= offset) & (chosen < offset + len(indices))] - offset
-            offset += len(indices)
-            if len(mine):
-                parts.append(self._datasets[task].batch(indices[mine]))
-        batch = parts[0]
-        for part in parts[1:]:
-            batch = batch.join(part)
-        return batch
+        kept = [WindowSubset(self._datasets[task], indices) for task, indices in self._indices.items()]
+        return JoinedWindows(kept).batch(torch.cat(rounds)[:n])
 
     def state_dict(self) -> dict[str, Any]:
-        """Budget and indices by task id; the frames are read again from the demonstrations."""
+        """Return the budget and the indices by task id; frames are read again from the demonstrations."""
         return {"budget": self.budget, "indices": {str(task): i.clone() for task, i in self._indices.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Takes up what `state_dict` gave.
+        """Restore what `state_dict` returned.
 
         Args:
-            state: from `state_dict`.
-            datasets: by task id, at least those the state names.
+            state: From `state_dict`.
+            datasets: Windows by task id, at least of the tasks in the state.
 
         Raises:
-            DataError: a dataset is absent or has fewer windows than the state refers to; nothing is changed then.
+            DataError: A dataset is missing or has fewer windows than the state refers to; the memory is unchanged.
         """
         indices = {int(task): i.clone() for task, i in state["indices"].items()}
         absent = sorted(set(indices) - set(datasets))
@@ -129,7 +119,7 @@ class FirstWindows(ReplayMemory):
     A thousand of them are the first eight or so demonstrations, not a sample of the task.
 
     Args:
-        per_task: windows kept of each task.
+        per_task: Number of windows kept of each task.
     """
 
     def __init__(self, per_task: int) -> None:
@@ -137,7 +127,7 @@ class FirstWindows(ReplayMemory):
         self.per_task = per_task
 
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
-        """Takes a task in; nothing is drawn, and no other task shrinks."""
+        """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""
         super().add(dataset, generator)
         self._indices[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
 

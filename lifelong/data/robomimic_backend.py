@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 
 from libero_env.demos.read import demo_files, demo_names, open_demo_file
-from lifelong.data.source import DemoSource, check_language
+from lifelong.data.source import DemoSource, check_indices, check_language
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation
 
 
 class RobomimicWindows:
-    """The windows that `SequenceVLDataset` has, each read by robomimic's `SequenceDataset` when it is asked for.
+    """The windows of `SequenceVLDataset`, each read by robomimic's `SequenceDataset` when it is requested.
 
-    robomimic keeps the low-dimensional data in memory and reads pictures from the file, as the original LIBERO
-    has it do. It repeats the last frame past the end of a demonstration, as `SequenceVLDataset` does; it knows
-    nothing of pairings, so for `aligned` windows of a file that pairs each action with the observation after it
-    it is asked for one step more, and observations and actions are taken one step apart.
+    robomimic keeps the low-dimensional data in memory and reads images from the file, as in the original LIBERO. It
+    repeats the last frame past the end of a demonstration, as `SequenceVLDataset` does. It has no notion of pairings:
+    for `aligned` windows of a file that pairs each action with the observation after it, windows of one more step are
+    read, and observations and actions are taken one step apart.
     """
 
     def __init__(
@@ -38,28 +38,30 @@ class RobomimicWindows:
 
         Args:
             source: What is read; a file, not a folder of parts.
-            language: (L,) embedding of the instruction.
+            language: Embedding of the instruction, (L,).
             task_id: Position in the task sequence.
-            device: Where batches are wanted.
+            device: Device of the batches.
 
         Raises:
             DemoError: The file is broken.
-            DataError: It does not fit the spec, or robomimic is not installed.
+            DataError: The file does not fit the spec, or robomimic is not installed.
         """
         self.source, self.task_id, self.seq_len = source, task_id, source.spec.seq_len
         self.device = torch.device(device)
         self.language = check_language(language, source.spec)
-        next(source.demos())  # refuses what does not fit
+        next(source.demos())  # raises DataError if the file does not fit
         self._labels, self._shift = self._layout()
         self._windows = _sequence_dataset(source, self._labels, self.seq_len + self._shift)
         lengths = torch.tensor(source.lengths())
-        self._steps = torch.cat([torch.arange(n) for n in lengths])  # (W,) of a window in its demonstration
-        self._left = lengths.repeat_interleave(lengths) - 1 - self._steps  # (W,) frames that come after it
+        self._steps = torch.cat([torch.arange(n) for n in lengths])  # (W,) first step of each window
+        self._left = (
+            lengths.repeat_interleave(lengths) - 1 - self._steps
+        )  # (W,) number of frames after that step
         starts = (lengths + self._shift).cumsum(0) - (lengths + self._shift)
-        self._indices = starts.repeat_interleave(lengths) + self._steps  # (W,) robomimic's index
+        self._indices = starts.repeat_interleave(lengths) + self._steps  # (W,) index in robomimic's dataset
 
     def _layout(self) -> tuple[str, int]:
-        """Where the labels are, and by how many steps actions and observations are apart."""
+        """Return the key of the labels, and by how many steps actions and observations are apart."""
         files = demo_files(self.source.path)
         if files != [self.source.path]:
             raise DataError(f"{self.source.path}: robomimic reads single files; use data.backend=native")
@@ -68,8 +70,8 @@ class RobomimicWindows:
             labelled = {"expert_actions" in file["data"][name] for name in names}
             if self.source.labels == "expert" and len(labelled) > 1:
                 raise DataError(
-                    f"{files[0]}: some demonstrations have expert_actions and some have not, which robomimic "
-                    "cannot read; use data.labels=executed or data.backend=native"
+                    f"{files[0]}: only some demonstrations have expert_actions, which robomimic cannot read; "
+                    "use data.labels=executed or data.backend=native"
                 )
             expert = self.source.labels == "expert" and True in labelled
             shifted = (
@@ -87,37 +89,34 @@ class RobomimicWindows:
         return len(self.source.lengths())
 
     def batch(self, indices: Tensor) -> Batch:
-        """The windows of these indices, (B,) int64 in [0, W), as one batch.
+        """Return the windows of the given indices, (B,) int64 in [0, W), as one batch.
 
         Raises:
-            DataError: An index out of range.
+            DataError: An index is out of range.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64, device="cpu")
-        if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
-            raise DataError(
-                f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
-            )
+        check_indices(indices, len(self))
         spec, windows = self.source.spec, [self._window(int(i)) for i in indices]
         views = [np.stack([w["obs"][view] for w in windows])[:, :, ::-1] for view in spec.views]
         images = torch.from_numpy(np.stack(views, axis=2))  # the file has OpenGL rows
         floats = lambda arrays: torch.from_numpy(np.stack(arrays).astype(np.float32))  # noqa: E731
-        proprio = {name: floats([w["obs"][name] for w in windows]) for name in spec.proprio or ()}
+        proprio = {name: floats([w["obs"][name] for w in windows]) for name in spec.proprio}
         observation = Observation(images, proprio, self.language.expand(len(indices), -1))
         actions = floats([w["actions"] for w in windows])
         task_ids = torch.full_like(indices, self.task_id)
         return Batch(observation, actions, task_ids, indices).to(self.device)
 
     def _window(self, index: int) -> dict[str, Any]:
-        """A window as arrays, (T, ...) each; observations at its steps, actions so many later as they are apart."""
+        """Return the arrays (T, ...) of a window: observations at its steps, actions `_shift` steps later."""
         raw = self._windows[int(self._indices[index])]
         steps = np.minimum(np.arange(self.seq_len), int(self._left[index]))
-        keys = [*self.source.spec.views, *(self.source.spec.proprio or ())]
+        keys = [*self.source.spec.views, *self.source.spec.proprio]
         observations = {key: raw["obs"][key][steps] for key in keys}
         return {"obs": observations, "actions": raw[self._labels][steps + self._shift]}
 
 
 def _sequence_dataset(source: DemoSource, labels: str, steps: int) -> Any:
-    """robomimic's dataset of a file, which it is told to be silent about."""
+    """Return robomimic's dataset of a file; what robomimic prints is suppressed."""
     try:
         from robomimic.utils import obs_utils
         from robomimic.utils.dataset import SequenceDataset
@@ -126,11 +125,11 @@ def _sequence_dataset(source: DemoSource, labels: str, steps: int) -> Any:
             f"data.backend=robomimic needs robomimic ({error}): pip install --no-deps robomimic termcolor, or "
             "data.backend=native"
         ) from error
-    rgb, low_dim = list(source.spec.views), list(source.spec.proprio or ())
-    silent = io.StringIO()
+    rgb, low_dim = list(source.spec.views), list(source.spec.proprio)
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stdout(silent), contextlib.redirect_stderr(silent):
-            # global in robomimic: which keys are pictures
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+            # which keys are images is global in robomimic
             obs_utils.initialize_obs_utils_with_obs_specs({"obs": {"low_dim": low_dim, "rgb": rgb}})
             return SequenceDataset(
                 hdf5_path=str(source.path),
@@ -143,6 +142,6 @@ def _sequence_dataset(source: DemoSource, labels: str, steps: int) -> Any:
             )
     except KeyError as error:
         raise DataError(
-            f"{source.path}: robomimic misses something in the file ({error}), such as the attribute "
-            "num_samples of each demonstration; use data.backend=native"
+            f"{source.path}: robomimic needs something that the file does not have ({error}), such as the "
+            "attribute num_samples of each demonstration; use data.backend=native"
         ) from error

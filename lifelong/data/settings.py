@@ -1,4 +1,4 @@
-"""What the policy sees and learns from."""
+"""Settings of the demonstrations that a policy learns from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +9,27 @@ from libero_env.errors import UnknownNameError
 from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.types import PolicySpec
 
-CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
+CAMERAS = {
+    "agentview_rgb": "agentview",
+    "eye_in_hand_rgb": "robot0_eye_in_hand",
+}  # view -> camera in the model
 
 
 @dataclass(frozen=True)
 class DataSettings:
-    """What the policy sees and learns from; see configs/data.
+    """Settings of the demonstrations that a policy learns from; see configs/data.
 
-    `memory` and `backend` say where it is held and what reads it, see `lifelong.data.loading`; what comes out is
-    the same.
+    Attributes:
+        demos: Number of demonstrations of each task.
+        image_size: Height and width of the images, pixels.
+        seq_len: Number of steps in a window of training data, T.
+        views: Names of the images that the policy sees, keys of `CAMERAS`.
+        proprio: Names of the proprioceptive readings that the policy sees, keys of `LOW_DIM_KEYS`.
+        pairing: `aligned` pairs each action with the observation before it; `stored` reads files as they are.
+        labels: `expert` learns the actions that the expert chose, `executed` those with noise that were executed.
+        folder: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
+        memory: Where frames are held, see `lifelong.data.loading`; batches do not depend on it.
+        backend: What reads the windows, see `lifelong.data.loading`; batches do not depend on it.
     """
 
     demos: int
@@ -47,7 +59,11 @@ class DataSettings:
                     raise UnknownNameError(f"data.{key}", name, names)
 
     def spec(self, language_dim: int) -> PolicySpec:
-        """What the policy is built for."""
+        """Return the inputs and outputs of a policy for these data.
+
+        Args:
+            language_dim: Size of the embedding of an instruction.
+        """
         return PolicySpec(
             views=tuple(self.views),
             image_size=(self.image_size, self.image_size),

@@ -1,4 +1,7 @@
-"""What is read of a demonstration file, and in which form the windows want it."""
+"""What is read of a demonstration file, and the tensors that datasets make of it.
+
+Shape legend: F frames, V views, H W C image, D size of a reading, A action, L language embedding.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,11 +22,11 @@ class DemoSource:
     """A demonstration file and what a policy takes from it.
 
     Attributes:
-        path: HDF5 in the original's layout.
-        spec: Which views and readings, their sizes, and `seq_len`.
-        limit: The first so many demonstrations only.
-        pairing: `aligned` pairs each action with the observation before it; `stored` takes the file as it is,
-            which in the original's files is the observation after it.
+        path: HDF5 file in the original's layout, or a folder with the parts of one.
+        spec: Views, readings, their sizes, and `seq_len`.
+        limit: Largest number of demonstrations to read; None for all.
+        pairing: `aligned` pairs each action with the observation before it; `stored` reads the file as it is, which
+            in the original's files pairs it with the observation after it.
         labels: `expert` or `executed`, see `libero_env.demos.read.read_demos`.
     """
 
@@ -34,53 +37,51 @@ class DemoSource:
     labels: Literal["expert", "executed"] = "expert"
 
     def lengths(self) -> list[int]:
-        """Frames of each demonstration, from the file's headers alone."""
+        """Return the number of frames of each demonstration; only shapes are read."""
         return demo_lengths(self.path, self.limit, pairing=self.pairing)
 
     def nbytes(self) -> int:
-        """Bytes that the pictures take in memory."""
+        """Return the number of bytes of the images in memory."""
         height, width = self.spec.image_size
         return sum(self.lengths()) * len(self.spec.views) * height * width * 3
 
     def demos(self) -> Iterator[Demo]:
-        """The demonstrations, one in memory at a time.
+        """Yield the demonstrations, with one in memory at a time.
 
         Raises:
-            DemoError: The file is broken; names file, demonstration, key and what was expected.
-            DataError: The file is sound but does not fit the spec.
+            DemoError: The file is broken; the message names file, demonstration, key and what was expected.
+            DataError: The file is valid but does not fit the spec.
         """
-        keys = [*self.spec.views, *(self.spec.proprio or ())]
+        keys = [*self.spec.views, *self.spec.proprio]
         for demo in iter_demos(self.path, keys, self.limit, pairing=self.pairing, labels=self.labels):
             check_fits(demo, self.spec, str(self.path))
             yield demo
 
 
-@dataclass(frozen=True)
-class DemoArrays:
-    """A demonstration as windows store it."""
+def demo_tensors(demo: Demo, spec: PolicySpec) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+    """Return the tensors of a demonstration that fits the spec.
 
-    images: Tensor  # (F, V, H, W, C) uint8, upright
-    proprio: dict[str, Tensor]  # name -> (F, D) float32
-    actions: Tensor  # (F, A) float32
-
-    @classmethod
-    def of(cls, demo: Demo, spec: PolicySpec) -> "DemoArrays":
-        """Those of a demonstration that fits the spec."""
-        images = torch.from_numpy(np.stack([demo.obs[view] for view in spec.views], axis=1))
-        proprio = {name: _floats(demo.obs[name]) for name in spec.proprio or ()}
-        return cls(images, proprio, _floats(demo.actions))
+    Returns:
+        Images, (F, V, H, W, C) uint8, upright; readings, name to (F, D) float32; actions, (F, A) float32.
+    """
+    images = torch.from_numpy(np.stack([demo.obs[view] for view in spec.views], axis=1))
+    return images, {name: _floats(demo.obs[name]) for name in spec.proprio}, _floats(demo.actions)
 
 
 def last_frames(lengths: list[int]) -> Tensor:
-    """(F,) int64: of each frame, the last one of its demonstration."""
+    """Return for each frame the index of the last frame of its demonstration, (F,) int64."""
     counts = torch.tensor(lengths, dtype=torch.int64)
     return (counts.cumsum(0) - 1).repeat_interleave(counts)
 
 
 def check_fits(demo: Demo, spec: PolicySpec, source: str) -> None:
-    """Raises DataError when a demonstration does not fit the spec."""
+    """Check that a demonstration fits the spec.
+
+    Raises:
+        DataError: It does not; the message names `source`, demonstration, key and what was expected.
+    """
     expected: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
-    expected |= {name: (size,) for name, size in (spec.proprio or {}).items()}
+    expected |= {name: (size,) for name, size in spec.proprio.items()}
     where = f"{source}: {demo.name}"
     if demo.actions.ndim != 2 or demo.actions.shape[1] != spec.action_dim:
         raise DataError(f"{where}/actions is {demo.actions.shape}; expected (T, {spec.action_dim})")
@@ -100,7 +101,11 @@ def check_fits(demo: Demo, spec: PolicySpec, source: str) -> None:
 
 
 def check_language(language: Tensor, spec: PolicySpec) -> Tensor:
-    """The embedding as (L,) float32; raises DataError where it is not what the policy was made for."""
+    """Return the embedding of the instruction as (L,) float32.
+
+    Raises:
+        DataError: It has another size than the spec.
+    """
     language = torch.as_tensor(language, dtype=torch.float32)
     if language.shape != (spec.language_dim,):
         raise DataError(
@@ -108,6 +113,16 @@ def check_language(language: Tensor, spec: PolicySpec) -> Tensor:
             f"({spec.language_dim},). Choose the language encoder that the spec was made for"
         )
     return language
+
+
+def check_indices(indices: Tensor, windows: int) -> None:
+    """Check the indices of windows.
+
+    Raises:
+        DataError: One of them is not in [0, windows).
+    """
+    if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < windows):
+        raise DataError(f"window indices must lie in [0, {windows}), got {indices.min()} .. {indices.max()}")
 
 
 def _floats(array: np.ndarray) -> Tensor:

@@ -29,6 +29,21 @@ def block_causal_mask(length: int, tokens: int) -> Tensor:
     return step[None, :] <= step[:, None]
 
 
+def attend(qkv: Tensor, heads: int, mask: Tensor | None = None, dropout: float = 0.0) -> Tensor:
+    """Return the attention of several heads, (B, S, heads * head_dim).
+
+    Args:
+        qkv: Queries, keys and values of all heads, (B, S, 3 * heads * head_dim).
+        heads: Number of heads.
+        mask: (S, S), True where a token may attend; None: everywhere.
+        dropout: Probability that an attention weight is dropped.
+    """
+    b, s, _ = qkv.shape
+    q, k, v = qkv.view(b, s, 3, heads, -1).permute(2, 0, 3, 1, 4)  # each (B, heads, S, head_dim)
+    mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=dropout)
+    return mixed.transpose(1, 2).reshape(b, s, -1)
+
+
 class TransformerLayer(nn.Module):
     """Pre-norm self-attention and feed-forward; torch's own layer ties the head size to E / heads, this does not."""
 
@@ -49,12 +64,9 @@ class TransformerLayer(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, S, E), mask (S, S) -> (B, S, E); without a mask every token sees every other."""
-        b, s, _ = x.shape
-        qkv = self.qkv(self.attention_norm(x)).view(b, s, 3, self.heads, self.head_dim)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, S, head_dim)
         dropout = self.dropout if self.training else 0.0
-        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=dropout)
-        x = x + self.drop(self.out(mixed.transpose(1, 2).reshape(b, s, -1)))
+        mixed = attend(self.qkv(self.attention_norm(x)), self.heads, mask, dropout)
+        x = x + self.drop(self.out(mixed))
         return x + self.mlp(self.mlp_norm(x))
 
 

@@ -7,15 +7,15 @@ import pytest
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
-from libero_env.expert.arm.gripper import MAX_OPENING, WIDEST
-from libero_env.expert.arm.reach import limit_elbow_extension
+from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm.kinematics import limit_elbow_extension
 from libero_env.expert.arm.servo import action_toward, downward
 from libero_env.expert.grasping.costs import finger_offset, grip_cost
-from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, grasps
-from libero_env.expert.planning.pick_plan import Failure, _alike, choose_approach, choose_place
+from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, find_grasps
+from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt, plan_pick, plan_place
 from libero_env.expert.rollout import run_experts
-from libero_env.expert.skills.transport import Carry, Move
-from libero_env.geometry import rotation_between, surface_points
+from libero_env.expert.skills.transport import Move, Transport
+from libero_env.geometry import Pose, rotation_between, surface_points
 from libero_env.sim.predicates import atoms_of, evaluate
 from libero_env.sim.regions import contains, is_over, region_boxes
 from libero_env.tasks import get_suite, get_task
@@ -64,7 +64,7 @@ def test_a_box_is_taken_across_its_narrow_side(angle):
     cloud = turned(box((0.04, 0.02, 0.015)), angle, (0.2, -0.1))
     grasp = choose_grasp(cloud, NOTHING, 0.0, X_AXIS)
     assert between(grasp.yaw, angle + np.pi / 2) < 0.06
-    assert grasp.width == pytest.approx(0.04, abs=0.004) and grasp.width <= WIDEST
+    assert grasp.width == pytest.approx(0.04, abs=0.004) and grasp.width <= GRIPPER.max_grasp_width
     np.testing.assert_allclose(grasp.pos_world[:2], [0.2, -0.1], atol=0.004)
     assert 0.012 < grasp.pos_world[2] < 0.03
 
@@ -98,7 +98,7 @@ def test_fingers_keep_out_of_neighbours():
 def test_what_is_too_wide_is_refused_with_its_width():
     with pytest.raises(GraspError, match=r"crate cannot be grasped.*1[0-9]\.[0-9] cm wide") as caught:
         choose_grasp(box((0.06, 0.07, 0.03), 0.005), NOTHING, 0.0, X_AXIS, "crate")
-    assert f"{100 * MAX_OPENING:.0f} cm" in str(caught.value)
+    assert f"{100 * GRIPPER.max_opening:.0f} cm" in str(caught.value)
 
 
 def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
@@ -232,7 +232,7 @@ def test_of_a_choice_the_easier_is_taken(view_of):
 def test_a_bowl_is_taken_by_its_wall(view_of):
     view = view_of("libero_goal/1")
     cloud = Shapes(view.scene).cloud(view, "akita_black_bowl_1")
-    for grasp in grasps(cloud, 0.9, X_AXIS)[:5]:
+    for grasp in find_grasps(cloud, 0.9, X_AXIS)[:5]:
         across = grasp.mat.T @ (view.body_pos("akita_black_bowl_1") - grasp.pos_world)
         assert 0.03 < np.hypot(across[0], across[1]) < 0.09  # beside the middle
         assert grasp.width < 0.03
@@ -243,8 +243,8 @@ def test_a_bowl_is_taken_by_its_wall(view_of):
 def test_at_a_place_the_atom_would_hold(task_id, view_of):
     view = view_of(task_id)
     (step,) = plan_goal(get_task(task_id).problem.goal, view)
-    way = choose_approach(view, Shapes(view.scene), step.atom)
-    np.testing.assert_allclose(way.hand_mat @ way.hand_mat.T, np.eye(3), atol=1e-9)
+    way = plan_pick(view, Shapes(view.scene), step.atom)
+    np.testing.assert_allclose(way.release_mat @ way.release_mat.T, np.eye(3), atol=1e-9)
     test = contains if step.atom.predicate == "In" else is_over
     assert any(test(box, way.place.pos + [0, 0, 0.003]) for box in region_boxes(view, step.atom.args[1]))
 
@@ -253,22 +253,22 @@ def test_at_a_place_the_atom_would_hold(task_id, view_of):
 def test_what_failed_is_not_tried_again_the_same_way(view_of):
     view = view_of("libero_goal/1")
     shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
-    first = choose_approach(view, shapes, atom)
-    failures = [Failure.of(first, placed=True)]
+    first = plan_pick(view, shapes, atom)
+    failures = [FailedAttempt.from_plan(first, placed=True)]
     for _ in range(2):
-        way = choose_approach(view, shapes, atom, failures=failures)
-        tried = Failure.of(way, placed=True)
-        assert not any(_alike(tried.hold, failure.hold) for failure in failures)
+        way = plan_pick(view, shapes, atom, failures=failures)
+        tried = FailedAttempt.from_plan(way, placed=True)
+        assert not any(SEARCH.is_same(tried.grasp, failure.grasp) for failure in failures)
         failures.append(tried)
-    assert np.linalg.norm(choose_approach(view, shapes, atom).grasp.pos_world - first.grasp.pos_world) == 0.0
+    assert np.linalg.norm(plan_pick(view, shapes, atom).grasp.pos_world - first.grasp.pos_world) == 0.0
 
 
 @pytest.mark.sim
 def test_another_place_is_found_for_what_is_in_the_hand(view_of):
     view = view_of("libero_goal/1")
     shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
-    first = choose_place(view, shapes, atom)
-    other = choose_place(view, shapes, atom, failures=[Failure(None, first.place)])
+    first = plan_place(view, shapes, atom)
+    other = plan_place(view, shapes, atom, failures=[FailedAttempt(None, first.place)])
     np.testing.assert_allclose(first.grasp.pos_world, view.eef_pos)
     turn = np.linalg.norm(rotation_between(first.place.mat, other.place.mat))
     assert np.linalg.norm(first.place.pos - other.place.pos) > 0.01 or turn > 0.3
@@ -280,12 +280,12 @@ def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     view = view_of("libero_90/73")
     (step,) = plan_goal(get_task("libero_90/73").problem.goal, view)
     shapes = Shapes(view.scene)
-    way = choose_approach(view, shapes, step.atom)
+    way = plan_pick(view, shapes, step.atom)
     assert way.place.entry[2] < -0.5
-    carry = Carry(view, step.atom, way, style=MotionStyle(), shapes=shapes)
-    low = shapes.span(view, step.atom.args[0])[0]
-    rim = shapes.span(view, "desk_caddy_1")[1]
-    move = carry.next(view, np.ones(3))
+    transport = Transport(view, step.atom, way, style=MotionStyle(), shapes=shapes)
+    low = shapes.height_range(view, step.atom.args[0])[0]
+    rim = shapes.height_range(view, "desk_caddy_1")[1]
+    move = transport.next_move(view, np.ones(3))
     assert isinstance(move, Move)
     assert move.pos[2] - view.eef_pos[2] + low > way.place.pos[2] + 0.04  # not yet where it will stand
     assert rim > way.place.pos[2] + 0.04
@@ -296,9 +296,11 @@ def test_the_arm_keeps_its_elbow_bent(view_of):
     view = view_of("libero_goal/1")
     arm, start = Shapes(view.scene).arm, view.simulations.fields["qpos"][view.index][:7]
     down = downward(0.0, X_AXIS)
-    near, miss = arm.reach(start, np.array([0.0, 0.0, 1.0]), down)
+    near, miss = arm.solve(start, Pose(np.array([0.0, 0.0, 1.0]), down))
     assert miss == 0.0 and near[3] < -0.9
-    far, miss = arm.reach(start, np.array([0.35, 0.0, 1.0]), down)  # could be touched with a straight arm
+    far, miss = arm.solve(
+        start, Pose(np.array([0.35, 0.0, 1.0]), down)
+    )  # could be touched with a straight arm
     assert miss > 0.0 and far[3] <= -0.9
 
 

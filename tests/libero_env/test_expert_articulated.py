@@ -5,11 +5,17 @@ import pytest
 
 from libero_env.assets.robot import REST_QPOS
 from libero_env.envs.batch import BatchEnv
+from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm.kinematics import ArmKinematics
 from libero_env.expert.arm.posture import posture_cost, reach_violation, wrist_bend
-from libero_env.expert.arm.reach import Arm
 from libero_env.expert.arm.servo import downward
-from libero_env.expert.grasping.handle_grasps import OPEN_HALF, TIP, crowding, handle_hold, knob_hold, under
-from libero_env.expert.grasping.handles import Part, find_handle, turned
+from libero_env.expert.grasping.handle_grasps import (
+    grasp_handle,
+    grasp_knob,
+    hand_collision_depth,
+    table_penetration,
+)
+from libero_env.expert.grasping.handles import Part, find_handle, hinge_rotation
 from libero_env.expert.skills.move_joint import MoveJoint
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
@@ -156,13 +162,13 @@ def test_the_handle_is_in_front(tmp_path, case):
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
     view = env.world.views[0]
-    part = Part.of(view.scene.model, view.scene.joints[address][0])
+    part = Part.from_joint(view.scene.model, view.scene.joints[address][0])
     handle = find_handle(view, part, -1.0)
     assert np.linalg.norm(handle.out) == pytest.approx(1.0) and abs(handle.out @ handle.along) < 1e-6
     assert handle.out[1] > 0.9  # towards the middle of the table
     assert (abs(handle.along[2]) > 0.9) == (case[0] == "microwave")
-    assert handle.half > 0.03 and handle.depth < 0.03
-    assert (handle.part @ handle.out).max() == pytest.approx(
+    assert handle.half_length > 0.03 and handle.depth < 0.03
+    assert (handle.part_points @ handle.out).max() == pytest.approx(
         handle.pos @ handle.out + 0.5 * handle.depth, abs=1e-3
     )
     env.close()
@@ -175,17 +181,17 @@ def poses(number, seed=0):
     mats = []
     for yaw, about, lean in rng.uniform([0.6, 0.0, 0.0], [2.5, 2 * np.pi, 0.5], (number, 3)):
         axis = np.array([np.cos(about), np.sin(about), 0.0])
-        mats.append(turned(axis, lean) @ downward(yaw, np.array([0.0, 1.0, 0.0])))
+        mats.append(hinge_rotation(axis, lean) @ downward(yaw, np.array([0.0, 1.0, 0.0])))
     return pos, np.array(mats)
 
 
 def test_the_wrist_bends_as_inverse_kinematics_says():
     env = BatchEnv("libero_goal/7", 1, num_threads=1, cameras=())
-    arm, base = Arm(env.world.scene.model), np.array(env.world.scene.workspace.robot_base_pos)
+    arm, base = ArmKinematics(env.world.scene.model), np.array(env.world.scene.workspace.robot_base_pos)
     env.close()
     pos, mat = poses(60)
     expected = wrist_bend(pos, mat, base)
-    found = [arm.reach(np.array(REST_QPOS), p, m) for p, m in zip(pos, mat, strict=True)]
+    found = [arm.solve(np.array(REST_QPOS), Pose(p, m)) for p, m in zip(pos, mat, strict=True)]
     errors = np.array(
         [angles[5] - e for (angles, miss), e in zip(found, expected, strict=True) if miss == 0.0]
     )
@@ -205,27 +211,29 @@ def test_a_hand_meets_what_is_in_it():
     pose = Pose(np.array([0.1, 0.2, 0.3]), downward(0.4, np.array([1.0, 0.0, 0.0])))
 
     def depth(x, y, z):  # in the frame of the hand: along the fingers, across them, and where they point
-        return crowding(pose.apply(np.array([[x, y, z]])), pose, OPEN_HALF, OPEN_HALF)
+        return hand_collision_depth(
+            pose.apply(np.array([[x, y, z]])), pose, GRIPPER.half_opening, GRIPPER.half_opening
+        )
 
     assert depth(0.0, 0.0, 0.0) == 0.0  # between the fingers
-    assert depth(OPEN_HALF + 0.5 * TIP, 0.0, 0.0) > 0.005
-    assert depth(OPEN_HALF + 0.5 * TIP, 0.03, 0.0) == 0.0  # beside them
+    assert depth(GRIPPER.half_opening + 0.5 * GRIPPER.tip_thickness, 0.0, 0.0) > 0.005
+    assert depth(GRIPPER.half_opening + 0.5 * GRIPPER.tip_thickness, 0.03, 0.0) == 0.0  # beside them
     assert depth(0.0, 0.0, -0.08) > 0.02  # the palm
     assert depth(0.0, 0.0, 0.02) == 0.0  # in front
-    assert under(0.2, pose, True) == 0.0 and under(0.3, pose, True) > 0.01
+    assert table_penetration(0.2, pose, True) == 0.0 and table_penetration(0.3, pose, True) > 0.01
 
 
 def test_a_hand_leans_over_a_knob_close_to_the_base():
     env = BatchEnv(get_task("libero_goal/7"), 1, num_threads=1, cameras=())
     env.reset(options={"init_state": 8})
     view = env.world.views[0]
-    part = Part.of(view.scene.model, view.scene.joints["flat_stove_1"][0])
-    hold, base = knob_hold(view, part, 0.8), np.array(view.scene.workspace.robot_base_pos)
-    ends = [hold.held, part.moved(view, hold.held, 0.8)]
-    upright = downward(np.arctan2(hold.held.mat[1, 0], hold.held.mat[0, 0]), hold.held.mat[:, 0])
-    assert wrist_bend(hold.held.pos[None], upright[None], base)[0] > 2.9
+    part = Part.from_joint(view.scene.model, view.scene.joints["flat_stove_1"][0])
+    hold, base = grasp_knob(view, part, 0.8), np.array(view.scene.workspace.robot_base_pos)
+    ends = [hold.contact, part.pose_after(view, hold.contact, 0.8)]
+    upright = downward(np.arctan2(hold.contact.mat[1, 0], hold.contact.mat[0, 0]), hold.contact.mat[:, 0])
+    assert wrist_bend(hold.contact.pos[None], upright[None], base)[0] > 2.9
     assert all(wrist_bend(pose.pos[None], pose.mat[None], base)[0] < 2.9 for pose in ends)
-    assert hold.held.mat[2, 2] < -0.8 and abs(hold.held.mat[2, 0]) < 1e-6  # the fingers stay level
+    assert hold.contact.mat[2, 2] < -0.8 and abs(hold.contact.mat[2, 0]) < 1e-6  # the fingers stay level
     env.close()
 
 
@@ -234,14 +242,17 @@ def test_a_door_may_turn_under_the_hand(tmp_path):
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
     view = env.world.views[0]
-    part = Part.of(view.scene.model, view.scene.joints[address][0])
+    part = Part.from_joint(view.scene.model, view.scene.joints[address][0])
     delta = -part.value(view)
-    hold = handle_hold(view, part, find_handle(view, part, 1.0), delta, False)
-    rigid, free = part.moved(view, hold.held, delta), part.moved(view, hold.held, delta, turn=0.0)
-    assert delta < -2.0 and hold.follow < 1.0
+    hold = grasp_handle(view, part, find_handle(view, part, 1.0), delta, False)
+    rigid, free = (
+        part.pose_after(view, hold.contact, delta),
+        part.pose_after(view, hold.contact, delta, rotation=0.0),
+    )
+    assert delta < -2.0 and hold.follow_ratio < 1.0
     np.testing.assert_allclose(rigid.pos, free.pos)
-    np.testing.assert_array_equal(free.mat, hold.held.mat)
+    np.testing.assert_array_equal(free.mat, hold.contact.mat)
     anchor, axis = part.axis(view)
-    radius = [np.linalg.norm(np.cross(p - anchor, axis)) for p in (hold.held.pos, rigid.pos)]
+    radius = [np.linalg.norm(np.cross(p - anchor, axis)) for p in (hold.contact.pos, rigid.pos)]
     assert radius[0] == pytest.approx(radius[1])
     env.close()

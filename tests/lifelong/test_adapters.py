@@ -10,10 +10,11 @@ from torch import nn
 from lifelong import checkpoints
 from lifelong.algorithms import DMPEL, LoRA
 from lifelong.algorithms.dmpel import _padded
+from lifelong.data.windows import WindowSubset
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import Router, change
 from lifelong.seeding import generator, seeded
-from lifelong.streams import StageWindows, WindowSubset
+from lifelong.streams import StageWindows
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Observation

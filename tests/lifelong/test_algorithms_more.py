@@ -8,7 +8,7 @@ import torch
 from lifelong import checkpoints
 from lifelong.algorithms import AGEM, MAS, SI, Algorithm, DERpp, LwF, Multitask, SingleTask
 from lifelong.algorithms.agem import project
-from lifelong.algorithms.base import JoinedWindows
+from lifelong.data.windows import JoinedWindows
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator

@@ -14,7 +14,7 @@ from libero_env.demos.read import Demo, demo_lengths, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import DemoSource, ReplayMemory, SequenceVLDataset, frame_cache, loading, open_windows
 from lifelong.data.frame_cache import cache_root
-from lifelong.data.loading import choose
+from lifelong.data.loading import choose_memory
 from lifelong.errors import DataError
 from lifelong.types import Batch, PolicySpec
 
@@ -225,7 +225,7 @@ def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
     gib = 2**30
     monkeypatch.setattr(loading, "host_memory", lambda: tuple(gib * n for n in host))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: tuple(gib * n for n in gpu))
-    assert choose(21 * gib, GPU if gpu else CPU) == expected
+    assert choose_memory(21 * gib, GPU if gpu else CPU) == expected
 
 
 def test_the_memory_of_this_machine_is_known() -> None:

@@ -58,5 +58,5 @@ def test_without_a_folder_ours_are_taken(tmp_path, recorded, monkeypatch):
 
 def test_too_few_are_told(tmp_path, recorded):
     lay_out(tmp_path, TASKS[0], 1)
-    with pytest.raises(DataError, match="has 1 demonstrations and 2 are wanted"):
+    with pytest.raises(DataError, match="has 1 demonstrations and 2 are required"):
         demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)

@@ -59,7 +59,7 @@ def to_native(obs: Mapping[str, Tensor], task_emb: Tensor, spec: PolicySpec) -> 
         spec: Views and proprioceptive inputs to take.
     """
     images = torch.stack([uint8_image(obs[view]).flip(-3) for view in spec.views], dim=2).contiguous()
-    proprio = {name: proprio_input(obs, name) for name in spec.proprio or ()}
+    proprio = {name: proprio_input(obs, name) for name in spec.proprio}
     return Observation(images, proprio, task_emb.float())
 
 

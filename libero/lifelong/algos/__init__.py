@@ -7,16 +7,3 @@ from libero.lifelong.algos.ewc import EWC
 from libero.lifelong.algos.multitask import Multitask
 from libero.lifelong.algos.packnet import PackNet
 from libero.lifelong.algos.single_task import SingleTask
-
-__all__ = [
-    "AGEM",
-    "ER",
-    "EWC",
-    "REGISTERED_ALGOS",
-    "Multitask",
-    "PackNet",
-    "Sequential",
-    "SingleTask",
-    "get_algo_class",
-    "get_algo_list",
-]

@@ -1,11 +1,11 @@
-"""What every policy of the original's kind gives, and the registry of them.
+"""Base class of the original's policies, and their registry.
 
-Shape legend: B batch, T time, C H W image, A action, L language embedding.
+Shape legend: B batch, T time, C H W image, D dimension of a proprioceptive input, A action, L language embedding.
 """
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from torch import Tensor, nn
@@ -18,31 +18,31 @@ REGISTERED_POLICIES: dict[str, type["BasePolicy"]] = {}
 
 
 def register_policy(policy_class: type["BasePolicy"]) -> None:
-    """Make a policy known by its name; subclasses of BasePolicy are when they are defined."""
+    """Register a policy under its class name. Subclasses of BasePolicy are registered when they are defined."""
     REGISTERED_POLICIES[policy_class.__name__] = policy_class
 
 
 def get_policy_class(policy_name: str) -> type["BasePolicy"]:
-    """The policy of this name; case does not count.
+    """Return the policy of a name, ignoring case.
 
     Raises:
-        UnknownNameError: no such policy.
+        UnknownNameError: There is no policy of this name.
     """
     return lookup(REGISTERED_POLICIES, "policy", policy_name)
 
 
 def get_policy_list() -> dict[str, type["BasePolicy"]]:
-    """Name -> class of all policies."""
+    """Return all policies by name."""
     return dict(REGISTERED_POLICIES)
 
 
 class PolicyMeta(type):
-    """Registers every subclass of BasePolicy, but for those defined with `registered=False`."""
+    """Registers every subclass of BasePolicy, except those defined with `registered=False`."""
 
     def __new__(mcs, name: str, bases: tuple, namespace: dict[str, Any], registered: bool = True) -> Any:
         cls = super().__new__(mcs, name, bases, namespace)
         if registered:
-            register_policy(cls)  # type: ignore[arg-type]
+            register_policy(cast(Any, cls))
         return cls
 
     def __init__(cls, name: str, bases: tuple, namespace: dict[str, Any], registered: bool = True):
@@ -50,15 +50,15 @@ class PolicyMeta(type):
 
 
 class BasePolicy(nn.Module, metaclass=PolicyMeta, registered=False):
-    """A policy trained on dictionaries of windows.
+    """Policy trained on dictionaries of windows.
 
-    A subclass sets `policy_head` and gives `forward` and `get_action`; `reset` forgets an episode. A batch is never
-    changed. Data in training: `obs` {view: (B, T, C, H, W) in [0, 1], reading: (B, T, D)}, `actions` (B, T, A),
-    `task_emb` (B, L); when acting without T.
+    A subclass sets `policy_head` and implements `forward` and `get_action`; it never changes a batch. Data in training:
+    `obs` {view: (B, T, C, H, W) in [0, 1], proprioceptive input: (B, T, D)}, `actions` (B, T, A), `task_emb` (B, L);
+    when acting without T.
 
     Args:
-        cfg: the configuration: `policy`, `data`, `train` and `device`.
-        shape_meta: from `get_dataset`.
+        cfg: Configuration with `policy`, `data`, `train` and `device`.
+        shape_meta: Shapes from `get_dataset`.
     """
 
     policy_head: Any
@@ -72,19 +72,19 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta, registered=False):
 
     @abstractmethod
     def forward(self, data: Mapping[str, Any]) -> Any:
-        """The distribution of actions (B, T, A) that `policy_head` gives."""
+        """Return the distribution of actions (B, T, A) from `policy_head`."""
         raise NotImplementedError(f"{type(self).__name__} has no forward(data)")
 
     @abstractmethod
     def get_action(self, data: Mapping[str, Any]) -> np.ndarray:
-        """The next actions (B, A) from observations without a time axis."""
+        """Return the next actions (B, A) from observations without a time axis."""
         raise NotImplementedError(f"{type(self).__name__} has no get_action(data)")
 
     def reset(self) -> None:
-        """Forget what was seen: the next observation begins an episode."""
+        """Forget the history: the next observation begins an episode."""
 
     def preprocess_input(self, data: Mapping[str, Any], train_mode: bool = True) -> dict[str, Any]:
-        """Augmented in training; when acting, with a time axis of one step."""
+        """Augment the images in training; when acting, add a time axis of one step."""
         if train_mode:
             if not self.use_augmentation:
                 return dict(data)
@@ -94,12 +94,12 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta, registered=False):
         return {**stepped, "task_emb": data["task_emb"]} if "task_emb" in data else stepped
 
     def compute_loss(self, data: Mapping[str, Any], reduction: str = "mean") -> Tensor:
-        """The head's loss on a batch."""
+        """Return the head's loss on a batch; the reduction is `mean`, `sum` or `none`."""
         data = self.preprocess_input(data, train_mode=True)
         return self.policy_head.loss_fn(self.forward(data), data["actions"], reduction)
 
     def loss(self, batch: DictBatch) -> Tensor:
-        """The mean loss, as the algorithms of `lifelong` ask for it."""
+        """Return the mean loss, for the algorithms of `lifelong`."""
         return self.compute_loss(batch.data)
 
     def _get_img_tuple(self, data: Mapping[str, Any]) -> tuple[Tensor, ...]:
@@ -110,7 +110,7 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta, registered=False):
 
 
 def _augmentations(policy_cfg: Any) -> list[nn.Module]:
-    """Those that the configuration names, colours first."""
+    """Return the configured augmentations, colours first."""
     nodes = [policy_cfg.get(key) for key in ("color_aug", "translation_aug")]
     return [
         lookup(AUGMENTATIONS, "augmentation", node["network"])(**plain(node["network_kwargs"]))

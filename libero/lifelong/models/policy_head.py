@@ -1,4 +1,4 @@
-"""From latents to actions: the heads of `lifelong.nn.heads` as distributions of PyTorch.
+"""Action heads: those of `lifelong.nn.heads`, which return distributions of PyTorch here.
 
 Shape legend: E latent, K modes, A action.
 """
@@ -11,23 +11,38 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from lifelong.errors import PolicyError
 from lifelong.nn import heads
 
-__all__ = ["DeterministicHead", "GMMHead"]
+
+class _Head(nn.Module):
+    """Native head and the factor of its loss."""
+
+    action_squash = True
+
+    def __init__(self, head: Any, loss_coef: float):
+        super().__init__()
+        self.head, self.loss_coef = head, loss_coef
+
+    def _reduce(self, losses: Tensor, reduction: str) -> Tensor:
+        if reduction not in ("mean", "sum", "none"):
+            raise PolicyError(f"reduction is {reduction!r}; valid: mean, sum, none")
+        return (losses if reduction == "none" else getattr(losses, reduction)()) * self.loss_coef
 
 
-class GMMHead(nn.Module):
-    """A mixture of K Gaussians over actions, means squashed by tanh.
+class GMMHead(_Head):
+    """Mixture of K Gaussians over actions, with means squashed by tanh; see `lifelong.nn.heads.GMMHead`.
 
     Args:
-        input_size, output_size: E, A.
-        hidden_size, num_layers: of the layers before.
-        min_std: smallest standard deviation.
+        input_size: E.
+        output_size: A.
+        hidden_size: Size of the hidden layers.
+        num_layers: Number of hidden layers.
+        min_std: Smallest standard deviation.
         num_modes: K.
-        activation: of the deviations: `softplus`, the only one.
-        low_eval_noise: in evaluation mode deviations are `min_std`.
-        loss_coef: the loss is multiplied by it.
+        activation: Activation of the deviations: `softplus`, the only one.
+        low_eval_noise: Whether deviations are `min_std` in evaluation mode.
+        loss_coef: Factor of the loss.
 
     Raises:
-        PolicyError: another activation.
+        PolicyError: Another activation.
     """
 
     def __init__(
@@ -42,40 +57,29 @@ class GMMHead(nn.Module):
         low_eval_noise: bool = False,
         loss_coef: float = 1.0,
     ):
-        super().__init__()
         check_activation(activation)
-        self.head = heads.GMMHead(
-            in_dim=input_size,
-            action_dim=output_size,
-            modes=num_modes,
-            hidden=hidden_size,
-            layers=num_layers,
-            min_std=min_std,
-            low_eval_noise=low_eval_noise,
-        )
-        self.loss_coef = loss_coef
+        sizes: dict[str, Any] = {"modes": num_modes, "min_std": min_std, "low_eval_noise": low_eval_noise}
+        sizes |= {"hidden": hidden_size, "layers": num_layers}
+        super().__init__(heads.GMMHead(in_dim=input_size, action_dim=output_size, **sizes), loss_coef)
 
     def forward(self, x: Tensor) -> MixtureSameFamily:
-        """(..., E) -> a distribution over (..., A)."""
-        params, stds = self.head(x), None
+        """Return the distribution over actions (..., A) given latents (..., E)."""
+        params = self.head(x)
+        stds = params["stds"]
         if self.head.low_eval_noise and not self.head.training:
-            stds = params["stds"].new_full(params["stds"].shape, self.head.min_std)
-        parts = Independent(Normal(params["means"], params["stds"] if stds is None else stds), 1)
+            stds = stds.new_full(stds.shape, self.head.min_std)
+        parts = Independent(Normal(params["means"], stds), 1)
         return MixtureSameFamily(Categorical(logits=params["logits"]), parts)
 
     def loss_fn(self, gmm: MixtureSameFamily, target: Tensor, reduction: str = "mean") -> Tensor:
-        """Negative log-likelihood of actions (..., A): mean, sum, or none (...)."""
-        return _reduced(-gmm.log_prob(target.float()), reduction) * self.loss_coef
+        """Return the negative log-likelihood of actions (..., A); the reduction is `mean`, `sum` or `none`."""
+        return self._reduce(-gmm.log_prob(target.float()), reduction)
 
 
-class DeterministicHead(nn.Module):
-    """One action, trained by absolute error.
+class DeterministicHead(_Head):
+    """One action, trained by absolute error; see `lifelong.nn.heads.DeterministicHead`.
 
-    Args:
-        input_size, output_size: E, A.
-        hidden_size, num_layers: of the layers before.
-        action_squash: actions go through tanh.
-        loss_coef: the loss is multiplied by it.
+    `action_squash` says whether actions go through tanh; for the other arguments see `GMMHead`.
     """
 
     def __init__(
@@ -87,42 +91,33 @@ class DeterministicHead(nn.Module):
         action_squash: bool = True,
         loss_coef: float = 1.0,
     ):
-        super().__init__()
-        self.head = heads.DeterministicHead(
-            in_dim=input_size, action_dim=output_size, hidden=hidden_size, layers=num_layers
+        sizes = {"hidden": hidden_size, "layers": num_layers}
+        super().__init__(
+            heads.DeterministicHead(in_dim=input_size, action_dim=output_size, **sizes), loss_coef
         )
-        self.action_squash, self.loss_coef = action_squash, loss_coef
+        self.action_squash = action_squash
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., E) -> (..., A)."""
-        if self.action_squash:
-            return self.head(x)["means"]
-        return self.head.means(self.head.trunk(x))
+        """Return actions (..., A) for latents (..., E)."""
+        return self.head(x)["means"] if self.action_squash else self.head.means(self.head.trunk(x))
 
     def loss_fn(self, action: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
-        """Absolute error of actions (..., A): mean, sum, or none (...)."""
-        return _reduced((action - target.float()).abs().mean(-1), reduction) * self.loss_coef
+        """Return the absolute error of actions (..., A); the reduction is `mean`, `sum` or `none`."""
+        return self._reduce((action - target.float()).abs().mean(-1), reduction)
 
 
 HEADS = {kind.__name__: kind for kind in (DeterministicHead, GMMHead)}
 
 
-def head_over(native: heads.ActionHead, loss_coef: float) -> GMMHead | DeterministicHead:
-    """A native head under the original's methods; the weights are shared."""
+def wrap_head(native: heads.ActionHead, loss_coef: float) -> GMMHead | DeterministicHead:
+    """Return a native head with the original's methods; the weights are shared."""
     kind: Any = GMMHead if isinstance(native, heads.GMMHead) else DeterministicHead
     head = kind.__new__(kind)
-    nn.Module.__init__(head)
-    head.head, head.loss_coef, head.action_squash = native, loss_coef, True
+    _Head.__init__(head, native, loss_coef)
     return head
 
 
 def check_activation(activation: str) -> None:
-    """Raises PolicyError where it is not the one there is."""
+    """Raise a PolicyError if the activation is not the only one there is."""
     if activation != "softplus":
         raise PolicyError(f"activation is {activation!r}; valid: softplus")
-
-
-def _reduced(losses: Tensor, reduction: str) -> Tensor:
-    if reduction not in ("mean", "sum", "none"):
-        raise PolicyError(f"reduction is {reduction!r}; valid: mean, sum, none")
-    return losses if reduction == "none" else getattr(losses, reduction)()

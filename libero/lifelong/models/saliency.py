@@ -1,4 +1,4 @@
-"""Where a policy looks: `lifelong.evaluation.saliency` for policies that take dictionaries.
+"""Saliency of `lifelong.evaluation.saliency` for policies whose batches are dictionaries.
 
 Shape legend: B batch, T time, C H W image, A action.
 """
@@ -17,13 +17,13 @@ from lifelong.types import Batch, Observation
 
 
 class PerturbationAttention:
-    """How far a policy's action moves when a place of a picture is blurred; see `lifelong.evaluation.saliency`.
+    """Change of a policy's action when a place of an image is blurred; see `lifelong.evaluation.saliency`.
 
     Args:
-        model: a policy: `forward(data)` gives a distribution of actions, or actions.
-        image_size: H, W of pictures in which lengths are measured.
-        patch_size: height and width of what is blurred at once, and the distance of such places.
-        device: where the model is.
+        model: Policy; `forward(data)` returns a distribution of actions, or actions.
+        image_size: H, W of the images that `patch_size` refers to.
+        patch_size: Height and width of a blurred place, and the distance between places, in pixels.
+        device: Device of the model.
     """
 
     def __init__(
@@ -38,43 +38,40 @@ class PerturbationAttention:
         self.model, self.device = model, torch.device(device)
 
     def __call__(self, data: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Saliency of each camera's pixels.
+        """Return the saliency of each camera's pixels: view -> (B, H, W), at least 0, bottom row first.
 
         Args:
-            data: as `get_action` takes it, pictures (B, C, H, W), or a window with T steps, the last of which counts.
-
-        Returns:
-            View -> (B, H, W), at least 0, as the pictures lie (lowest row first).
+            data: Input of `get_action` with images (B, C, H, W), or windows, whose last step counts.
         """
         data = map_tensors(dict(data), lambda x: x.to(self.device))
         obs = data["obs"]
         views = [name for name, value in obs.items() if value.dim() >= 4]
         if obs[views[0]].dim() == 4:
             obs = map_tensors(obs, lambda x: x.unsqueeze(1))
-        rows = [self._maps({**data, "obs": obs}, views, b) for b in range(len(obs[views[0]]))]
-        heat = torch.stack(rows).flip(-2).cpu().numpy()  # (B, V, H, W)
+        maps = [self._map({**data, "obs": obs}, views, b) for b in range(len(obs[views[0]]))]
+        heat = torch.stack(maps).flip(-2).cpu().numpy()  # (B, V, H, W)
         return {view: heat[:, k] for k, view in enumerate(views)}
 
-    def _maps(self, data: Mapping[str, Any], views: Sequence[str], row: int) -> Tensor:
-        """(V, H, W) of one row, upright."""
+    def _map(self, data: Mapping[str, Any], views: Sequence[str], row: int) -> Tensor:
+        """Return the saliency (V, H, W) of one row of the batch, top row first."""
         one = map_tensors(dict(data), lambda x: x[row : row + 1])
         images = torch.stack([uint8_image(one["obs"][view]).flip(-3) for view in views], dim=2)
-        nothing = torch.zeros(1, 1, device=self.device)
-        batch = Batch(Observation(images, {}, nothing), nothing, nothing[0].long(), nothing[0].long())
-        return saliency(cast(Any, _Answering(self.model, one, views)), batch, self.settings)
+        empty = torch.zeros(1, 1, device=self.device)
+        batch = Batch(Observation(images, {}, empty), empty, empty[0].long(), empty[0].long())
+        return saliency(cast(Any, _MeanAction(self.model, one, views)), batch, self.settings)
 
 
-class _Answering(nn.Module):
-    """A policy's mean actions for other pictures, with all else as it was."""
+class _MeanAction(nn.Module):
+    """Predicts a policy's mean actions for other images, with all other inputs unchanged."""
 
     def __init__(self, model: nn.Module, data: Mapping[str, Any], views: Sequence[str]):
         super().__init__()
         self.model, self.data, self.views = model, data, views
 
     def predict(self, batch: Batch) -> Tensor:
-        """(B, T, A)."""
+        """Return the mean actions, (B, T, A)."""
         images = batch.observation.images.flip(-3)
         data = map_tensors(dict(self.data), lambda x: x.expand(len(images), *x.shape[1:]))
-        seen = {view: image_tensor(images[:, :, k]) for k, view in enumerate(self.views)}
-        answer = self.model({**data, "obs": {**data["obs"], **seen}})
-        return (answer if isinstance(answer, Tensor) else answer.mean).float()
+        changed = {view: image_tensor(images[:, :, k]) for k, view in enumerate(self.views)}
+        output = self.model({**data, "obs": {**data["obs"], **changed}})
+        return (output if isinstance(output, Tensor) else output.mean).float()

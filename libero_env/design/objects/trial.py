@@ -9,8 +9,8 @@ from PIL import Image
 
 from libero_env.design.objects.mesh_file import Notify
 from libero_env.errors import LiberoError
-from libero_env.expert.arm.gripper import FINGER_HALF_WIDTH, PAD_ABOVE, PAD_BELOW, WIDEST
-from libero_env.expert.grasping.grasps import Grasp, GraspError, grasps
+from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
 from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
@@ -169,7 +169,7 @@ def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify
     body = data.body(_BODY)
     cloud = surface_points(model, body.id, _SPACING) @ body.xmat.reshape(3, 3).T + body.xpos
     try:
-        found = grasps(cloud, 0.0, np.array([0.0, 1.0, 0.0]), name=name, number=400, apart=0.01)
+        found = find_grasps(cloud, 0.0, np.array([0.0, 1.0, 0.0]), name=name, max_count=400, spacing=0.01)
         reason = f"{name}: only its edges fit between the fingers, which would slip off; its faces are too far apart"
     except GraspError as error:
         found, reason = [], str(error)
@@ -179,7 +179,7 @@ def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify
         return {"width": round(float(best.width), 4), "height": round(float(best.pos_world[2]), 4)}
     notify(
         f"{reason}. It can support or contain other objects; to be picked up, a part of it must be at most "
-        f"{100 * WIDEST:.1f} cm wide (--size)"
+        f"{100 * GRIPPER.max_grasp_width:.1f} cm wide (--size)"
     )
     return {"width": None, "reason": reason}
 
@@ -187,8 +187,8 @@ def _grasp(model: mujoco.MjModel, data: mujoco.MjData, name: str, notify: Notify
 def _is_square(cloud: np.ndarray, hold: Grasp) -> bool:
     """Return whether the finger pads touch faces across the closing direction, and not the two sides of an edge."""
     along, across, down = ((cloud - hold.pos_world) @ hold.mat).T
-    near = (np.abs(along) < 0.5 * hold.width + _SPACING) & (np.abs(across) < FINGER_HALF_WIDTH)
-    near &= (down < PAD_BELOW) & (down > -PAD_ABOVE)
+    near = (np.abs(along) < 0.5 * hold.width + _SPACING) & (np.abs(across) < GRIPPER.finger_half_width)
+    near &= (down < GRIPPER.pad_below) & (down > -GRIPPER.pad_above)
     for side in (along, -along):
         halves = [side[near & half] for half in (across < 0, across >= 0)]
         if not all(map(len, halves)) or abs(halves[0].max() - halves[1].max()) > _MAX_SLANT:

@@ -1,1 +1,1 @@
-"""The arm and the hand: the gripper's dimensions, postures, reachability, servo control."""
+"""The arm and its gripper: dimensions, postures, inverse kinematics, servo control."""

@@ -1,28 +1,49 @@
 """Dimensions of the Panda gripper."""
 
-# The Panda gripper, measured from the grip site along the fingers, m.
-MAX_OPENING = 0.08
+from dataclasses import dataclass
 
 
-WIDEST = 0.072  # what still goes between the fingers with room to spare
+@dataclass(frozen=True)
+class PandaGripper:
+    """Dimensions of the Franka hand and its fingers, [m].
+
+    The frame is that of the grip site between the fingertips: x is the direction in which the fingers open, y lies
+    across them, z points from the palm to the fingertips. "Below" is towards the fingertips.
+
+    Attributes:
+        max_opening: Distance between the fingertips of the open gripper.
+        max_grasp_width: Largest width that is grasped: it leaves room for errors on both sides.
+        pad_below: Reach of the finger pads below the grip site.
+        pad_above: Reach of the finger pads above the grip site.
+        tip_below: Reach of the fingertips below the grip site.
+        palm_above: Height of the palm above the grip site, with 1.5 mm to spare.
+        finger_half_width: Half the width of a finger, along y.
+        finger_thickness: Largest thickness of a finger, along x.
+        tip_thickness: Thickness of a finger at its tip, along x.
+        finger_taper: Thickness that a finger gains for each metre above its tip, [m/m].
+        palm_half_length: Half the extent of the hand along x.
+        palm_half_width: Half the extent of the hand along y.
+        hand_length: Extent of hand and wrist above the grip site.
+    """
+
+    max_opening: float = 0.08
+    max_grasp_width: float = 0.072
+    pad_below: float = 0.004
+    pad_above: float = 0.012
+    tip_below: float = 0.0095
+    palm_above: float = 0.0285
+    finger_half_width: float = 0.011
+    finger_thickness: float = 0.0265
+    tip_thickness: float = 0.0145
+    finger_taper: float = 0.41
+    palm_half_length: float = 0.105
+    palm_half_width: float = 0.035
+    hand_length: float = 0.28
+
+    @property
+    def half_opening(self) -> float:
+        """Distance of an open finger from the middle, [m]."""
+        return 0.5 * self.max_opening
 
 
-PAD_BELOW, PAD_ABOVE = 0.004, 0.012  # the pads reach from below to above the site
-
-
-TIP_BELOW = 0.0095  # the finger tips reach that far below it
-
-
-PALM_ABOVE = 0.0285  # and the palm begins there, with a little room
-
-
-FINGER_HALF_WIDTH = 0.011
-
-
-FINGER_THICKNESS = 0.0265
-
-
-HAND_HALF_LENGTH, HAND_HALF_WIDTH = 0.105, 0.035  # of the palm, along and across the direction of the fingers
-
-
-HAND_LENGTH = 0.28  # m, of hand and wrist above the grip site
+GRIPPER = PandaGripper()

@@ -1,1 +1,1 @@
-"""Where to grasp a body: from above, by a wall, by a handle."""
+"""Grasps of objects, from above or from a side, and of handles and knobs."""

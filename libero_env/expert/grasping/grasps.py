@@ -1,4 +1,4 @@
-"""Where to take hold of something: around it, or by a wall that leaves room for a finger on either side."""
+"""Grasps from one side, usually from above: around the body, or at a wall with room for a finger on either side."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,210 +6,261 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.expert.arm.gripper import (
-    FINGER_HALF_WIDTH,
-    FINGER_THICKNESS,
-    HAND_HALF_LENGTH,
-    HAND_HALF_WIDTH,
-    HAND_LENGTH,
-    MAX_OPENING,
-    PAD_ABOVE,
-    PAD_BELOW,
-    PALM_ABOVE,
-    TIP_BELOW,
-    WIDEST,
-)
+from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.arm.servo import downward
-from libero_env.expert.grasping import kernels as hold_kernels
+from libero_env.expert.grasping import kernels
 
-_YAWS = 18
-_HEIGHTS = 4
-_SHIFTS = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03, 0.045, -0.045)  # of the hold along the jaws, m
-WALL = 0.5  # cost of a hold by a wall, over one around the whole body
-_WALL_STEP = 0.012  # m between such holds
-_LEAST = 0.005  # m, that a wall must reach up between the pads
-_STEEPEST = 0.4  # slope of the faces against the pads
-_SLANT = 0.0025  # m, that a face may give way over the pads
-_THICKEST = 0.045  # m, of a wall
-_TIP, _WIDENS = 0.0145, 0.41  # m, thickness of a finger at its tip, and how much more of it each m further up
-_TIP_THICKNESS = 0.021  # m, of a finger, on average over what is beside it in a wall hold
-_SPARE = 0.006  # m, kept between an open finger and the body when the hand is moved to one side
+WALL_COST = 0.5  # cost of a grasp at a wall, compared with one around the whole body
+_NUM_YAWS, _NUM_TILTED_YAWS = 18, 8  # yaws that are tried, from above and from another side
+_NUM_HEIGHTS = 4
+_SHIFTS = np.array([0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03, 0.045, -0.045])  # [m] along the pads
+_SPARE = 0.006  # [m] between an open finger and the body where the hand is off-centre
+_WALL_STEP = 0.012  # [m] between grasps along a wall
+_MIN_WALL_OVERLAP = 0.005  # [m] of a wall between the pads
+_MAX_WALL_SLOPE = 0.4  # of the faces of a wall against the pads
+_MAX_WALL_THICKNESS = 0.045  # [m]
+_WALL_FINGER_THICKNESS = 0.021  # [m] of a finger, averaged over the height beside a wall
+_FACE_TOLERANCE = 0.0025  # [m] by which a face may recede over the height of the pads
 
 
 class GraspError(LiberoError):
-    """Nothing of a body fits between the fingers; the message says what was tried."""
+    """No part of a body fits between the fingers; the message states what was tried."""
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """The hand at `pos_world` (3,), m, turned by `mat` (3, 3), closes on something `width` m thick."""
+    """Pose of the grip site at which the fingers close on a body.
+
+    Attributes:
+        pos_world: Position of the grip site, (3,), [m].
+        mat: Orientation of the grip site, (3, 3).
+        width: Width of the body between the fingers, [m].
+        cost: Cost of the grasp; lower is better.
+    """
 
     pos_world: np.ndarray
     mat: np.ndarray
-    width: float  # m between the fingers
-    cost: float  # of the hold alone
+    width: float
+    cost: float
 
     @property
     def yaw(self) -> float:
-        """Direction in which the fingers close over the ground, rad from the world's x axis, modulo pi."""
+        """Direction in which the fingers close in the ground plan, from the world's x axis, modulo pi, [rad]."""
         return float(np.arctan2(self.mat[1, 0], self.mat[0, 0]))
 
 
-def grasps(
-    cloud: np.ndarray, floor: float, finger_axis: np.ndarray, *, tilt: np.ndarray | None = None, name: str = "body",
-    number: int = 10_000, apart: float = 0.0,
-) -> list[Grasp]:  # fmt: skip
-    """All holds from one side, the best first; the same input gives the same list.
+def find_grasps(
+    cloud: np.ndarray,
+    surface_height: float,
+    finger_axis: np.ndarray,
+    *,
+    tilt: np.ndarray | None = None,
+    name: str = "body",
+    max_count: int = 10_000,
+    spacing: float = 0.0,
+) -> list[Grasp]:
+    """Return the feasible grasps from one side, best first; the result is deterministic.
 
-    Feasible is what fits between the open fingers, is not too low for the finger tips nor too high for the palm. The
-    order prefers little turning of the hand, a narrow hold (a wide one forgives no error), and a height near the
-    middle of the body. Walls, such as the rim of a bowl, come after holds around the whole body.
+    A grasp is feasible where the body fits between the open fingers, and where neither the fingertips hit the surface
+    below nor the palm hits the body. Preferred are small rotations of the hand, narrow grasps (a wide one forgives no
+    error), and heights near the middle of the body. Walls come after grasps around the whole body.
 
     Args:
-        cloud: points on the body, world frame, (N, 3).
-        floor: height of what the body stands on, m.
-        finger_axis: direction in which the fingers open now, world frame, (3,).
-        tilt: rotation (3, 3) from straight down to the direction of the approach; None for straight down.
-        name: for messages.
-        number: at most so many.
-        apart: m, of holds that count as unlike each other; 0 for all.
+        cloud: Points on the body, world frame, (N, 3).
+        surface_height: Height of the surface that the body stands on, [m].
+        finger_axis: Direction in which the fingers open now, world frame, (3,).
+        tilt: Rotation (3, 3) from straight down to the direction of the approach; None for straight down.
+        name: Name of the body, for messages.
+        max_count: Largest number of grasps that is returned.
+        spacing: Distance between grasps below which only the best is kept, [m]; 0 keeps all.
 
     Raises:
-        GraspError: nothing is narrow enough.
+        GraspError: No part of the body is narrow enough.
     """
-    turn = np.eye(3) if tilt is None else tilt
-    points = cloud @ turn
-    axis = finger_axis @ turn
-    now = float(np.arctan2(axis[1], axis[0]))
-    candidates = list(
-        _candidates(points, floor if tilt is None else -np.inf, now, _YAWS if tilt is None else 8)
-    )
-    narrow = sorted((c for c in candidates if c[3] <= WIDEST), key=lambda candidate: candidate[0])
-    if not narrow:
-        narrowest = min((c[3] for c in candidates), default=np.inf)
-        raise GraspError(
-            f"{name} cannot be grasped from above: its narrowest part is {100 * narrowest:.1f} cm wide, "
-            f"the gripper opens {100 * MAX_OPENING:.0f} cm and takes {100 * WIDEST:.1f} cm"
-        )
+    rotation = np.eye(3) if tilt is None else tilt
+    points = cloud @ rotation
+    axis = finger_axis @ rotation
+    yaw_now = float(np.arctan2(axis[1], axis[0]))
+    if tilt is None:
+        candidates = list(_candidates(points, surface_height, yaw_now, _NUM_YAWS))
+    else:
+        candidates = list(_candidates(points, -np.inf, yaw_now, _NUM_TILTED_YAWS))
+    feasible = sorted((c for c in candidates if c[3] <= GRIPPER.max_grasp_width), key=lambda c: c[0])
+    if not feasible:
+        raise too_wide(name, min((c[3] for c in candidates), default=np.inf))
     kept: dict[tuple, Grasp] = {}
-    for cost, pos, yaw, width in narrow:
-        key = (*np.round(pos / apart).astype(int), round(yaw / 0.35)) if apart else (len(kept),)
-        if key not in kept and (tilt is None or _faced(points, pos, yaw)):
-            kept[key] = Grasp(turn @ pos, turn @ downward(yaw, axis), width, cost)
-        if len(kept) == number:
+    for cost, pos, yaw, width in feasible:
+        cell = (*np.round(pos / spacing).astype(int), round(yaw / 0.35)) if spacing else (len(kept),)
+        if cell not in kept and (tilt is None or _meets_upright_faces(points, pos, yaw)):
+            kept[cell] = Grasp(rotation @ pos, rotation @ downward(yaw, axis), width, cost)
+        if len(kept) == max_count:
             break
     if not kept:
-        raise GraspError(f"{name} has no faces that the pads meet squarely from this side")
+        raise GraspError(f"{name} has no faces that the finger pads meet squarely from this side")
     return list(kept.values())
 
 
-def _faced(points: np.ndarray, pos: np.ndarray, yaw: float) -> bool:
-    """Whether the pads meet faces on both sides that stand along the approach, and not slanted ones."""
-    return hold_kernels.faces_reach_up(
-        points,
-        pos,
-        np.cos(yaw),
-        np.sin(yaw),
-        FINGER_HALF_WIDTH,
-        PAD_ABOVE,
-        MAX_OPENING,
-        _SLANT,
-        0.6 * PAD_ABOVE,
-    )
-
-
 def choose_grasp(
-    cloud: np.ndarray, obstacles: np.ndarray, floor: float, finger_axis: np.ndarray, name: str = "body"
+    cloud: np.ndarray,
+    obstacles: np.ndarray,
+    surface_height: float,
+    finger_axis: np.ndarray,
+    name: str = "body",
 ) -> Grasp:
-    """The best hold from straight above that keeps fingers and palm out of the obstacles (M, 3); else as `grasps`.
+    """Return the best grasp from straight above that keeps fingers and palm out of the obstacles.
+
+    Args:
+        cloud: Points on the body, world frame, (N, 3).
+        obstacles: Points on everything else, world frame, (M, 3).
+        surface_height: Height of the surface that the body stands on, [m].
+        finger_axis: Direction in which the fingers open now, world frame, (3,).
+        name: Name of the body, for messages.
 
     Raises:
-        GraspError: nothing is narrow enough.
+        GraspError: No part of the body is narrow enough.
     """
     best: tuple[float, Grasp] | None = None
-    for grasp in grasps(cloud, floor, finger_axis, name=name):
+    for grasp in find_grasps(cloud, surface_height, finger_axis, name=name):
         if best is not None and grasp.cost >= best[0]:
             break
-        crowd = crowding(obstacles, grasp.pos_world, grasp.mat)
-        cost = grasp.cost + 20.0 * crowd + 0.3 * (crowd > 0)
+        depth = collision_depth(obstacles, grasp.pos_world, grasp.mat)
+        cost = grasp.cost + 20.0 * depth + 0.3 * (depth > 0)
         if best is None or cost < best[0]:
             best = cost, grasp
     assert best is not None
     return best[1]
 
 
-def _candidates(
-    cloud: np.ndarray, floor: float, now: float, yaws: int = _YAWS
-) -> Iterator[tuple[float, np.ndarray, float, float]]:
-    """(cost, position, yaw, width) of all holds within reach of fingers and palm."""
-    bottom, top = cloud[:, 2].min(), cloud[:, 2].max()
-    lowest = max(floor + TIP_BELOW + 0.004, top - PALM_ABOVE)
-    for height in np.linspace(lowest, max(lowest, top - 0.006), _HEIGHTS):
-        slab = _slab(cloud, height - PAD_BELOW, height + PAD_ABOVE)
-        if len(slab) < 4:
-            continue
-        aligned = aligned_yaws(slab, now)
-        away_from_middle = abs(height - 0.5 * (bottom + top)) + 5.0 * max(0.010 - top + height, 0.0)
-        for yaw in aligned + [now + np.pi * k / yaws for k in range(yaws)]:
-            askew = min((turn_between(yaw, other) for other in aligned), default=0.0)
-            price = 0.25 * turn_between(yaw, now) + 4.0 * away_from_middle + 0.4 * askew
-            for x, y, width, shift in whole_holds(slab, yaw):
-                yield price + 8.0 * width + 3.0 * shift, np.array([x, y, height]), float(yaw), width
-        # what is below the highest point of a cell makes no difference to fingers
-        column = hold_kernels.highest_in_cells(cloud[cloud[:, 2] > height - TIP_BELOW], 0.004)
-        for yaw in [now + np.pi * k / yaws for k in range(yaws)]:
-            price = WALL + 0.25 * turn_between(yaw, now)
-            for x, y, width, badness in _walls(slab, column, height, yaw):
-                yield price + badness, np.array([x, y, height]), float(yaw), width
-
-
-def _slab(cloud: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Ground plan (N, 2) of what lies between two heights."""
-    return np.unique(np.round(cloud[(cloud[:, 2] > low) & (cloud[:, 2] < high), :2], 3), axis=0)
-
-
-def _walls(slab: np.ndarray, column: np.ndarray, height: float, yaw: float) -> np.ndarray:
-    """(x, y, thickness, badness) of walls across the fingers with room for both of them, (K, 4)."""
-    return hold_kernels.wall_holds(
-        slab, column, height, np.cos(yaw), np.sin(yaw), _WALL_STEP, FINGER_HALF_WIDTH, _THICKEST, _LEAST,
-        _STEEPEST, MAX_OPENING, _SPARE, _TIP_THICKNESS,
-    )  # fmt: skip
-
-
-def turn_between(yaw: float, other: float) -> float:
-    """Angle between two directions of the fingers, which have no front, rad."""
-    return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
-
-
-def aligned_yaws(slab: np.ndarray, now: float) -> list[float]:
-    """Yaws at which the fingers meet a cross-section (N, 2) squarely: where it is narrowest among the yaws nearby."""
-    grid = np.pi * np.arange(_YAWS) / _YAWS
-    width = np.array([_width(slab, now + yaw) for yaw in grid])
-    near = np.stack([np.roll(width, k) for k in (-3, -2, -1, 1, 2, 3)]).min(axis=0)
-    yaws = []
-    for yaw in grid[width <= near + 1e-3]:
-        fine = now + yaw + np.pi / _YAWS * np.linspace(-1, 1, 9)
-        widths = np.array([_width(slab, angle) for angle in fine])
-        # of equally narrow ones the one in the middle, which is no turn at all for a round body
-        yaws.append(float(np.mean(fine[widths <= widths.min() + 2e-4])))
-    return yaws
-
-
-def whole_holds(slab: np.ndarray, yaw: float) -> np.ndarray:
-    """(x, y, width, distance from the middle) of holds around the whole body at a yaw, (K, 4)."""
-    return hold_kernels.whole_holds(
-        slab, np.cos(yaw), np.sin(yaw), np.array(_SHIFTS), FINGER_HALF_WIDTH, MAX_OPENING, _SPARE
+def collision_depth(obstacles: np.ndarray, pos_world: np.ndarray, mat: np.ndarray) -> float:
+    """Return how deep obstacles (M, 3) reach into the open fingers and the palm, [m]; 0 without a collision."""
+    hand = GRIPPER
+    return kernels.open_hand_collision_depth(
+        obstacles,
+        pos_world,
+        mat,
+        hand.tip_below,
+        hand.tip_thickness,
+        hand.finger_taper,
+        hand.finger_thickness,
+        hand.half_opening,
+        hand.finger_half_width + 0.005,
+        hand.palm_above - 0.01,
+        hand.palm_half_width,
+        hand.palm_half_length,
+        hand.hand_length,
     )
 
 
-def _width(slab: np.ndarray, yaw: float) -> float:
-    """Width of the hold in the middle, m."""
-    return hold_kernels.width_in_the_middle(slab, np.cos(yaw), np.sin(yaw), FINGER_HALF_WIDTH)
+def too_wide(name: str, width: float) -> GraspError:
+    """Return the error for a body whose narrowest part has this width, [m]."""
+    return GraspError(
+        f"{name} cannot be grasped from above: its narrowest part is {100 * width:.1f} cm wide, "
+        f"the gripper opens {100 * GRIPPER.max_opening:.0f} cm and takes {100 * GRIPPER.max_grasp_width:.1f} cm"
+    )
 
 
-def crowding(obstacles: np.ndarray, pos_world: np.ndarray, mat: np.ndarray) -> float:
-    """How deep obstacles (M, 3) reach into the open fingers and the palm, m; 0 where the way is free."""
-    return hold_kernels.depth_in_hand(
-        obstacles, pos_world, mat, TIP_BELOW, _TIP, _WIDENS, FINGER_THICKNESS, 0.5 * MAX_OPENING,
-        FINGER_HALF_WIDTH + 0.005, PALM_ABOVE - 0.01, HAND_HALF_WIDTH, HAND_HALF_LENGTH, HAND_LENGTH,
-    )  # fmt: skip
+def grasp_heights(cloud: np.ndarray, surface_height: float) -> np.ndarray:
+    """Return heights of the grip site that suit a body (N, 3): fingertips above the surface, palm above the body."""
+    top = cloud[:, 2].max()
+    lowest = max(surface_height + GRIPPER.tip_below + 0.004, top - GRIPPER.palm_above)
+    return np.linspace(lowest, max(lowest, top - 0.006), _NUM_HEIGHTS)
+
+
+def cross_section(cloud: np.ndarray, height: float) -> np.ndarray:
+    """Return the ground plan (M, 2) of the points (N, 3) that are at the height of the finger pads."""
+    low, high = height - GRIPPER.pad_below, height + GRIPPER.pad_above
+    return np.unique(np.round(cloud[(cloud[:, 2] > low) & (cloud[:, 2] < high), :2], 3), axis=0)
+
+
+def yaw_grid(start: float, number: int = _NUM_YAWS) -> list[float]:
+    """Return equally spaced yaws over half a turn, [rad]."""
+    return [start + np.pi * k / number for k in range(number)]
+
+
+def yaw_distance(yaw: float, other: float) -> float:
+    """Return the angle between two directions of the fingers, which are the same after half a turn, [rad]."""
+    return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
+
+
+def aligned_yaws(section: np.ndarray, start: float) -> list[float]:
+    """Return yaws at which the fingers meet a cross-section (N, 2) squarely: local minima of its width."""
+    grid = np.pi * np.arange(_NUM_YAWS) / _NUM_YAWS
+    widths = np.array([_central_width(section, start + yaw) for yaw in grid])
+    neighbours = np.stack([np.roll(widths, k) for k in (-3, -2, -1, 1, 2, 3)]).min(axis=0)
+    yaws = []
+    for yaw in grid[widths <= neighbours + 1e-3]:
+        fine = start + yaw + np.pi / _NUM_YAWS * np.linspace(-1, 1, 9)
+        fine_widths = np.array([_central_width(section, angle) for angle in fine])
+        # of equally narrow ones the one in the middle, which is no rotation at all for a round body
+        yaws.append(float(np.mean(fine[fine_widths <= fine_widths.min() + 2e-4])))
+    return yaws
+
+
+def body_grasps(section: np.ndarray, yaw: float) -> np.ndarray:
+    """Return rows (x, y, width, distance from the middle) of grasps around the whole body at a yaw, (K, 4)."""
+    return kernels.body_grasps(
+        section, np.cos(yaw), np.sin(yaw), _SHIFTS, GRIPPER.finger_half_width, GRIPPER.max_opening, _SPARE
+    )
+
+
+def _candidates(
+    cloud: np.ndarray, surface_height: float, yaw_now: float, num_yaws: int
+) -> Iterator[tuple[float, np.ndarray, float, float]]:
+    """Yield (cost, position, yaw, width) of all grasps whose height suits fingers and palm."""
+    bottom, top = cloud[:, 2].min(), cloud[:, 2].max()
+    for height in grasp_heights(cloud, surface_height):
+        section = cross_section(cloud, height)
+        if len(section) < 4:
+            continue
+        aligned = aligned_yaws(section, yaw_now)
+        off_centre = abs(height - 0.5 * (bottom + top)) + 5.0 * max(0.010 - top + height, 0.0)
+        for yaw in aligned + yaw_grid(yaw_now, num_yaws):
+            misalignment = min((yaw_distance(yaw, other) for other in aligned), default=0.0)
+            cost = 0.25 * yaw_distance(yaw, yaw_now) + 4.0 * off_centre + 0.4 * misalignment
+            for x, y, width, shift in body_grasps(section, yaw):
+                yield cost + 8.0 * width + 3.0 * shift, np.array([x, y, height]), float(yaw), width
+        # what is below the highest point of a cell makes no difference to fingers
+        column = kernels.highest_per_cell(cloud[cloud[:, 2] > height - GRIPPER.tip_below], 0.004)
+        for yaw in yaw_grid(yaw_now, num_yaws):
+            cost = WALL_COST + 0.25 * yaw_distance(yaw, yaw_now)
+            for x, y, width, wall_cost in _wall_grasps(section, column, height, yaw):
+                yield cost + wall_cost, np.array([x, y, height]), float(yaw), width
+
+
+def _wall_grasps(section: np.ndarray, column: np.ndarray, height: float, yaw: float) -> np.ndarray:
+    """Return rows (x, y, thickness, cost) of grasps at walls across the fingers, (K, 4)."""
+    return kernels.wall_grasps(
+        section,
+        column,
+        height,
+        np.cos(yaw),
+        np.sin(yaw),
+        _WALL_STEP,
+        GRIPPER.finger_half_width,
+        _MAX_WALL_THICKNESS,
+        _MIN_WALL_OVERLAP,
+        _MAX_WALL_SLOPE,
+        GRIPPER.max_opening,
+        _SPARE,
+        _WALL_FINGER_THICKNESS,
+    )
+
+
+def _central_width(section: np.ndarray, yaw: float) -> float:
+    """Return the width between the fingers in the middle of a cross-section, [m]."""
+    return kernels.central_width(section, np.cos(yaw), np.sin(yaw), GRIPPER.finger_half_width)
+
+
+def _meets_upright_faces(points: np.ndarray, pos: np.ndarray, yaw: float) -> bool:
+    """Return whether both pads meet faces that stand along the approach, and not slanted ones."""
+    return kernels.pads_meet_upright_faces(
+        points,
+        pos,
+        np.cos(yaw),
+        np.sin(yaw),
+        GRIPPER.finger_half_width,
+        GRIPPER.pad_above,
+        GRIPPER.max_opening,
+        _FACE_TOLERANCE,
+        0.6 * GRIPPER.pad_above,
+    )

@@ -1,39 +1,57 @@
-"""The inner loops of the search for holds, compiled: cross-sections of a body between the fingers.
+"""Compiled inner loops of the search for grasps: cross-sections of a body between the fingers, and collisions.
 
-A direction of the fingers is given as (cos, sin) of its yaw. Slabs are ground plans (N, 2), columns points (M, 3).
+The direction in which the fingers open is given as the cosine `c` and sine `s` of its yaw. Coordinates along it are
+called u, those across it v. Sections are ground plans (N, 2), [m].
 """
 
 import numpy as np
 from numba import njit
 
-GAP = 0.012  # m between points of a strip that belong to different walls
-_LIP = 0.008  # m, of a wall's neighbourhood that counts as the wall
-_BIN = 0.006  # m, of a wall's length, for which its face is one point
+_WALL_GAP = 0.012  # [m] between points of different walls
+_WALL_MARGIN = 0.008  # [m] around a wall that counts as the wall
+_FACE_BIN = 0.006  # [m] of a wall's length that is one point of its face
+_HAND_MARGIN = 0.002  # [m] around the hand
 
 
 @njit(cache=True, nogil=True)
-def width_in_the_middle(slab: np.ndarray, c: float, s: float, half: float) -> float:
-    """Extent along the fingers of the strip, `half` to either side, in the middle of a cross-section; m."""
-    v = slab[:, 1] * c - slab[:, 0] * s
+def central_width(section: np.ndarray, c: float, s: float, finger_half: float) -> float:
+    """Return the width between the fingers in the middle of a cross-section, [m]."""
+    v = section[:, 1] * c - section[:, 0] * s
     middle = 0.5 * (v.min() + v.max())
     low, high = np.inf, -np.inf
-    for i in range(len(slab)):
-        if abs(v[i] - middle) < half:
-            u = slab[i, 0] * c + slab[i, 1] * s
+    for i in range(len(section)):
+        if abs(v[i] - middle) < finger_half:
+            u = section[i, 0] * c + section[i, 1] * s
             low, high = min(low, u), max(high, u)
     return high - low if high >= low else 0.0
 
 
 @njit(cache=True, nogil=True)
-def whole_holds(
-    slab: np.ndarray, c: float, s: float, shifts: np.ndarray, half: float, opening: float, spare: float
+def body_grasps(
+    section: np.ndarray,
+    c: float,
+    s: float,
+    shifts: np.ndarray,
+    finger_half: float,
+    opening: float,
+    spare: float,
 ) -> np.ndarray:
-    """Holds around the whole of a cross-section.
+    """Return grasps around the whole of a cross-section.
 
-    Rows (x, y, width, distance from the middle): along the jaws by each of `shifts`, and within what fingers
-    `opening` apart leave free, but `spare`, to either side; (K, 4), m.
+    Args:
+        section: Cross-section at the height of the pads, (N, 2).
+        c: Cosine of the yaw.
+        s: Sine of the yaw.
+        shifts: Offsets of the grasp along the pads, (S,), [m].
+        finger_half: Half the width of a finger, [m].
+        opening: Distance between the open fingers, [m].
+        spare: Distance kept between an open finger and the body, [m].
+
+    Returns:
+        Rows (x, y, width, distance from the middle), (K, 4), [m]; each shift with the body in the middle between the
+        fingers and close to either of them.
     """
-    u, v = slab[:, 0] * c + slab[:, 1] * s, slab[:, 1] * c - slab[:, 0] * s
+    u, v = section[:, 0] * c + section[:, 1] * s, section[:, 1] * c - section[:, 0] * s
     low, high = v.min(), v.max()
     found = np.empty((3 * len(shifts), 4))
     count = 0
@@ -43,110 +61,124 @@ def whole_holds(
             continue
         first, last, points = np.inf, -np.inf, 0
         for i in range(len(u)):
-            if abs(v[i] - middle) < half:
+            if abs(v[i] - middle) < finger_half:
                 first, last, points = min(first, u[i]), max(last, u[i]), points + 1
         if points < 2:
             continue
         width = last - first
-        side = max(0.5 * (opening - width) - spare, 0.0)
-        for aside in (0.0, side, -side):
-            along = 0.5 * (first + last) + aside
-            found[count] = along * c - middle * s, along * s + middle * c, width, abs(shift) + abs(aside)
+        room = max(0.5 * (opening - width) - spare, 0.0)
+        for offset in (0.0, room, -room):
+            centre = 0.5 * (first + last) + offset
+            found[count] = centre * c - middle * s, centre * s + middle * c, width, abs(shift) + abs(offset)
             count += 1
     return found[:count]
 
 
 @njit(cache=True, nogil=True)
-def wall_holds(
-    slab: np.ndarray, column: np.ndarray, height: float, c: float, s: float, step: float, half: float,
-    thickest: float, least: float, steepest: float, opening: float, spare: float, finger: float,
-) -> np.ndarray:  # fmt: skip
-    """Holds by walls across the fingers with room for both of them; rows (x, y, thickness, badness), (K, 4).
+def wall_grasps(
+    section: np.ndarray,
+    column: np.ndarray,
+    height: float,
+    c: float,
+    s: float,
+    step: float,
+    finger_half: float,
+    max_thickness: float,
+    min_overlap: float,
+    max_slope: float,
+    opening: float,
+    spare: float,
+    finger_thickness: float,
+) -> np.ndarray:
+    """Return grasps of walls, such as the rim of a bowl, with room for a finger on either side.
 
     Args:
-        slab: what the pads would touch.
-        column: what is beside fingers that reach down to the hold.
-        height: of the hold, m.
-        c, s: direction of the fingers.
-        step: between holds along a wall, m.
-        half: width of a finger to either side, m.
-        thickest: of a wall, m.
-        least: that a wall must reach up over the hold, m.
-        steepest: slope of a face against a pad.
-        opening: of the fingers, m.
-        spare: between an open finger and the wall, m.
-        finger: thickness of one, m.
+        section: Cross-section at the height of the pads, (N, 2).
+        column: Points that fingers at this height could touch, (M, 3).
+        height: Height of the grasp, [m].
+        c: Cosine of the yaw.
+        s: Sine of the yaw.
+        step: Distance between grasps along a wall, [m].
+        finger_half: Half the width of a finger, [m].
+        max_thickness: Largest thickness of a wall, [m].
+        min_overlap: Least height of a wall above the grasp, [m].
+        max_slope: Largest slope of a face against a pad.
+        opening: Distance between the open fingers, [m].
+        spare: Distance kept between an open finger and the wall, [m].
+        finger_thickness: Thickness of a finger, [m].
+
+    Returns:
+        Rows (x, y, thickness, cost), (K, 4).
     """
-    u, v = slab[:, 0] * c + slab[:, 1] * s, slab[:, 1] * c - slab[:, 0] * s
+    u, v = section[:, 0] * c + section[:, 1] * s, section[:, 1] * c - section[:, 0] * s
     order = np.argsort(u, kind="mergesort")
     u, v = u[order], v[order]
-    beside_u = column[:, 0] * c + column[:, 1] * s
-    beside_v = column[:, 1] * c - column[:, 0] * s
+    column_u = column[:, 0] * c + column[:, 1] * s
+    column_v = column[:, 1] * c - column[:, 0] * s
     found = np.empty((64, 4))
     count = 0
     for middle in np.arange(v.min() + 0.01, v.max() - 0.009, step):
-        own = np.flatnonzero(np.abs(v - middle) < half)
-        if len(own) < 2:
+        strip = np.flatnonzero(np.abs(v - middle) < finger_half)
+        if len(strip) < 2:
             continue
-        here = np.flatnonzero(np.abs(beside_v - middle) < half + 0.003)
+        beside = np.flatnonzero(np.abs(column_v - middle) < finger_half + 0.003)
         start = 0
-        for end in range(1, len(own) + 1):
-            if end < len(own) and u[own[end]] - u[own[end - 1]] <= GAP:
+        for end in range(1, len(strip) + 1):
+            if end < len(strip) and u[strip[end]] - u[strip[end - 1]] <= _WALL_GAP:
                 continue
-            wall = own[start:end]
+            wall = strip[start:end]
             start = end
             first, last = u[wall[0]], u[wall[-1]]
             width = last - first
-            if width > thickest or len(wall) < 2:
+            if width > max_thickness or len(wall) < 2:
                 continue
-            top = -np.inf
-            for k in here:
-                if first - _LIP < beside_u[k] < last + _LIP:
-                    top = max(top, column[k, 2] - height)
-            if top < least:
+            low, high = first - _WALL_MARGIN, last + _WALL_MARGIN
+            overlap = -np.inf
+            for k in beside:
+                if low < column_u[k] < high:
+                    overlap = max(overlap, column[k, 2] - height)
+            if overlap < min_overlap:
                 continue
             slope = -1.0
-            side = 0.5 * (opening - width) - spare
-            for aside in (0.0, 0.5 * side, -0.5 * side, side, -side):
-                center = 0.5 * (first + last) + aside
-                if not _room(beside_u, here, center, first - _LIP, last + _LIP, 0.5 * opening + finger):
+            room = 0.5 * (opening - width) - spare
+            for offset in (0.0, 0.5 * room, -0.5 * room, room, -room):
+                centre = 0.5 * (first + last) + offset
+                if not _has_room(column_u, beside, centre, low, high, 0.5 * opening + finger_thickness):
                     continue
                 if slope < 0.0:
-                    slope = 0.5 * (_slope(v, u, wall, 1.0) + _slope(v, u, wall, -1.0))
-                if slope > steepest:
+                    slope = 0.5 * (_face_slope(v, u, wall, 1.0) + _face_slope(v, u, wall, -1.0))
+                if slope > max_slope:
                     break
-                badness = 2.0 * width + 40.0 * max(0.012 - top, 0.0) + 6.0 * max(top - 0.02, 0.0)
+                cost = 2.0 * width + 40.0 * max(0.012 - overlap, 0.0) + 6.0 * max(overlap - 0.02, 0.0)
                 if count == len(found):
                     found = np.concatenate((found, np.empty_like(found)))
-                found[count] = (
-                    center * c - middle * s,
-                    center * s + middle * c,
-                    width,
-                    badness + 3.0 * abs(aside) + slope,
-                )
+                x, y = centre * c - middle * s, centre * s + middle * c
+                found[count] = x, y, width, cost + 3.0 * abs(offset) + slope
                 count += 1
     return found[:count]
 
 
 @njit(cache=True, nogil=True)
-def _room(u: np.ndarray, here: np.ndarray, center: float, low: float, high: float, reach: float) -> bool:
-    """Whether open fingers around `center` meet nothing, and hold between them only what is in [low, high]."""
-    for k in here:  # noqa: SIM110 (numba has no generators)
-        if abs(u[k] - center) < reach and not low < u[k] < high:
+def _has_room(
+    u: np.ndarray, beside: np.ndarray, centre: float, low: float, high: float, reach: float
+) -> bool:
+    """Return whether all points within reach of open fingers around `centre` are in [low, high]."""
+    for k in beside:  # noqa: SIM110 (numba has no generators)
+        if abs(u[k] - centre) < reach and not low < u[k] < high:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def _slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> float:
-    """How much the face of a wall at its smallest sign * u leans against a pad, 0 where the pad meets it squarely."""
+def _face_slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> float:
+    """Return the slope, against a pad, of the face of a wall at its smallest sign * u; 0 where they are parallel."""
     first = np.inf
     last = -np.inf
     for i in wall:
-        first, last = min(first, np.rint(v[i] / _BIN)), max(last, np.rint(v[i] / _BIN))
+        first, last = min(first, np.rint(v[i] / _FACE_BIN)), max(last, np.rint(v[i] / _FACE_BIN))
     face = np.full(int(last - first) + 1, -1)
     for i in wall:
-        k = int(np.rint(v[i] / _BIN) - first)
+        k = int(np.rint(v[i] / _FACE_BIN) - first)
         if face[k] < 0 or sign * u[i] < sign * u[face[k]]:
             face[k] = i
     face = face[face >= 0]
@@ -160,14 +192,37 @@ def _slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> float
 
 
 @njit(cache=True, nogil=True)
-def depth_in_hand(
-    points: np.ndarray, pos: np.ndarray, mat: np.ndarray, tip_below: float, tip: float, widens: float,
-    thickest: float, half_opening: float, finger_half: float, palm_above: float, palm_half: float,
-    palm_reach: float, length: float,
-) -> float:  # fmt: skip
-    """How deep points (M, 3) reach into open fingers and the palm of a hand, m; 0 where the way is free.
+def open_hand_collision_depth(
+    points: np.ndarray,
+    pos: np.ndarray,
+    mat: np.ndarray,
+    tip_below: float,
+    tip_thickness: float,
+    taper: float,
+    max_thickness: float,
+    half_opening: float,
+    finger_half: float,
+    palm_above: float,
+    palm_half_width: float,
+    palm_half_length: float,
+    length: float,
+) -> float:
+    """Return how deep points reach into open fingers and palm from the sides, [m]; 0 without a collision.
 
-    Fingers are `tip` thick at their ends, `tip_below` under the grip site, and `widens` more for each m further up.
+    Args:
+        points: Points on obstacles, (M, 3).
+        pos: Position of the grip site, (3,).
+        mat: Orientation of the grip site, (3, 3).
+        tip_below: Reach of the fingertips below the grip site, [m].
+        tip_thickness: Thickness of a finger at its tip, [m].
+        taper: Thickness that a finger gains for each metre above its tip.
+        max_thickness: Largest thickness of a finger, [m].
+        half_opening: Distance of an open finger from the middle, [m].
+        finger_half: Half the width of a finger, [m].
+        palm_above: Height of the palm above the grip site, [m].
+        palm_half_width: Half the extent of the palm across the fingers' motion, [m].
+        palm_half_length: Half the extent of the palm along the fingers' motion, [m].
+        length: Extent of hand and wrist above the grip site, [m].
     """
     deepest = 0.0
     for i in range(len(points)):
@@ -176,20 +231,71 @@ def depth_in_hand(
         if not -tip_below < up < length:
             continue
         v = abs(x * mat[0, 1] + y * mat[1, 1] + z * mat[2, 1])
-        if v >= palm_half:
+        if v >= palm_half_width:
             continue
         u = abs(x * mat[0, 0] + y * mat[1, 0] + z * mat[2, 0])
         if v < finger_half:
-            thick = min(max(tip + widens * (up + tip_below), tip), thickest)
-            deepest = max(deepest, half_opening + thick + 0.002 - u)
+            thickness = min(max(tip_thickness + taper * (up + tip_below), tip_thickness), max_thickness)
+            deepest = max(deepest, half_opening + thickness + 0.002 - u)
         if up > palm_above:
-            deepest = max(deepest, palm_reach - u)
+            deepest = max(deepest, palm_half_length - u)
     return deepest
 
 
 @njit(cache=True, nogil=True)
-def highest_in_cells(points: np.ndarray, cell: float) -> np.ndarray:
-    """The highest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
+def hand_collision_depth(
+    points: np.ndarray,
+    pos: np.ndarray,
+    mat: np.ndarray,
+    inner: float,
+    outer: float,
+    tip_below: float,
+    tip_thickness: float,
+    taper: float,
+    finger_half: float,
+) -> float:
+    """Return how deep points reach into a hand, measured to its nearest surface, [m]; 0 without a collision.
+
+    Args:
+        points: Points on obstacles, (N, 3).
+        pos: Position of the grip site, (3,).
+        mat: Orientation of the grip site, (3, 3).
+        inner: Distance from the middle where the volume of each finger begins, [m].
+        outer: Distance from the middle where each finger's thickness begins, [m].
+        tip_below: Reach of the fingertips below the grip site, [m].
+        tip_thickness: Thickness of a finger at its tip, [m].
+        taper: Thickness that a finger gains for each metre above its tip.
+        finger_half: Half the width of a finger, [m].
+    """
+    deepest = 0.0
+    for i in range(len(points)):
+        a, b, c = points[i, 0] - pos[0], points[i, 1] - pos[1], points[i, 2] - pos[2]
+        z = a * mat[0, 2] + b * mat[1, 2] + c * mat[2, 2]
+        if z > tip_below + _HAND_MARGIN or z < -0.3:
+            continue
+        x = abs(a * mat[0, 0] + b * mat[1, 0] + c * mat[2, 0])
+        y = abs(a * mat[0, 1] + b * mat[1, 1] + c * mat[2, 1])
+        if z > -0.04:  # fingers
+            side = outer + tip_thickness + taper * (tip_below - z) + _HAND_MARGIN
+            depth = min(
+                side - x,
+                x - inner + _HAND_MARGIN,
+                finger_half + _HAND_MARGIN - y,
+                tip_below + _HAND_MARGIN - z,
+            )
+            deepest = max(deepest, depth)
+        if z > -0.13:  # the palm, which is thinner in front
+            half = min(max(0.0175 - 0.22 * (z + 0.031), 0.0), 0.032) + _HAND_MARGIN
+            deepest = max(
+                deepest, min(0.104 + _HAND_MARGIN - x, half - y, -0.031 + _HAND_MARGIN - z, z + 0.13)
+            )
+        deepest = max(deepest, min(0.06 - x, 0.06 - y, -0.12 - z, z + 0.3))  # the wrist
+    return deepest
+
+
+@njit(cache=True, nogil=True)
+def highest_per_cell(points: np.ndarray, cell: float) -> np.ndarray:
+    """Return the highest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
     x, y = np.rint(points[:, 0] / cell), np.rint(points[:, 1] / cell)
     x, y = x - x.min(), y - y.min()
     rows = int(y.max()) + 1
@@ -202,30 +308,39 @@ def highest_in_cells(points: np.ndarray, cell: float) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def faces_reach_up(
-    points: np.ndarray, pos: np.ndarray, c: float, s: float, half: float, high: float, opening: float,
-    slant: float, least: float,
-) -> bool:  # fmt: skip
-    """Whether on both sides what pads at `pos` touch first, within `slant`, reaches higher than `least` over it, m.
+def pads_meet_upright_faces(
+    points: np.ndarray,
+    pos: np.ndarray,
+    c: float,
+    s: float,
+    finger_half: float,
+    pad_half_height: float,
+    opening: float,
+    tolerance: float,
+    min_height: float,
+) -> bool:
+    """Return whether both pads meet a face that stands along the approach, and not a slanted one.
 
     Args:
-        points: of a body, (N, 3).
-        pos: middle of the pads, (3,).
-        c, s: direction of the fingers.
-        half, high: of the pads to either side, m.
-        opening: of the fingers, m.
-        slant: m, that a face may give way over the pads.
-        least: m.
+        points: Points on a body, (N, 3), [m].
+        pos: Middle of the pads, (3,).
+        c: Cosine of the yaw.
+        s: Sine of the yaw.
+        finger_half: Half the width of a finger, [m].
+        pad_half_height: Height above and below the middle that is looked at, [m].
+        opening: Distance between the open fingers, [m].
+        tolerance: Distance from the first contact that still counts as the face, [m].
+        min_height: Least height of the face above the middle, [m].
     """
     us, zs = np.empty(len(points)), np.empty(len(points))
     count = 0
     for i in range(len(points)):
         z = points[i, 2] - pos[2]
-        if abs(z) >= high:
+        if abs(z) >= pad_half_height:
             continue
         x, y = points[i, 0] - pos[0], points[i, 1] - pos[1]
         u = x * c + y * s
-        if abs(y * c - x * s) < half and abs(u) < 0.5 * opening:
+        if abs(y * c - x * s) < finger_half and abs(u) < 0.5 * opening:
             us[count], zs[count] = u, z
             count += 1
     if count == 0:
@@ -234,8 +349,8 @@ def faces_reach_up(
     first, last = us.min(), us.max()
     low_side, high_side = -np.inf, -np.inf
     for i in range(count):
-        if us[i] - first < slant:
+        if us[i] - first < tolerance:
             low_side = max(low_side, zs[i])
-        if last - us[i] < slant:
+        if last - us[i] < tolerance:
             high_side = max(high_side, zs[i])
-    return low_side > least and high_side > least
+    return low_side > min_height and high_side > min_height

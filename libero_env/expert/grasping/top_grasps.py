@@ -1,111 +1,104 @@
-"""Where to take hold of something from straight above: chosen from the shape of the body alone."""
+"""The grasp from straight above for dropping an object into a container, chosen from the object's shape alone."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import (
-    FINGER_HALF_WIDTH,
-    FINGER_THICKNESS,
-    HAND_HALF_LENGTH,
-    HAND_HALF_WIDTH,
-    MAX_OPENING,
-    PAD_ABOVE,
-    PAD_BELOW,
-    PALM_ABOVE,
-    TIP_BELOW,
-    WIDEST,
+from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.grasping.grasps import (
+    aligned_yaws,
+    body_grasps,
+    cross_section,
+    grasp_heights,
+    too_wide,
+    yaw_distance,
+    yaw_grid,
 )
-from libero_env.expert.grasping.grasps import GraspError, aligned_yaws, turn_between, whole_holds
-
-_YAWS = 18
-_HEIGHTS = 4
 
 
 @dataclass(frozen=True)
 class TopGrasp:
-    """The fingers close along `yaw` (rad, from the world's x axis, modulo pi) around `pos_world` (3,), m."""
+    """Grasp from straight above.
+
+    Attributes:
+        pos_world: Position of the grip site, (3,), [m].
+        yaw: Direction in which the fingers close, from the world's x axis, modulo pi, [rad].
+        width: Width of the body between the fingers, [m].
+    """
 
     pos_world: np.ndarray
     yaw: float
-    width: float  # m between the fingers
+    width: float
 
 
 def choose_top_grasp(
-    cloud: np.ndarray, obstacles: np.ndarray, floor: float, finger_axis: np.ndarray, name: str = "body"
+    cloud: np.ndarray,
+    obstacles: np.ndarray,
+    surface_height: float,
+    finger_axis: np.ndarray,
+    name: str = "body",
 ) -> TopGrasp:
-    """The best top-down grasp; the same input gives the same grasp.
+    """Return the best grasp from straight above; the result is deterministic.
 
-    Feasible is what fits between the open fingers, is not too low for the finger tips nor too high for the palm, and
-    keeps fingers and palm out of the obstacles. Among those the choice is for little turning of the hand, a narrow
-    hold (a wide one forgives no error), and a height near the middle of the body.
+    A grasp is feasible where the body fits between the open fingers, and where neither the fingertips hit the surface
+    below nor the palm hits the body. Collisions with obstacles are avoided. Preferred are small rotations of the hand,
+    narrow grasps (a wide one forgives no error), and heights near the middle of the body.
 
     Args:
-        cloud: points on the body, world frame, (N, 3).
-        obstacles: points on everything else, world frame, (M, 3).
-        floor: height of what the body stands on, m.
-        finger_axis: direction in which the fingers open now, world frame, (3,).
-        name: for messages.
+        cloud: Points on the body, world frame, (N, 3).
+        obstacles: Points on everything else, world frame, (M, 3).
+        surface_height: Height of the surface that the body stands on, [m].
+        finger_axis: Direction in which the fingers open now, world frame, (3,).
+        name: Name of the body, for messages.
 
     Raises:
-        GraspError: no grasp is feasible.
+        GraspError: No grasp is feasible.
     """
-    now = np.arctan2(finger_axis[1], finger_axis[0])
-    candidates = sorted(_candidates(cloud, floor, now), key=lambda candidate: candidate[0])
+    yaw_now = np.arctan2(finger_axis[1], finger_axis[0])
+    candidates = sorted(_candidates(cloud, surface_height, yaw_now), key=lambda candidate: candidate[0])
     best: tuple[float, TopGrasp] | None = None
     for cost, grasp in candidates:
-        if grasp.width > WIDEST:
+        if grasp.width > GRIPPER.max_grasp_width:
             continue
         if best is not None and cost >= best[0]:
             break
-        crowd = _crowding(obstacles, grasp)
-        cost += 20.0 * crowd + 0.3 * (crowd > 0)
+        depth = _collision_depth(obstacles, grasp)
+        cost += 20.0 * depth + 0.3 * (depth > 0)
         if best is None or cost < best[0]:
             best = cost, grasp
     if best is None:
-        narrowest = min((grasp.width for _, grasp in candidates), default=np.inf)
-        raise GraspError(
-            f"{name} cannot be grasped from above: its narrowest part is {100 * narrowest:.1f} cm wide, "
-            f"the gripper opens {100 * MAX_OPENING:.0f} cm and takes {100 * WIDEST:.1f} cm"
-        )
+        raise too_wide(name, min((grasp.width for _, grasp in candidates), default=np.inf))
     return best[1]
 
 
-def _candidates(cloud: np.ndarray, floor: float, now: float) -> Iterator[tuple[float, TopGrasp]]:
-    """(cost, grasp) of all holds within reach of fingers and palm, obstacles not yet considered."""
+def _candidates(cloud: np.ndarray, surface_height: float, yaw_now: float) -> Iterator[tuple[float, TopGrasp]]:
+    """Yield (cost, grasp) of all grasps whose height suits fingers and palm, without obstacles."""
     bottom, top = cloud[:, 2].min(), cloud[:, 2].max()
-    lowest = max(floor + TIP_BELOW + 0.004, top - PALM_ABOVE)
-    for height in np.linspace(lowest, max(lowest, top - 0.006), _HEIGHTS):
-        slab = cloud[(cloud[:, 2] > height - PAD_BELOW) & (cloud[:, 2] < height + PAD_ABOVE), :2]
-        slab = np.unique(np.round(slab, 3), axis=0)
-        if len(slab) < 4:
+    for height in grasp_heights(cloud, surface_height):
+        section = cross_section(cloud, height)
+        if len(section) < 4:
             continue
-        aligned = aligned_yaws(slab, now)
-        away_from_middle = abs(height - 0.5 * (bottom + top))
-        for yaw in aligned + [now + np.pi * k / _YAWS for k in range(_YAWS)]:
-            askew = min((turn_between(yaw, other) for other in aligned), default=0.0)
-            for x, y, width, shift in whole_holds(slab, yaw):
-                cost = (
-                    0.25 * turn_between(yaw, now)
-                    + 8.0 * width
-                    + 4.0 * away_from_middle
-                    + 3.0 * shift
-                    + 0.4 * askew
-                )
+        aligned = aligned_yaws(section, yaw_now)
+        off_centre = abs(height - 0.5 * (bottom + top))
+        for yaw in aligned + yaw_grid(yaw_now):
+            turn = yaw_distance(yaw, yaw_now)
+            misalignment = min((yaw_distance(yaw, other) for other in aligned), default=0.0)
+            for x, y, width, shift in body_grasps(section, yaw):
+                cost = 0.25 * turn + 8.0 * width + 4.0 * off_centre + 3.0 * shift + 0.4 * misalignment
                 yield cost, TopGrasp(np.array([x, y, height]), float(yaw), width)
 
 
-def _crowding(obstacles: np.ndarray, grasp: TopGrasp) -> float:
-    """How deep obstacles reach into the open fingers and the palm, m; 0 where the way is free."""
+def _collision_depth(obstacles: np.ndarray, grasp: TopGrasp) -> float:
+    """Return how deep obstacles reach into the open fingers and the palm, [m]; 0 without a collision."""
     if not len(obstacles):
         return 0.0
     c, s = np.cos(grasp.yaw), np.sin(grasp.yaw)
     along, across = np.array([c, s]), np.array([-s, c])
     offset = obstacles - grasp.pos_world
     u, v, z = np.abs(offset[:, :2] @ along), np.abs(offset[:, :2] @ across), offset[:, 2]
-    outer = 0.5 * MAX_OPENING + FINGER_THICKNESS + 0.003
-    fingers = (z > -TIP_BELOW) & (v < FINGER_HALF_WIDTH + 0.005)
-    palm = (z > PALM_ABOVE - 0.01) & (v < HAND_HALF_WIDTH)
-    depth = np.maximum(np.where(fingers, outer - u, 0.0), np.where(palm, HAND_HALF_LENGTH - u, 0.0))
+    outer = GRIPPER.half_opening + GRIPPER.finger_thickness + 0.003
+    fingers = (z > -GRIPPER.tip_below) & (v < GRIPPER.finger_half_width + 0.005)
+    palm = (z > GRIPPER.palm_above - 0.01) & (v < GRIPPER.palm_half_width)
+    depth = np.maximum(np.where(fingers, outer - u, 0.0), np.where(palm, GRIPPER.palm_half_length - u, 0.0))
     return float(max(depth.max(), 0.0))

@@ -1,1 +1,1 @@
-"""What to do next: goal to steps, pick plans, poses for placing."""
+"""Plans: from a goal to steps, and from a step to a grasp and a place pose."""

@@ -1,78 +1,89 @@
-"""From a goal and a state to the next thing to do."""
+"""From a goal and a state to the steps that are left."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from libero_env.errors import LiberoError
-from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.regions import contains, region_boxes
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or
 
-__all__ = ["Shapes", "Step", "UnsupportedGoalError", "plan_goal", "pose_of"]
-
-JOINT_STATES = {"Open": "open", "Close": "close", "Turnon": "turnon", "Turnoff": "turnoff"}
-PLACES = ("On", "In", "Stack")
+JointState = Literal["open", "close", "turnon", "turnoff"]
+JOINT_STATES: dict[str, JointState] = {
+    "Open": "open",
+    "Close": "close",
+    "Turnon": "turnon",
+    "Turnoff": "turnoff",
+}
 OPPOSITES = {"Open": "Close", "Close": "Open", "Turnon": "Turnoff", "Turnoff": "Turnon"}
+PLACES = ("On", "In", "Stack")
 
 
 class UnsupportedGoalError(LiberoError):
-    """A goal for which no skill exists; the message lists those that do."""
+    """No skill reaches a goal; the message lists the goals that are supported."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One skill's work: an atom to make true."""
+    """The work of one skill.
+
+    Attributes:
+        atom: Atom to make true.
+        slot: (k, n): the object is number k of n that go to the same place.
+    """
 
     atom: Atom
-    share: tuple[int, int] = (0, 1)  # which of how many things that go to the same place
+    slot: tuple[int, int] = (0, 1)
 
 
 def plan_goal(goal: Expression, view: StateView) -> tuple[Step, ...]:
-    """The steps that are left, in the order in which they are safe; empty where the goal holds.
+    """Return the steps that are left, in a safe order; none where the goal holds.
 
-    First what is to be closed and receives nothing is closed, so that it is not in the way; then joints are turned and
-    opened, those that a place or an object needs included; then things are put, what carries before what it carries;
-    then what received something is closed.
+    The order: close what receives nothing, so that it is not in the way; turn knobs and open parts, including those
+    that give access to a place or an object; place objects, each after the object that carries it; close what has
+    received something.
+
+    Args:
+        goal: Goal of a task.
+        view: State of the simulation.
 
     Raises:
-        UnsupportedGoalError: an atom that no skill reaches.
+        UnsupportedGoalError: No skill reaches an atom of the goal.
     """
     scene = view.scene
-    atoms = _wanted(goal, view)
+    atoms = _required_atoms(goal, view)
     for atom in atoms:
         _check(atom, scene)
-    places = [atom for atom in atoms if atom.predicate in PLACES]
-    shares = {atom: _share(atom, places) for atom in places}
+    placements = [atom for atom in atoms if atom.predicate in PLACES]
+    slots = {atom: _slot(atom, placements) for atom in placements}
     left = [atom for atom in atoms if not evaluate(atom, view)]
-    putting = _carriers_first([atom for atom in left if atom.predicate in PLACES])
-    needed = [need for atom in putting for need in _needs(atom, view)]
-    receiving = {_joint_owner(atom.args[1], scene) for atom in putting} | {need.args[0] for need in needed}
+    placing = _carriers_first([atom for atom in left if atom.predicate in PLACES])
+    access = [need for atom in placing for need in _required_open(atom, view)]
+    receiving = {_joint_address(atom.args[1], scene) for atom in placing} | {need.args[0] for need in access}
     closing = [atom for atom in left if atom.predicate == "Close"]
-    early = [atom for atom in closing if atom.args[0] not in receiving]
-    turning = [
-        atom for atom in left if atom.predicate in ("Turnon", "Turnoff", "Open") and atom not in needed
-    ]
-    late = [atom for atom in closing if atom not in early]
-    opening = [need for need in dict.fromkeys(needed) if not evaluate(need, view)]
-    order = [*early, *turning, *opening, *putting, *late]
-    return tuple(Step(atom, shares.get(atom, (0, 1))) for atom in dict.fromkeys(order))
+    closing_first = [atom for atom in closing if atom.args[0] not in receiving]
+    closing_last = [atom for atom in closing if atom not in closing_first]
+    moving = [a for a in left if a.predicate in ("Turnon", "Turnoff", "Open") and a not in access]
+    opening = [need for need in dict.fromkeys(access) if not evaluate(need, view)]
+    order = [*closing_first, *moving, *opening, *placing, *closing_last]
+    return tuple(Step(atom, slots.get(atom, (0, 1))) for atom in dict.fromkeys(order))
 
 
-def _wanted(goal: Expression, view: StateView) -> list[Atom]:
-    """The atoms that shall hold, of each choice the one with the least to do."""
+def _required_atoms(goal: Expression, view: StateView) -> list[Atom]:
+    """Return the atoms that have to hold; of alternatives, those with the fewest left to do."""
     match goal:
         case Atom("Up" | "True" | "Printjointstate" | "Incontact"):
             if evaluate(goal, view):
                 return []
-            raise UnsupportedGoalError(_refusal(goal))
+            raise UnsupportedGoalError(_unsupported(goal))
         case Atom():
             return [goal]
         case And(parts):
-            return list(dict.fromkeys(atom for part in parts for atom in _wanted(part, view)))
+            return list(dict.fromkeys(atom for part in parts for atom in _required_atoms(part, view)))
         case Or(parts):
-            choices = [_wanted(part, view) for part in parts]
+            choices = [_required_atoms(part, view) for part in parts]
             return min(choices, key=lambda atoms: sum(not evaluate(atom, view) for atom in atoms))
         case Not(Atom(predicate, args)) if predicate in OPPOSITES:
             return [] if evaluate(goal, view) else [Atom(OPPOSITES[predicate], args)]
@@ -80,7 +91,7 @@ def _wanted(goal: Expression, view: StateView) -> list[Atom]:
             if evaluate(goal, view):
                 return []
             raise UnsupportedGoalError(
-                f"no skill reaches {goal}; state what shall hold instead of what shall not"
+                f"no skill reaches {goal}; state what has to hold instead of what must not"
             )
     raise TypeError(f"not a goal: {goal!r}")
 
@@ -89,23 +100,23 @@ def _check(atom: Atom, scene: Scene) -> None:
     joint = atom.predicate in JOINT_STATES and scene.owner(atom.args[0]) is not None
     place = atom.predicate in PLACES and len(atom.args) == 2 and atom.args[0] in scene.objects
     if not joint and not place:
-        raise UnsupportedGoalError(_refusal(atom))
+        raise UnsupportedGoalError(_unsupported(atom))
 
 
-def _refusal(atom: Atom) -> str:
+def _unsupported(atom: Atom) -> str:
     return (
-        f"no skill reaches ({atom.predicate} {' '.join(atom.args)}); there are some for (On OBJECT PLACE), "
-        "(In OBJECT REGION), (Stack OBJECT PLACE), and (Open PART), (Close PART), (Turnon THING), (Turnoff THING)"
+        f"no skill reaches ({atom.predicate} {' '.join(atom.args)}); supported are (On OBJECT PLACE), "
+        "(In OBJECT REGION), (Stack OBJECT PLACE), (Open PART), (Close PART), (Turnon FIXTURE), (Turnoff FIXTURE)"
     )
 
 
-def _share(atom: Atom, places: list[Atom]) -> tuple[int, int]:
-    same = [other for other in places if other.args[1] == atom.args[1]]
-    return same.index(atom), len(same)
+def _slot(atom: Atom, placements: list[Atom]) -> tuple[int, int]:
+    same_place = [other for other in placements if other.args[1] == atom.args[1]]
+    return same_place.index(atom), len(same_place)
 
 
 def _carriers_first(atoms: list[Atom]) -> list[Atom]:
-    """What other things are put on or into comes before them."""
+    """Return placements in an order in which an object is moved before others are put on or into it."""
     order: list[Atom] = []
     waiting = list(atoms)
     while waiting:
@@ -115,34 +126,35 @@ def _carriers_first(atoms: list[Atom]) -> list[Atom]:
             for atom in waiting
             if not any(_belongs(atom.args[1], name) for name in moved - {atom.args[0]})
         ]
-        order += ready or waiting  # in a circle as they are written
+        order += ready or waiting  # a cycle stays as it is written
         waiting = [atom for atom in waiting if atom not in order]
     return order
 
 
 def _belongs(place: str, name: str) -> bool:
+    """Return whether a place is an object, or a region of the object: `bowl_1_top`, but not `bowl_1_2`."""
     return place == name or place.startswith(f"{name}_") and not place.removeprefix(f"{name}_")[:1].isdigit()
 
 
-def _joint_owner(place: str, scene: Scene) -> str | None:
-    """The address whose joints give access to a region: its own part's, else those of the whole thing."""
+def _joint_address(place: str, scene: Scene) -> str | None:
+    """Return the address whose joints give access to a region: its own, or its fixture; None without such joints."""
     owner = scene.owner(place)
     if owner is None or owner not in scene.fixtures or "open" not in scene.entities[owner].articulation:
         return None
     return place if scene.joints.get(place) else owner
 
 
-def _needs(atom: Atom, view: StateView) -> list[Atom]:
-    """Parts that must be open to put something there, and to take it from where it is."""
-    scene, thing = view.scene, atom.args[0]
+def _required_open(atom: Atom, view: StateView) -> list[Atom]:
+    """Return the parts that have to be open to reach the place of a placement, and its object."""
+    scene = view.scene
     found = []
-    address = _joint_owner(atom.args[1], scene)
+    address = _joint_address(atom.args[1], scene)
     if atom.predicate == "In" and address is not None:
         found.append(address)
     for region in scene.problem.regions:
-        part = None if region.ranges else _joint_owner(region.address, scene)
+        part = None if region.ranges else _joint_address(region.address, scene)
         if part is None or region.address not in scene.joints or region.address.endswith("_side"):
             continue
-        if any(contains(box, view.body_pos(thing)) for box in region_boxes(view, region.address)):
+        if any(contains(box, view.body_pos(atom.args[0])) for box in region_boxes(view, region.address)):
             found.append(part)
     return [Atom("Open", (part,)) for part in found if scene.joints.get(part)]

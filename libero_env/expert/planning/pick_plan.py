@@ -1,312 +1,384 @@
-"""How to take and put something together: the pair of a hold and a place that leaves the hand room at both."""
+"""Plan a pick and a place together: a grasp and a place pose that the arm reaches and that leave the hand room."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from libero_env.expert.arm.kinematics import joint_angles
 from libero_env.expert.arm.servo import finger_axis
-from libero_env.expert.clearance import Voxels
 from libero_env.expert.grasping.costs import HAND, collision_cost, grip_cost
-from libero_env.expert.grasping.grasps import Grasp, GraspError, grasps
-from libero_env.expert.planning.place_poses import DOWN, Place, places
-from libero_env.expert.shapes import DENSE, Shapes, pose_of
-from libero_env.geometry import Pose, rotation_between
+from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
+from libero_env.expert.planning.place_poses import DOWN, Placement, PlacePose, find_place_poses
+from libero_env.expert.shapes import Shapes
+from libero_env.geometry import Pose, rotation_about_z, rotation_between
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
-
-def _lean(azimuth: float, tilt: float) -> np.ndarray:
-    """Rotation (3, 3) that takes straight down to an approach that leans towards a horizontal direction."""
-    c, s, c1, s1 = np.cos(azimuth), np.sin(azimuth), np.cos(tilt), np.sin(tilt)
-    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return about @ np.array([[c1, 0.0, -s1], [0.0, 1.0, 0.0], [s1, 0.0, c1]]) @ about.T
-
-
-_CROWDED = 1.0  # cost of a hold from which on the hand tries to lean away from what is in its way
-_RING = [_lean(2 * np.pi * k / 8, tilt) for tilt in (0.25, 0.35, 0.6) for k in range(8)]
-_GRASPS, _PLACES, _TRIED = 20, 72, 24
-_PAIRS = 1000  # of holds and places, that are looked at
-_EACH, _DEPTH = 2, 0.03  # places at most for one turn of the body and so many m of depth
-_LEANING = 4  # holds for one approach that leans
-_MISSED = 1e-4  # m, by which a pose may be missed that counts as reached
-_HOPELESS = 0.03  # m, that a pose is missed by where others turned the same way are missed too
-_RAISED = 0.10  # m, over where a body was taken, where the hand has turned as it will put it down
-_AGAIN = 0.5  # cost of a hold that failed before, or of a place
-_ALIKE, _ALIKE_TURN = 0.02, 0.4  # m and rad, between holds or places that share their fate
-_LIFTS = np.array(
-    [0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18]
-)  # m, over the place, from which a body is let fall
-_TILTS = (0.5, 0.8, 1.1, 1.45)  # rad, of approaches that are not straight down
-_NEAR = 0.3  # m, around a body: what is further away is in no hand's way
-ASIDE = 0.16  # m, before a place that is entered from a side
-_WAYS_ROUND = np.ones(3), np.array([-1.0, -1.0, 1.0])  # the hand as it is, and turned by half
-_SIDES = 8  # directions of such approaches that are tried
+ENTRY_DISTANCE = 0.16  # [m] before a place that is entered from a side
+_ENTRY_HEIGHT = 0.08  # [m] above a place that is entered from above
+_PREGRASP_DISTANCE = 0.10  # [m] before a grasp
+_LIFT_HEIGHT = 0.10  # [m] above the grasp, where the hand rotates to its orientation at the place
+_DROP_HEIGHTS = np.array([0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18])  # [m] above the place
+_FLIPS = np.ones(3), np.array([-1.0, -1.0, 1.0])  # the hand as it is, and rotated by half a turn
+_TILTS = (0.5, 0.8, 1.1, 1.45)  # [rad] of approaches that suit places entered from a side
 
 
 @dataclass(frozen=True)
-class Approach:
-    """Where to take a body and where to let go of it."""
+class PickSearch:
+    """Limits of the search for a pick plan.
+
+    Attributes:
+        top_grasps: Number of grasps from straight above, for each attempt so far and the next one.
+        tilted_grasps: Number of grasps for one tilted approach, likewise.
+        grasp_spacing: Distance between grasps below which only the best is kept, [m].
+        obstacle_radius: Distance from an object beyond which nothing is in the hand's way, [m].
+        collision_limit: Cost of the best grasp from which on more tilted approaches are searched.
+        places: Number of places.
+        places_per_group: Number of places with the same orientation of the object and the same depth.
+        depth_step: Difference in depth, along the entry, that makes a different group, [m].
+        entry_directions: Number of directions of tilted approaches.
+        pairs: Number of grasp and place pairs.
+        reach_trials: Number of pairs for which inverse kinematics is solved.
+        reach_tolerance: Error of inverse kinematics that counts as reached, [m].
+        unreachable_error: Error from which on similar pairs are skipped, [m].
+        retry_cost: Cost of a grasp or a place that failed before.
+        same_distance: Distance between grasps or places that count as the same, [m].
+        same_angle: Angle between them, [rad].
+    """
+
+    top_grasps: int = 20
+    tilted_grasps: int = 4
+    grasp_spacing: float = 0.015
+    obstacle_radius: float = 0.3
+    collision_limit: float = 1.0
+    places: int = 72
+    places_per_group: int = 2
+    depth_step: float = 0.03
+    entry_directions: int = 8
+    pairs: int = 1000
+    reach_trials: int = 24
+    reach_tolerance: float = 1e-4
+    unreachable_error: float = 0.03
+    retry_cost: float = 0.5
+    same_distance: float = 0.02
+    same_angle: float = 0.4
+
+    def is_same(self, pose: Pose, other: Pose) -> bool:
+        """Return whether two grasps or places are so close that they succeed or fail together."""
+        near = np.linalg.norm(pose.pos - other.pos) < self.same_distance
+        return bool(near and np.linalg.norm(rotation_between(pose.mat, other.mat)) < self.same_angle)
+
+
+SEARCH = PickSearch()
+
+
+@dataclass(frozen=True)
+class PickPlan:
+    """Where to grasp an object and where to release it.
+
+    Attributes:
+        grasp: Grasp of the object.
+        place: Pose of the object at its place.
+        object_pose: Pose of the object now.
+        drop_height: Height above the place at which the object is released, [m].
+        cost: Cost of the plan; lower is better.
+    """
 
     grasp: Grasp
-    place: Place
-    pose: Pose  # of the body now
-    lift: float  # m, over the place where it is let go
+    place: PlacePose
+    object_pose: Pose
+    drop_height: float
     cost: float
 
     @property
-    def hand_mat(self) -> np.ndarray:
-        """The hand's orientation at the place, (3, 3)."""
-        return self.place.mat @ self.pose.mat.T @ self.grasp.mat
+    def release_mat(self) -> np.ndarray:
+        """Orientation of the grip site where the object is released, (3, 3)."""
+        return self.place.mat @ self.object_pose.mat.T @ self.grasp.mat
 
     @property
-    def hand_pos(self) -> np.ndarray:
-        """The grip site at the place, (3,)."""
-        turn = self.place.mat @ self.pose.mat.T
-        return self.place.pos + [0, 0, self.lift] + turn @ (self.grasp.pos_world - self.pose.pos)
+    def release_pos(self) -> np.ndarray:
+        """Position of the grip site where the object is released, (3,)."""
+        rotation = self.place.mat @ self.object_pose.mat.T
+        offset = rotation @ (self.grasp.pos_world - self.object_pose.pos)
+        return self.place.pos + [0, 0, self.drop_height] + offset
 
 
 @dataclass(frozen=True)
-class Failure:
-    """What was tried in vain: a hold, as a pose in the body's frame, and the place if the body got there."""
+class FailedAttempt:
+    """What was tried without success.
 
-    hold: Pose | None
-    place: Place | None = None
+    Attributes:
+        grasp: Pose of the grip site in the object's frame; None where the grasp did not fail.
+        place: Place, where the object got there.
+    """
+
+    grasp: Pose | None
+    place: PlacePose | None = None
 
     @classmethod
-    def of(cls, way: Approach, placed: bool) -> "Failure":
-        """The failure of an approach, before or after the body was let go."""
-        back = way.pose.mat.T
-        hold = Pose(way.pose.invert(way.grasp.pos_world), back @ way.grasp.mat)
-        return cls(hold, way.place if placed else None)
+    def from_plan(cls, plan: PickPlan, placed: bool) -> "FailedAttempt":
+        """Return the failed attempt of a plan, after the object was released at its place or before."""
+        grasp = plan.object_pose.to_local(Pose(plan.grasp.pos_world, plan.grasp.mat))
+        return cls(grasp, plan.place if placed else None)
 
 
-def choose_approach(
+def plan_pick(
     view: StateView,
     shapes: Shapes,
     atom: Atom,
-    share: tuple[int, int] = (0, 1),
-    failures: Sequence[Failure] = (),
-) -> Approach:
-    """The best way to make an (On thing place) or (In thing place) true; the same input gives the same answer.
+    slot: tuple[int, int] = (0, 1),
+    failures: Sequence[FailedAttempt] = (),
+) -> PickPlan:
+    """Return the best plan to make an atom true; the result is deterministic.
 
     Args:
-        view: the state.
-        shapes: of the scene.
-        atom: what shall hold.
-        share: see `places`.
-        failures: what was tried before; something else is preferred.
+        view: State of the simulation.
+        shapes: Shapes of the scene.
+        atom: (On object place), (In object region) or (Stack object place).
+        slot: (k, n): the object is number k of n that go to this place.
+        failures: Attempts that failed before; others are preferred.
 
     Raises:
-        GraspError: nothing of the body fits between the fingers.
-        PlaceError: there is no room for it.
+        GraspError: No part of the object fits between the fingers.
+        PlaceError: There is no room for the object.
     """
-    thing = atom.args[0]
-    cloud, pose = shapes.cloud(view, thing), pose_of(view, thing)
-    floor = view.scene.workspace.surface_height
-    voxels = Voxels(shapes.others(view, thing, spacing=DENSE), floor, pose.pos)
-    spots = _varied(_places_again(places(view, voxels, cloud, pose, atom, share), failures))
-    tilts = _tilts(spots, pose)
-    holds = _free_holds(view, voxels, cloud, pose, thing, [None, *tilts], failures)
-    pairs = _pairs(voxels, holds, spots, pose)
-    best, miss = _reachable(view, shapes, pairs)
-    if holds[0].cost < _CROWDED and miss <= _MISSED:
+    placement = Placement.from_view(view, shapes, atom, slot)
+    places = _candidate_places(placement, failures)
+    tilts = _entry_tilts(places, placement.object_pose)
+    grasps = _candidate_grasps(placement, [None, *tilts], failures)
+    pairs = _rank_pairs(placement, grasps, places)
+    best, error = _first_reachable(view, shapes, pairs)
+    if grasps[0].cost < SEARCH.collision_limit and error <= SEARCH.reach_tolerance:
         return best
-    try:  # lean away from what is in the way, or towards the arm
-        leaning = _free_holds(view, voxels, cloud, pose, thing, _RING, failures)
+    try:  # tilt the hand away from obstacles, or towards the arm
+        tilted = _candidate_grasps(placement, _ALL_TILTS, failures)
     except GraspError:
         return best
-    pairs = sorted([*pairs, *_pairs(voxels, leaning, spots, pose)], key=lambda approach: approach.cost)
-    other, short = _reachable(view, shapes, pairs)
-    return other if short <= max(miss, _MISSED) else best
+    pairs = sorted([*pairs, *_rank_pairs(placement, tilted, places)], key=lambda plan: plan.cost)
+    other, other_error = _first_reachable(view, shapes, pairs)
+    return other if other_error <= max(error, SEARCH.reach_tolerance) else best
 
 
-def choose_place(
+def plan_place(
     view: StateView,
     shapes: Shapes,
     atom: Atom,
-    share: tuple[int, int] = (0, 1),
-    failures: Sequence[Failure] = (),
-) -> Approach:
-    """Where to put what the hand holds already, as it holds it; arguments as of `choose_approach`.
+    slot: tuple[int, int] = (0, 1),
+    failures: Sequence[FailedAttempt] = (),
+) -> PickPlan:
+    """Return where to place the object that is in the hand, as the hand holds it now.
+
+    Args:
+        view: State of the simulation.
+        shapes: Shapes of the scene.
+        atom: (On object place), (In object region) or (Stack object place).
+        slot: (k, n): the object is number k of n that go to this place.
+        failures: Attempts that failed before; other places are preferred.
 
     Raises:
-        PlaceError: there is no room for it.
+        PlaceError: There is no room for the object.
     """
-    thing = atom.args[0]
-    cloud, pose = shapes.cloud(view, thing), pose_of(view, thing)
-    voxels = Voxels(shapes.others(view, thing, spacing=DENSE), view.scene.workspace.surface_height, pose.pos)
-    spots = _varied(_places_again(places(view, voxels, cloud, pose, atom, share), failures))
-    hold = Grasp(view.eef_pos, view.eef_mat, float(np.abs(view.finger_pos).sum()), 0.0)
-    return _reachable(view, shapes, _pairs(voxels, [hold], spots, pose), both_ways=False)[0]
+    placement = Placement.from_view(view, shapes, atom, slot)
+    places = _candidate_places(placement, failures)
+    held = Grasp(view.eef_pos, view.eef_mat, float(np.abs(view.finger_pos).sum()), 0.0)
+    return _first_reachable(view, shapes, _rank_pairs(placement, [held], places), flip=False)[0]
 
 
-def is_graspable(view: StateView, shapes: Shapes, thing: str) -> bool:
-    """Whether something of a body fits between the fingers from above."""
+def is_graspable(view: StateView, shapes: Shapes, name: str) -> bool:
+    """Return whether some part of an object fits between the fingers from above."""
+    surface_height = view.scene.workspace.surface_height
     try:
-        grasps(
-            shapes.cloud(view, thing),
-            view.scene.workspace.surface_height,
-            finger_axis(view.eef_mat),
-            number=1,
-        )
+        find_grasps(shapes.cloud(view, name), surface_height, finger_axis(view.eef_mat), max_count=1)
     except GraspError:
         return False
     return True
 
 
-def _places_again(spots: list[Place], failures: Sequence[Failure]) -> list[Place]:
-    """Places in order, those like the ones that failed later."""
-    if not any(failure.place for failure in failures):
-        return spots
+def _candidate_places(placement: Placement, failures: Sequence[FailedAttempt]) -> list[PlacePose]:
+    """Return the best places, some of each orientation of the object and each depth; failed ones cost more."""
+    places = find_place_poses(placement)
     failed = [Pose(f.place.pos, f.place.mat) for f in failures if f.place]
-    dearer = [
-        replace(s, cost=s.cost + _AGAIN * sum(_alike(Pose(s.pos, s.mat), f) for f in failed)) for s in spots
-    ]
-    return sorted(dearer, key=lambda spot: spot.cost)
+    if failed:
+        places = [
+            replace(
+                p,
+                cost=p.cost + SEARCH.retry_cost * sum(SEARCH.is_same(Pose(p.pos, p.mat), f) for f in failed),
+            )
+            for p in places
+        ]
+        places.sort(key=lambda place: place.cost)
+    groups: dict[tuple, list[PlacePose]] = {}
+    for place in places:
+        orientation = np.round(place.mat[:2, :2].ravel(), 1)
+        depth = round(float(place.pos @ place.entry) / SEARCH.depth_step)
+        group = groups.setdefault((*orientation, *np.round(place.entry), depth), [])
+        if len(group) < SEARCH.places_per_group:
+            group.append(place)
+    kept = [place for group in groups.values() for place in group]
+    return sorted(kept, key=lambda place: place.cost)[: SEARCH.places]
 
 
-def _varied(spots: list[Place]) -> list[Place]:
-    """The best places, few of each turn of the body and each depth that it goes in, so that all are among them."""
-    kept: dict[tuple, list[Place]] = {}
-    for spot in spots:
-        turn, depth = np.round(spot.mat[:2, :2].ravel(), 1), round(float(spot.pos @ spot.entry) / _DEPTH)
-        same = kept.setdefault((*turn, *np.round(spot.entry), depth), [])
-        if len(same) < _EACH:
-            same.append(spot)
-    return sorted((spot for same in kept.values() for spot in same), key=lambda spot: spot.cost)[:_PLACES]
-
-
-def _alike(pose: Pose, other: Pose) -> bool:
-    near = np.linalg.norm(pose.pos - other.pos) < _ALIKE
-    return bool(near and np.linalg.norm(rotation_between(pose.mat, other.mat)) < _ALIKE_TURN)
-
-
-def _free_holds(
-    view: StateView,
-    voxels: Voxels,
-    cloud: np.ndarray,
-    pose: Pose,
-    thing: str,
-    tilts: Sequence[np.ndarray | None],
-    failures: Sequence[Failure],
+def _candidate_grasps(
+    placement: Placement, tilts: Sequence[np.ndarray | None], failures: Sequence[FailedAttempt]
 ) -> list[Grasp]:
-    """Holds along some approaches, those in the way of others and those that failed last.
+    """Return grasps for some approaches, best first; collisions, a poor grip and failed attempts cost.
+
+    Args:
+        placement: Object and scene.
+        tilts: Rotations (3, 3) from straight down to an approach; None for straight down.
+        failures: Attempts that failed before.
 
     Raises:
-        GraspError: there is none.
+        GraspError: There is no grasp.
     """
-    near = voxels.points[np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1) < _NEAR]
+    view, voxels, cloud, name = placement.view, placement.voxels, placement.cloud, placement.atom.args[0]
+    distance = np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1)
+    obstacles = voxels.points[distance < SEARCH.obstacle_radius]
     axis, error = finger_axis(view.eef_mat), None
     found: list[Grasp] = []
     for tilt in tilts:
+        tilt_cost = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
+        number = (SEARCH.top_grasps if tilt is None else SEARCH.tilted_grasps) * (1 + len(failures))
         try:
-            lean = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
-            number = (_GRASPS if tilt is None else _LEANING) * (1 + len(failures))
-            own = grasps(cloud, voxels.floor, axis, tilt=tilt, name=thing, number=number, apart=0.015)
+            grasps = find_grasps(
+                cloud,
+                voxels.surface_height,
+                axis,
+                tilt=tilt,
+                name=name,
+                max_count=number,
+                spacing=SEARCH.grasp_spacing,
+            )
         except GraspError as problem:
             error = error or problem
             continue
-        for g in own:
-            price = collision_cost(voxels, near, g) + grip_cost(cloud, g) + _failed_price(pose, g, failures)
-            found.append(replace(g, cost=g.cost + lean + price))
+        for grasp in grasps:
+            extra = collision_cost(voxels, obstacles, grasp) + grip_cost(cloud, grasp)
+            extra = extra + _retry_cost(placement.object_pose, grasp, failures)
+            found.append(replace(grasp, cost=grasp.cost + tilt_cost + extra))
     if not found:
-        raise error or GraspError(f"{thing} cannot be grasped")
-    return sorted(found, key=lambda g: g.cost)
+        raise error or GraspError(f"{name} cannot be grasped")
+    return sorted(found, key=lambda grasp: grasp.cost)
 
 
-def _failed_price(pose: Pose, grasp: Grasp, failures: Sequence[Failure]) -> float:
-    """What it costs that holds like this one failed; either finger may be on either side."""
-    hold = Pose(pose.invert(grasp.pos_world), pose.mat.T @ grasp.mat)
-    turned = Pose(hold.pos, hold.mat * [-1.0, -1.0, 1.0])
-    return _AGAIN * sum(
-        f.hold is not None and (_alike(hold, f.hold) or _alike(turned, f.hold)) for f in failures
-    )
+def _retry_cost(object_pose: Pose, grasp: Grasp, failures: Sequence[FailedAttempt]) -> float:
+    """Return the cost of similar grasps that failed; a grasp rotated by half a turn is the same."""
+    local = object_pose.to_local(Pose(grasp.pos_world, grasp.mat))
+    poses = [Pose(local.pos, local.mat * flip) for flip in _FLIPS]
+    failed = [f.grasp for f in failures if f.grasp is not None]
+    return SEARCH.retry_cost * sum(any(SEARCH.is_same(pose, grasp) for pose in poses) for grasp in failed)
 
 
-def _tilts(spots: list[Place], pose: Pose) -> list[np.ndarray]:
-    """Rotations (3, 3) from straight down to approaches that suit places entered from a side or with a lean."""
-    turns: list[np.ndarray] = []
-    seen: set[tuple] = set()
-    for spot in spots:
-        back = pose.mat @ spot.mat.T
-        side = back @ (spot.entry if spot.entry[2] > -0.5 else DOWN)
-        flat = float(np.hypot(side[0], side[1]))
-        key = round(np.arctan2(side[1], side[0]) / (np.pi / 6)) % 12
-        if flat < 0.3 or key in seen or len(seen) == _SIDES:
+def _tilt(azimuth: float, angle: float) -> np.ndarray:
+    """Return the rotation (3, 3) from straight down to an approach that leans towards a horizontal direction."""
+    about, c, s = rotation_about_z(azimuth), np.cos(angle), np.sin(angle)
+    return about @ np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]) @ about.T
+
+
+_ALL_TILTS = [_tilt(2 * np.pi * k / 8, angle) for angle in (0.25, 0.35, 0.6) for k in range(8)]
+
+
+def _entry_tilts(places: list[PlacePose], object_pose: Pose) -> list[np.ndarray]:
+    """Return rotations (3, 3) from straight down to approaches that suit places entered from a side or leaning."""
+    tilts: list[np.ndarray] = []
+    seen: set[int] = set()
+    for place in places:
+        to_now = object_pose.mat @ place.mat.T
+        entry = to_now @ (DOWN if place.from_above else place.entry)
+        horizontal, azimuth = float(np.hypot(entry[0], entry[1])), np.arctan2(entry[1], entry[0])
+        direction = round(azimuth / (np.pi / 6)) % 12
+        if horizontal < 0.3 or direction in seen or len(seen) == SEARCH.entry_directions:
             continue
-        seen.add(key)
-        turns += [_lean(float(np.arctan2(side[1], side[0])), tilt) for tilt in _TILTS]
-    return turns
+        seen.add(direction)
+        tilts += [_tilt(float(azimuth), angle) for angle in _TILTS]
+    return tilts
 
 
-def _pairs(voxels: Voxels, holds: list[Grasp], spots: list[Place], pose: Pose) -> list[Approach]:
-    """The best holds and places together, in order; a body is let fall from where the hand has room."""
-    turns = np.stack([spot.mat @ pose.mat.T for spot in spots])
-    at, entries = np.stack([spot.pos for spot in spots]), np.stack([spot.entry for spot in spots])
-    aside = np.flatnonzero(entries[:, 2] > -0.5)
-    cost = np.array([[grasp.cost + spot.cost for spot in spots] for grasp in holds])
-    lifts = np.zeros(cost.shape, int)
-    for h, grasp in enumerate(holds):
-        mats, origins = turns @ grasp.mat, at + turns @ (grasp.pos_world - pose.pos)
-        hits = np.full((len(spots), len(_LIFTS)), 1e6)
-        wanting = np.ones(len(spots), bool)
-        for k, lift in enumerate(_LIFTS):
-            raised = origins[wanting] + [0, 0, lift + 0.008]
-            hits[wanting, k] = voxels.touched(HAND, raised, mats[wanting])
-            wanting &= hits[:, k] > 0
-            wanting[aside] = False
-            if not wanting.any():
+def _rank_pairs(placement: Placement, grasps: list[Grasp], places: list[PlacePose]) -> list[PickPlan]:
+    """Return the best pairs of a grasp and a place, in order, each with the height at which the hand has room."""
+    object_pose, voxels = placement.object_pose, placement.voxels
+    rotations = np.stack([place.mat @ object_pose.mat.T for place in places])
+    positions, entries = np.stack([p.pos for p in places]), np.stack([p.entry for p in places])
+    from_side = np.flatnonzero(entries[:, 2] > -0.5)
+    cost = np.array([[grasp.cost + place.cost for place in places] for grasp in grasps])
+    heights = np.zeros(cost.shape, int)
+    for g, grasp in enumerate(grasps):
+        mats = rotations @ grasp.mat
+        origins = positions + rotations @ (grasp.pos_world - object_pose.pos)
+        hits = np.full((len(places), len(_DROP_HEIGHTS)), 1e6)
+        colliding = np.ones(len(places), bool)
+        for k, height in enumerate(_DROP_HEIGHTS):
+            raised = origins[colliding] + [0, 0, height + 0.008]
+            hits[colliding, k] = voxels.count_hand_collisions(HAND, raised, mats[colliding])
+            colliding &= hits[:, k] > 0
+            colliding[from_side] = False
+            if not colliding.any():
                 break
-        price = 0.01 * hits + 0.3 * (hits > 0) + 4.0 * _LIFTS
-        lifts[h] = price.argmin(axis=1)
-        cost[h] += price.min(axis=1)
-        for back in (0.08, 0.16):
-            before = origins[aside] - back * entries[aside]
-            cost[h, aside] += 0.01 * voxels.touched(HAND, before, mats[aside])
-    best = np.argsort(cost, axis=None, kind="stable")[:_PAIRS]
+        height_cost = 0.01 * hits + 0.3 * (hits > 0) + 4.0 * _DROP_HEIGHTS
+        heights[g] = height_cost.argmin(axis=1)
+        cost[g] += height_cost.min(axis=1)
+        for distance in (0.08, 0.16):
+            before = origins[from_side] - distance * entries[from_side]
+            cost[g, from_side] += 0.01 * voxels.count_hand_collisions(HAND, before, mats[from_side])
+    best = np.argsort(cost, axis=None, kind="stable")[: SEARCH.pairs]
     return [
-        Approach(holds[h], spots[s], pose, float(_LIFTS[lifts[h, s]]), float(cost[h, s]))
-        for h, s in zip(*np.unravel_index(best, cost.shape), strict=True)
+        PickPlan(grasps[g], places[p], object_pose, float(_DROP_HEIGHTS[heights[g, p]]), float(cost[g, p]))
+        for g, p in zip(*np.unravel_index(best, cost.shape), strict=True)
     ]
 
 
-def _reachable(
-    view: StateView, shapes: Shapes, pairs: list[Approach], both_ways: bool = True
-) -> tuple[Approach, float]:
-    """The first that the arm reaches, or the one it misses least; and by how much it does, as `Arm.follow`."""
-    angles = view.simulations.fields["qpos"][view.index][:7]
-    best: tuple[float, Approach] | None = None
-    seen: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
-    hopeless: set[tuple] = set()
-    tried = 0
-    for pair in pairs:
-        for side, flip in enumerate(_WAYS_ROUND[: 1 + both_ways]):
-            grasp, key = replace(pair.grasp, mat=pair.grasp.mat * flip), (id(pair.grasp), side)
-            if key not in seen:
-                above = grasp.pos_world - 0.10 * grasp.mat[:, 2]
-                seen[key] = shapes.arm.follow(angles, [(above, grasp.mat), (grasp.pos_world, grasp.mat)])
-            after, missed = seen[key]
-            if best is not None and missed >= best[0]:
+def _first_reachable(
+    view: StateView, shapes: Shapes, plans: list[PickPlan], flip: bool = True
+) -> tuple[PickPlan, float]:
+    """Return the first plan that the arm reaches, or the one with the smallest error; and the error.
+
+    Args:
+        view: State of the simulation.
+        shapes: Shapes of the scene, with the arm's kinematics.
+        plans: Plans, best first.
+        flip: Whether the hand may also be rotated by half a turn.
+    """
+    start = joint_angles(view)
+    best: tuple[float, PickPlan] | None = None
+    grasped: dict[tuple[int, int], tuple[np.ndarray, float]] = {}  # grasp and flip -> angles and error there
+    unreachable: set[tuple] = set()
+    trials = 0
+    for candidate in plans:
+        for side, signs in enumerate(_FLIPS[: 1 + flip]):
+            grasp, key = (
+                replace(candidate.grasp, mat=candidate.grasp.mat * signs),
+                (id(candidate.grasp), side),
+            )
+            if key not in grasped:
+                pregrasp = Pose(grasp.pos_world - _PREGRASP_DISTANCE * grasp.mat[:, 2], grasp.mat)
+                grasped[key] = shapes.arm.follow(start, [pregrasp, Pose(grasp.pos_world, grasp.mat)])
+            angles, grasp_error = grasped[key]
+            if best is not None and grasp_error >= best[0]:
                 continue
-            turned = (*key, *np.round(pair.place.mat.ravel(), 1), *np.round(pair.place.entry))
-            if turned in hopeless:
+            similar = (*key, *np.round(candidate.place.mat.ravel(), 1), *np.round(candidate.place.entry))
+            if similar in unreachable:
                 continue
-            own, tried = replace(pair, grasp=grasp), tried + 1
-            clear = 0.08 if pair.place.entry[2] < -0.5 else ASIDE
-            way = [
-                (grasp.pos_world + [0.0, 0.0, _RAISED], own.hand_mat),
-                (own.hand_pos - clear * pair.place.entry, own.hand_mat),
-                (own.hand_pos, own.hand_mat),
-            ]
-            miss = max(missed, shapes.arm.follow(after, way)[1])
-            if miss > _HOPELESS:
-                hopeless.add(turned)
-            if best is None or miss < best[0]:
-                best = miss, own
-            if miss < _MISSED:
-                return own, miss
-        if tried > _TRIED:
+            plan, trials = replace(candidate, grasp=grasp), trials + 1
+            error = max(grasp_error, shapes.arm.follow(angles, _place_path(plan))[1])
+            if error > SEARCH.unreachable_error:
+                unreachable.add(similar)
+            if best is None or error < best[0]:
+                best = error, plan
+            if error < SEARCH.reach_tolerance:
+                return plan, error
+        if trials > SEARCH.reach_trials:
             break
     assert best is not None
     return best[1], best[0]
+
+
+def _place_path(plan: PickPlan) -> list[Pose]:
+    """Return poses of the grip site on the way from the grasp to the place."""
+    distance = _ENTRY_HEIGHT if plan.place.from_above else ENTRY_DISTANCE
+    pos, mat = plan.release_pos, plan.release_mat
+    return [
+        Pose(plan.grasp.pos_world + [0.0, 0.0, _LIFT_HEIGHT], mat),
+        Pose(pos - distance * plan.place.entry, mat),
+        Pose(pos, mat),
+    ]

@@ -1,242 +1,305 @@
-"""Where to put something: poses of a body that make a goal's atom true, found by letting its shape down there."""
+"""Where to put an object: poses that make a goal's atom true, found by lowering the object's shape onto the scene."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.expert.clearance import Voxels, underside, upper_side
-from libero_env.expert.shapes import pose_of
-from libero_env.geometry import Pose
+from libero_env.expert.clearance import Voxels, lower_surface, upper_surface
+from libero_env.expert.shapes import DENSE, Shapes, pose_of
+from libero_env.geometry import Pose, rotation_about, rotation_about_z
 from libero_env.sim.regions import Box, contains, is_over, region_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
 DOWN = np.array([0.0, 0.0, -1.0])
-_YAWS = 12
+UP = np.array([0.0, 0.0, 1.0])
+_NUM_YAWS = 12
 _GRID = 7  # spots along each side of a region
-_LIFT = 0.008  # m, off what carries it when a body is tested for room
-_SIDEWAYS = tuple(np.arange(0.02, 0.29, 0.025))  # m, of the way in from a side that must be free
-_NEAR = 0.024  # m, between the origins of things that stand on one another
-_LEANS = (0.45, 0.8, 1.3)  # rad, of a body that fits nowhere upright
-_EDGE, _WITHIN = 40.0, 0.02  # cost of each m that a spot is nearer to the edge of its region than so many m
-_CROWDED = 0.04  # share of a body's points that may seem to lie in others, as voxels are coarse
-_UNDER = 0.15  # share of a body's columns that may reach into what hangs over them
-_UNCARRIED = 2.0  # cost of a lean with nothing under the middle of the body
-_ENOUGH = 80  # points of a body that are tested
+_OFFSETS = np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)])  # [m] of spots on an object
+_MAX_STACK_OFFSET = 0.024  # [m] between the origins of stacked objects
+_LIFT = 0.008  # [m] off its support, when an object is tested for collisions
+_ENTRY_STEPS = tuple(np.arange(0.02, 0.29, 0.025))  # [m] of the path from a side that has to be free
+_LEANS = (0.45, 0.8, 1.3)  # [rad] of an object that fits nowhere upright
+_EDGE_COST, _EDGE_MARGIN = 40.0, 0.02  # cost for each [m] closer to the edge of a region than the margin
+_MAX_OVERLAP = 0.04  # share of an object's points that may be in occupied cells, as voxels are coarse
+_MAX_OVERHANG = 0.15  # share of an object's columns that may reach into an overhang
+_MIN_ENTRY_OVERLAP = 0.03  # share of points that is tolerated on the way in
+_UNSUPPORTED_COST = 2.0  # of a leaning object with nothing under its middle
+_NUM_TESTED = 80  # points of an object that are tested
 
 
 class PlaceError(LiberoError):
-    """A body has no room where the goal wants it."""
+    """There is no room for an object where the goal wants it."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """The body's origin at `pos` (3,), m, turned by `mat` (3, 3); it comes there along `entry` (3,)."""
+class PlacePose:
+    """Pose of an object at its place.
+
+    Attributes:
+        pos: Position of the object's origin, (3,), [m].
+        mat: Orientation of the object, (3, 3).
+        entry: Direction in which the object comes in, unit vector (3,).
+        cost: Cost of the place; lower is better.
+    """
 
     pos: np.ndarray
     mat: np.ndarray
     entry: np.ndarray
     cost: float
 
+    @property
+    def from_above(self) -> bool:
+        """Whether the object comes in from above and not from a side."""
+        return bool(self.entry[2] <= -0.5)
 
-def places(
-    view: StateView,
-    voxels: Voxels,
-    cloud: np.ndarray,
-    pose: Pose,
-    atom: Atom,
-    share: tuple[int, int] = (0, 1),
-) -> list[Place]:
-    """Poses at which the atom would hold, the best first; upright as the body is now, turned about the vertical.
 
-    Args:
-        view: the state.
-        voxels: of everything but the body.
-        cloud: points on the body, world frame, (N, 3).
-        pose: of the body.
-        atom: (On thing place) or (In thing place).
-        share: which of how many things that go to this place, so that each leaves room for the others.
+@dataclass(frozen=True)
+class Placement:
+    """An object that is to be placed, and the scene around it.
+
+    Attributes:
+        view: State of the simulation.
+        atom: Atom to make true: (On object place), (In object region) or (Stack object place).
+        slot: (k, n): the object is number k of n that go to this place; each leaves room for the others.
+        cloud: Points on the object, world frame, (N, 3).
+        object_pose: Pose of the object now.
+        voxels: Voxels of everything else.
+    """
+
+    view: StateView
+    atom: Atom
+    slot: tuple[int, int]
+    cloud: np.ndarray
+    object_pose: Pose
+    voxels: Voxels
+
+    @classmethod
+    def from_view(cls, view: StateView, shapes: Shapes, atom: Atom, slot: tuple[int, int]) -> "Placement":
+        """Build the voxels of a scene for placing one of its objects."""
+        name = atom.args[0]
+        cloud, pose = shapes.cloud(view, name), pose_of(view, name)
+        obstacles = shapes.obstacles(view, name, spacing=DENSE)
+        voxels = Voxels(obstacles, view.scene.workspace.surface_height, pose.pos)
+        return cls(view, atom, slot, cloud, pose, voxels)
+
+    @property
+    def target(self) -> str:
+        """Object, fixture or region on which or in which the object is placed."""
+        return self.atom.args[1]
+
+    @property
+    def on_table(self) -> bool:
+        """Whether the target is a region of a flat surface."""
+        region = self.view.scene.problem.region(self.target)
+        return region is not None and bool(region.ranges)
+
+    @cached_property
+    def sides(self) -> list[np.ndarray]:
+        """The four horizontal directions along the sides of what the target belongs to, (3,) each."""
+        owner = self.view.scene.owner(self.target)
+        x = pose_of(self.view, owner).mat[:, 0] if owner is not None else np.array([1.0, 0.0, 0.0])
+        x = np.array([x[0], x[1], 0.0]) / max(float(np.hypot(x[0], x[1])), 1e-9)
+        y = np.array([-x[1], x[0], 0.0])
+        return [x, -x, y, -y]
+
+
+def find_place_poses(placement: Placement) -> list[PlacePose]:
+    """Return poses at which the atom would hold, best first.
+
+    The object stays upright and is rotated about the vertical. Only where it fits nowhere, it is rotated parallel to
+    the sides of the place, then leaned; at last more overlap with the coarse voxels is accepted.
 
     Raises:
-        PlaceError: it fits nowhere.
+        PlaceError: There is no room.
     """
-    frame = _directions(view, atom.args[1])
-    crowded = _CROWDED if not view.is_entity(atom.args[1]) else 3 * _CROWDED
-    square = _square(cloud, frame[0])
-    upright = [(turn, 0.1 * abs(angle), None) for angle, turn in _turns(_YAWS)]
-    found = _found(view, voxels, cloud, pose, atom, share, upright, frame, crowded)
+    on_entity = placement.view.is_entity(placement.target)
+    overlap = 3 * _MAX_OVERLAP if on_entity else _MAX_OVERLAP
+    upright = [_Rotation(mat, 0.1 * abs(angle)) for angle, mat in _yaw_rotations(_NUM_YAWS)]
+    parallel = _parallel_rotations(placement.cloud, placement.sides[0])
+    found = _search(placement, upright, overlap)
     if not found:
-        upright += [(turn, 0.1 * abs(angle), None) for angle, turn in square]
-        found = _found(view, voxels, cloud, pose, atom, share, upright[_YAWS:], frame, crowded)
-    if not found and not _flat_region(view, atom.args[1]):
-        yaws = [*square, *_turns(_YAWS // 2)]
-        for angle in _LEANS:
-            turns = [(_lean(d, angle) @ turn, 0.1 * abs(a), d) for d in frame for a, turn in yaws]
-            found += _found(view, voxels, cloud, pose, atom, share, turns, frame, crowded)
-    if not found:
-        found = _found(view, voxels, cloud, pose, atom, share, upright, frame, 8 * crowded)
-    if not found:
-        raise PlaceError(f"({atom.predicate} {' '.join(atom.args)}): there is no room for {atom.args[0]}")
-    lowest = min(place.pos[2] for place in found)
-    deep = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
-    return sorted(deep, key=lambda place: place.cost)
-
-
-Turn = tuple[np.ndarray, float, np.ndarray | None]  # (3, 3) to apply, its cost, the only way in that it suits
-
-
-def _found(
-    view: StateView,
-    voxels: Voxels,
-    cloud: np.ndarray,
-    pose: Pose,
-    atom: Atom,
-    share: tuple[int, int],
-    turns: list[Turn],
-    directions: list[np.ndarray],
-    crowded: float,
-) -> list[Place]:
-    """Places of a body turned in these ways, of which at most a share may seem to lie in others."""
-    found = []
-    step = max(1, len(cloud) // _ENOUGH)
-    for turn, price, only in turns:
-        body = (cloud - pose.pos) @ turn.T
-        for spots, costs, below, holds in _regions(view, atom, body, share):
-            heights = voxels.drop(underside(body), spots, below)
-            keep = [
-                i
-                for i, (xy, z) in enumerate(zip(spots, heights, strict=True))
-                if holds(np.array([*xy, z + 0.003]))
+        extra = [_Rotation(mat, 0.1 * abs(angle)) for angle, mat in parallel]
+        upright += extra
+        found = _search(placement, extra, overlap)
+    if not found and not placement.on_table:
+        yaws = [*parallel, *_yaw_rotations(_NUM_YAWS // 2)]
+        for lean in _LEANS:
+            leaning = [
+                _Rotation(rotation_about(np.cross(side, UP), lean) @ mat, 0.1 * abs(angle), side)
+                for side in placement.sides
+                for angle, mat in yaws
             ]
-            if not keep:
-                continue
-            origins = np.column_stack([spots, heights])[keep]
-            under = voxels.overhead(upper_side(body) + [0, 0, _LIFT], origins, below)
-            costs, origins = (costs[keep] + 2.0 * under)[under < _UNDER], origins[under < _UNDER]
-            if not len(origins):
-                continue
-            if only is not None:  # it falls back: its middle should have something under it
-                middle = body.mean(axis=0)[None] * [1, 1, 0] + [0, 0, body[:, 2].min()]
-                costs = costs + _UNCARRIED * (
-                    origins[:, 2] - voxels.drop(middle, origins[:, :2], below) > 0.01
-                )
-            ways = directions if only is None else [only]
-            entries, crowd = _ways_in(voxels, body[::step], origins, ways, crowded)
-            for pos, cost, entry, full in zip(origins, costs, entries, crowd, strict=True):
-                if entry is not None:
-                    aside = 0.5 * (entry[2] > -0.5)
-                    found.append(Place(pos, turn @ pose.mat, entry, cost + price + 8.0 * full + aside))
+            found += _search(placement, leaning, overlap)
+    if not found:
+        found = _search(placement, upright, 8 * overlap)
+    if not found:
+        name, args = placement.atom.args[0], " ".join(placement.atom.args)
+        raise PlaceError(f"({placement.atom.predicate} {args}): there is no room for {name}")
+    lowest = min(place.pos[2] for place in found)
+    found = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
+    return sorted(found, key=lambda place: place.cost)
+
+
+@dataclass(frozen=True)
+class _Rotation:
+    """Rotation of an object from its orientation now."""
+
+    mat: np.ndarray  # (3, 3)
+    cost: float
+    only_entry: np.ndarray | None = None  # the direction that a leaning object has to come in, (3,)
+
+
+@dataclass(frozen=True)
+class _Spots:
+    """Spots of one part of a target."""
+
+    xy: np.ndarray  # (S, 2)
+    costs: np.ndarray  # (S,)
+    below: float  # [m] height above which nothing supports the object
+    holds: Callable[[np.ndarray], bool]  # whether the atom holds for an origin (3,)
+
+
+def _search(placement: Placement, rotations: list[_Rotation], max_overlap: float) -> list[PlacePose]:
+    """Return places of an object with some rotations, of whose points at most a share is in occupied cells."""
+    found: list[PlacePose] = []
+    for rotation in rotations:
+        body = (placement.cloud - placement.object_pose.pos) @ rotation.mat.T
+        for spots in _target_spots(placement):
+            found += _search_spots(placement, body, rotation, spots, max_overlap)
     return found
 
 
-def _turns(number: int) -> list[tuple[float, np.ndarray]]:
-    """Turns about the vertical: (angle, (3, 3))."""
+def _search_spots(
+    placement: Placement, body: np.ndarray, rotation: _Rotation, spots: _Spots, max_overlap: float
+) -> list[PlacePose]:
+    """Return places of an object, whose points relative to its origin are `body` (N, 3), at some spots."""
+    voxels, tested = placement.voxels, body[:: max(1, len(body) // _NUM_TESTED)]
+    heights = voxels.resting_heights(lower_surface(body), spots.xy, spots.below)
+    keep = [
+        i
+        for i, (xy, z) in enumerate(zip(spots.xy, heights, strict=True))
+        if spots.holds(np.array([*xy, z + 0.003]))
+    ]
+    if not keep:
+        return []
+    origins = np.column_stack([spots.xy, heights])[keep]
+    overhang = voxels.overhang_overlap(upper_surface(body) + [0, 0, _LIFT], origins, spots.below)
+    free = overhang < _MAX_OVERHANG
+    costs, origins = (spots.costs[keep] + 2.0 * overhang)[free], origins[free]
+    if not len(origins):
+        return []
+    entries = placement.sides
+    if rotation.only_entry is not None:
+        entries = [rotation.only_entry]
+        middle = body.mean(axis=0)[None] * [1, 1, 0] + [0, 0, body[:, 2].min()]
+        gap = origins[:, 2] - voxels.resting_heights(middle, origins[:, :2], spots.below)
+        costs = costs + _UNSUPPORTED_COST * (gap > 0.01)
+    ways, overlaps = _find_entries(voxels, tested, origins, entries, max_overlap)
+    found = []
+    for pos, cost, entry, overlap in zip(origins, costs, ways, overlaps, strict=True):
+        if entry is not None:
+            total = cost + rotation.cost + 8.0 * overlap + 0.5 * (entry[2] > -0.5)
+            found.append(PlacePose(pos, rotation.mat @ placement.object_pose.mat, entry, total))
+    return found
+
+
+def _yaw_rotations(number: int) -> list[tuple[float, np.ndarray]]:
+    """Return equally spaced rotations about the vertical: (angle, (3, 3))."""
     angles = [2 * np.pi * k / number for k in range(number)]
     angles = [a - 2 * np.pi if a > np.pi else a for a in angles]
-    return [(a, _about_vertical(a)) for a in angles]
+    return [(a, rotation_about_z(a)) for a in angles]
 
 
-def _square(cloud: np.ndarray, side: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Turns about the vertical that put the narrowest way through a body along or across a direction."""
+def _parallel_rotations(cloud: np.ndarray, side: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Return rotations about the vertical that put the narrowest width of an object along or across a direction."""
     plan = np.unique(np.round(cloud[:, :2], 3), axis=0)
     yaws = np.pi * np.arange(90) / 90
     widths = np.ptp(plan @ [np.cos(yaws), np.sin(yaws)], axis=0)
     first = np.arctan2(side[1], side[0]) - yaws[widths.argmin()]
     angles = [(first + k * np.pi / 2 + np.pi) % (2 * np.pi) - np.pi for k in range(4)]
-    return [(a, _about_vertical(a)) for a in angles]
+    return [(a, rotation_about_z(a)) for a in angles]
 
 
-def _lean(entry: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation (3, 3) by which the top of a body leans back, away from where it goes."""
-    axis = np.cross(entry, [0.0, 0.0, 1.0])
-    x, y, _ = axis
-    cross = np.array([[0, 0, y], [0, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-def _regions(view: StateView, atom: Atom, body: np.ndarray, share: tuple[int, int]):
-    """(spots (S, 2), costs (S,), height below which things carry, test of an origin) for each part of a place."""
-    target = atom.args[1]
+def _target_spots(placement: Placement) -> Iterator[_Spots]:
+    """Yield the spots of each part of the target."""
+    view, target = placement.view, placement.target
     if view.is_entity(target):
         xy = view.body_pos(target)[:2]
-        offsets = np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)])
-        yield (
-            xy + offsets,
-            8.0 * np.linalg.norm(offsets, axis=1),
-            np.inf,
-            lambda origin: bool(np.linalg.norm(origin[:2] - xy) < _NEAR),
+        costs = 8.0 * np.linalg.norm(_OFFSETS, axis=1)
+        yield _Spots(
+            xy + _OFFSETS, costs, np.inf, lambda pos: bool(np.linalg.norm(pos[:2] - xy) < _MAX_STACK_OFFSET)
         )
         return
-    test = contains if atom.predicate == "In" else is_over
+    inside = placement.atom.predicate == "In"
+    test = contains if inside else is_over
     for box in region_boxes(view, target):
         centre, mat, size = box
         half = np.abs(mat @ size)
         u, v = (np.linspace(-0.9, 0.9, _GRID) * h for h in half[:2])
         offsets = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        costs = 4.0 * np.linalg.norm(offsets - _wanted(half, share), axis=1)
-        costs += _EDGE * np.maximum(_WITHIN - (half[:2] - np.abs(offsets)).min(axis=1), 0.0)
-        below = centre[2] + (0.5 * half[2] if atom.predicate == "In" else 0.06)
-        if _flat_region(view, target):
+        costs = 4.0 * np.linalg.norm(offsets - _slot_offset(half, placement.slot), axis=1)
+        costs += _EDGE_COST * np.maximum(_EDGE_MARGIN - (half[:2] - np.abs(offsets)).min(axis=1), 0.0)
+        below = centre[2] + (0.5 * half[2] if inside else 0.06)
+        if placement.on_table:
             below = view.scene.workspace.surface_height + 0.02
-        yield centre[:2] + offsets, costs, below, lambda origin, box=box: test(_smaller(box), origin)
+        yield _Spots(centre[:2] + offsets, costs, below, partial(test, _shrunk(box)))
 
 
-def _wanted(half: np.ndarray, share: tuple[int, int]) -> np.ndarray:
-    """Where in a region one of several things should stand: along its longer side, (2,) from the middle."""
-    which, number = share
+def _slot_offset(half: np.ndarray, slot: tuple[int, int]) -> np.ndarray:
+    """Return where in a region one of several objects stands, along its longer side, (2,) from the middle, [m]."""
+    k, number = slot
     offset = np.zeros(2)
     if number > 1:
         axis = int(half[1] > half[0])
-        offset[axis] = 0.62 * half[axis] * (2 * which / (number - 1) - 1)
+        offset[axis] = 0.62 * half[axis] * (2 * k / (number - 1) - 1)
     return offset
 
 
-def _flat_region(view: StateView, address: str) -> bool:
-    region = view.scene.problem.region(address)
-    return region is not None and bool(region.ranges)
-
-
-def _smaller(box: Box) -> Box:
+def _shrunk(box: Box) -> Box:
+    """Return a box that is smaller by a margin, where it is not flat."""
     centre, mat, size = box
     half = np.abs(mat @ size)
     return centre, mat, np.where(np.abs(size) > 0.012, np.maximum(size - 0.1 * half.min(), 0.7 * size), size)
 
 
-def _directions(view: StateView, target: str) -> list[np.ndarray]:
-    """The four horizontal directions along the sides of what a place belongs to."""
-    owner = view.scene.owner(target)
-    x = pose_of(view, owner).mat[:, 0] if owner is not None else np.array([1.0, 0.0, 0.0])
-    x = np.array([x[0], x[1], 0.0]) / max(float(np.hypot(x[0], x[1])), 1e-9)
-    y = np.array([-x[1], x[0], 0.0])
-    return [x, -x, y, -y]
-
-
-def _ways_in(
-    voxels: Voxels, body: np.ndarray, origins: np.ndarray, directions: list[np.ndarray], crowded: float
+def _find_entries(
+    voxels: Voxels, body: np.ndarray, origins: np.ndarray, directions: list[np.ndarray], max_overlap: float
 ) -> tuple[list[np.ndarray | None], np.ndarray]:
-    """For each origin (S, 3) the direction along which the body comes in, None for none; and the share in walls."""
+    """Find the direction along which an object comes in.
+
+    Args:
+        voxels: Voxels of everything but the object.
+        body: Points on the object relative to its origin, (N, 3).
+        origins: Positions of the object, (S, 3).
+        directions: Directions from a side; used only where no position can be reached from above.
+        max_overlap: Largest share of points in occupied cells.
+
+    Returns:
+        For each position the direction (3,), or None without one; and the share of points in occupied cells, (S,).
+    """
     standing = origins[:, None] + body[None] + [0, 0, _LIFT]
-    crowd = voxels.hits(standing) / len(body)
+    overlap = voxels.count_occupied(standing) / len(body)
     entries: list[np.ndarray | None] = [None] * len(origins)
-    roofed = voxels.roofed(standing).mean(axis=1)
-    for i in np.flatnonzero((crowd < crowded) & (roofed <= np.maximum(crowd, 0.03))):
+    covered = voxels.is_covered(standing).mean(axis=1)
+    tolerated = np.maximum(overlap, _MIN_ENTRY_OVERLAP)
+    from_above = (overlap < max_overlap) & (covered <= tolerated)
+    for i in np.flatnonzero(from_above):
         entries[i] = DOWN
-    for entry in () if any(entry is not None for entry in entries) else directions:
-        open_ = [i for i in range(len(origins)) if entries[i] is None and crowd[i] < crowded]
-        if not open_:
+    if from_above.any():
+        return entries, overlap
+    for direction in directions:
+        left = [i for i in range(len(origins)) if entries[i] is None and overlap[i] < max_overlap]
+        if not left:
             break
-        free = np.ones(len(open_), bool)
-        for length in _SIDEWAYS:
-            free &= voxels.hits(standing[open_] - length * entry) <= np.maximum(crowd[open_], 0.03) * len(
-                body
-            )
-        for i, good in zip(open_, free, strict=True):
-            if good:
-                entries[i] = entry
-    return entries, crowd
-
-
-def _about_vertical(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        free = np.ones(len(left), bool)
+        for length in _ENTRY_STEPS:
+            occupied = voxels.count_occupied(standing[left] - length * direction)
+            free &= occupied <= tolerated[left] * len(body)
+        for index, is_free in zip(left, free, strict=True):
+            if is_free:
+                entries[index] = direction
+    return entries, overlap

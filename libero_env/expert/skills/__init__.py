@@ -1,1 +1,1 @@
-"""Motions that last many control steps: pick and place, drag, drop into a container, move a joint."""
+"""Skills of many control steps: pick and place, drag, drop into a container, move a joint."""

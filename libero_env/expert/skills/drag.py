@@ -1,110 +1,100 @@
-"""Moving something too wide and flat to take: a fingertip in its hollow draws it over the table."""
+"""Dragging an object that is too wide and flat to be grasped: a fingertip in its hollow moves it over the table."""
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import TIP_BELOW
-from libero_env.expert.arm.servo import CLOSE, action_toward, downward, finger_axis
+from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm.servo import CLOSE, downward, finger_axis, lateral_ramp
 from libero_env.expert.shapes import Shapes, pose_of
-from libero_env.expert.skills.pick_place import CONTROL_HZ
+from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.variation import MotionStyle
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.regions import region_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
-ATTEMPTS = 5
-OVER = 0.07  # m, of the fingertips over the body on the way to it
-LEAD = 0.035  # m, of the goal ahead of the hand while it draws
-LIGHT = -0.006  # m over the bottom of the hollow: it presses, and friction helps
+MAX_RETRIES = 5
+HOLLOW_RADIUS, MIN_HOLLOW = 0.02, 0.006  # [m] around the origin, and its depth below the rim
+HOVER = 0.07  # [m] of the fingertips over the object on the way to it
+LEAD = 0.035  # [m] of the target ahead of the hand while it drags
+PRESS = -0.006  # [m] of the fingertips over the bottom of the hollow: the hand presses, and friction helps
+DRAG_SPEED = 0.6  # factor on the speed
 
 
-class Drag:
-    """Makes an (On thing region-of-the-table) true for a body with a hollow, such as a plate; as `PickPlace`."""
+class Drag(Skill):
+    """Makes an (On object region-of-the-table) true for an object with a hollow, such as a plate.
+
+    Phases: reach, carry, withdraw.
+
+    Args:
+        atom: Atom to make true.
+        style: Motion style.
+        shapes: Shapes of the scene.
+    """
+
+    NOISE_SCALES = {"reach": 1.0, "carry": 0.3}
 
     def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes):
-        self.atom, self.style, self.shapes = atom, style, shapes
-        self.phase = "reach"
-        self.retries, self.failure_reason = 0, ""
-        self._steps = 0
-        self._before: np.ndarray | None = None
-        self._velocity = np.zeros(3)
+        super().__init__(style)
+        self.atom, self.shapes = atom, shapes
 
     @staticmethod
-    def suits(view: StateView, shapes: Shapes, atom: Atom) -> bool:
-        """Whether the place is on the table and the body has a hollow over its origin."""
+    def applies(view: StateView, shapes: Shapes, atom: Atom) -> bool:
+        """Return whether the place is on the table and the object is upright and has a hollow at its origin."""
         region = view.scene.problem.region(atom.args[1])
         flat = region is not None and bool(region.ranges) and region.target == view.scene.workspace_name
         points = shapes.cloud(view, atom.args[0]) - view.body_pos(atom.args[0])
-        inner = points[np.hypot(points[:, 0], points[:, 1]) < 0.02, 2]
+        hollow = points[np.hypot(points[:, 0], points[:, 1]) < HOLLOW_RADIUS, 2]
         upright = pose_of(view, atom.args[0]).mat[2, 2] > 0.9
-        return flat and upright and len(inner) > 0 and points[:, 2].max() - inner.max() > 0.006
-
-    @property
-    def noise_scale(self) -> float:
-        """How much disturbance the moment bears, in [0, 1]."""
-        return {"reach": 1.0, "carry": 0.3}.get(self.phase, 0.0)
+        return bool(flat and upright and len(hollow) > 0 and points[:, 2].max() - hollow.max() > MIN_HOLLOW)
 
     def done(self, view: StateView) -> bool:
-        """Whether the atom holds and the hand is away."""
+        """Return whether the atom holds and the hand is away."""
         return self.phase in ("reach", "rest") and evaluate(self.atom, view)
 
-    def act(self, view: StateView) -> np.ndarray:
-        """The next action, (7,) in [-1, 1]."""
-        pos, thing = view.eef_pos, self.atom.args[0]
-        self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
-        self._before = pos
-        self._steps += 1
-        points = self.shapes.cloud(view, thing)
-        origin = view.body_pos(thing)
-        hollow = points[np.hypot(*(points - origin)[:, :2].T) < 0.02, 2].max()
-        target = min(
-            (box[0][:2] for box in region_boxes(view, self.atom.args[1])),
-            key=lambda c: np.linalg.norm(c - origin[:2]),
-        )
-        way = target - origin[:2]
-        left = float(np.linalg.norm(way))
-        mat = downward(float(np.arctan2(*view.eef_mat[1::-1, 0])), finger_axis(view.eef_mat))
-        low = hollow + TIP_BELOW + LIGHT
+    def _next_action(self, view: StateView) -> np.ndarray:
         if self.phase == "rest":
             self.phase = "reach"
-        if self.phase == "reach":
-            return self._reach(view, mat, np.array([*origin[:2], low]), float(points[:, 2].max()))
-        if self.phase == "carry":
-            lost = np.linalg.norm(pos[:2] - origin[:2]) > 0.10 or self._steps > 150
-            if left < 0.012 or lost:
-                self.phase, self._steps = "withdraw", 0
-                self.retries += int(lost)
-                if self.retries > ATTEMPTS:
-                    self.failure_reason = f"{thing} does not follow the hand"
-            ahead = way / max(left, 1e-9) * min(left + 0.01, LEAD)
-            return self._toward(view, np.array([*(pos[:2] + ahead), low]), mat, 0.6)
+        return self._run_phase(view)
+
+    def _reach(self, view: StateView) -> np.ndarray:
+        """Move over the middle of the object, then down into the hollow."""
+        pos, goal = view.eef_pos, self._contact_pos(view)
+        target = goal.copy()
+        if np.linalg.norm(goal[:2] - pos[:2]) > 0.015 or gripper_opening(view) > 0.01:
+            target[2] = float(self.shapes.cloud(view, self.atom.args[0])[:, 2].max()) + HOVER
+        elif pos[2] < goal[2] + 0.006 or self._steps > 90:
+            self._enter("carry")
+        return self._push(view, target, lateral_scale=lateral_ramp(pos[2], target[2], 0.0, 0.06))
+
+    def _carry(self, view: StateView) -> np.ndarray:
+        pos, name = view.eef_pos, self.atom.args[0]
+        origin, contact = view.body_pos(name), self._contact_pos(view)
+        centres = (box[0][:2] for box in region_boxes(view, self.atom.args[1]))
+        path = min(centres, key=lambda centre: float(np.linalg.norm(centre - origin[:2]))) - origin[:2]
+        left = float(np.linalg.norm(path))
+        lost = np.linalg.norm(pos[:2] - origin[:2]) > 0.10 or self._steps > 150
+        if left < 0.012 or lost:
+            self._enter("withdraw")
+            self.retries += int(lost)
+            if self.retries > MAX_RETRIES:
+                self.failure_reason = f"{name} does not follow the hand"
+        ahead = path / max(left, 1e-9) * min(left + 0.01, LEAD)
+        return self._push(view, np.array([*(pos[:2] + ahead), contact[2]]), speed_scale=DRAG_SPEED)
+
+    def _withdraw(self, view: StateView) -> np.ndarray:
         if self._steps > 8:
             self.phase = "rest"
-        return self._toward(view, pos + [0, 0, 0.08], mat)
+        return self._push(view, view.eef_pos + [0, 0, 0.08])
 
-    def _reach(self, view: StateView, mat: np.ndarray, goal: np.ndarray, top: float) -> np.ndarray:
-        """Over the body's middle, then down into the hollow."""
-        pos = view.eef_pos
-        away = float(np.linalg.norm(goal[:2] - pos[:2]))
-        over = goal.copy()
-        if away > 0.015 or np.abs(view.finger_pos).sum() > 0.01:
-            over[2] = top + OVER
-        elif pos[2] < goal[2] + 0.006 or self._steps > 90:
-            self.phase, self._steps = "carry", 0
-        lateral = np.clip(1.0 - (over[2] - pos[2]) / 0.06, 0.0, 1.0)
-        return self._toward(view, over, mat, lateral=lateral)
+    def _contact_pos(self, view: StateView) -> np.ndarray:
+        """Return the position of the grip site with the closed fingertips in the hollow, (3,)."""
+        points, origin = self.shapes.cloud(view, self.atom.args[0]), view.body_pos(self.atom.args[0])
+        hollow = points[np.hypot(*(points - origin)[:, :2].T) < HOLLOW_RADIUS, 2].max()
+        return np.array([*origin[:2], hollow + GRIPPER.tip_below + PRESS])
 
-    def _toward(
-        self, view: StateView, goal: np.ndarray, mat: np.ndarray, speed: float = 1.0, lateral: float = 1.0
-    ):
-        return action_toward(
-            view.eef_pos,
-            view.eef_mat,
-            goal,
-            mat,
-            velocity=self._velocity,
-            gripper=CLOSE,
-            gain=self.style.gain,
-            speed=speed * self.style.speed,
-            lateral=lateral,
-        )
+    def _push(
+        self, view: StateView, pos: np.ndarray, lateral_scale: float = 1.0, speed_scale: float = 1.0
+    ) -> np.ndarray:
+        """Return the action towards a position of the closed hand, which points down."""
+        mat = downward(float(np.arctan2(*view.eef_mat[1::-1, 0])), finger_axis(view.eef_mat))
+        return self._toward(view, pos, mat, CLOSE, lateral_scale, speed_scale)

@@ -1,14 +1,15 @@
-"""Opening, closing and turning what a joint moves: drawers, doors and knobs."""
-
-from typing import Literal
+"""Moving joints of fixtures: opening and closing drawers and doors, and turning knobs."""
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import TIP_BELOW
-from libero_env.expert.arm.servo import CLOSE, OPEN, action_toward
+from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm.servo import CLOSE, OPEN, lateral_ramp
+from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.grasping.grasps import GraspError
-from libero_env.expert.grasping.handle_grasps import Hold, handle_hold, knob_hold
-from libero_env.expert.grasping.handles import Part, find_handle, inner_side, is_knob, surroundings
+from libero_env.expert.grasping.handle_grasps import HandleGrasp, grasp_handle, grasp_knob
+from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
+from libero_env.expert.planning.goal_plan import JointState
+from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -16,301 +17,277 @@ from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 from libero_env.timing import CONTROL_HZ
 
-State = Literal["open", "close", "turnon", "turnoff"]
-Phase = Literal["reach", "close", "move", "release", "withdraw", "rest"]
+_OPPOSITES = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}
 
-ATTEMPTS = 5
-ARRIVED, ARRIVED_TURN = 0.008, 0.15  # m and rad, to where the fingers close
-BACK = 0.08  # m, that the hand comes from along its approach
-LEAD = 0.06  # m, of the goal ahead of the hand while it moves the part
-SLIPPED = 0.035  # m, between the hand and the hold
-AWAY = 0.06  # m, from the handle, where the hand counts as withdrawn
-AROUND = 0.07  # m, within which things count as in the way
-AJAR, PULLED = 0.5, 0.85  # rad; a door is drawn until it is that far open, and beyond AJAR pushed
-KNOB = 0.45  # rad, of the hand ahead of a knob, at most
-BRAKE = 2.0, 0.05  # 1/s and rad/s: speed of a knob before its stop by what is left, and when it gets there
-STUCK, STUCK_MOVING = 90, 180  # steps of one phase, and of moving the part
+MAX_RETRIES = 5
+ARRIVED, ARRIVED_TURN = 0.008, 0.15  # [m], [rad] from where the fingers close
+APPROACH = 0.08  # [m] from which the hand comes along its approach
+OBSTACLE_RADIUS = 0.07  # [m] around the hand
+LEAD = 0.06  # [m] of the target ahead of the hand while it moves the part
+MAX_SLIP = 0.035  # [m] between hand and grasp
+WITHDRAWN = 0.06  # [m] from the part, where the hand counts as withdrawn
+AJAR, PULLED = 0.5, 0.85  # [rad] from which on a door is pushed open, and up to which it is pulled
+MAX_KNOB_LEAD, MIN_KNOB_LEAD = 0.45, -0.15  # [rad] of the hand ahead of a knob
+KNOB_SPEED_GAIN, KNOB_STOP_SPEED = 2.0, 0.05  # [1/s], [rad/s] of a knob before its stop
+MAX_KNOB_SPEED = 0.9  # [rad/s]
+MAX_PHASE_STEPS, MAX_MOVE_STEPS = 90, 180  # of one phase, and of moving the part
 
 
-class MoveJoint:
+class MoveJoint(Skill):
     """Brings the joints of a fixture, or of one of its parts, into a state.
 
-    To open, it takes the handle and draws; to close, it pushes with closed fingers; a knob is taken from above and
+    To open, the hand grasps the handle and pulls; to close, closed fingers push; a knob is grasped from above and
     turned. The hand withdraws when the state holds with a margin, and begins again after a slip.
+    Phases: reach, close, move, release, withdraw, rest.
 
     Args:
-        address: fixture, or region of its part.
-        state: of the joint, by the names of `ObjectModel.articulation`.
-        style: the manner.
-
-    Attributes:
-        phase: what it is doing.
-        retries: how often it had to begin again.
-        failure_reason: why it cannot go on, or "".
+        address: Name of a fixture, or address of a region that belongs to its part.
+        state: State of the joint, by the names of `ObjectModel.articulation`.
+        style: Motion style; the default one if None.
     """
 
-    def __init__(self, address: str, state: State, *, style: MotionStyle | None = None):
-        self.address, self.state = address, state
-        self.style = style or MotionStyle()
-        self.phase: Phase = "reach"
-        self.retries, self.failure_reason = 0, ""
-        self._part: Part | None = None
-        self._hold: Hold | None = None  # in the frame of the part
-        self._around = np.zeros((0, 3))
-        self._before: np.ndarray | None = None
-        self._velocity = np.zeros(3)
-        self._steps, self._still = 0, 0
-        self._opening, self._begun, self._value, self._aim = 0.0, 0.0, 0.0, 0.0  # m; m or rad, of the joint
-        self._drawn = False  # a door, as far as by its handle
-        self._left: Pose | None = None  # where the hand let go
-        self._failed: list[Pose] = []  # holds of earlier attempts
+    NOISE_SCALES = {"reach": 1.0, "withdraw": 0.7, "move": 0.4}
 
-    @property
-    def noise_scale(self) -> float:
-        """How much disturbance the moment bears, in [0, 1]."""
-        return {"reach": 1.0, "withdraw": 0.7, "move": 0.4}.get(self.phase, 0.0)
+    def __init__(self, address: str, state: JointState, *, style: MotionStyle | None = None):
+        super().__init__(style or MotionStyle())
+        self.address, self.state = address, state
+        self._plan: tuple[Part, HandleGrasp] | None = None  # the grasp in the frame of the part
+        self._failed: list[Pose] = []  # pre-grasps of earlier attempts
+        self._obstacles = np.zeros((0, 3))
+        self._still_steps = 0
+        self._start_value, self._previous_value, self._target_value = (
+            0.0,
+            0.0,
+            0.0,
+        )  # of the joint, [m] or [rad]
+        self._pulled = False  # a door, as far as it is pulled by its handle
+        self._release_pose = Pose(np.zeros(3), np.eye(3))  # where the hand let go
 
     def done(self, view: StateView) -> bool:
-        """Whether the state holds with a margin and the hand is away."""
-        return self._moved(view) and (self._hold is None or self.phase == "rest")
+        """Return whether the state holds with a margin and the hand is away."""
+        return self._is_reached(view) and (self._plan is None or self.phase == "rest")
 
-    def act(self, view: StateView) -> np.ndarray:
-        """The next action, (7,) in [-1, 1]."""
-        pos = view.eef_pos
-        self._velocity = (pos - (pos if self._before is None else self._before)) * CONTROL_HZ
-        self._before = pos
-        self._steps += 1
-        if self.failure_reason or self.phase == "rest" and self._moved(view):
-            return self._stay()
+    def _next_action(self, view: StateView) -> np.ndarray:
+        if self.failure_reason or self.phase == "rest" and self._is_reached(view):
+            return self._rest(view)
         if self.phase == "rest":
-            self._again()
-        if self._hold is None and not self._plan(view):
-            return self._stay()
-        if self._steps > (STUCK_MOVING if self.phase == "move" else STUCK):
-            return self._retreat(view)
-        return getattr(self, f"_{self.phase}")(view)
+            self._retry()
+        if self._plan is None and not self._make_plan(view):
+            return self._rest(view)
+        if self._steps > (MAX_MOVE_STEPS if self.phase == "move" else MAX_PHASE_STEPS):
+            return self._let_go(view)
+        return self._run_phase(view)
 
-    def _plan(self, view: StateView) -> bool:
-        """Choose the joint and the hold; False where nothing is to do or to take."""
+    @property
+    def _part(self) -> Part:
+        assert self._plan is not None
+        return self._plan[0]
+
+    @property
+    def _grasp(self) -> HandleGrasp:
+        assert self._plan is not None
+        return self._plan[1]
+
+    def _make_plan(self, view: StateView) -> bool:
+        """Choose the joint and the grasp; return False where nothing is left to do or nothing can be grasped."""
         model = view.scene.model
-        parts = [Part.of(model, joint) for joint in view.scene.joints.get(self.address, ())]
+        parts = [Part.from_joint(model, joint) for joint in view.scene.joints.get(self.address, ())]
         if not parts:
             self.failure_reason = f"{self.address} has no joint to {self.state}"
             return False
-        gaps = [abs(self._goal(view, part) - part.value(view)) for part in parts]
+        gaps = [abs(self._goal_value(view, part) - part.value(view)) for part in parts]
         # one joint is enough to open, all have to be closed
         choose = np.argmin if self.state in ("open", "turnon") else np.argmax
         part = parts[int(choose(gaps))]
-        if self._moved(view):
+        if self._is_reached(view):
             self._enter("rest")
             return False
-        value, self._aim = part.value(view), self._goal(view, part)
-        way = float(np.sign(self._aim - value))
+        value, self._target_value = part.value(view), self._goal_value(view, part)
         try:
-            if is_knob(view, part):
-                hold = knob_hold(view, part, self._aim - value)
-            elif self.state in ("close", "turnoff"):
-                handle = find_handle(view, part, -way)
-                hold = handle_hold(view, part, handle, self._aim - value, False, self._failed)
-            elif part.slides or abs(value - self._shut(view, part, way)) < AJAR:
-                if not part.slides:
-                    self._aim = value + way * min(PULLED, abs(self._aim - value))
-                handle = find_handle(view, part, way)
-                hold = handle_hold(view, part, handle, self._aim - value, True, self._failed)
-            else:
-                hold = handle_hold(
-                    view, part, inner_side(view, part, way), self._aim - value, False, self._failed
-                )
+            grasp = self._find_grasp(view, part, value)
         except GraspError as error:
             self.failure_reason = str(error)
             return False
-        self._part = part
-        self._around = surroundings(view, -1, hold.held.pos, view.scene.entities)
-        self._hold = hold.within(part.pose(view))
-        self._begun = value
-        self._failed.append(hold.ready)
-        self._drawn = False
+        self._plan = part, grasp.relative_to(part.pose(view))
+        self._obstacles = nearby_points(view, grasp.contact.pos, view.scene.entities)
+        self._start_value = value
+        self._failed.append(grasp.pregrasp)
+        self._pulled = False
         self._enter("reach")
         return True
 
+    def _find_grasp(self, view: StateView, part: Part, value: float) -> HandleGrasp:
+        """Return the grasp of a part, whose joint is at `value`, that moves it towards the target value.
+
+        Raises:
+            GraspError: The part cannot be grasped.
+        """
+        left = self._target_value - value
+        direction = float(np.sign(left))
+        if is_knob(view, part):
+            return grasp_knob(view, part, left)
+        if self.state in ("close", "turnoff"):
+            return grasp_handle(view, part, find_handle(view, part, -direction), left, False, self._failed)
+        closed = float(view.scene.model.jnt_range[part.joint][0 if direction > 0 else 1])
+        if not part.slides and abs(value - closed) >= AJAR:
+            return grasp_handle(view, part, find_inner_side(view, part, direction), left, False, self._failed)
+        if not part.slides:
+            self._target_value = value + direction * min(PULLED, abs(left))
+        left = self._target_value - value
+        return grasp_handle(view, part, find_handle(view, part, direction), left, True, self._failed)
+
     def _limits(self, view: StateView) -> tuple[float, float, float, float]:
-        """(threshold, end, margin, upwards) of the state, m or rad."""
+        """Return (threshold, end, width, direction) of the state, [m] or [rad]."""
         owner = view.scene.owner(self.address)
+        assert owner is not None
         ranges = view.scene.entities[owner].articulation
         low, high = sorted(ranges[self.state])
-        opposite = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}[self.state]
+        opposite = _OPPOSITES[self.state]
         upwards = opposite not in ranges or low + high > sum(ranges[opposite])
         return (low, high, high - low, 1.0) if upwards else (high, low, high - low, -1.0)
 
-    def _goal(self, view: StateView, part: Part) -> float:
-        """Where the joint is brought: well into the state, or against its stop."""
-        threshold, end, width, way = self._limits(view)
+    def _goal_value(self, view: StateView, part: Part) -> float:
+        """Return the position to which a joint is moved: well into the state, or against its stop."""
+        threshold, end, width, direction = self._limits(view)
         if self.state in ("open", "turnon"):
-            return threshold + way * min(0.6 * width, 0.25)
+            return threshold + direction * min(0.6 * width, 0.25)
         if self.state == "turnoff":
-            return end + way * 0.02
-        stop = view.scene.model.jnt_range[part.joint][1 if way > 0 else 0]
-        return float(max(end, stop) if way > 0 else min(end, stop))
+            return end + direction * 0.02
+        stop = view.scene.model.jnt_range[part.joint][1 if direction > 0 else 0]
+        return float(max(end, stop) if direction > 0 else min(end, stop))
 
-    def _shut(self, view: StateView, part: Part, way: float) -> float:
-        """Where the joint is when it is closed, by the range that it is moved away from."""
-        return float(view.scene.model.jnt_range[part.joint][0 if way > 0 else 1])
-
-    def _moved(self, view: StateView) -> bool:
-        """Whether the predicate holds with a margin."""
-        name = self.state.capitalize()
-        if not evaluate(Atom(name, (self.address,)), view):
+    def _is_reached(self, view: StateView) -> bool:
+        """Return whether the state holds with a margin."""
+        if not evaluate(Atom(self.state.capitalize(), (self.address,)), view):
             return False
         if self.state in ("close", "turnoff"):
             return True
-        threshold, _, width, way = self._limits(view)
+        threshold, _, width, direction = self._limits(view)
         values = view.joint_positions(self.address).values()
-        return any(way * (value - threshold) > min(0.15 * width, 0.12) for value in values)
+        return any(direction * (value - threshold) > min(0.15 * width, 0.12) for value in values)
 
-    def _enter(self, phase: Phase) -> None:
-        self.phase, self._steps, self._still = phase, 0, 0
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._still_steps = 0
 
-    def _again(self) -> None:
+    def _retry(self) -> None:
+        """Begin again with another grasp."""
         self.retries += 1
-        self._hold = None
-        if self.retries > ATTEMPTS:
+        self._plan = None
+        if self.retries > MAX_RETRIES:
             self.failure_reason = f"{self.address} did not get to {self.state} in {self.retries} attempts"
         self._enter("reach")
 
     def _reach(self, view: StateView) -> np.ndarray:
-        frame = self._part.pose(view)
-        goal, way = _placed(frame, self._hold.ready), frame.mat @ self._hold.back
-        error = goal.pos - view.eef_pos
-        aside = float(np.linalg.norm(error - (error @ way) * way))
+        pos, frame = view.eef_pos, self._part.pose(view)
+        goal, back = frame.to_world(self._grasp.pregrasp), frame.mat @ self._grasp.retreat
+        error = goal.pos - pos
+        lateral_error = float(np.linalg.norm(error - (error @ back) * back))
         away = float(np.linalg.norm(error))
         turn = float(np.linalg.norm(rotation_between(view.eef_mat, goal.mat)))
-        self._still = self._still + 1 if np.linalg.norm(self._velocity) < 0.01 and self._steps > 5 else 0
-        touching = self._still > 4 and away < 0.025 and turn < 2 * ARRIVED_TURN
+        still = np.linalg.norm(self._velocity) < 0.01 and self._steps > 5
+        self._still_steps = self._still_steps + 1 if still else 0
+        touching = self._still_steps > 4 and away < 0.025 and turn < 2 * ARRIVED_TURN
         if away < ARRIVED and turn < ARRIVED_TURN or touching:
-            self._enter("close" if self._hold.grips else "move")
-            return getattr(self, f"_{self.phase}")(view)
-        if self._still > 8:
-            return self._retreat(view)
-        back = np.clip(self.style.slope * (aside - 0.006) + 0.3 * max(turn - ARRIVED_TURN, 0.0), 0.0, BACK)
-        target = goal.pos + back * way
-        flat = float(np.linalg.norm((target - view.eef_pos)[:2]))
-        lateral = 1.0
-        if flat > 0.08:
-            target[2] = max(target[2], self._in_the_way(view, target) + 0.04 + TIP_BELOW)
-            lateral = np.clip(1.0 - (target[2] - view.eef_pos[2] - 0.03) / 0.05, 0.0, 1.0)
-        return self._toward(view, target, goal.mat, OPEN if self._hold.grips else CLOSE, lateral)
+            return self._start("close" if self._grasp.gripping else "move", view)
+        if self._still_steps > 8:
+            return self._let_go(view)
+        lift = self.style.funnel_slope * (lateral_error - 0.006) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
+        target = goal.pos + np.clip(lift, 0.0, APPROACH) * back
+        lateral_scale = 1.0
+        if np.linalg.norm((target - pos)[:2]) > 0.08:
+            surface = view.scene.workspace.surface_height
+            height = obstacle_height(self._obstacles, pos, target, OBSTACLE_RADIUS, surface)
+            target[2] = max(target[2], height + 0.04 + GRIPPER.tip_below)
+            lateral_scale = lateral_ramp(pos[2], target[2], 0.03, 0.05)
+        return self._toward(view, target, goal.mat, OPEN if self._grasp.gripping else CLOSE, lateral_scale)
 
     def _close(self, view: StateView) -> np.ndarray:
-        goal = _placed(self._part.pose(view), self._hold.held)
-        opening = float(np.abs(view.finger_pos).sum())
-        still = abs(opening - self._opening) < 4e-4
-        self._opening = opening
-        if self._steps > 4 + self.style.pause and still or self._steps > 16:
-            if opening < 0.004:
-                return self._retreat(view)
-            self._value = self._part.value(view)
-            self._enter("move")
-            return self._move(view)
+        if self._fingers_rest(view, max_steps=16):
+            if self._opening < 0.004:
+                return self._let_go(view)
+            self._previous_value = self._part.value(view)
+            return self._start("move", view)
+        goal = self._part.pose(view).to_world(self._grasp.contact)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
 
     def _move(self, view: StateView) -> np.ndarray:
-        part, value = self._part, self._part.value(view)
-        left = self._aim - value
-        hold = _placed(part.pose(view), self._hold.held)
+        part, grasp, value = self._part, self._grasp, self._part.value(view)
+        left = self._target_value - value
+        contact = part.pose(view).to_world(grasp.contact)
         anchor, axis = part.axis(view)
-        arm = 1.0 if part.slides else max(float(np.linalg.norm(np.cross(hold.pos - anchor, axis))), 0.03)
-        speed = np.sign(left) * (value - self._value) * CONTROL_HZ
-        slow = abs(speed) * max(arm, 0.2) < 0.01
-        self._value = value
-        self._still = self._still + 1 if slow and self._steps > 5 else 0
-        settled = slow
-        if self.state in ("open", "turnon"):
-            settled = abs(left) < (0.003 if part.slides else 0.05) or self._still > 3
+        radius = (
+            1.0 if part.slides else max(float(np.linalg.norm(np.cross(contact.pos - anchor, axis))), 0.03)
+        )
+        speed = np.sign(left) * (value - self._previous_value) * CONTROL_HZ
+        self._previous_value = value
+        slow = abs(speed) * max(radius, 0.2) < 0.01
+        self._still_steps = self._still_steps + 1 if slow and self._steps > 5 else 0
+        fully_pulled = self._is_fully_pulled(left)
+        if (
+            self._is_reached(view)
+            and self._is_settled(left, speed, slow)
+            or self._still_steps > 30
+            or fully_pulled
+        ):
+            self._pulled = fully_pulled
+            return self._start("release", view)
+        if grasp.gripping and np.linalg.norm(view.eef_pos - contact.pos) > MAX_SLIP:
+            return self._let_go(view)
+        lead = min(LEAD / radius, 0.5)
+        ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond the target, as the hand gives way
         if self.state == "turnoff":
-            settled = abs(speed) < 0.004
-        if self._moved(view) and settled or self._still > 30 or self._stage(left):
-            self._drawn = self._stage(left)
-            self._enter("release")
-            return self._release(view)
-        if self._hold.grips and np.linalg.norm(view.eef_pos - hold.pos) > SLIPPED:
-            return self._retreat(view)
-        lead = min(LEAD / arm, 0.5)
-        ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond it, as the hand gives way
-        if self.state == "turnoff":
-            ahead = np.sign(left) * self._brake(left, speed)
-        then = value + ahead - self._begun
-        begun = part.moved(view, hold, self._begun - value)
-        goal = part.moved(view, begun, then, turn=self._hold.follow * then)
+            ahead = np.sign(left) * self._knob_lead(left, speed)
+        moved = value + ahead - self._start_value
+        start = part.pose_after(view, contact, self._start_value - value)
+        goal = part.pose_after(view, start, moved, rotation=grasp.follow_ratio * moved)
         return self._toward(view, goal.pos, goal.mat, CLOSE)
 
-    def _brake(self, left: float, speed: float) -> float:
-        """How far the hand is ahead of a heavy knob, rad, so that it comes to its stop slowly and stays there."""
-        wanted = min(BRAKE[0] * abs(left) + BRAKE[1], 0.9)
-        return float(np.clip(0.6 * wanted + wanted - speed, -0.15, KNOB))
+    def _is_settled(self, left: float, speed: float, slow: bool) -> bool:
+        """Return whether the joint stays where it is: near its target, or slow where it has a stop.
 
-    def _stage(self, left: float) -> bool:
-        """Whether a door is as far open as it is drawn; the rest of the way it is pushed."""
-        return self.state == "open" and not self._part.slides and self._hold.grips and abs(left) < 0.05
+        Args:
+            left: Distance to the target value, [m] or [rad].
+            speed: Speed towards it, per second.
+            slow: Whether the hand hardly moves.
+        """
+        if self.state in ("open", "turnon"):
+            return abs(left) < (0.003 if self._part.slides else 0.05) or self._still_steps > 3
+        return abs(speed) < 0.004 if self.state == "turnoff" else slow
+
+    def _knob_lead(self, left: float, speed: float) -> float:
+        """Return how far the hand is ahead of a heavy knob, [rad], so that it reaches its stop slowly and stays there.
+
+        Args:
+            left: Angle to the stop, [rad].
+            speed: Speed towards it, [rad/s].
+        """
+        target_speed = min(KNOB_SPEED_GAIN * abs(left) + KNOB_STOP_SPEED, MAX_KNOB_SPEED)
+        lead = 0.6 * target_speed + target_speed - speed
+        return float(np.clip(lead, MIN_KNOB_LEAD, MAX_KNOB_LEAD))
+
+    def _is_fully_pulled(self, left: float) -> bool:
+        """Return whether a door is as far open as it is pulled; it is pushed the rest of the way."""
+        return self.state == "open" and not self._part.slides and self._grasp.gripping and abs(left) < 0.05
+
+    def _let_go(self, view: StateView) -> np.ndarray:
+        """Release the part, withdraw, and begin again; return the first action."""
+        return self._start("release", view)
 
     def _release(self, view: StateView) -> np.ndarray:
-        if self._left is None or self._steps <= 1:
-            self._left = Pose(view.eef_pos, view.eef_mat)
-        if not self._hold.grips or self._steps > 9:
-            self._enter("withdraw")
-            return self._withdraw(view)
-        return self._toward(view, self._left.pos, self._left.mat, OPEN)
+        if self._steps <= 1:
+            self._release_pose = Pose(view.eef_pos, view.eef_mat)
+        if not self._grasp.gripping or self._steps > 9:
+            return self._start("withdraw", view)
+        return self._toward(view, self._release_pose.pos, self._release_pose.mat, OPEN)
 
     def _withdraw(self, view: StateView) -> np.ndarray:
-        left, back = self._left, self._part.pose(view).mat @ self._hold.back
-        if (view.eef_pos - left.pos) @ back > AWAY or self._steps > 25:
+        start, back = self._release_pose, self._part.pose(view).mat @ self._grasp.retreat
+        if (view.eef_pos - start.pos) @ back > WITHDRAWN or self._steps > 25:
             self._enter("rest")
-            if not self._moved(view):
-                self._again()
-                self.retries -= self._drawn
-            return self._stay()
-        return self._toward(
-            view, left.pos + (AWAY + 0.05) * back, left.mat, OPEN if self._hold.grips else CLOSE
-        )
-
-    def _retreat(self, view: StateView) -> np.ndarray:
-        """Let go, withdraw, and begin again."""
-        self._enter("release")
-        self._left = None
-        return self._release(view)
-
-    def _rest(self, view: StateView) -> np.ndarray:
-        return self._stay()
-
-    def _stay(self) -> np.ndarray:
-        return np.array([0.0] * 6 + [OPEN])
-
-    def _toward(
-        self, view: StateView, pos: np.ndarray, mat: np.ndarray, gripper: float, lateral: float = 1.0
-    ) -> np.ndarray:
-        style = self.style
-        return action_toward(
-            view.eef_pos,
-            view.eef_mat,
-            pos,
-            mat,
-            velocity=self._velocity,
-            gripper=gripper,
-            gain=style.gain,
-            speed=style.speed,
-            lateral=lateral,
-        )
-
-    def _in_the_way(self, view: StateView, goal: np.ndarray) -> float:
-        """Height of the highest thing near the next decimetre of the way, m."""
-        start = view.eef_pos[:2]
-        way = goal[:2] - start
-        way = way * min(1.0, 0.10 / max(float(np.linalg.norm(way)), 1e-9))
-        offset = self._around[:, :2] - start
-        along = np.clip(offset @ way / max(way @ way, 1e-12), 0.0, 1.0)
-        near = np.linalg.norm(offset - along[:, None] * way, axis=1) < AROUND
-        return float(self._around[near, 2].max(initial=view.scene.workspace.surface_height))
-
-
-def _placed(frame: Pose, pose: Pose) -> Pose:
-    """A pose of a frame in the world."""
-    return Pose(frame.mat @ pose.pos + frame.pos, frame.mat @ pose.mat)
+            if not self._is_reached(view):
+                self._retry()
+                self.retries -= self._pulled
+            return self._rest(view)
+        gripper = OPEN if self._grasp.gripping else CLOSE
+        return self._toward(view, start.pos + (WITHDRAWN + 0.05) * back, start.mat, gripper)

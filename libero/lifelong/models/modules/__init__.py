@@ -1,1 +1,1 @@
-"""The parts that the original's policies are put together from."""
+"""Modules that the original's policies are assembled from."""

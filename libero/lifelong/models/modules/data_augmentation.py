@@ -1,6 +1,6 @@
-"""Augmentation under the original's names: what is drawn and done is `lifelong.nn.augmentation`'s.
+"""Image augmentation under the original's names; `lifelong.nn.augmentation` draws and applies it.
 
-Pictures are (B, T, C, H, W) in [0, 1]; a window changes as a whole. In evaluation mode nothing changes.
+Images are (B, T, C, H, W) in [0, 1]; all frames of a window change alike. In evaluation mode nothing changes.
 """
 
 from collections.abc import Sequence
@@ -11,16 +11,6 @@ from torch import Tensor, nn
 from libero._adapters.lifelong.observations import uint8_image
 from lifelong.nn.augmentation import Augmentation, ColorJitter, RandomShift
 
-__all__ = [
-    "BatchWiseImgColorJitterAug",
-    "DataAugGroup",
-    "IdentityAug",
-    "ImgColorJitterAug",
-    "ImgColorJitterGroupAug",
-    "TranslationAug",
-    "TranslationAugGroup",
-]
-
 
 class IdentityAug(nn.Module):
     """No augmentation."""
@@ -29,33 +19,30 @@ class IdentityAug(nn.Module):
         super().__init__()
 
     def forward(self, x: Tensor) -> Tensor:
-        """The pictures as they are."""
+        """Return the images unchanged."""
         return x
 
     def output_shape(self, input_shape: Sequence[int]) -> Sequence[int]:
-        """Of the pictures, which keep theirs."""
+        """Return the shape of the images, which does not change."""
         return input_shape
 
 
 class _Aug(IdentityAug):
-    """A change of a tensor of pictures, or the same change of a tuple of them.
+    """Applies a native augmentation; with `whole_batch` one draw is for all windows, else each has its own."""
 
-    `together` says how far one draw goes: `window` (each one its own) or `batch` (all the same).
-    """
-
-    together = "window"
+    whole_batch = False
 
     def __init__(self, augmentation: Augmentation):
         super().__init__()
         self.augmentation = augmentation
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, T, C, H, W) -> the same shape."""
+        """Map (B, T, C, H, W) to the same shape."""
         if not self.training:
             return x
         b, t = x.shape[:2]
         images = uint8_image(x)[:, :, None]  # (B, T, 1, H, W, C)
-        if self.together == "batch":
+        if self.whole_batch:
             images = images.flatten(0, 1)[None]
         changed = self.augmentation.images(images).view(b, t, *images.shape[-3:])
         return changed.movedim(-1, -3).to(x.dtype) / 255
@@ -68,10 +55,10 @@ class TranslationAug(_Aug):
         super().__init__(RandomShift(translation // 2))
 
 
-class _JitterAug(_Aug):
-    """Brightness, contrast, saturation and hue; `epsilon` is the chance that nothing changes."""
+class BatchWiseImgColorJitterAug(_Aug):
+    """Brightness, contrast, saturation and hue of each window; `epsilon` is the probability of no change."""
 
-    epsilon = 0.05
+    epsilon = 0.1
 
     def __init__(
         self,
@@ -86,20 +73,14 @@ class _JitterAug(_Aug):
         super().__init__(ColorJitter(brightness, contrast, saturation, hue, keep=keep))
 
 
-class ImgColorJitterAug(_JitterAug):
-    """One change of colours for the whole batch."""
+class ImgColorJitterAug(BatchWiseImgColorJitterAug):
+    """The same change of colours for the whole batch."""
 
-    together = "batch"
-
-
-class BatchWiseImgColorJitterAug(_JitterAug):
-    """A change of colours for each window of the batch."""
-
-    epsilon = 0.1
+    epsilon, whole_batch = 0.05, True
 
 
-class _OfAllViews(nn.Module):
-    """Changes pictures of several cameras alike: forward takes and gives a tuple of (B, T, C, H, W)."""
+class _AllViews(nn.Module):
+    """Changes the images of several cameras alike: forward maps a tuple of (B, T, C, H, W) to another."""
 
     def __init__(self, change: nn.Module):
         super().__init__()
@@ -110,42 +91,34 @@ class _OfAllViews(nn.Module):
         return torch.split(self.change(torch.cat(list(x_groups), dim=1)), steps, dim=1)
 
 
-class ImgColorJitterGroupAug(_OfAllViews):
-    """A change of colours for each window, the same for all cameras; arguments as of `BatchWiseImgColorJitterAug`."""
+class ImgColorJitterGroupAug(_AllViews):
+    """`BatchWiseImgColorJitterAug` with the same change for all cameras."""
 
     def __init__(self, input_shape: Sequence[int] | None = None, **limits: float):
         super().__init__(BatchWiseImgColorJitterAug(input_shape, **{"epsilon": 0.05, **limits}))
 
 
-class TranslationAugGroup(_OfAllViews):
-    """A shift for each window, the same for all cameras."""
+class TranslationAugGroup(_AllViews):
+    """`TranslationAug` with the same shift for all cameras."""
 
     def __init__(self, input_shape: Sequence[int] | None = None, translation: int = 8):
         super().__init__(TranslationAug(input_shape, translation))
 
 
 class DataAugGroup(nn.Module):
-    """Several augmentations in order, of the pictures of several cameras: a tuple of (B, T, C, H, W) to another."""
+    """Several augmentations in order, of the images of several cameras."""
 
     def __init__(self, aug_list: Sequence[nn.Module]):
         super().__init__()
         self.aug_layers = nn.ModuleList(aug_list)
 
     def forward(self, x_groups: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Pictures of each camera, changed."""
+        """Map a tuple of (B, T, C, H, W), one for each camera, to another."""
         for aug in self.aug_layers:
-            x_groups = aug(x_groups) if isinstance(aug, _OfAllViews) else [aug(x) for x in x_groups]
+            x_groups = aug(x_groups) if isinstance(aug, _AllViews) else [aug(x) for x in x_groups]
         return tuple(x_groups)
 
 
-AUGMENTATIONS = {
-    kind.__name__: kind
-    for kind in (
-        BatchWiseImgColorJitterAug,
-        IdentityAug,
-        ImgColorJitterAug,
-        ImgColorJitterGroupAug,
-        TranslationAug,
-        TranslationAugGroup,
-    )
-}
+_VIEWS_ALIKE = (ImgColorJitterGroupAug, TranslationAugGroup)
+_EACH_VIEW = (BatchWiseImgColorJitterAug, IdentityAug, ImgColorJitterAug, TranslationAug)
+AUGMENTATIONS = {kind.__name__: kind for kind in (*_EACH_VIEW, *_VIEWS_ALIKE)}

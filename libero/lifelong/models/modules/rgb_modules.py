@@ -1,9 +1,9 @@
-"""Image encoders under the original's names: the networks are those of `lifelong.nn`.
+"""Image encoders: the networks of `lifelong.nn`, for images (N, C, H, W) in [0, 1].
 
 Shape legend: N images, C H W image, K keypoints, L language embedding, E latent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch import Tensor, nn
@@ -12,31 +12,24 @@ from libero._adapters.lifelong.observations import uint8_image
 from lifelong.errors import PolicyError
 from lifelong.nn import patches, vision
 
-__all__ = ["PatchEncoder", "ResnetEncoder", "SpatialProjection", "SpatialSoftmax"]
-
 
 class SpatialSoftmax(nn.Module):
-    """Expected image position of each heat map, (N, C, H, W) -> (N, 2 K).
-
-    Args:
-        in_c, in_h, in_w: C, H, W.
-        num_kp: K, learned maps; None takes each channel as one.
-    """
+    """Expected image position of each heat map; `num_kp` maps are learned, with None each channel is one."""
 
     def __init__(self, in_c: int, in_h: int, in_w: int, num_kp: int | None = None):
         super().__init__()
         self.num_kp = num_kp or in_c
-        self.softmax = vision.SpatialSoftmax(channels=in_c, size=(in_h, in_w), keypoints=self.num_kp)
+        self.softmax: Any = vision.SpatialSoftmax(channels=in_c, size=(in_h, in_w), keypoints=self.num_kp)
         if num_kp is None:
-            self.softmax.heat = nn.Identity()  # type: ignore[assignment]
+            self.softmax.heat = nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Positions in [-1, 1], x rightwards and y downwards."""
+        """Map (N, C, H, W) to positions (N, 2 K) in [-1, 1], x to the right and y down."""
         return self.softmax(x)
 
 
 class SpatialProjection(nn.Module):
-    """Keypoints and one linear map, (N, C, H, W) -> (N, out_dim); out_dim is even."""
+    """Keypoints and one linear map; `out_dim` is even, as a keypoint is two numbers."""
 
     def __init__(self, input_shape: Sequence[int], out_dim: int):
         super().__init__()
@@ -47,30 +40,30 @@ class SpatialProjection(nn.Module):
         self.projection = nn.Linear(out_dim, out_dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) -> (N, out_dim)."""
+        """Map (N, C, H, W) to (N, out_dim)."""
         return self.projection(self.spatial_softmax(x))
 
     def output_shape(self, input_shape: Sequence[int]) -> tuple[int, ...]:
-        """(N, ...) -> (N, out_dim)."""
+        """Return the shape of the output, (N, out_dim)."""
         return (*input_shape[:-3], self.out_dim)
 
 
 class ResnetEncoder(nn.Module):
-    """The first stages of ResNet-18 with FiLM, read out as keypoints; see `lifelong.nn.vision.ResNetFiLMEncoder`.
+    """First stages of ResNet-18 with FiLM, read out as keypoints; see `lifelong.nn.vision.ResNetFiLMEncoder`.
 
     Args:
         input_shape: C, H, W.
         output_size: E.
-        pretrained: refused: no weights come with this package.
-        freeze: nothing in it learns.
-        remove_layer_num: of ResNet-18's ten layers, so many are left out at the end: 2 leaves four stages, 5 one.
-        no_stride: the stem keeps the resolution.
+        pretrained: Must be false: no weights come with this package.
+        freeze: Whether the encoder is not trained.
+        remove_layer_num: Number of ResNet-18's ten layers removed at the end: 2 leaves four stages, 5 one.
+        no_stride: Whether the stem keeps the resolution.
         language_dim: L.
         language_fusion: `film` or `none`.
-        more: other arguments of the network, such as `norm="batch"`.
+        more: Other arguments of the network, such as `norm="batch"`.
 
     Raises:
-        PolicyError: values that cannot work, or an image too small for the number of stages.
+        PolicyError: Invalid values, or an image too small for the number of stages.
     """
 
     def __init__(
@@ -87,44 +80,41 @@ class ResnetEncoder(nn.Module):
     ):
         super().__init__()
         self.language_dim, self.output_size = language_dim, output_size
-        sizes = {**resnet_sizes(remove_layer_num, no_stride), **more}
-        self.encoder = vision.ResNetFiLMEncoder(
-            image_size=tuple(input_shape)[1:],  # type: ignore[arg-type]
-            language_dim=language_dim,
-            latent_dim=output_size,
-            **sizes,
-        )
-        fuse(self.encoder, pretrained=pretrained, freeze=freeze, language_fusion=language_fusion)
+        kwargs: dict[str, Any] = {
+            "remove_layer_num": remove_layer_num,
+            "no_stride": no_stride,
+            "freeze": freeze,
+        }
+        kwargs |= {"pretrained": pretrained, "language_fusion": language_fusion}
+        sizes = {
+            "image_size": tuple(input_shape)[1:],
+            "language_dim": language_dim,
+            "latent_dim": output_size,
+        }
+        self.encoder = vision.ResNetFiLMEncoder(**{**sizes, **resnet_arguments(kwargs), **more})
+        configure_resnet(self.encoder, kwargs)
 
     def forward(self, x: Tensor, langs: Tensor | None = None) -> Tensor:
-        """Encodes pictures.
-
-        Args:
-            x: (N, C, H, W) in [0, 1].
-            langs: (M, L), N a multiple of M; None: zeros.
-
-        Returns:
-            (N, E).
-        """
+        """Encode images (N, C, H, W) as (N, E), given embeddings (M, L) with N a multiple of M, or zeros."""
         langs = x.new_zeros(1, self.language_dim) if langs is None else langs
         return self.encoder(uint8_image(x), langs.float())
 
     def output_shape(self, input_shape: Sequence[int] = (), shape_meta: Any = None) -> tuple[int, ...]:
-        """(E,)."""
+        """Return the shape of one latent, (E,)."""
         return (self.output_size,)
 
 
 class PatchEncoder(nn.Module):
-    """A strided convolution and one linear map per patch of it, (N, C, H, W) -> (N, E, rows, columns).
+    """Strided convolution and one linear map for each patch of it; see `lifelong.nn.patches.PatchEncoder`.
 
     Args:
         input_shape: C, H, W.
-        patch_size: sides of a patch, equal, in cells of the convolution's output.
+        patch_size: Equal sides of a patch, in cells of the convolution's output.
         embed_size: E.
-        more: other arguments of `lifelong.nn.patches.PatchEncoder`.
+        more: Other arguments of the network.
 
     Raises:
-        PolicyError: patches that do not tile the picture.
+        PolicyError: Patches do not tile the image.
     """
 
     def __init__(
@@ -136,60 +126,47 @@ class PatchEncoder(nn.Module):
     ):
         super().__init__()
         _, height, width = input_shape
-        self.patch_size = patch_size
-        self.encoder = patches.PatchEncoder(
-            image_size=(height, width), dim=embed_size, patch=square(patch_size), **more
-        )
-        self.num_patches = self.encoder.patches
-        self._aspect = width / height
+        sizes = {"image_size": (height, width), "dim": embed_size, "patch": square(patch_size)}
+        self.encoder = patches.PatchEncoder(**{**sizes, **more})
+        self.patch_size, self.num_patches, self._aspect = patch_size, self.encoder.patches, width / height
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) in [0, 1] -> (N, E, rows, columns)."""
+        """Encode images (N, C, H, W) as (N, E, rows, columns)."""
         rows = round((self.num_patches / self._aspect) ** 0.5)
         return self.encoder(uint8_image(x)).transpose(1, 2).unflatten(2, (rows, -1))
 
 
-class _WithoutLanguage(nn.Module):
-    """Stands for FiLM where the instruction has no say."""
+class _NoLanguage(nn.Module):
+    """Stands in for FiLM where the instruction is not used."""
 
     def forward(self, h: Tensor, language: Tensor) -> Tensor:
         return h
 
 
-def resnet_sizes(remove_layer_num: int, no_stride: bool) -> dict[str, Any]:
-    """The native encoder's sizes for the original's way to name them.
-
-    Raises:
-        PolicyError: more or fewer layers than can be left out.
-    """
-    if not 2 <= remove_layer_num <= 5:
-        raise PolicyError(f"remove_layer_num is {remove_layer_num}; valid: 2 (four stages) to 5 (one stage)")
-    stem = {"stem_stride": 1, "stem_pool": False} if no_stride else {}
-    return {"stage_blocks": (2,) * (6 - remove_layer_num), **stem}
+def resnet_arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the native encoder's arguments for the original's; see `ResnetEncoder`."""
+    removed = kwargs.get("remove_layer_num", 2)
+    if not 2 <= removed <= 5:
+        raise PolicyError(f"remove_layer_num is {removed}; valid: 2 (four stages) to 5 (one stage)")
+    stem = {"stem_stride": 1, "stem_pool": False} if kwargs.get("no_stride") else {}
+    return {"stage_blocks": (2,) * (6 - removed), **stem}
 
 
-def fuse(encoder: vision.ResNetFiLMEncoder, *, pretrained: bool, freeze: bool, language_fusion: str) -> None:
-    """What the original's arguments change of an encoder.
-
-    Raises:
-        PolicyError: weights that there are not, or an unknown way to bring the instruction in.
-    """
-    if pretrained:
+def configure_resnet(encoder: vision.ResNetFiLMEncoder, kwargs: Mapping[str, Any]) -> None:
+    """Apply the original's arguments that change a built encoder; see `ResnetEncoder`."""
+    fusion = kwargs.get("language_fusion", "film")
+    if kwargs.get("pretrained"):
         raise PolicyError("no pretrained ResNet comes with this package: set pretrained to false")
-    if language_fusion not in ("film", "none"):
-        raise PolicyError(f"language_fusion is {language_fusion!r}; valid: film, none")
-    if language_fusion == "none":
-        encoder.films = nn.ModuleList(_WithoutLanguage() for _ in encoder.films)
-    if freeze:
+    if fusion not in ("film", "none"):
+        raise PolicyError(f"language_fusion is {fusion!r}; valid: film, none")
+    if fusion == "none":
+        encoder.films = nn.ModuleList(_NoLanguage() for _ in encoder.films)
+    if kwargs.get("freeze"):
         encoder.requires_grad_(False)
 
 
 def square(patch_size: Sequence[int]) -> int:
-    """The side of a patch.
-
-    Raises:
-        PolicyError: its sides differ.
-    """
+    """Return the side of a patch; raise a PolicyError if its sides differ."""
     if len(set(patch_size)) != 1:
         raise PolicyError(f"patch_size is {list(patch_size)}; patches are squares, such as [8, 8]")
     return int(patch_size[0])

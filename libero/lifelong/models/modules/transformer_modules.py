@@ -1,22 +1,12 @@
-"""Parts of transformers.
+"""Modules of transformers.
 
 Shape legend: B batch, T time, M tokens per time step, N tokens, E token.
 """
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from lifelong.nn.transformer import TransformerLayer, block_causal_mask, sinusoidal_positions
-
-__all__ = [
-    "Attention",
-    "DropPath",
-    "Norm",
-    "SinusoidalPositionEncoding",
-    "TransformerDecoder",
-    "TransformerFeedForwardNN",
-]
+from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask, sinusoidal_positions
 
 
 class SinusoidalPositionEncoding(nn.Module):
@@ -24,8 +14,8 @@ class SinusoidalPositionEncoding(nn.Module):
 
     Args:
         input_size: E.
-        inv_freq_factor: stands where the paper has 10000.
-        factor_ratio: the codes are multiplied by it; None: by 1.
+        inv_freq_factor: Base of the wavelengths; 10000 in the paper.
+        factor_ratio: Factor of the codes.
     """
 
     def __init__(self, input_size: int, inv_freq_factor: float = 10, factor_ratio: float | None = None):
@@ -33,35 +23,28 @@ class SinusoidalPositionEncoding(nn.Module):
         self.input_size, self.inv_freq_factor, self.factor_ratio = input_size, inv_freq_factor, factor_ratio
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, T, ...) -> (T, E), the codes of its time steps."""
+        """Return the codes (T, E) of the time steps of x, (B, T, ...)."""
         codes = sinusoidal_positions(x.shape[1], self.input_size, self.inv_freq_factor).to(x.device)
         return codes if self.factor_ratio is None else codes * self.factor_ratio
 
     def output_shape(self, input_shape: tuple[int, ...]) -> tuple[int, ...]:
-        """The shape that it is given."""
+        """Return the given shape."""
         return input_shape
 
 
 class Norm(nn.Module):
-    """Layer normalisation."""
+    """Layer normalisation, (..., E) -> (..., E)."""
 
     def __init__(self, size: int):
         super().__init__()
         self.norm = nn.LayerNorm(size)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., E) -> (..., E)."""
         return self.norm(x)
 
 
 class Attention(nn.Module):
-    """Self-attention whose heads have a size of their own.
-
-    Args:
-        dim: E.
-        num_heads, head_output_size: heads and the size of each.
-        dropout: of the weights and of the output.
-    """
+    """Self-attention of `num_heads` heads of size `head_output_size`, with dropout of weights and output."""
 
     def __init__(self, dim: int, num_heads: int = 8, head_output_size: int = 64, dropout: float = 0.0):
         super().__init__()
@@ -70,38 +53,29 @@ class Attention(nn.Module):
         self.output_layer = nn.Sequential(nn.Linear(num_heads * head_output_size, dim), nn.Dropout(dropout))
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, N, E), mask (N, N) true where a token may look -> (B, N, E)."""
-        qkv = self.qkv(x).unflatten(-1, (3, self.num_heads, self.head_output_size))
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        allowed = None if mask is None else mask.bool()
+        """Map (B, N, E) to (B, N, E); the mask (N, N) is true where a token may attend."""
         dropout = self.dropout if self.training else 0.0
-        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=allowed, dropout_p=dropout)
-        return self.output_layer(mixed.transpose(1, 2).flatten(2))
+        mask = None if mask is None else mask.bool()
+        return self.output_layer(attend(self.qkv(x), self.num_heads, mask, dropout))
 
 
 class TransformerFeedForwardNN(nn.Module):
-    """The layers between two attentions."""
+    """Layers between two attentions, (..., E) -> (..., E)."""
 
     def __init__(self, dim: int, hidden_dim: int, dropout: float = 0.0):
         super().__init__()
-        self.net = nn.Sequential(
-            nn.Linear(dim, hidden_dim),
-            nn.GELU(),
-            nn.Dropout(dropout),
-            nn.Linear(hidden_dim, dim),
-            nn.Dropout(dropout),
-        )
+        layers = (nn.Linear(dim, hidden_dim), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden_dim, dim))
+        self.net = nn.Sequential(*layers, nn.Dropout(dropout))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., E) -> (..., E)."""
         return self.net(x)
 
 
 class DropPath(nn.Module):
-    """In training, a branch of a residual network is left out for some rows (Huang et al., ECCV 2016).
+    """Drops a branch of a residual network for random rows in training (Huang et al., ECCV 2016).
 
     Args:
-        drop_prob: chance for a row; what stays is scaled so that the mean is as before.
+        drop_prob: Probability for a row; the other rows are scaled so that the mean stays.
     """
 
     def __init__(self, drop_prob: float | None = None):
@@ -109,20 +83,15 @@ class DropPath(nn.Module):
         self.drop_prob = drop_prob or 0.0
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, ...) -> (B, ...)."""
+        """Map (B, ...) to (B, ...)."""
         if not self.training or self.drop_prob == 0.0:
             return x
-        rows = torch.rand(len(x), *[1] * (x.dim() - 1), device=x.device) >= self.drop_prob
-        return x * rows / (1 - self.drop_prob)
+        kept = torch.rand(len(x), *[1] * (x.dim() - 1), device=x.device) >= self.drop_prob
+        return x * kept / (1 - self.drop_prob)
 
 
 class TransformerDecoder(nn.Module):
-    """Layers of pre-norm attention and feed-forward, each `lifelong.nn.transformer.TransformerLayer`.
-
-    Args:
-        input_size: E.
-        num_layers, num_heads, head_output_size, mlp_hidden_size, dropout: sizes.
-    """
+    """`num_layers` layers of `lifelong.nn.transformer.TransformerLayer`."""
 
     def __init__(
         self,
@@ -135,24 +104,18 @@ class TransformerDecoder(nn.Module):
         **_: object,
     ):
         super().__init__()
+        sizes = {"dim": input_size, "heads": num_heads, "head_dim": head_output_size}
         self.layers = nn.ModuleList(
-            TransformerLayer(
-                dim=input_size,
-                heads=num_heads,
-                head_dim=head_output_size,
-                mlp_dim=mlp_hidden_size,
-                dropout=dropout,
-            )
-            for _ in range(num_layers)
+            TransformerLayer(**sizes, mlp_dim=mlp_hidden_size, dropout=dropout) for _ in range(num_layers)
         )
         self.mask: Tensor | None = None
 
     def compute_mask(self, input_shape: tuple[int, ...]) -> None:
-        """From now on tokens see their own time step and earlier ones; input_shape is (B, T, M, E)."""
+        """Make tokens attend to their own time step and earlier ones; input_shape is (B, T, M, E)."""
         self.mask = block_causal_mask(input_shape[1], input_shape[2])
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, N, E) -> (B, N, E), with this mask, else that of `compute_mask`, else without one."""
+        """Map (B, N, E) to (B, N, E), with the given mask, else that of `compute_mask`."""
         mask = self.mask if mask is None else mask
         for layer in self.layers:
             x = layer(x, None if mask is None else mask.to(x.device).bool())
