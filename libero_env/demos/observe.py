@@ -1,7 +1,6 @@
 """Observations of recorded states: for new recordings, for replaying, and for rendering files again."""
 
 import re
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,13 +9,13 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
+from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.demos.write import Episode
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
-from libero_env.mujoco_compat import delete
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.observations import DEFAULT_CAMERAS
-from libero_env.sim.scene import Scene, scene_spec
+from libero_env.sim.scene import Scene
 from libero_env.tasks import Task
 
 
@@ -94,21 +93,12 @@ class StateRenderer:
         Args:
             fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
         """
-        spec = self._spec_without_textures
-        for name, pose in zip(self.scene.fixtures, fixtures, strict=True):
-            body = spec.body(f"{name}_{ROOT_BODY}")
-            body.pos, body.quat = pose[:3], pose[3:]
-        return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', spec.to_xml())
+        xml = model_xml(self._spec, dict(zip(self.scene.fixtures, fixtures, strict=True)))
+        return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', xml)
 
     @cached_property
-    def _spec_without_textures(self) -> mujoco.MjSpec:
-        spec = scene_spec(self.task.problem)
-        for material in spec.materials:
-            material.textures = [""] * len(list(material.textures))
-        for texture in list(spec.textures):
-            delete(spec, texture)
-        spec.compile()
-        return spec
+    def _spec(self) -> mujoco.MjSpec:
+        return spec_without_textures(self.task.problem)
 
     def close(self) -> None:
         """Free the simulation and the OpenGL context."""
@@ -138,17 +128,11 @@ def fixture_poses(episode: Episode, scene: Scene, where: str) -> np.ndarray:
         return episode.fixtures
     if "model_file" not in episode.attrs or not scene.fixtures:
         return poses
-    try:
-        root = ElementTree.fromstring(episode.attrs["model_file"])
-    except ElementTree.ParseError as error:
-        raise DemoError(f"{where}/model_file is no XML ({error}); expected the scene as MJCF") from error
-    bodies = {body.get("name"): body for body in root.iter("body")}
+    stored = read_fixture_poses(episode.attrs["model_file"], scene, f"{where}/model_file")
     for pose, name in zip(poses, scene.fixtures, strict=True):
-        body = bodies.get(f"{name}_{ROOT_BODY}")
-        if body is None:
+        if name not in stored:
             raise DemoError(
                 f"{where}/model_file has no body {name}_{ROOT_BODY}; expected one for each fixture"
             )
-        pose[:3] = [float(number) for number in body.get("pos", "0 0 0").split()]
-        pose[3:] = [float(number) for number in body.get("quat", "1 0 0 0").split()]
+        pose[:] = stored[name]
     return poses

@@ -172,10 +172,10 @@ class MjData:
 class ClientSimulations(LoopSimulations):
     """A simulation in whose model clients may move fixtures."""
 
-    def read_fixtures(self) -> None:
-        """Read the poses of the fixtures from the model."""
+    def read_fixtures(self) -> np.ndarray:
+        """Return the poses of the fixtures in the model, (nfixtures, 7)."""
         bodies = self.fixture_bodies
-        self.fixtures[0] = np.concatenate([self.model.body_pos[bodies], self.model.body_quat[bodies]], axis=1)
+        return np.concatenate([self.model.body_pos[bodies], self.model.body_quat[bodies]], axis=1)
 
 
 class MjSim:

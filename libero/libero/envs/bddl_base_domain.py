@@ -11,7 +11,6 @@ import numpy as np
 
 from libero._adapters.envs.observations import Observer, cameras
 from libero._adapters.envs.sim import ClientSimulations, MjSim
-from libero._adapters.envs.stored_model import fixtures_of, write_model
 from libero._adapters.envs.window import Window
 from libero._adapters.lookup import lookup
 from libero.libero.envs import bddl_utils as BDDLUtils
@@ -22,6 +21,7 @@ from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
+from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
@@ -241,7 +241,7 @@ class BDDLBaseDomain:
                 f"{self.bddl_file_name}: a state is {short} finite numbers, or {whole} with the poses of the fixtures; "
                 f"got {state.size}. Is it a state of another task?"
             )
-        self.simulations.read_fixtures()
+        self.simulations.fixtures[0] = self.simulations.read_fixtures()
         fixtures = state[short:].reshape(1, -1, 7) if state.size == whole else None
         self.simulations.reset(
             [0], state[None, 1 : 1 + nq], state[None, 1 + nq : short], float(state[0]), fixtures
@@ -355,13 +355,14 @@ class BDDLBaseDomain:
 
     def get_xml(self) -> str:
         """Return the scene as MJCF without textures, with the present poses of the fixtures."""
-        return write_model(self.scene, self.sim.model._model)
+        poses = dict(zip(self.scene.fixtures, self.simulations.read_fixtures(), strict=True))
+        return model_xml(spec_without_textures(self.problem, self.scene.pack), poses)
 
     def reset_from_xml_string(self, xml_string: str) -> None:
         """Set the poses of the fixtures from a stored model of this task, and everything else to its initial state."""
-        for name, (pos, quat) in fixtures_of(self.scene, xml_string).items():
-            self.sim.model.body_pos[self.obj_body_id[name]] = pos
-            self.sim.model.body_quat[self.obj_body_id[name]] = quat
+        for name, pose in read_fixture_poses(xml_string, self.scene).items():
+            self.sim.model.body_pos[self.obj_body_id[name]] = pose[:3]
+            self.sim.model.body_quat[self.obj_body_id[name]] = pose[3:]
         self.sim.reset()
         self.sim.forward()
         self.timestep, self.cur_time, self.done = 0, 0.0, False
