@@ -26,7 +26,7 @@ from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import NUM_INIT_STATES, split_row
 from libero_env.tasks import Task, get_suite, read_task, suite_names
 from lifelong.evaluation.actors import Obs
-from lifelong.evaluation.rollout import Rollouts, play
+from lifelong.evaluation.rollout import Rollouts, run_episodes
 from lifelong.seeding import seeded
 
 CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
@@ -121,7 +121,7 @@ def rollouts(
             with closing(_EvalEnv(cfg, task, len(rows), states, on_step and partial(on_step, start))) as env:
                 policy = _PolicyActor(actor, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
                 horizon = int(cfg.eval.max_steps)
-                results.append(play(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS))
+                results.append(run_episodes(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS))
     return results
 
 

@@ -1,14 +1,16 @@
 from .environments import EnvPool, VectorEnv
-from .restore import restore
-from .rollout import Episode, Rollouts, save_animation
+from .restore import LoadedRun, restore
+from .rollout import Episode, Rollouts, run_episodes, save_animation
 from .settings import EvalSettings
 
 __all__ = [
     "EnvPool",
     "Episode",
     "EvalSettings",
+    "LoadedRun",
     "Rollouts",
     "VectorEnv",
     "restore",
+    "run_episodes",
     "save_animation",
 ]

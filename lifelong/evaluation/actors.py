@@ -1,4 +1,4 @@
-"""What acts in a rollout: a policy of this package, or any object that answers observations with actions."""
+"""Actors of rollouts: a policy of this package, or any object that answers observations with actions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,29 +22,29 @@ class Actor(Protocol):
 
     @property
     def action_dim(self) -> int:
-        """A."""
+        """Dimension A of actions."""
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Entries of the observation that a recorded rollout shows."""
+        """Names of the observed images that recorded rollouts show."""
 
     def reset(self, num_envs: int) -> None:
-        """Forget the past; the next observation is the first of new episodes."""
+        """Reset the history; the next observation is the first of new episodes."""
 
     def act(self, obs: Obs) -> np.ndarray:
-        """Actions (B, A) float64."""
+        """Return (B, A) float64 actions for the observations."""
 
 
 @dataclass
 class PolicyActor:
-    """A policy of this package, told one instruction.
+    """A policy of this package with one instruction.
 
     Attributes:
-        policy: In evaluation mode.
+        policy: Policy in evaluation mode.
         language: (L,) embedding of the instruction.
-        device: Where the policy is.
-        precision: See `lifelong.training.settings.FitSettings`.
-        draws: A CPU generator per simulation, for policies that act at random.
+        device: Device of the policy.
+        precision: Precision of the policy, see `lifelong.training.settings.FitSettings`.
+        draws: CPU generator of each simulation, for stochastic policies.
     """
 
     policy: Policy
@@ -55,20 +55,20 @@ class PolicyActor:
 
     @property
     def action_dim(self) -> int:
-        """A."""
+        """Dimension A of actions."""
         return self.policy.spec.action_dim
 
     @property
     def views(self) -> tuple[str, ...]:
-        """The cameras it looks through."""
+        """Names of the images the policy observes."""
         return self.policy.spec.views
 
     def reset(self, num_envs: int) -> None:
-        """See `Actor`."""
+        """Reset the history; see `Actor`."""
         self.policy.reset(num_envs)
 
     def act(self, obs: Obs) -> np.ndarray:
-        """See `Actor`."""
+        """Return (B, A) float64 actions; see `Actor`."""
         observation = observe(obs, self.policy.spec, self.language, self.device)
         with autocast(self.device, self.precision):
             return self.policy.act(observation, self.draws).cpu().numpy().astype(np.float64)
@@ -87,7 +87,7 @@ ORIGINAL_NAMES = {
 
 
 def as_original(obs: Obs) -> dict[str, np.ndarray]:
-    """Observations under the names of LIBERO's own environments: pictures bottom up, quaternions xyzw."""
+    """Return observations as LIBERO's own environments name them, with flipped images and xyzw quaternions."""
     found = {}
     for name, value in obs.items():
         if name.endswith("_rgb"):
@@ -100,18 +100,19 @@ def as_original(obs: Obs) -> dict[str, np.ndarray]:
 
 @dataclass
 class CallableActor:
-    """An object of somebody else's with `predict(observations) -> actions`.
+    """A user-defined object with `predict(observations) -> actions`.
 
-    `predict` is given what `libero_env.envs.batch.BatchEnv` observes, (B, ...) arrays by name, with upright pictures,
-    and under "instruction" the text. Rows of episodes that are over stay in it; what is answered for them is not
-    used. It returns (B, 7) actions; the gripper opens at -1 and closes at +1. An optional
+    `predict` receives the observations of `libero_env.envs.batch.BatchEnv`, (B, ...) arrays by name, with upright
+    images, and the instruction as text under "instruction". Finished episodes keep their rows; actions for them are
+    ignored. It returns (B, 7) actions; the gripper opens at -1 and closes at +1. An optional
     `reset(instruction, num_envs)` is called before each task's episodes.
 
     Attributes:
         policy: The object.
-        instruction: What it is told.
-        views: Entries of the observation that a recorded rollout shows.
-        original: Give observations as LIBERO's own environments do, see `as_original`.
+        instruction: Instruction that the object receives.
+        views: Names of the observed images that recorded rollouts show.
+        original: Whether observations are those of LIBERO's own environments, see `as_original`.
+        action_dim: Dimension A of actions.
     """
 
     policy: Any
@@ -121,40 +122,40 @@ class CallableActor:
     action_dim: int = ACTION_DIM
 
     def reset(self, num_envs: int) -> None:
-        """See `Actor`."""
+        """Call the object's `reset`, if it has one; see `Actor`."""
         if hasattr(self.policy, "reset"):
             self.policy.reset(self.instruction, num_envs)
 
     def act(self, obs: Obs) -> np.ndarray:
-        """See `Actor`.
+        """Return the object's actions; see `Actor`.
 
         Raises:
-            PolicyError: The answer has another shape, or is not finite.
+            PolicyError: The actions have the wrong shape, or are not finite.
         """
-        seen = as_original(obs) if self.original else obs
-        answer = self.policy.predict({**seen, "instruction": self.instruction})
+        given = as_original(obs) if self.original else obs
+        answer = self.policy.predict({**given, "instruction": self.instruction})
         actions = np.asarray(answer.detach().cpu() if isinstance(answer, Tensor) else answer, np.float64)
-        wanted = (len(next(iter(obs.values()))), self.action_dim)
+        expected = (len(next(iter(obs.values()))), self.action_dim)
         name = f"{type(self.policy).__name__}.predict"
-        if actions.shape != wanted:
-            raise PolicyError(f"{name} returned actions of shape {actions.shape}; expected {wanted}")
+        if actions.shape != expected:
+            raise PolicyError(f"{name} returned actions of shape {actions.shape}; expected {expected}")
         if not np.isfinite(actions).all():
             raise PolicyError(f"{name} returned actions that are not finite")
         return actions
 
 
 def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) -> Observation:
-    """What the simulations show, as a policy takes it: T = 1.
+    """Convert observations of the simulations to a policy's input with T = 1.
 
     Args:
         obs: (B, ...) arrays by name.
-        spec: What the policy sees.
+        spec: Inputs of the policy.
         language: (L,) embedding of the instruction.
-        device: Where the policy is.
+        device: Device of the policy.
     """
     images = np.stack([obs[view] for view in spec.views], axis=1)[:, None]  # (B, 1, V, H, W, C)
     proprio = {
         name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None].to(device) for name in spec.proprio
     }
-    told = language.to(device).expand(len(images), -1)
-    return Observation(torch.from_numpy(images).to(device), proprio, told)
+    languages = language.to(device).expand(len(images), -1)
+    return Observation(torch.from_numpy(images).to(device), proprio, languages)

@@ -1,4 +1,4 @@
-"""The environments of an evaluation: what a rollout needs of one, and a pool of open ones."""
+"""Environments of an evaluation: the interface that rollouts use, and a pool of open environments."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -10,9 +10,10 @@ from lifelong.evaluation.actors import Obs
 
 
 class VectorEnv(Protocol):
-    """What a rollout needs of `libero_env.envs.batch.BatchEnv`; finished simulations stand still.
+    """Interface of `libero_env.envs.batch.BatchEnv` that rollouts use; finished simulations are not stepped.
 
-    Where it has `atoms`, the parts of the goal as text, its infos say under `progress` which hold, (B, atoms) bool.
+    An environment may have `atoms`, the atoms of the goal as text; then its infos report under `progress` which of
+    them hold, (B, atoms) bool.
     """
 
     num_envs: int
@@ -25,20 +26,20 @@ class VectorEnv(Protocol):
 
 
 class EnvPool:
-    """Environments by task, at most `capacity` of them open; the one not used for longest is closed first."""
+    """Environments by task, at most `capacity` of them open; the least recently used is closed first."""
 
     def __init__(self, make: Callable[[Any], VectorEnv], capacity: int = 4):
-        """Make a pool.
+        """Initialise an empty pool.
 
         Args:
-            make: Builds the environment of a key.
-            capacity: Largest number of open environments.
+            make: Function that builds the environment of a key.
+            capacity: Maximum number of open environments.
         """
         self._make, self._capacity = make, max(1, capacity)
         self._open: OrderedDict[Hashable, VectorEnv] = OrderedDict()
 
     def get(self, key: Hashable) -> VectorEnv:
-        """The environment of a key, built if it is not open."""
+        """Return the environment of a key; it is built if it is not open."""
         if key not in self._open:
             while len(self._open) >= self._capacity:
                 self._open.popitem(last=False)[1].close()

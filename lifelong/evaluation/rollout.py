@@ -1,4 +1,4 @@
-"""The evaluation loop: there is no other."""
+"""The evaluation loop. The package has no other."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -24,11 +24,13 @@ class Episode:
     """The outcome of one rollout.
 
     Attributes:
-        init_state: Index of the initial state it began in.
+        init_state: Index of the initial state.
         success: Whether the goal was reached.
-        length: Control steps the policy took, without those of settling.
-        at_start, ever, at_end: Which of the goal's atoms held before the policy acted, at any time from then on,
-            and at the end; empty where the environment does not say.
+        length: Number of control steps of the policy, without the settling steps.
+        at_start: Whether each atom of the goal held before the policy acted; empty if the environment does not
+            report it.
+        ever: Whether each atom held at any time from then on.
+        at_end: Whether each atom held at the end.
     """
 
     init_state: int
@@ -41,24 +43,24 @@ class Episode:
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Outcomes in the order asked for, and what was seen in some of them.
+    """Outcomes of all simulations, in order, and recorded frames of some of them.
 
     Attributes:
-        episodes: One for each simulation.
-        seconds: Wall time.
-        atoms: The parts of the goal, as in the episodes.
-        films: Of each recorded simulation its frames, (H, W, 3) uint8, upright.
+        episodes: Outcome of each simulation.
+        seconds: Wall time, [s].
+        atoms: Atoms of the goal, in the order of the episodes' flags.
+        recordings: Frames of each recorded simulation, (H, W, 3) uint8, upright.
     """
 
     episodes: tuple[Episode, ...]
     seconds: float
     atoms: tuple[str, ...] = ()
-    films: tuple[tuple[np.ndarray, ...], ...] = field(default=(), repr=False)
+    recordings: tuple[tuple[np.ndarray, ...], ...] = field(default=(), repr=False)
 
     @property
     def frames(self) -> tuple[np.ndarray, ...]:
-        """What was seen in the first recorded simulation."""
-        return self.films[0] if self.films else ()
+        """Frames of the first recorded simulation."""
+        return self.recordings[0] if self.recordings else ()
 
     @property
     def rate(self) -> float:
@@ -81,26 +83,30 @@ def rollout(
     label: str = "",
     progress: bool = False,
 ) -> Rollouts:
-    """Let a policy act from given initial states, all at once; see `play`.
+    """Run episodes of a policy from the given initial states, all at once; see `run_episodes`.
 
     Args:
-        policy: Put in evaluation mode; back in its old mode afterwards.
-        env: As many simulations as initial states.
+        policy: Policy, put in evaluation mode; its mode is restored afterwards.
+        env: Environment with one simulation for each initial state.
         init_states: Indices of stored initial states, one per simulation.
         language: (L,) embedding of the instruction.
-        horizon, settle_steps, record_every, label, progress: See `play`.
-        seed: Whole numbers from which a policy that acts at random gets a generator per episode.
-        device: Where the policy is.
-        precision: See `lifelong.training.settings.FitSettings`.
+        horizon: Maximum number of control steps of the policy per episode.
+        settle_steps: Number of steps before the policy acts.
+        seed: Integers from which stochastic policies get a generator per episode.
+        device: Device of the policy.
+        precision: Precision of the policy, see `lifelong.training.settings.FitSettings`.
+        record_every: Number of control steps between two recorded frames of the first simulation; 0 records none.
+        label: Text before the progress bar.
+        progress: Whether to show a progress bar.
 
     Raises:
-        ConfigError: The number of simulations is not that of the initial states.
+        ConfigError: The numbers of simulations and of initial states differ.
     """
     draws = [generator(*seed, state) for state in init_states]
     was_training = policy.training
     policy.eval()
     try:
-        return play(
+        return run_episodes(
             PolicyActor(policy, language, torch.device(device), precision, draws),
             env,
             init_states,
@@ -114,7 +120,7 @@ def rollout(
         policy.train(was_training)
 
 
-def play(
+def run_episodes(
     actor: Actor,
     env: VectorEnv,
     init_states: Sequence[int],
@@ -127,25 +133,25 @@ def play(
     label: str = "",
     progress: bool = False,
 ) -> Rollouts:
-    """Let an actor act from given initial states, all at once.
+    """Run episodes of an actor from the given initial states, all at once.
 
-    Each step is one call of the actor on all simulations. Finished ones keep their row, so that the numbers
-    the others get do not depend on when they finished, but are neither stepped nor drawn.
+    Each step is one call of the actor on all simulations. Finished simulations keep their row, so that the results of
+    the others do not depend on when they finished, but they are neither stepped nor rendered.
 
     Args:
-        actor: Answers observations.
-        env: As many simulations as initial states.
+        actor: Actor that answers observations with actions.
+        env: Environment with one simulation for each initial state.
         init_states: Indices of stored initial states, one per simulation.
-        horizon: Most control steps of the actor per episode.
-        settle_steps: Steps before the actor acts, so that objects come to rest (LIBERO: 5).
-        settle_action: What is done in them; nothing by default.
-        record_every: Keep every so many steps a picture of all cameras of the recorded simulations; 0 keeps none.
-        recorded: Positions of these simulations.
-        label: Stands before the progress bar.
-        progress: Show a progress bar.
+        horizon: Maximum number of control steps of the actor per episode.
+        settle_steps: Number of steps before the actor acts, so that objects come to rest (LIBERO: 5).
+        settle_action: Action of these steps; zeros by default.
+        record_every: Number of control steps between two recorded frames; 0 records none.
+        recorded: Indices of the recorded simulations.
+        label: Text before the progress bar.
+        progress: Whether to show a progress bar.
 
     Raises:
-        ConfigError: The number of simulations is not that of the initial states.
+        ConfigError: The numbers of simulations and of initial states differ.
     """
     if env.num_envs != len(init_states):
         raise ConfigError(
@@ -154,30 +160,36 @@ def play(
     started = time.perf_counter()
     actor.reset(env.num_envs)
     obs, info = env.reset(options={"init_state": np.asarray(init_states)})
-    watch = _Watch(env, info)
-    still = np.zeros(actor.action_dim) if settle_action is None else np.asarray(settle_action, float)
+    tracker = EpisodeTracker(env, info)
+    settling = np.zeros(actor.action_dim) if settle_action is None else np.asarray(settle_action, float)
     for _ in range(settle_steps):
-        obs = watch.step(np.tile(still, (env.num_envs, 1)))
-    watch.begin()
+        obs = tracker.step(np.tile(settling, (env.num_envs, 1)))
+    tracker.start()
     lengths = np.zeros(env.num_envs, int)
-    films: list[list[np.ndarray]] = [[] for _ in (recorded if record_every else ())]
+    recordings: list[list[np.ndarray]] = [[] for _ in (recorded if record_every else ())]
     bar = tqdm(range(horizon), desc=label, disable=not progress, unit="step", leave=False)
     for step in bar:
-        for film, i in zip(films, recorded, strict=False):
-            if step % record_every == 0 and not watch.over[i]:
-                film.append(_picture(obs, actor.views, i))
-        if watch.over.all():
+        for frames, i in zip(recordings, recorded, strict=False):
+            if step % record_every == 0 and not tracker.over[i]:
+                frames.append(_frame(obs, actor.views, i))
+        if tracker.over.all():
             break
-        lengths += ~watch.over
-        obs = watch.step(actor.act(obs))
-        bar.set_postfix(done=int(watch.over.sum()), refresh=False)
+        lengths += ~tracker.over
+        obs = tracker.step(actor.act(obs))
+        bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
-    episodes = watch.episodes(init_states, lengths)
-    return Rollouts(episodes, time.perf_counter() - started, watch.atoms, tuple(map(tuple, films)))
+    episodes = tracker.episodes(init_states, lengths)
+    return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
 
 
 def save_animation(frames: Sequence[np.ndarray], path: Path, *, seconds_per_frame: float) -> None:
-    """Write frames, each (H, W, 3) uint8, as an animated WebP that plays for ever."""
+    """Write frames, each (H, W, 3) uint8, as an animated WebP that repeats forever.
+
+    Args:
+        frames: Frames in order.
+        path: File to write; its folder is created.
+        seconds_per_frame: Duration of each frame, [s].
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     first, *rest = [Image.fromarray(frame) for frame in frames]
     first.save(
@@ -185,8 +197,14 @@ def save_animation(frames: Sequence[np.ndarray], path: Path, *, seconds_per_fram
     )
 
 
-class _Watch:
-    """Steps an environment and notes which episodes are over, how, and what of the goal was reached."""
+class EpisodeTracker:
+    """Steps an environment and tracks which episodes are over, their success, and which atoms of the goal held.
+
+    Attributes:
+        atoms: Atoms of the goal; empty if the environment does not report them.
+        over: (B,) whether each episode is over.
+        success: (B,) whether each episode has succeeded.
+    """
 
     def __init__(self, env: VectorEnv, info: Mapping[str, Any]):
         self._env = env
@@ -195,11 +213,12 @@ class _Watch:
         self._now = self._progress(info)
         self._start = self._ever = self._now
 
-    def begin(self) -> None:
-        """What holds now is what the actor found."""
+    def start(self) -> None:
+        """Take the present state as that before the actor acts."""
         self._start = self._ever = self._now
 
     def step(self, actions: np.ndarray) -> Obs:
+        """Step all simulations with (B, A) actions and return their observations."""
         obs, _, terminated, truncated, info = self._env.step(actions)
         self.success = self.success | (np.asarray(info["success"], bool) & ~self.over)
         self._now = np.where(self.over[:, None], self._now, self._progress(info))
@@ -208,17 +227,17 @@ class _Watch:
         return obs
 
     def episodes(self, init_states: Sequence[int], lengths: np.ndarray) -> tuple[Episode, ...]:
-        """The outcome of each simulation."""
+        """Return the outcome of each simulation."""
         atoms = [list(map(tuple, a.tolist())) for a in (self._start, self._ever, self._now)]
         rows = zip(map(int, init_states), self.success.tolist(), lengths.tolist(), *atoms, strict=True)
         return tuple(Episode(*row) for row in rows)
 
     def _progress(self, info: Mapping[str, Any]) -> np.ndarray:
-        """(B, atoms) bool."""
+        """Return whether each atom holds, (B, atoms) bool."""
         shape = (self._env.num_envs, len(self.atoms))
         return np.asarray(info["progress"], bool).reshape(shape) if self.atoms else np.zeros(shape, bool)
 
 
-def _picture(obs: Obs, views: Sequence[str], i: int) -> np.ndarray:
-    """All cameras of a simulation side by side."""
+def _frame(obs: Obs, views: Sequence[str], i: int) -> np.ndarray:
+    """Return the images of all cameras of a simulation, side by side."""
     return np.concatenate([np.array(obs[view][i]) for view in views], axis=1)

@@ -1,13 +1,13 @@
-"""Where a policy looks: how much its answer changes when a place of the picture is blurred.
+"""Saliency maps of a policy: how much its action changes when a place of the image is blurred.
 
 Greydanus et al., "Visualizing and understanding Atari agents" (ICML 2018). Around a place (i, j) the image I is mixed
 with a blurred copy A of it by a Gaussian mask M centred there,
     I' = I (1 - M) + A M                                   (eq. 1),
-so that what is to be seen there is lost without an edge or colour that is new. Saliency is the change of the answer,
+which removes the local content without introducing new edges or colours. Saliency is the change of the output,
     S(i, j) = 1/2 |π(I) - π(I')|²                          (eq. 2).
 
-A place is blurred in every frame of the window. Blurred pixels are whole numbers, as the policy takes them: where
-blurring changes nothing (a plain surface), there is no saliency.
+A place is blurred in every frame of the window. Blurred pixels are rounded to integers, the input type of the
+policy: where blurring changes nothing (a plain surface), the saliency is zero.
 """
 
 import math
@@ -25,18 +25,18 @@ from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
-_CHUNK = 32  # windows that the policy answers at once
-_CUT = 3.0  # deviations beyond which a mask is zero
+_CHUNK = 32  # [windows] per batch of the policy
+_MASK_RADIUS = 3.0  # [standard deviations] beyond which a mask is zero
 
 
 @dataclass(frozen=True)
 class SaliencySettings:
-    """How finely is looked; lengths in pixels of an image 128 high, and in proportion for others.
+    """Resolution of saliency maps; lengths in pixels of an image of height 128, scaled for other heights.
 
     Attributes:
-        stride: Between two places (5 in the paper, for images of 80).
-        sigma: Deviation of the mask (the paper's is 5).
-        blur: Deviation of the blur (3 in the paper).
+        stride: Distance between two places (5 in the paper, for images of height 80).
+        sigma: Standard deviation of the mask (5 in the paper).
+        blur: Standard deviation of the blur (3 in the paper).
     """
 
     stride: float = 8.0
@@ -57,24 +57,24 @@ def saliency(
     *,
     measure: Literal["action", "loss"] = "action",
 ) -> Tensor:
-    """Maps of how much each place of each picture matters to a policy's answer on one window.
+    """Return maps of how much each place of each image affects a policy's output on one window.
 
     Args:
-        policy: Any policy with `predict`, or with `window_losses` for `measure="loss"`. Its mode stays.
+        policy: Policy with `predict`, or with `window_losses` for `measure="loss"`. Its mode is unchanged.
         batch: One window (B = 1), on the policy's device.
-        settings: How finely is looked.
-        measure: `action`: of the answer at the last step, eq. 2. `loss`: the absolute change of the window's loss,
-            which needs the demonstrated actions.
+        settings: Resolution of the maps.
+        measure: `action`: the change of the action at the last step, eq. 2. `loss`: the absolute change of the
+            window's loss, which needs the demonstrated actions.
 
     Returns:
         (V, H, W) float32, at least 0: values at the places, interpolated between them.
 
     Raises:
-        ConfigError: Another number of windows, or another measure.
+        ConfigError: The batch has not one window, or the measure is unknown.
         PolicyError: The policy has no `predict`.
     """
     if len(batch) != 1:
-        raise ConfigError(f"saliency is of one window; the batch has {len(batch)}")
+        raise ConfigError(f"saliency needs a batch of one window; this one has {len(batch)}")
     if measure not in ("action", "loss"):
         raise ConfigError(f"saliency: measure is {measure!r}; valid: action, loss")
     images = batch.observation.images  # (1, T, V, H, W, 3)
@@ -83,33 +83,33 @@ def saliency(
     rows, cols = (_places(n, settings.stride * scale) for n in (height, width))
     blurred = _blur(images, settings.blur * scale)
     with _evaluating(policy):
-        usual = _answer(policy, batch, measure)
+        reference = _outputs(policy, batch, measure)
         maps = []
         for view in range(images.shape[2]):
             changes = []
-            for some in torch.cartesian_prod(rows, cols).split(_CHUNK):
-                masks = _masks(some, (height, width), settings.sigma * scale).to(images.device)
-                answers = _answer(policy, _perturbed(batch, blurred, masks, view), measure)
-                difference = answers - usual
+            for places in torch.cartesian_prod(rows, cols).split(_CHUNK):
+                masks = _masks(places, (height, width), settings.sigma * scale).to(images.device)
+                outputs = _outputs(policy, _perturbed(batch, blurred, masks, view), measure)
+                difference = outputs - reference
                 changes.append(
                     0.5 * difference.square().sum(-1) if measure == "action" else difference.abs()[:, 0]
                 )
             maps.append(torch.cat(changes).view(1, 1, len(rows), len(cols)))
-    return _spread(torch.cat(maps, dim=1).float(), rows, cols, (height, width))[0]
+    return _interpolate(torch.cat(maps, dim=1).float(), rows, cols, (height, width))[0]
 
 
 def overlay(image: np.ndarray, heat: np.ndarray, strongest: float) -> np.ndarray:
-    """A picture with its saliency: grey where nothing matters, from blue to yellow where something does.
+    """Return an image with its saliency map: grey where it is zero, from blue to yellow where it is not.
 
     Args:
-        image: (H, W, 3) uint8.
-        heat: (H, W), at least 0.
-        strongest: The saliency that is drawn in full; the same for pictures that are compared.
+        image: (H, W, 3) uint8 image.
+        heat: (H, W) saliency, at least 0.
+        strongest: Saliency of the brightest colour; the same for images that are compared.
 
     Returns:
         (H, W, 3) uint8.
     """
-    from matplotlib import colormaps  # here, as only pictures need it
+    from matplotlib import colormaps  # only needed here
 
     share = np.clip(heat / strongest, 0, 1) if strongest > 0 else np.zeros_like(heat)
     grey = np.repeat(image.mean(-1, keepdims=True), 3, axis=-1)
@@ -125,16 +125,16 @@ def overlay(image: np.ndarray, heat: np.ndarray, strongest: float) -> np.ndarray
 def contact_sheet(
     pictures: Sequence[np.ndarray], heats: Sequence[np.ndarray], enlarge: int = 1, gap: int = 4
 ) -> np.ndarray:
-    """Pictures of several moments and what mattered in them: a column for each, two rows for each camera.
+    """Return images of several moments with their saliency maps: a column per moment, two rows per camera.
 
     Args:
-        pictures: At each moment (V, H, W, 3) uint8.
-        heats: At each moment (V, H, W).
-        enlarge: Whole factor of size.
-        gap: White pixels between pictures.
+        pictures: Images of each moment, (V, H, W, 3) uint8.
+        heats: Saliency maps of each moment, (V, H, W).
+        enlarge: Integer factor of the size.
+        gap: Number of white pixels between images.
 
     Returns:
-        (height, width, 3) uint8. In a camera's second row all moments share one scale.
+        (height, width, 3) uint8. In a camera's second row all moments share one colour scale.
     """
     views = range(len(pictures[0]))
     rows = []
@@ -150,33 +150,33 @@ def contact_sheet(
 
 
 def window_at(frames: Sequence[Mapping[str, Tensor]], step: int, length: int) -> dict[str, Tensor]:
-    """The frames a policy saw until a step, at most `length`, joined on the time axis.
+    """Return the last observations up to a step, concatenated along time.
 
     Args:
-        frames: By step, (1, 1, ...) tensors by name.
-        step: The last of them.
-        length: `seq_len`.
+        frames: Observations of each step, (1, 1, ...) tensors by name.
+        step: Last step of the window.
+        length: Maximum number of steps of the window.
     """
-    seen = frames[max(0, step + 1 - length) : step + 1]
-    return {name: torch.cat([frame[name] for frame in seen], dim=1) for name in seen[0]}
+    window = frames[max(0, step + 1 - length) : step + 1]
+    return {name: torch.cat([frame[name] for frame in window], dim=1) for name in window[0]}
 
 
 def _places(size: int, stride: float) -> Tensor:
-    """Centres about a stride apart, evenly over the image, as far from its edge as half of their distance."""
+    """Return evenly spaced centres about a stride apart; the outer ones are half a distance from the edge."""
     count = max(1, round(size / stride))
     return (torch.arange(count) + 0.5) * (size / count) - 0.5
 
 
 def _masks(places: Tensor, size: tuple[int, int], sigma: float) -> Tensor:
-    """M of places (N, 2), (N, H, W): 1 at its centre, 0 beyond three deviations."""
+    """Return the masks M (N, H, W) of places (N, 2): 1 at the centre, 0 beyond three standard deviations."""
     ys, xs = torch.arange(size[0]), torch.arange(size[1])
     squares = (ys - places[:, :1])[:, :, None].square() + (xs - places[:, 1:])[:, None].square()
-    return torch.where(squares <= (_CUT * sigma) ** 2, (-squares / (2 * sigma**2)).exp(), 0.0)
+    return torch.where(squares <= (_MASK_RADIUS * sigma) ** 2, (-squares / (2 * sigma**2)).exp(), 0.0)
 
 
 def _blur(images: Tensor, sigma: float) -> Tensor:
-    """A of images (..., H, W, 3), float32; edges are continued."""
-    radius = min(math.ceil(_CUT * sigma), min(images.shape[-3:-1]) - 1)
+    """Return the blurred copies A (float32) of images (..., H, W, 3), with replicated edges."""
+    radius = min(math.ceil(_MASK_RADIUS * sigma), min(images.shape[-3:-1]) - 1)
     line = torch.arange(-radius, radius + 1, device=images.device)
     weights = (-line.square() / (2 * sigma**2)).exp()
     weights = weights / weights.sum()
@@ -187,12 +187,12 @@ def _blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def _perturbed(batch: Batch, blurred: Tensor, masks: Tensor, view: int) -> Batch:
-    """The window as often as there are masks (N, H, W), each with its place blurred in a view."""
+    """Return a batch of N copies of the window, each blurred in one view with one of the masks (N, H, W)."""
     count, obs = len(masks), batch.observation
     repeat = lambda x: x.expand(count, *x.shape[1:])  # noqa: E731
     images = repeat(obs.images).clone()
-    seen, weight = obs.images[:, :, view].float(), masks[:, None, :, :, None]
-    images[:, :, view] = torch.lerp(seen, blurred[:, :, view], weight).round().to(torch.uint8)
+    original, weight = obs.images[:, :, view].float(), masks[:, None, :, :, None]
+    images[:, :, view] = torch.lerp(original, blurred[:, :, view], weight).round().to(torch.uint8)
     proprio = {name: repeat(value) for name, value in obs.proprio.items()}
     return replace(
         batch,
@@ -203,13 +203,13 @@ def _perturbed(batch: Batch, blurred: Tensor, masks: Tensor, view: int) -> Batch
     )
 
 
-def _answer(policy: Policy, batch: Batch, measure: str) -> Tensor:
-    """(B, A) actions at the last step, or (B, 1) losses."""
+def _outputs(policy: Policy, batch: Batch, measure: str) -> Tensor:
+    """Return (B, A) actions at the last step, or (B, 1) losses."""
     return policy.predict(batch)[:, -1] if measure == "action" else policy.window_losses(batch)[:, None]
 
 
-def _spread(values: Tensor, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> Tensor:
-    """Values at places (1, V, R, C) interpolated to (1, V, H, W); places are cell centres of an even grid."""
+def _interpolate(values: Tensor, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> Tensor:
+    """Interpolate values at places (1, V, R, C), the cell centres of a regular grid, to (1, V, H, W)."""
     if (len(rows), len(cols)) == size:
         return values
     return functional.interpolate(values, size=size, mode="bilinear", align_corners=False)

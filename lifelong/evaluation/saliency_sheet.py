@@ -1,4 +1,4 @@
-"""Pictures of where a run's policy looks while it acts."""
+"""Contact sheets of a run's saliency: images of where its policy looks while it acts."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,22 +11,22 @@ from libero_env.envs.batch import BatchEnv
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Obs, PolicyActor, observe
-from lifelong.evaluation.restore import Restored, restore
-from lifelong.evaluation.rollout import play
+from lifelong.evaluation.restore import LoadedRun, restore
+from lifelong.evaluation.rollout import run_episodes
 from lifelong.evaluation.saliency import SaliencySettings, contact_sheet, saliency, window_at
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator
 from lifelong.types import Batch, Observation
 
-SHEET_HEIGHT = 128  # pixels of a picture at least
+SHEET_HEIGHT = 128  # [pixels] minimum height of an image on the sheet
 
 
 @dataclass
-class _Remembering:
-    """An actor that keeps what it was shown."""
+class RecordingActor:
+    """An actor that records the observations it receives."""
 
     actor: PolicyActor
-    seen: list[Obs] = field(default_factory=list)
+    observations: list[Obs] = field(default_factory=list)
 
     @property
     def action_dim(self) -> int:
@@ -37,11 +37,11 @@ class _Remembering:
         return self.actor.views
 
     def reset(self, num_envs: int) -> None:
-        self.seen.clear()
+        self.observations.clear()
         self.actor.reset(num_envs)
 
     def act(self, obs: Obs) -> np.ndarray:
-        self.seen.append({name: np.array(value) for name, value in obs.items()})
+        self.observations.append({name: np.array(value) for name, value in obs.items()})
         return self.actor.act(obs)
 
 
@@ -56,82 +56,93 @@ def draw_saliency(
     settings: SaliencySettings = SaliencySettings(),  # noqa: B008 - frozen
     device: str = "auto",
 ) -> Path:
-    """Lets a run's policy act on one of its tasks, and draws where it looks at some moments.
+    """Run one episode of a run's policy, and draw where the policy looks at some moments.
 
     Args:
-        source: The run's directory, or one of its checkpoints.
+        source: Directory of the run, or one of its checkpoints.
         task: Position of the task in the run's sequence.
         after: See `lifelong.evaluation.restore.restore`.
-        start: Initial state.
-        moments: Number of columns; evenly over the rollout, its beginning included.
-        horizon: Most control steps.
-        settings: How finely is looked.
+        start: Index of the initial state.
+        moments: Number of columns, evenly distributed over the episode from its first step on.
+        horizon: Maximum number of control steps.
+        settings: Resolution of the saliency maps.
         device: See `lifelong.evaluation.restore.restore`.
 
     Returns:
-        The contact sheet, `saliency/task_<k>_after_<l>.png` in the run's directory; a text file beside it has the
-        caption.
+        The contact sheet, `saliency/task_<k>_after_<l>.png` in the run's directory, with its caption in a text file
+        beside it.
 
     Raises:
-        ConfigError: No such task, or no moments.
-        LiberoError: The run cannot be read, or its policy gives no `predict`.
+        ConfigError: The task does not exist, or there are no moments.
+        LiberoError: The run cannot be read, or its policy has no `predict`.
     """
-    found = restore(source, after=after, device=device)
-    if not 0 <= task < len(found.tasks) or moments < 1:
+    run = restore(source, after=after, device=device)
+    if not 0 <= task < len(run.tasks) or moments < 1:
         raise ConfigError(
-            f"task {task}, {moments} moments; there are tasks 0 to {len(found.tasks) - 1}, and 1 moment or more"
+            f"task {task} and {moments} moments; valid: tasks 0 to {len(run.tasks) - 1}, and 1 moment or more"
         )
-    steps, pictures, heats, success = _look(found, task, start, moments, horizon, settings)
+    frames, success = _run_episode(run, task, start, horizon)
+    steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, moments)})
+    heats = _saliency_maps(run, task, frames, steps, settings)
+    pictures = [frames[step]["images"][0, 0].cpu().numpy() for step in steps]
     enlarge = -(-SHEET_HEIGHT // pictures[0].shape[1])
-    folder = found.path / "saliency"
+    folder = run.path / "saliency"
     folder.mkdir(exist_ok=True)
-    path = folder / f"task_{task:02d}_after_{found.learned:02d}.png"
+    path = folder / f"task_{task:02d}_after_{run.learned:02d}.png"
     Image.fromarray(contact_sheet(pictures, heats, enlarge)).save(path)
     outcome = "success" if success else "failure"
-    told = f"{found.tasks[task].language}: {outcome}, after learning {found.learned + 1} tasks"
-    path.with_suffix(".txt").write_text(f"{told}; steps {', '.join(map(str, steps))}\n", encoding="utf-8")
+    caption = f"{run.tasks[task].language}: {outcome}, after learning {run.learned + 1} tasks"
+    path.with_suffix(".txt").write_text(f"{caption}; steps {', '.join(map(str, steps))}\n", encoding="utf-8")
     return path
 
 
-def _look(
-    found: Restored, task: int, start: int, moments: int, horizon: int, settings: SaliencySettings
-) -> tuple[list[int], list[np.ndarray], list[np.ndarray], bool]:
-    """Steps, what was seen at each (V, H, W, 3), what mattered there (V, H, W), and whether the goal was reached."""
-    spec, language = found.policy.spec, found.embed(found.tasks[task])
-    with found.acting(found.tasks[task]) as policy:
-        draws = [generator(found.seed, start)]
-        actor = _Remembering(PolicyActor(policy, language, found.device, found.eval.precision, draws))
-        env = BatchEnv(
-            found.tasks[task],
-            1,
-            cameras=tuple(CAMERAS[view] for view in spec.views),
-            camera_size=spec.image_size,
-            horizon=horizon + found.eval.settle_steps,
-        )
-        try:
-            done = play(actor, env, [start], horizon=horizon, settle_steps=found.eval.settle_steps)
-        finally:
-            env.close()
-        frames = [_parts(observe(obs, spec, language, found.device)) for obs in actor.seen]
-        steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, moments)})
-        heats = []
-        for step in steps:
-            seen = window_at(frames, step, spec.seq_len)
-            heats.append(
-                saliency(policy, _batch(seen, language.to(found.device), policy), settings).cpu().numpy()
-            )
-    pictures = [frames[step]["images"][0, 0].cpu().numpy() for step in steps]
-    return steps, pictures, heats, done.episodes[0].success
+def _run_episode(
+    run: LoadedRun, task: int, start: int, horizon: int
+) -> tuple[list[dict[str, torch.Tensor]], bool]:
+    """Return the policy's observations at each step, (1, 1, ...) tensors by name, and the episode's success."""
+    spec, language = run.policy.spec, run.embed(run.tasks[task])
+    env = BatchEnv(
+        run.tasks[task],
+        1,
+        cameras=tuple(CAMERAS[view] for view in spec.views),
+        camera_size=spec.image_size,
+        horizon=horizon + run.eval.settle_steps,
+    )
+    try:
+        with run.acting(run.tasks[task]) as policy:
+            draws = [generator(run.seed, start)]
+            actor = RecordingActor(PolicyActor(policy, language, run.device, run.eval.precision, draws))
+            done = run_episodes(actor, env, [start], horizon=horizon, settle_steps=run.eval.settle_steps)
+    finally:
+        env.close()
+    frames = [_tensors(observe(obs, spec, language, run.device)) for obs in actor.observations]
+    return frames, done.episodes[0].success
 
 
-def _parts(observation: Observation) -> dict[str, torch.Tensor]:
+def _saliency_maps(
+    run: LoadedRun,
+    task: int,
+    frames: list[dict[str, torch.Tensor]],
+    steps: list[int],
+    settings: SaliencySettings,
+) -> list[np.ndarray]:
+    """Return the saliency (V, H, W) of the windows that end at the steps."""
+    language = run.embed(run.tasks[task]).to(run.device)
+    with run.acting(run.tasks[task]) as policy:
+        windows = [window_at(frames, step, run.policy.spec.seq_len) for step in steps]
+        return [
+            saliency(policy, _batch(window, language, policy), settings).cpu().numpy() for window in windows
+        ]
+
+
+def _tensors(observation: Observation) -> dict[str, torch.Tensor]:
     return {"images": observation.images, **observation.proprio}
 
 
-def _batch(seen: dict[str, torch.Tensor], language: torch.Tensor, policy: Policy) -> Batch:
-    """A window as a batch; its actions are not read."""
-    proprio = {name: value for name, value in seen.items() if name != "images"}
-    images = seen["images"]
-    none = torch.zeros(1, dtype=torch.int64, device=images.device)
+def _batch(window: dict[str, torch.Tensor], language: torch.Tensor, policy: Policy) -> Batch:
+    """Return a window as a batch; its actions are not read."""
+    proprio = {name: value for name, value in window.items() if name != "images"}
+    images = window["images"]
+    ids = torch.zeros(1, dtype=torch.int64, device=images.device)
     actions = images.new_zeros((1, images.shape[1], policy.spec.action_dim), dtype=torch.float32)
-    return Batch(Observation(images, proprio, language[None]), actions, none, none)
+    return Batch(Observation(images, proprio, language[None]), actions, ids, ids)

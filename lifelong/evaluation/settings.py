@@ -1,4 +1,4 @@
-"""How success is measured."""
+"""Settings of the measurement of success."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,23 +9,23 @@ from lifelong.errors import ConfigError
 
 @dataclass(frozen=True)
 class EvalSettings:
-    """How success is measured; the defaults are the paper's, but for `selection`.
+    """Settings of the measurement of success; the defaults are those of LIBERO's paper, except `selection`.
 
     Attributes:
-        episodes: Rollouts per cell of the success matrix; they start in the first so many initial states.
-        curve_episodes: Rollouts per point of a learning curve.
-        every: Epochs between two points of a learning curve; it also has epoch 0 and the last one.
-        horizon: Most control steps per episode.
-        settle_steps: Steps with a zero action before the policy acts.
+        episodes: Number of rollouts per cell of the success matrix; they start in the first initial states.
+        curve_episodes: Number of rollouts per point of a learning curve.
+        every: Number of epochs between two points of a learning curve; it also has epoch 0 and the last epoch.
+        horizon: Maximum number of control steps per episode.
+        settle_steps: Number of steps with a zero action before the policy acts.
         selection: Initial states of the learning curve, by which the best epoch is chosen. `apart`: the last
-            ones of the 50, which no reported number uses. `reporting`: those reported afterwards, as LIBERO
+            ones of the 50, which no reported number uses. `reporting`: those of the reported numbers, as LIBERO
             does.
-        select: Which weights are kept of a task: those of the `best` epoch, the earliest if several are, or
+        select: Weights that are kept of a task: those of the `best` epoch, the earliest of equally good ones, or of
             the `last`.
-        precision: See `FitSettings`.
-        record_every: Control steps between two pictures of the recorded rollouts; 0 records none.
-        open_environments: Environments kept open, of different tasks.
-        sim_threads: Threads that step simulations; 0 takes all cores.
+        precision: Precision of the policy, see `FitSettings`.
+        record_every: Number of control steps between two frames of the recorded rollouts; 0 records none.
+        open_environments: Number of environments kept open, of different tasks.
+        sim_threads: Number of threads that step simulations; 0 uses all cores.
     """
 
     episodes: int = 20
@@ -56,7 +56,7 @@ class EvalSettings:
             )
 
     def init_states(self, phase: Literal["curve", "matrix"]) -> range:
-        """Indices of the initial states that rollouts of a kind start in."""
+        """Return the indices of the initial states of a learning curve, or of the success matrix."""
         if phase == "matrix":
             return range(self.episodes)
         if self.selection == "reporting":
@@ -64,5 +64,5 @@ class EvalSettings:
         return range(NUM_INIT_STATES - self.curve_episodes, NUM_INIT_STATES)
 
     def curve_epochs(self, epochs: int) -> tuple[int, ...]:
-        """The epochs at which a learning curve has points."""
+        """Return the epochs at which a learning curve has points, given the number of epochs."""
         return tuple(sorted({*range(0, epochs + 1, self.every), epochs}))

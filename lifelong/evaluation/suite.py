@@ -1,6 +1,6 @@
-"""Success of a policy on tasks of the benchmark: fixed starts, all episodes of a task at once, Wilson's intervals.
+"""Success of a policy on tasks of the benchmark: fixed initial states, all episodes of a task at once.
 
-What is done of a task is on disk when it is done, so a stopped evaluation goes on where it was.
+Each task's result is written when the task is done, so a stopped evaluation resumes after it.
 """
 
 import hashlib
@@ -20,25 +20,26 @@ from libero_env.timing import CONTROL_PERIOD
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.rollout import Rollouts, play, save_animation
+from lifelong.evaluation.rollout import Rollouts, run_episodes, save_animation
 from lifelong.results.metrics import Estimate, combine_intervals, wilson_interval
 from lifelong.results.records import installed_versions, utc_now
 from lifelong.results.subgoals import predicate_of
-from lifelong.results.summary import plain
+from lifelong.results.summary import json_safe
 
-SELECTION = range(NUM_INIT_STATES - 20, NUM_INIT_STATES)  # starts that choose a checkpoint by default
+# Initial states by which a checkpoint is chosen by default
+SELECTION = range(NUM_INIT_STATES - 20, NUM_INIT_STATES)
 
 
 @dataclass(frozen=True)
-class Protocol:
+class EvalProtocol:
     """How episodes are run.
 
     Attributes:
-        horizon: Most control steps, or by suite.
-        settle_steps: Steps before the policy acts.
-        settle_action: What is done in them; None: nothing.
-        camera_size: Pixels of the pictures, (height, width), for policies that do not say themselves.
-        original: Observations under the names of LIBERO's own environments, pictures bottom up.
+        horizon: Maximum number of control steps, or that of each suite.
+        settle_steps: Number of steps before the policy acts.
+        settle_action: Action of these steps; None for zeros.
+        camera_size: Image size (height, width), [pixels], for policies that do not define it.
+        original: Whether observations have the names and flipped images of LIBERO's own environments.
     """
 
     horizon: int | Mapping[str, int] = 600
@@ -48,16 +49,16 @@ class Protocol:
     original: bool = False
 
     def steps(self, task: Task) -> int:
-        """The horizon of a task."""
+        """Return the maximum number of control steps on a task."""
         if isinstance(self.horizon, int):
             return self.horizon
         return self.horizon.get(task.suite, max(self.horizon.values()))
 
 
-# `libero`: Liu et al. 2023, appendix B. `openpi`: as the scripts of openpi and OpenVLA-OFT evaluate.
+# `libero`: Liu et al. 2023, appendix B. `openpi`: the evaluation scripts of openpi and OpenVLA-OFT.
 PROTOCOLS = {
-    "libero": Protocol(),
-    "openpi": Protocol(
+    "libero": EvalProtocol(),
+    "openpi": EvalProtocol(
         horizon={
             "libero_spatial": 220,
             "libero_object": 280,
@@ -73,16 +74,18 @@ PROTOCOLS = {
 }
 
 
-def starts(which: str, count: int | None, selection: Sequence[int] = SELECTION) -> tuple[int, ...]:
-    """Indices of the initial states that are evaluated.
+def choose_init_states(
+    which: str, count: int | None, selection: Sequence[int] = SELECTION
+) -> tuple[int, ...]:
+    """Return the indices of the initial states to evaluate.
 
     Args:
         which: `all`; `selection`: those by which a checkpoint may have been chosen; `reporting`: the others.
-        count: The first so many of them; None: all of them.
-        selection: Those for selection.
+        count: Number of them, from the first on; None: all of them.
+        selection: Initial states for selection.
 
     Raises:
-        ConfigError: Another word, or more starts than there are.
+        ConfigError: `which` is none of these, or there are fewer than `count`.
     """
     parts: dict[str, Sequence[int]] = {
         "all": range(NUM_INIT_STATES),
@@ -100,7 +103,7 @@ def starts(which: str, count: int | None, selection: Sequence[int] = SELECTION) 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What a policy did on a task; an entry for each episode."""
+    """Results of a policy on a task, with one entry per episode; see `lifelong.evaluation.rollout.Episode`."""
 
     task: str
     name: str
@@ -115,38 +118,40 @@ class TaskResult:
 
     @property
     def success(self) -> Estimate:
-        """Share of successes with Wilson's interval."""
+        """Success rate with Wilson's interval."""
         wins, count = sum(self.successes), len(self.successes)
         low, high = wilson_interval(wins, count)
         return Estimate(wins / count, float(low), float(high))
 
     @property
     def steps(self) -> float:
-        """Mean length of the successful episodes, control steps; NaN without any."""
+        """Mean length of the successful episodes, [control steps]; NaN if there are none."""
         lengths = [n for n, won in zip(self.lengths, self.successes, strict=True) if won]
         return float(np.mean(lengths)) if lengths else float("nan")
 
 
 @dataclass(frozen=True)
 class SuiteEvaluation:
-    """What is evaluated, and how.
+    """An evaluation of a policy on tasks.
 
     Attributes:
-        what: What identifies the policy, as plain data; a folder holds results of one such only.
-        tasks: Of the benchmark.
-        init_states: The starts of each.
+        identity: Plain data that identify the policy; a folder holds results of one policy only.
+        tasks: Tasks of the benchmark.
+        init_states: Initial states of each task.
         protocol: How episodes are run.
         out: Folder of the results.
-        env: Makes the environment of a task, with as many simulations as starts.
-        actor: The actor on a task, within a context.
-        videos: So many episodes of each task are recorded.
-        record_every: Control steps between two pictures.
+        env: Function that builds the environment of a task, with one simulation for each initial state.
+        actor: Function that returns the context manager of a task's actor.
+        videos: Number of recorded episodes of each task.
+        record_every: Number of control steps between two frames.
+        progress: Whether to show progress bars.
+        versions: Versions of the packages and models.
     """
 
-    what: Mapping[str, Any]
+    identity: Mapping[str, Any]
     tasks: Sequence[Task]
     init_states: tuple[int, ...]
-    protocol: Protocol
+    protocol: EvalProtocol
     out: Path
     env: Callable[[Task], VectorEnv]
     actor: Callable[[Task], AbstractContextManager[Actor]]
@@ -155,27 +160,27 @@ class SuiteEvaluation:
     progress: bool = False
     versions: Mapping[str, str] = field(default_factory=installed_versions)
 
-    def run(self, say: Callable[[TaskResult], None] = lambda _: None) -> list[TaskResult]:
-        """Evaluate what is not on disk yet, and write `eval.json`.
+    def run(self, on_result: Callable[[TaskResult], None] = lambda _: None) -> list[TaskResult]:
+        """Evaluate the tasks whose results are not on disk yet, and write `eval.json`.
 
         Args:
-            say: Told each task's result, as soon as there is one.
+            on_result: Function called with each task's result, as soon as it is known.
 
         Raises:
-            ConfigError: The folder holds results of something else.
+            ConfigError: The folder holds results of another evaluation.
         """
         results = []
         for task in self.tasks:
-            results.append(self._stored(task) or self._evaluate(task))
-            say(results[-1])
+            results.append(self._stored_result(task) or self._evaluate(task))
+            on_result(results[-1])
         _write(self.out / "eval.json", self.summary(results))
         return results
 
     def summary(self, results: Sequence[TaskResult]) -> dict[str, Any]:
-        """Everything as plain data: what was evaluated, success in all, of each suite and of each task."""
+        """Return everything as plain data: the policy, and its success on all tasks, each suite and each task."""
         suites = dict.fromkeys(r.task.partition("/")[0] for r in results)
         return {
-            "evaluated": dict(self.what),
+            "evaluated": dict(self.identity),
             "protocol": asdict(self.protocol),
             "init_states": self.init_states,
             "finished": utc_now(),
@@ -192,7 +197,7 @@ class SuiteEvaluation:
         env = self.env(task)
         try:
             with self.actor(task) as actor:
-                done = play(
+                done = run_episodes(
                     actor,
                     env,
                     self.init_states,
@@ -211,7 +216,7 @@ class SuiteEvaluation:
         _write(self._path(task), {"digest": self._digest(task), **asdict(result)})
         return result
 
-    def _stored(self, task: Task) -> TaskResult | None:
+    def _stored_result(self, task: Task) -> TaskResult | None:
         path = self._path(task)
         if not path.is_file():
             return None
@@ -220,11 +225,11 @@ class SuiteEvaluation:
             digest = found.pop("digest")
             rows = {f.name: _tuples(found[f.name]) for f in fields(TaskResult)}
         except (ValueError, KeyError, AttributeError) as error:
-            raise LifelongError(f"{path} is no result of a task ({error}); remove it") from error
+            raise LifelongError(f"{path} is not a valid result of a task ({error}); remove it") from error
         if digest != self._digest(task):
             raise ConfigError(
-                f"{path} was made with another policy, protocol, set of starts or version of the simulation: "
-                "name another folder with --out, or run it anew with --again"
+                f"{path} was made with another policy, protocol, set of initial states or version of the simulation: "
+                "name another folder with --out, or repeat the evaluation with --again"
             )
         return TaskResult(**rows)
 
@@ -233,25 +238,22 @@ class SuiteEvaluation:
 
     def _digest(self, task: Task) -> str:
         simulation = {k: v for k, v in self.versions.items() if k in ("mujoco", "models")}
-        parts = [dict(self.what), asdict(self.protocol), self.init_states, simulation, task.bddl_text]
+        parts = [dict(self.identity), asdict(self.protocol), self.init_states, simulation, task.bddl_text]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
     def _save_videos(self, task: Task, done: Rollouts) -> None:
-        for film, episode in zip(done.films, done.episodes, strict=False):
-            if film:
+        folder, seconds = self.out / "videos", CONTROL_PERIOD * self.record_every
+        for frames, episode in zip(done.recordings, done.episodes, strict=False):
+            if frames:
                 outcome = "success" if episode.success else "failure"
-                path = (
-                    self.out
-                    / "videos"
-                    / f"{task.suite}_{task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
-                )
-                save_animation(film, path, seconds_per_frame=CONTROL_PERIOD * self.record_every)
+                name = f"{task.suite}_{task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
+                save_animation(frames, folder / name, seconds_per_frame=seconds)
 
 
 def overall(results: Sequence[TaskResult]) -> Estimate:
-    """Success averaged over tasks, with the interval that Wilson's of the tasks imply (see `combine_intervals`).
+    """Return the mean success over tasks, with the interval from Wilson's of the tasks (see `combine_intervals`).
 
-    The tasks are fixed, so it covers chance in the episodes and not the choice of tasks.
+    The tasks are fixed, so the interval covers the chance in the episodes, not the choice of tasks.
     """
     found = [r.success for r in results]
     weights = np.full(len(found), 1 / max(1, len(found)))
@@ -261,7 +263,7 @@ def overall(results: Sequence[TaskResult]) -> Estimate:
 
 
 def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
-    """How often atoms of the goals were reached at any time, by predicate; mean over atoms."""
+    """Return how often atoms of the goals held at any time, by predicate: means over atoms."""
     rates: dict[str, list[float]] = {}
     for result in results:
         for i, atom in enumerate(result.atoms):
@@ -274,15 +276,15 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
 HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"
 
 
-def line(result: TaskResult) -> str:
-    """A task's line under `HEADER`: successes, share and interval in percent, mean steps of the successes."""
+def table_row(result: TaskResult) -> str:
+    """Format a task's row under `HEADER`: successes, rate and interval in percent, mean steps of the successes."""
     wins = f"{sum(result.successes)}/{len(result.successes)}"
     steps = f"{result.steps:.0f}" if np.isfinite(result.steps) else "-"
     return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}"
 
 
-def total_line(results: Sequence[TaskResult]) -> str:
-    """The line of all tasks together."""
+def total_row(results: Sequence[TaskResult]) -> str:
+    """Format the row of all tasks together."""
     wins, episodes = sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results)
     return f"{'mean over tasks':<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}"
 
@@ -308,7 +310,7 @@ def _result(task: Task, done: Rollouts) -> TaskResult:
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:
-    atomic_write_text(path, json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n")
+    atomic_write_text(path, json.dumps(json_safe(values), indent=1, ensure_ascii=False) + "\n")
 
 
 def _tuples(value: Any) -> Any:

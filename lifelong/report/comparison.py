@@ -1,6 +1,6 @@
-"""Several groups of runs as numbers: means over seeds, intervals, differences, forgetting task by task, costs.
+"""Comparison of groups of runs: means over seeds, intervals, differences, forgetting by task, costs.
 
-The published ± is the standard error over seeds; the intervals are those of `lifelong.results.bootstrap`.
+The number after ± is the standard error over seeds; the intervals are those of `lifelong.results.bootstrap`.
 """
 
 import json
@@ -15,22 +15,22 @@ from libero_env.storage import atomic_write_text
 from lifelong.report.runs import Group, Run
 from lifelong.results.bootstrap import DRAWS, Member, Resamples, resample
 from lifelong.results.metrics import METRIC_NAMES, Estimate, mean_and_standard_error
-from lifelong.results.summary import plain
+from lifelong.results.summary import json_safe
 
 CONFIDENCE = 0.95
 SEED = 2023  # of the bootstrap
 
 
 def compare(groups: Sequence[Group]) -> dict[str, Any]:
-    """Everything that is computed of the groups, as plain data with NaN where something is not known.
+    """Compute all statistics of the groups, as plain data with NaN where something is unknown.
 
     Args:
-        groups: Each of runs that differ in seed and order only. Runs without a learned task do not count.
+        groups: Groups of runs that differ in seed and order only. Runs without a learned task are ignored.
 
     Returns:
         `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high and the value of
-        each run), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`; `differences`: of each two, the
-        first less the second; `bootstrap`: how the intervals were made.
+        each run), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`; `differences`: of each pair, the
+        first minus the second; `bootstrap`: the parameters of the intervals.
     """
     measured = {g.label: [r for r in g.runs if r.metrics is not None] for g in groups}
     drawn = {
@@ -58,8 +58,10 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
 
 
 def write_comparison(found: Mapping[str, Any], path: Path) -> None:
-    """Writes what `compare` found as JSON, in one step; NaN is null."""
-    atomic_write_text(path, json.dumps(plain(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    """Write the result of `compare` as JSON, in one step; NaN becomes null."""
+    atomic_write_text(
+        path, json.dumps(json_safe(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    )
 
 
 def _group(group: Group, runs: Sequence[Run], drawn: Resamples | None) -> dict[str, Any]:
@@ -93,7 +95,7 @@ def _interval(estimate: Estimate) -> dict[str, float]:
 
 
 def _forgetting(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
-    """NBT_k of every task by its name, over the runs in which another task followed it."""
+    """Return NBT_k of every task by its name, over the runs in which another task followed it."""
     found: dict[str, list[float]] = {}
     for run in runs:
         assert run.metrics is not None
@@ -104,7 +106,7 @@ def _forgetting(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
 
 
 def _subgoals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of every predicate how often it was reached just after learning, at the end, and the difference."""
+    """Return how often each predicate was reached right after learning, at the end, and the difference."""
     rows = [p for run in runs for p in run.results.subgoals().predicates]
     return {
         name: {
@@ -116,9 +118,9 @@ def _subgoals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def costs_of(runs: Sequence[Run]) -> dict[str, float]:
-    """Costs of a method: what is stored at the end, the largest peaks, and means over tasks of everything else.
+    """Return the costs of a method: storage at the end, the largest peaks, and means over tasks of everything else.
 
-    A cost that no run recorded is left out.
+    Costs that no run recorded are omitted.
     """
     by_task: list[dict[str, float]] = []
     last: list[dict[str, float]] = []

@@ -1,4 +1,4 @@
-"""Figures of a report: matplotlib's object interface only, sized for a paper's column or a page."""
+"""Figures of a report, through matplotlib's object interface only, sized for a paper's column or page."""
 
 import io
 import math
@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 
 from lifelong.results.metrics import Curve, mean_and_standard_error, wilson_interval
 
-# Okabe & Ito's colours, safe for colour-blind readers, without the yellow that fades on white.
+# Okabe and Ito's colours, distinguishable for colour-blind readers, without yellow, which is too light on white
 LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-_INK = "#010203"  # stands for the page's text colour, light or dark, in SVG
+_INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
 _STYLE = {
     "svg.fonttype": "none",
     "svg.hashsalt": "lifelong",
@@ -44,29 +45,40 @@ _STYLE = {
 
 @dataclass(frozen=True)
 class Panel:
-    """One success matrix with its title and row and column labels."""
+    """One success matrix.
+
+    Attributes:
+        title: Title of the panel.
+        rates: (K, K) success rates, NaN where not evaluated.
+        labels: K short task names.
+    """
 
     title: str
-    rates: NDArray[np.float64]  # (K, K), NaN where there is nothing
-    labels: Sequence[str]  # K short task names
+    rates: NDArray[np.float64]
+    labels: Sequence[str]
 
 
 @dataclass(frozen=True)
 class Line:
-    """One labelled curve over the tasks learned: a row for each seed, NaN beyond what it learned."""
+    """One curve over the tasks learned.
+
+    Attributes:
+        label: Label in the legend; empty for none.
+        values: (runs, K) values of each run, NaN beyond the tasks it learned.
+    """
 
     label: str
-    values: NDArray[np.float64]  # (runs, K)
+    values: NDArray[np.float64]
 
 
 def success_colours() -> Colormap:
-    """Light to dark through one change of hue; lightness falls evenly, so it also prints in grey."""
+    """Return the colour map of success: light to dark with evenly falling lightness, so it also prints in grey."""
     stops = ("#f4f6ec", "#cfe8d2", "#8fcfc3", "#45aabf", "#2379ab", "#1d4a8c", "#14265e")
     return LinearSegmentedColormap.from_list("success", stops)
 
 
 def cell_colours(rate: float) -> tuple[str, str]:
-    """Background and text colour of a cell with this success rate, as #rrggbb."""
+    """Return the background and text colour of a cell with this success rate, as #rrggbb."""
     channels = np.array(success_colours()(rate)[:3])
     linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
     luminance = float(linear @ (0.2126, 0.7152, 0.0722))
@@ -75,7 +87,7 @@ def cell_colours(rate: float) -> tuple[str, str]:
 
 
 def heatmap_figure(panels: Sequence[Panel]) -> Figure:
-    """Success matrices side by side, up to four in a row, in percent, with one colour bar."""
+    """Draw success matrices side by side, up to four in a row, in percent, with one colour bar."""
     columns = min(len(panels), 4)
     rows = math.ceil(len(panels) / columns)
     with matplotlib.rc_context(_STYLE):
@@ -83,12 +95,10 @@ def heatmap_figure(panels: Sequence[Panel]) -> Figure:
         width, height = (4.4, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
         figure = Figure(figsize=(width, height), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
-        image = None
-        for place, axes in enumerate(grid.flat):
-            if place >= len(panels):
-                axes.set_axis_off()
-                continue
-            image = _draw_matrix(axes, panels[place], label_rows=single)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_axis_off()
+        for place, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
+            image = _draw_matrix(axes, panel, label_rows=single)
             if place % columns == 0:
                 axes.set_ylabel("after learning task")
             if place + columns >= len(panels):
@@ -108,7 +118,13 @@ def learning_figure(
     losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]],
     labels: Sequence[str],
 ) -> Figure:
-    """For each task, success (with Wilson's 95 % band, best epoch ringed) above training loss."""
+    """Draw for each task its success (with Wilson's 95 % band, best epoch circled) above its training loss.
+
+    Args:
+        curves: Learning curve of each task.
+        losses: Epochs and mean training losses of each task.
+        labels: K short task names.
+    """
     tasks = sorted(curves.keys() | losses.keys())
     columns = min(5, len(tasks))
     # Inches. Placed by hand: automatic layout of a hundred panels takes a minute.
@@ -133,10 +149,8 @@ def learning_figure(
             below.set_ylim(*limits)
             below.yaxis.set_major_locator(MaxNLocator(3))
             for axes, name in ((above, "success (%)"), (below, "loss")):
-                _clean(axes)
-                axes.set_xlim(-0.03 * last, 1.03 * last)
-                axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-                axes.tick_params(labelleft=column == 0, labelbottom=axes is below)
+                _set_epoch_axis(axes, last, labelbottom=axes is below)
+                axes.tick_params(labelleft=column == 0)
                 if column == 0:
                     axes.set_ylabel(name)
                     axes.yaxis.set_label_coords(-0.5 / panel, 0.5)
@@ -146,22 +160,22 @@ def learning_figure(
 
 
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
-    """Average success over the tasks learned so far against their number; ± one standard error.
+    """Draw average success over the tasks learned so far against their number, ± one standard error.
 
-    Beyond as many lines as there are colours, the next ones are dashed with open markers.
+    If there are more lines than colours, the further ones are dashed with open markers.
     """
     named = any(line.label for line in lines)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(5.6, 3.1) if named else (3.5, 2.7), layout="constrained")
         axes = figure.subplots()
         for number, line in enumerate(lines):
-            mean, error = zip(*(mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T), strict=True)
-            x, mean, error = np.arange(1, len(mean) + 1), 100 * np.array(mean), 100 * np.array(error)
-            turn, place = divmod(number, len(LINE_COLOURS))
-            colour, look = LINE_COLOURS[place], {"ls": "--", "mfc": "white"} if turn else {}
-            marker = LINE_MARKERS[place % len(LINE_MARKERS)]
+            columns = [mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T]
+            mean, error = 100 * np.array(columns).T
+            x, (turn, place) = np.arange(1, len(mean) + 1), divmod(number, len(LINE_COLOURS))
+            colour, marker = LINE_COLOURS[place], LINE_MARKERS[place % len(LINE_MARKERS)]
+            style: dict[str, Any] = {"ls": "--", "mfc": "white"} if turn else {}
             axes.plot(
-                x, mean, color=colour, marker=marker, ms=3.8, lw=1.4, label=line.label, clip_on=False, **look
+                x, mean, color=colour, marker=marker, ms=3.8, lw=1.4, label=line.label, clip_on=False, **style
             )
             band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
             axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)
@@ -172,14 +186,14 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         axes.set_xlabel("tasks learned")
         axes.set_ylabel("average success (%)")
         axes.grid(axis="y", lw=0.4, alpha=0.3, color=_INK)
-        _clean(axes)
+        _hide_spines(axes)
         if named:
             axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
     return figure
 
 
 def as_svg(figure: Figure) -> str:
-    """The figure as an inline SVG on a clear background, in the page's own font and text colour."""
+    """Return the figure as an inline SVG with transparent background, in the page's font and text colour."""
     buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
@@ -192,7 +206,7 @@ def as_svg(figure: Figure) -> str:
 
 
 def save(figure: Figure, stem: Path) -> None:
-    """Writes `stem`.png (300 dpi) and `stem`.pdf, black on white."""
+    """Write `stem`.png (300 dpi) and `stem`.pdf, black on white."""
     with matplotlib.rc_context(_STYLE):
         FigureCanvasAgg(figure)
         for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
@@ -202,7 +216,7 @@ def save(figure: Figure, stem: Path) -> None:
 
 
 def shorten(text: str, length: int) -> str:
-    """The text, cut at a word with an ellipsis if it is longer than `length`."""
+    """Return the text, shortened at a word with an ellipsis if it is longer than `length` characters."""
     if len(text) <= length:
         return text
     cut = text[: length - 1].rsplit(" ", 1)[0] if " " in text[: length - 1] else text[: length - 1]
@@ -248,6 +262,13 @@ def _draw_curve(axes: Axes, curve: Curve | None) -> None:
     axes.plot(*best, "o", ms=6.5, mfc="none", mec=_INK, mew=0.9, clip_on=False)
 
 
+def _set_epoch_axis(axes: Axes, last: int, labelbottom: bool) -> None:
+    _hide_spines(axes)
+    axes.set_xlim(-0.03 * last, 1.03 * last)
+    axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    axes.tick_params(labelbottom=labelbottom)
+
+
 def _loss_limits(losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]]) -> tuple[float, float]:
     values = np.concatenate([v for _, v in losses.values()]) if losses else np.zeros(0)
     values = values[np.isfinite(values)]
@@ -257,5 +278,5 @@ def _loss_limits(losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float6
     return float(values.min()) - margin, float(values.max()) + margin
 
 
-def _clean(axes: Axes) -> None:
+def _hide_spines(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)

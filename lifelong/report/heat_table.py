@@ -1,4 +1,4 @@
-"""Success matrices as table cells: text, colours, and what a cell says when pointed at."""
+"""Success matrices as table cells with text, colours and tooltips."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from lifelong.results.results import Results
 
 
 def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
-    """Cells of one run's matrix: percent, colours, and Wilson's interval as the text on hover."""
+    """Return the cells of one run's matrix: percent, colours, and Wilson's interval as the tooltip."""
     rates, episodes = results.success_matrix()
     low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
     spread = "{} of {} episodes; 95 % interval {} to {} %"
@@ -27,7 +27,7 @@ def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
 
 
 def mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
-    """Cells of the mean over seeds, its standard error as the text on hover."""
+    """Return the cells of the mean over seeds, with its standard error as the tooltip."""
 
     def spread(i: int, j: int) -> tuple[float, int]:
         values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
@@ -46,29 +46,20 @@ def _grid(
     hint: Callable[[int, int], str],
     detail: Callable[[int, int], str],
 ) -> dict[str, Any]:
-    size = len(rates)
-    rows = []
+    """Return the rows of the table; cells without an evaluation are None."""
+
+    def cell(i: int, j: int) -> dict[str, str] | None:
+        if np.isnan(rates[i, j]):
+            return None
+        back, ink = cell_colours(float(rates[i, j]))
+        text = f"{100 * rates[i, j]:.0f}"
+        where = f"after task {i + 1} ({labels[i]}), on task {j + 1} ({labels[j]}): {text} %"
+        tooltip = f"{where}\n{hint(i, j)}"
+        return {"text": text, "detail": detail(i, j), "hint": tooltip, "back": back, "ink": ink}
+
+    size, rows = len(rates), []
     for i in range(size):
-        cells = []
-        for j in range(size):
-            if np.isnan(rates[i, j]):
-                cells.append(None)
-                continue
-            back, ink = cell_colours(float(rates[i, j]))
-            where = (
-                f"after task {i + 1} ({labels[i]}), on task {j + 1} ({labels[j]}): {100 * rates[i, j]:.0f} %"
-            )
-            text = f"{100 * rates[i, j]:.0f}"
-            cells.append(
-                {
-                    "text": text,
-                    "detail": detail(i, j),
-                    "hint": f"{where}\n{hint(i, j)}",
-                    "back": back,
-                    "ink": ink,
-                }
-            )
         known = rates[i, : i + 1]
         average = f"{100 * known.mean():.0f}" if not np.isnan(known).any() else ""
-        rows.append({"label": labels[i], "cells": cells, "average": average})
+        rows.append({"label": labels[i], "cells": [cell(i, j) for j in range(size)], "average": average})
     return {"rows": rows, "size": size, "title": ""}

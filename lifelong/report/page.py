@@ -1,4 +1,4 @@
-"""One self-contained page about one run, or about several side by side."""
+"""A self-contained report page about one run, or a comparison of several."""
 
 import base64
 import os
@@ -42,22 +42,22 @@ MEDIA_TYPES = {
     ".mp4": "video/mp4",
     ".webm": "video/webm",
 }
-MEDIA_LIMIT = 48 * 2**20  # bytes of rollout pictures in one page
+MEDIA_LIMIT = 48 * 2**20  # [bytes] of rollout recordings in one page
 
 
 def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
-    """Writes report.html, heatmap.png and heatmap.pdf; for several runs also forgetting.png, .pdf, comparison.json.
+    """Write report.html, heatmap.png and heatmap.pdf; for several runs also forgetting.png, .pdf, comparison.json.
 
     Args:
-        run_dirs: One run to describe, or several to compare. Unfinished runs count as far as they are.
-        out: The page, or an existing folder for it. Default: in the run directory; for several runs,
-            in the current folder.
+        run_dirs: Directory of one run to describe, or of several to compare. Runs need not be finished.
+        out: File of the page, or an existing folder for it. Default: the run directory; for several runs, the
+            current folder.
 
     Returns:
-        The page's path. It needs no other file and no network.
+        Path of the page. It needs no other file and no network.
 
     Raises:
-        LifelongError: No run is given, a run directory lacks its results, or `out` cannot be written.
+        LifelongError: No run is given, a run directory has no results, or `out` cannot be written.
     """
     if not run_dirs:
         raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
@@ -67,7 +67,7 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
         out = out / "report.html"
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        context = _single(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
+        context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
         page = _template().render(**context, metric_texts=METRIC_TEXTS)
         atomic_write_text(out, page)
     except OSError as error:
@@ -75,8 +75,8 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
     return out
 
 
-def _single(run: Run, folder: Path) -> dict[str, Any]:
-    """What the template shows of one run; writes the heatmap beside the page."""
+def _single_run(run: Run, folder: Path) -> dict[str, Any]:
+    """Return the template's variables for one run, and write the heatmap beside the page."""
     record, labels = run.record, short_labels(run.record.instructions)
     rates, _ = run.results.success_matrix()
     save(heatmap_figure([Panel(f"{record.algo}, {record.benchmark}", rates, labels)]), folder / "heatmap")
@@ -109,7 +109,7 @@ def _single(run: Run, folder: Path) -> dict[str, Any]:
 
 
 def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
-    """What the template shows of several runs; writes heatmaps, forgetting curves and numbers beside the page."""
+    """Return the template's variables for several runs, and write figures and numbers beside the page."""
     groups = group_runs(runs)
     found = compare(groups)
     write_comparison(found, folder / "comparison.json")
@@ -165,7 +165,7 @@ def _metric_rows(run: Run) -> list[dict[str, Any]]:
 
 
 def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Every metric of a group over its runs, the best of each column marked."""
+    """Return a row of metrics for each group, with the best of each column marked."""
     rows: list[dict[str, Any]] = []
     for group in groups:
         measured = found["groups"][group.label]
@@ -182,7 +182,7 @@ def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str
 
 
 def _forgotten_tasks(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
-    """NBT of every task, a cell for each method; tasks as they come in the first run."""
+    """Return a row for each task with its NBT in each group; tasks in the order of the first run."""
     texts: dict[str, str] = {}
     for run in (run for group in groups for run in group.runs):
         texts |= dict(zip(run.record.tasks, short_labels(run.record.instructions), strict=True))
@@ -195,7 +195,7 @@ def _forgotten_tasks(groups: Sequence[Group], found: dict[str, Any]) -> list[dic
 
 
 def _forgotten_subgoals(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """What is lost of every predicate, a cell for each method."""
+    """Return a row for each predicate with its forgetting in each group."""
     tables = [group["subgoals"] for group in found["groups"].values()]
     names = dict.fromkeys(name for table in tables for name in table)
     return [{"label": name, "cells": [table.get(name) for table in tables]} for name in names]
@@ -236,8 +236,10 @@ def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
 
 
 def _media(folder: Path) -> dict[str, Any]:
-    """Rollout pictures as data URLs; a text file of the same stem is the caption."""
-    items, left_out, used = [], [], 0
+    """Return the images and videos of a folder as data URLs, with captions from text files of the same stem."""
+    items: list[dict[str, Any]] = []
+    left_out: list[str] = []
+    used = 0
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         kind = MEDIA_TYPES.get(path.suffix.lower())
         if kind is None:
@@ -256,7 +258,7 @@ def _media(folder: Path) -> dict[str, Any]:
 
 
 def _percent(value: float | None, digits: int = 1) -> str:
-    """A share as percent with a true minus sign; a dash where it is undefined."""
+    """Format a share as percent with a typographic minus sign; a dash where it is undefined."""
     if value is None or np.isnan(value):
         return "–"
     text = f"{100 * value:.{digits}f}"

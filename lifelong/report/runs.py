@@ -1,4 +1,4 @@
-"""Run directories read back: one run as far as it went, or groups of runs that differ in seed and order."""
+"""Loading of run directories: single runs, finished or not, and groups that differ in seed and order only."""
 
 import os
 import re
@@ -22,7 +22,18 @@ _COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark",
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory as far as it could be read."""
+    """A run, as far as it could be read.
+
+    Attributes:
+        path: Directory of the run.
+        results: Its recorded results.
+        record: Record that names the run.
+        config: Its configuration; empty if it cannot be read.
+        config_text: The configuration as text.
+        notes: Remarks for the reader, such as that the run is not finished.
+        learned: Number of tasks learned.
+        metrics: Metrics over these; None before the first task is learned.
+    """
 
     path: Path
     results: Results
@@ -31,19 +42,19 @@ class Run:
     config_text: str
     notes: tuple[str, ...]
     learned: int
-    metrics: Metrics | None  # None before the first task is learned
+    metrics: Metrics | None
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in nothing but their seed and the order of their tasks."""
+    """Runs that differ only in their seed and the order of their tasks."""
 
     label: str
     runs: tuple[Run, ...]
 
     @property
     def labels(self) -> list[str]:
-        """Short names of the positions in the sequence: the tasks there, or numbers if they differ."""
+        """Short names of the positions in the sequence: those of the tasks, or numbers if the orders differ."""
         first = self.runs[0].record
         if all(r.record.tasks == first.tasks for r in self.runs):
             return short_labels(first.instructions)
@@ -51,14 +62,18 @@ class Group:
 
 
 def load_run(path: Path) -> Run:
-    """Reads a run directory. Raises: LifelongError naming what is missing."""
+    """Read a run directory.
+
+    Raises:
+        LifelongError: The directory or its results are missing or cannot be read.
+    """
     if not path.is_dir():
         raise LifelongError(f"{path}: no such run directory")
     log = path / "results.jsonl"
     if not log.is_file():
         present = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
         raise LifelongError(
-            f"{path}: results.jsonl is missing, so this is no run directory (it has: {present})"
+            f"{path}: results.jsonl is missing, so this is not a run directory (it contains: {present})"
         )
     results = ResultLog(log).read()
     try:
@@ -75,7 +90,7 @@ def load_run(path: Path) -> Run:
 
 
 def short_labels(instructions: Sequence[str]) -> list[str]:
-    """Instructions without the words that all of them begin and end with; whole if nothing would be left."""
+    """Return the instructions without their common first and last words, or whole if nothing would remain."""
     words = [text.split() for text in instructions]
     start = len(os.path.commonprefix(words)) if len(words) > 1 else 0
     end = len(os.path.commonprefix([w[::-1] for w in words])) if len(words) > 1 else 0
@@ -85,7 +100,7 @@ def short_labels(instructions: Sequence[str]) -> list[str]:
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
-    """Runs that differ only in seed and order of tasks together, as they come; labels name what differs."""
+    """Group runs that differ only in seed and order of tasks; the labels name what differs between groups."""
     groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
     for run in runs:
         groups.setdefault(_identity(run), []).append(run)
@@ -97,7 +112,7 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
 
 
 def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
-    """The algorithm's name and what else tells it apart; settings count among runs of one algorithm."""
+    """Return the algorithm's name and what else distinguishes the group; settings only within one algorithm."""
     rivals = [o for o in others if o["algo"] == identity["algo"]]
     differs = {
         k: v
@@ -114,10 +129,10 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
     record = run.record
     basic = {n: getattr(record, n) for n in _BASICS}
     flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
-    passed = ("seed", "_target_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
-    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(passed)}
-    if begun_from := run.config.get("init_from"):  # each seed may begin from a run of its own
-        flat["init_from"] = re.sub(r"seed\d+", "seed", str(begun_from))
+    ignored = ("seed", "_target_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
+    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(ignored)}
+    if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
+        flat["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
     return tuple((basic | dict(sorted(flat.items()))).items())
 
 

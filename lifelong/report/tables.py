@@ -1,4 +1,4 @@
-"""Rows of a report's tables about costs and about parts of the goals."""
+"""Rows of a report's tables of costs and subgoals."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from lifelong.results.subgoals import AtomRates, Subgoals
 
 
 def duration(seconds: float) -> str:
-    """Seconds for people: 0.4 s, 42 s, 3 min 20 s, 2 h 05 min."""
+    """Format seconds for readers: 0.4 s, 42 s, 3 min 20 s, 2 h 05 min."""
     if seconds < 1:
         return f"{seconds:.1g} s" if seconds else "0 s"
     seconds = round(seconds)
@@ -24,7 +24,7 @@ def duration(seconds: float) -> str:
 
 
 def quantity(value: float, unit: str = "") -> str:
-    """A number of three digits with its SI prefix: 5.38 M, 1.20 TFLOP, 512 B."""
+    """Format a number with three digits and its SI prefix: 5.38 M, 1.20 TFLOP, 512 B."""
     for power, prefix in ((12, "T"), (9, "G"), (6, "M"), (3, "k")):
         if value >= 10**power:
             digits = f"{value / 10**power:#.3g}".rstrip(".")
@@ -34,7 +34,14 @@ def quantity(value: float, unit: str = "") -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table of costs."""
+    """A column of the table of costs.
+
+    Attributes:
+        name: Name of the cost, as in `lifelong.training.costs`.
+        head: Head of the column.
+        title: Tooltip of the head.
+        text: Function that formats a value.
+    """
 
     name: str
     head: str
@@ -71,7 +78,7 @@ COST_COLUMNS = (
 
 
 def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any] | None:
-    """Labelled rows of costs under the columns that any of them fills; None without any."""
+    """Return labelled rows of costs, with the columns that any row has; None if there are none."""
     columns = [c for c in COST_COLUMNS if any(c.name in costs for _, costs in rows)]
     if not columns:
         return None
@@ -84,7 +91,7 @@ def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any
 
 
 def task_costs(run: Run, labels: Sequence[str]) -> dict[str, Any] | None:
-    """The costs of every task of a run, and of a task on average."""
+    """Return the costs of every task of a run, and their average."""
     results = run.results
     recorded = [task for task in range(len(labels)) if results.costs(task)]
     rows = [
@@ -98,7 +105,7 @@ def task_costs(run: Run, labels: Sequence[str]) -> dict[str, Any] | None:
 
 
 def atom_rows(found: Subgoals, labels: Sequence[str]) -> list[dict[str, Any]]:
-    """A row for each atom of each task; the task is named at its first."""
+    """Return a row for each atom of each task; the first of a task has the task's label."""
     rows: list[dict[str, Any]] = []
     for atom in found.atoms:
         first = not rows or rows[-1]["atom"].task != atom.task
@@ -108,7 +115,7 @@ def atom_rows(found: Subgoals, labels: Sequence[str]) -> list[dict[str, Any]]:
     return rows
 
 
-def most_forgotten(atoms: Iterable[AtomRates], least: float = 0.005) -> list[AtomRates]:
-    """The atoms that lost most, worst first: at most three, and none that lost nothing."""
-    lost = [a for a in atoms if a.forgotten > least and a.at_start < 1]
+def most_forgotten(atoms: Iterable[AtomRates], threshold: float = 0.005) -> list[AtomRates]:
+    """Return the atoms that were forgotten most, worst first: at most three, above the given threshold."""
+    lost = [a for a in atoms if a.forgotten > threshold and a.at_start < 1]
     return sorted(lost, key=lambda a: -a.forgotten)[:3]

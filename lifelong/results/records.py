@@ -1,4 +1,4 @@
-"""The records of a run: frozen values, one JSON line each. Tasks are positions in the sequence."""
+"""Records of a run: frozen values, one JSON line each. Tasks are positions in the sequence."""
 
 import hashlib
 import json
@@ -36,7 +36,7 @@ class RunRecord:
     seed: int
     preset: str
     tasks: tuple[str, ...]  # names, in learning order
-    instructions: tuple[str, ...]  # what the policy is told, in the same order
+    instructions: tuple[str, ...]  # of the tasks, in the same order
     config_digest: str
     versions: Mapping[str, str]
     commit: str | None
@@ -64,9 +64,9 @@ class LossRecord:
 class EvalRecord:
     """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
 
-    The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). Which of
-    the goal's atoms held before the policy acted, at any time from then on, and at the end is said for each
-    episode; older records do not say it.
+    The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). For each
+    episode the record states which atoms of the goal held before the policy acted, at any time from then on, and at
+    the end; older records do not.
     """
 
     kind: Literal["eval"] = field(default="eval", init=False)
@@ -74,11 +74,11 @@ class EvalRecord:
     learned: int
     epoch: int
     task: int
-    successes: tuple[bool, ...]  # one for each episode
-    lengths: tuple[int, ...]  # control steps
+    successes: tuple[bool, ...]  # one per episode
+    lengths: tuple[int, ...]  # [control steps]
     init_states: tuple[int, ...]
     seconds: float
-    atoms: tuple[str, ...] = ()  # the parts of the goal: (On plate_1 stove_1)
+    atoms: tuple[str, ...] = ()  # of the goal, such as (On plate_1 stove_1)
     atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
@@ -88,19 +88,19 @@ class EvalRecord:
             raise ValueError(f"phase of an evaluation is 'curve' or 'matrix', not {self.phase!r}")
         if not len(self.successes) == len(self.lengths) == len(self.init_states) > 0:
             raise ValueError(
-                "an evaluation has as many successes as lengths and initial states, at least one; got "
+                "an evaluation needs equal numbers of successes, lengths and initial states, at least one; got "
                 f"{len(self.successes)}, {len(self.lengths)} and {len(self.init_states)}"
             )
         for name in ("atoms_at_start", "atoms_ever", "atoms_at_end"):
             shape = [len(row) for row in getattr(self, name)]
             if self.atoms and shape != [len(self.atoms)] * len(self.successes):
                 raise ValueError(
-                    f"{name} of an evaluation has a row for each episode, a column for each atom"
+                    f"{name} of an evaluation needs a row for each episode and a column for each atom"
                 )
 
     @property
     def rate(self) -> float:
-        """Share of the episodes that succeeded."""
+        """Success rate of the episodes."""
         return sum(self.successes) / len(self.successes)
 
 
@@ -115,9 +115,9 @@ class PhaseRecord:
 
 @dataclass(frozen=True)
 class CostRecord:
-    """What learning a task took beside the time of its epochs and evaluations; names as in `lifelong.training.costs`.
+    """Costs of learning a task besides the time of its epochs and evaluations, named as in `lifelong.training.costs`.
 
-    A task may have several, each with some of the costs.
+    A task may have several such records, each with some of the costs.
     """
 
     kind: Literal["cost"] = field(default="cost", init=False)
@@ -127,7 +127,7 @@ class CostRecord:
 
 @dataclass(frozen=True)
 class TaskEndRecord:
-    """A task is learned and its row of the matrix complete."""
+    """The end of a task: it is learned, and its row of the success matrix is complete."""
 
     kind: Literal["task_end"] = field(default="task_end", init=False)
     task: int
@@ -137,7 +137,7 @@ class TaskEndRecord:
 
 @dataclass(frozen=True)
 class RunEndRecord:
-    """The whole sequence is learned."""
+    """The end of the run: the whole sequence is learned."""
 
     kind: Literal["run_end"] = field(default="run_end", init=False)
     seconds: float
@@ -145,9 +145,14 @@ class RunEndRecord:
 
 
 Record = RunRecord | LossRecord | EvalRecord | PhaseRecord | CostRecord | TaskEndRecord | RunEndRecord
-RECORD_TYPES: Mapping[str, type] = {
-    t.__dataclass_fields__["kind"].default: t
-    for t in (RunRecord, LossRecord, EvalRecord, PhaseRecord, CostRecord, TaskEndRecord, RunEndRecord)
+RECORD_TYPES: Mapping[str, type[Record]] = {
+    "run": RunRecord,
+    "loss": LossRecord,
+    "eval": EvalRecord,
+    "phase": PhaseRecord,
+    "cost": CostRecord,
+    "task_end": TaskEndRecord,
+    "run_end": RunEndRecord,
 }
 
 
@@ -163,13 +168,18 @@ def start_record(
     config: str,
     group_size: int = 1,
 ) -> RunRecord:
-    """The record of a start, now and on this machine.
+    """Return the record of a run that starts now, on this machine.
 
     Args:
-        tasks: Names in learning order.
-        instructions: What the policy is told, in the same order.
-        config: The resolved configuration as text; its SHA-256 is kept.
-        group_size: Tasks learned together.
+        algo: Name of the algorithm's configuration.
+        benchmark: Name of the benchmark's configuration.
+        policy: Name of the policy's configuration.
+        seed: Seed of the run.
+        preset: Name of the preset.
+        tasks: Names of the tasks in learning order.
+        instructions: Instructions of the tasks, in the same order.
+        config: Resolved configuration as text, of which the SHA-256 is recorded.
+        group_size: Number of tasks learned together.
     """
     return RunRecord(
         algo=algo,
@@ -189,12 +199,12 @@ def start_record(
 
 
 def utc_now() -> str:
-    """The time as ISO 8601 with seconds, UTC."""
+    """Return the time as ISO 8601 with seconds, UTC."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of Python, this package and what a result depends on; `models` says whose objects were simulated."""
+    """Return the versions of Python and of the packages results depend on; `models` names the pack of objects."""
     from libero_env.assets.pack import select_pack
 
     versions = {"python": ".".join(map(str, sys.version_info[:3]))}
@@ -207,7 +217,7 @@ def installed_versions() -> dict[str, str]:
 
 
 def source_commit() -> str | None:
-    """The git commit of this source tree, with "+changes" if it was edited; None outside a checkout."""
+    """Return the git commit of this source tree, with "+changes" if it was edited; None outside a checkout."""
     if not (_SOURCE / ".git").exists():
         return None
     try:
@@ -218,7 +228,7 @@ def source_commit() -> str | None:
 
 
 def to_line(record: Record) -> bytes:
-    """One line of strict JSON with its newline; numbers that are not finite become null."""
+    """Return a record as one line of strict JSON with its newline; numbers that are not finite become null."""
     values = {
         k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(record).items()
     }
@@ -226,16 +236,16 @@ def to_line(record: Record) -> bytes:
 
 
 def from_line(line: bytes) -> Record:
-    """The record on a line.
+    """Parse a line of the file.
 
     Raises:
-        ValueError: Not a record; says which key is wrong and what was expected.
+        ValueError: The line is not a record; the message names the wrong key and what was expected.
     """
     try:
         values = json.loads(line)
     except ValueError as error:
         raise ValueError(f"not JSON ({error})") from error
-    kind = values.pop("kind", None) if isinstance(values, dict) else None
+    kind: Any = values.pop("kind", None) if isinstance(values, dict) else None
     if kind not in RECORD_TYPES:
         raise ValueError(f"unknown kind of record {kind!r}; valid: {', '.join(RECORD_TYPES)}")
     known = [f for f in fields(RECORD_TYPES[kind]) if f.init]
@@ -256,20 +266,20 @@ def _git(*args: str) -> str:
     return done.stdout.strip()
 
 
-def _checked(kind: str, key: str, value: Any, wanted: Any) -> Any:
-    """The value as the field's type wants it: lists become tuples, null among floats becomes NaN."""
-    origin = get_origin(wanted)
-    if wanted is float and value is None:
+def _checked(kind: str, key: str, value: Any, expected: Any) -> Any:
+    """Return the value in its field's type: lists become tuples, null among floats becomes NaN."""
+    origin = get_origin(expected)
+    if expected is float and value is None:
         return math.nan
     if origin is tuple and isinstance(value, list):
-        return tuple(_checked(kind, key, v, get_args(wanted)[0]) for v in value)
+        return tuple(_checked(kind, key, v, get_args(expected)[0]) for v in value)
     if origin is Literal:
-        valid = value in get_args(wanted)
+        valid = value in get_args(expected)
     elif origin is Mapping:
         valid = isinstance(value, dict)
     else:
-        accepted = (int, float) if wanted is float else wanted
-        valid = isinstance(value, accepted) and (wanted is bool or not isinstance(value, bool))
+        accepted = (int, float) if expected is float else expected
+        valid = isinstance(value, accepted) and (expected is bool or not isinstance(value, bool))
     if origin is tuple or not valid:
-        raise ValueError(f"{key!r} of a {kind!r} record should be {wanted}, not {value!r}")
+        raise ValueError(f"{key!r} of a {kind!r} record should be {expected}, not {value!r}")
     return value

@@ -1,7 +1,7 @@
-"""Which parts of the goals were learned, and which of them forgotten.
+"""Subgoals: which atoms of the goals were learned, and which were forgotten.
 
-A goal is a conjunction of atoms, such as (Turnon stove_1) and (On pot_1 stove_1_cook_region). An episode that fails
-may have reached some of them. What held before the policy acted is no achievement and does not count.
+A goal is a conjunction of atoms, such as (Turnon stove_1) and (On pot_1 stove_1_cook_region). A failed episode may have
+reached some of them. Atoms that held before the policy acted do not count.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,14 +16,16 @@ from lifelong.results.records import EvalRecord
 
 @dataclass(frozen=True)
 class AtomRates:
-    """How often one part of a task's goal was reached; shares of the episodes.
+    """How often one atom of a task's goal held, as shares of the episodes.
 
     Attributes:
         task: Position in the sequence.
-        atom: As in the task file.
-        at_start: How often it held before the policy acted.
-        learned_ever, learned_end: How often it held at any time, and at the end, right after learning the task.
-        final_ever, final_end: The same after the last task learned.
+        atom: Atom as in the task file.
+        at_start: Share in which it held before the policy acted.
+        learned_ever: Share in which it held at any time, right after learning the task.
+        learned_end: Share in which it held at the end, right after learning the task.
+        final_ever: Share in which it held at any time, after the last task learned.
+        final_end: Share in which it held at the end, after the last task learned.
     """
 
     task: int
@@ -36,20 +38,20 @@ class AtomRates:
 
     @property
     def forgotten(self) -> float:
-        """The drop from just learned to last, of having been reached at any time."""
+        """Drop of `learned_ever` to `final_ever`."""
         return self.learned_ever - self.final_ever
 
 
 @dataclass(frozen=True)
 class PredicateRates:
-    """How often atoms with a predicate were reached at any time, averaged over the tasks that ask for it.
+    """How often atoms with a predicate were reached at any time: means over the tasks whose goals contain it.
 
     Attributes:
-        predicate: Such as In.
+        predicate: Name of the predicate, such as In.
         tasks: Positions of the tasks.
-        learned: Right after learning each of the tasks.
-        final: After the last task learned.
-        forgotten: Learned less final; NaN where no task was followed by another.
+        learned: Rate right after learning each of the tasks.
+        final: Rate after the last task learned.
+        forgotten: Learned minus final; NaN where no task was followed by another.
     """
 
     predicate: str
@@ -61,22 +63,22 @@ class PredicateRates:
 
 @dataclass(frozen=True)
 class Subgoals:
-    """The parts of the goals of a run; both empty where its records do not tell of them."""
+    """The subgoals of a run; empty where its records have no atoms."""
 
     atoms: tuple[AtomRates, ...] = ()
     predicates: tuple[PredicateRates, ...] = ()
 
 
 def predicate_of(atom: str) -> str:
-    """`(In milk_1 basket_1_contain_region)` -> `In`."""
+    """Return the predicate of an atom: In of (In milk_1 basket_1_contain_region)."""
     return atom.strip("() ").split(" ", 1)[0]
 
 
 def subgoals(evaluations: Iterable[EvalRecord], tasks: int) -> Subgoals:
-    """What became of the atoms of the first so many tasks.
+    """Return how often the atoms of the learned tasks were reached.
 
     Args:
-        evaluations: Records of a run; those of learning curves are passed over. Of equal keys the last one counts.
+        evaluations: Records of a run; those of learning curves are ignored. Of equal keys the last one counts.
         tasks: Number of tasks learned.
     """
     cells = {
@@ -111,11 +113,11 @@ def _predicates(pairs: Sequence[tuple[EvalRecord, EvalRecord]]) -> list[Predicat
             shares = [_shares(record, name) for record in (learned, final)]
             if all(len(s) for s in shares):
                 counted.append((learned, final, shares))
-        if not counted:  # it held from the start wherever it is asked for
+        if not counted:  # it held from the start in all goals that contain it
             continue
         same = all(learned.learned == final.learned for learned, final, _ in counted)
         first, last = ([shares[i] for *_, shares in counted] for i in (0, 1))
-        # A task that nothing follows has one evaluation only: it is no difference of two.
+        # A task that is not followed by another has one evaluation only, so no difference.
         drops = [s for learned, final, s in counted if learned.learned != final.learned]
         forgotten = _mean([s[0] for s in drops], [s[1] for s in drops], over=len(counted))
         found.append(
@@ -131,21 +133,21 @@ def _predicates(pairs: Sequence[tuple[EvalRecord, EvalRecord]]) -> list[Predicat
 
 
 def _shares(record: EvalRecord, predicate: str) -> NDArray[np.float64]:
-    """Of each episode the share of the predicate's atoms that were reached; those it began with do not count."""
-    mine = [i for i, atom in enumerate(record.atoms) if predicate_of(atom) == predicate]
-    open_ = ~np.asarray(record.atoms_at_start, bool)[:, mine]
-    reached = np.asarray(record.atoms_ever, bool)[:, mine] & open_
-    asked = open_.sum(1)
-    return reached.sum(1)[asked > 0] / asked[asked > 0]
+    """Return each episode's share of the predicate's atoms that were reached, except those that held at its start."""
+    columns = [i for i, atom in enumerate(record.atoms) if predicate_of(atom) == predicate]
+    unmet = ~np.asarray(record.atoms_at_start, bool)[:, columns]
+    reached = np.asarray(record.atoms_ever, bool)[:, columns] & unmet
+    count = unmet.sum(1)
+    return reached.sum(1)[count > 0] / count[count > 0]
 
 
 def _mean(
     plus: Sequence[NDArray[np.float64]], minus: Sequence[NDArray[np.float64]] = (), over: int | None = None
 ) -> Estimate:
-    """Mean over tasks, or mean difference, with the interval of `combine_intervals`.
+    """Return the mean over tasks, or the mean difference, with the interval of `combine_intervals`.
 
-    Atoms of one episode are not independent, so an episode counts once, with the share of them it reached;
-    Wilson's interval is wide enough for that, as no share in [0, 1] varies more than a success of its mean.
+    Atoms of one episode are not independent, so an episode counts once, with the share that it reached;
+    Wilson's interval is wide enough for that, as no share in [0, 1] varies more than a success rate of its mean.
     """
     cells, count = [*plus, *minus], over or len(plus)
     rates, episodes = np.array([c.mean() for c in cells]), np.array([len(c) for c in cells])

@@ -1,4 +1,4 @@
-"""`results.json`: the matrix, curves, metrics and times of a run."""
+"""`results.json`: the success matrix, learning curves, metrics and times of a run."""
 
 import json
 import math
@@ -17,19 +17,19 @@ from lifelong.results.results import Results
 
 
 def write_summary(path: Path | str, results: Results, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Writes `results.json`: matrix, curves, metrics with intervals, config, versions and wall times.
+    """Write `results.json`: matrix, curves, metrics with intervals, configuration, versions and wall times.
 
     The file is replaced in one step, so a reader never sees half of it.
 
     Args:
-        path: Usually `run_dir/results.json`.
-        results: What is recorded so far; an unfinished run is summed up as far as it is.
-        config: The resolved configuration as plain data.
+        path: File to write, usually `run_dir/results.json`.
+        results: Results so far; a run need not be finished.
+        config: Resolved configuration as plain data.
 
     Returns:
-        What was written. Rates are in [0, 1]; NaN is null.
+        The content of the file. Rates are in [0, 1]; NaN is null.
     """
-    summary = plain(summarize(results) | {"config": dict(config)})
+    summary = json_safe(summarize(results) | {"config": dict(config)})
     path = Path(path)
     try:
         atomic_write_text(
@@ -43,7 +43,7 @@ def write_summary(path: Path | str, results: Results, config: Mapping[str, Any])
 
 
 def summarize(results: Results) -> dict[str, Any]:
-    """The summary as plain data: who ran, what succeeded, the metrics, the times."""
+    """Return the summary as plain data: the run, its success, metrics, costs and times."""
     run, size = results.run, results.learned_tasks()
     rates, episodes = results.success_matrix()
     low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
@@ -88,10 +88,10 @@ def _metrics(results: Results, diagonal: Literal["matrix", "curve"]) -> dict[str
     return {name: asdict(getattr(found, name)) for name in METRIC_NAMES} | {"by_task": by_task}
 
 
-def plain(value: Any) -> Any:
-    """The same data with None for numbers that are not finite: JSON has no NaN."""
+def json_safe(value: Any) -> Any:
+    """Return the same data with None for numbers that are not finite, as JSON has no NaN."""
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): json_safe(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
+        return [json_safe(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

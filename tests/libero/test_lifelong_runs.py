@@ -192,9 +192,9 @@ def acting(folder, tmp_path_factory):
 
 def test_success_is_measured_from_the_first_states(acting, monkeypatch):
     algo, cfg, suite = acting
-    begun, real = [], metric.play
+    begun, real = [], metric.run_episodes
     monkeypatch.setattr(
-        metric, "play", lambda a, e, rows, **k: begun.append(list(rows)) or real(a, e, rows, **k)
+        metric, "run_episodes", lambda a, e, rows, **k: begun.append(list(rows)) or real(a, e, rows, **k)
     )
     rate = metric.evaluate_one_task_success(cfg, algo, suite.get_task(1), suite.get_task_emb(1), 1)
     assert (rate, begun) == (0.0, [[0, 1], [2]])

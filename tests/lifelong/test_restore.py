@@ -97,18 +97,18 @@ def test_instructions_are_embedded_as_in_the_run(tmp_path):
     tasks, *_ = make_run(tmp_path / "run", "language=onehot")
     found = restore(tmp_path / "run")
     assert found.embed(tasks[1]).tolist() == [0.0, 1.0]
-    with pytest.raises(LifelongError, match="none of its own"):
+    with pytest.raises(LifelongError, match="not one of its tasks"):
         found.embed(get_task("libero_goal/1"))
 
 
 def test_what_is_no_run_is_named(tmp_path):
-    with pytest.raises(LifelongError, match="no run's directory"):
+    with pytest.raises(LifelongError, match="no run directory"):
         restore(tmp_path)
     make_run(tmp_path / "run")
-    with pytest.raises(LifelongError, match=r"no checkpoint after task 5; there are those after \[0, 1\]"):
+    with pytest.raises(LifelongError, match=r"no checkpoint after task 5; valid: \[0, 1\]"):
         restore(tmp_path / "run", after=5)
     (tmp_path / "run" / "config.yaml").unlink()
-    with pytest.raises(LifelongError, match="read with its run's configuration"):
+    with pytest.raises(LifelongError, match="needs the configuration of its run"):
         restore(tmp_path / "run" / "checkpoints" / "task_0.safetensors")
 
 

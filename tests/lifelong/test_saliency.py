@@ -84,7 +84,7 @@ def test_a_blurred_place_is_half_the_squared_difference_of_actions():
 
 def test_what_cannot_be_looked_at_is_refused():
     policy = OnePatch(SPEC)
-    with pytest.raises(ConfigError, match="one window; the batch has 2"):
+    with pytest.raises(ConfigError, match="one window; this one has 2"):
         saliency(policy, fake_batch(SPEC, 2, generator(0)))
     with pytest.raises(ConfigError, match="valid: action, loss"):
         saliency(policy, window(), measure="logits")

@@ -14,7 +14,7 @@ from lifelong.cli import main as cli
 from lifelong.cli.evaluate import load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
-from lifelong.evaluation.suite import PROTOCOLS, Protocol, SuiteEvaluation, overall, starts
+from lifelong.evaluation.suite import PROTOCOLS, EvalProtocol, SuiteEvaluation, choose_init_states, overall
 from lifelong.results.metrics import wilson_interval
 
 pytestmark = pytest.mark.unit
@@ -76,10 +76,10 @@ class Countdown:
 
 class Still:
     def __init__(self):
-        self.told = []
+        self.instructions = []
 
     def predict(self, observations):
-        self.told.append(observations["instruction"])
+        self.instructions.append(observations["instruction"])
         return np.zeros((len(observations["x"]), 7))
 
 
@@ -91,10 +91,10 @@ def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
         yield CallableActor(policy, task.language, views=())
 
     arguments = {
-        "what": {"policy": "still"},
+        "identity": {"policy": "still"},
         "tasks": TASKS,
         "init_states": (3, 4, 9, 20),
-        "protocol": Protocol(horizon=10, settle_steps=0),
+        "protocol": EvalProtocol(horizon=10, settle_steps=0),
         "env": lambda task: Countdown(4),
         "versions": {"mujoco": "3"},
     }
@@ -108,7 +108,7 @@ def test_success_with_its_interval_in_all_and_by_task(tmp_path):
     assert results[0].lengths == (3, 4, 9, 10) and results[0].steps == pytest.approx(16 / 3)
     low, high = wilson_interval(3, 4)
     assert (results[0].success.low, results[0].success.high) == (low, high)
-    assert set(policy.told) == {t.language for t in TASKS}
+    assert set(policy.instructions) == {t.language for t in TASKS}
     found = json.loads((tmp_path / "eval.json").read_text())
     assert found["success"]["value"] == 0.75
     both = overall(results)
@@ -130,8 +130,8 @@ def test_what_is_done_is_not_done_again(tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"what": {"policy": "moving"}},
-        {"protocol": Protocol(horizon=11, settle_steps=0)},
+        {"identity": {"policy": "moving"}},
+        {"protocol": EvalProtocol(horizon=11, settle_steps=0)},
         {"init_states": (3, 4, 9, 21)},
         {"versions": {"mujoco": "4"}},
     ],
@@ -144,14 +144,16 @@ def test_results_of_something_else_are_not_mixed_in(tmp_path, changes):
 
 
 def test_selection_and_reporting_are_apart():
-    chosen, reported = (starts(which, None, range(15)) for which in ("selection", "reporting"))
-    assert set(chosen).isdisjoint(reported) and set(chosen) | set(reported) == set(starts("all", None))
-    assert len(chosen) == 15 and starts("reporting", 4, range(15)) == (15, 16, 17, 18)
-    assert starts("reporting", 2) == (0, 1) and len(starts("selection", None)) == 20
+    chosen, reported = (choose_init_states(which, None, range(15)) for which in ("selection", "reporting"))
+    assert set(chosen).isdisjoint(reported) and set(chosen) | set(reported) == set(
+        choose_init_states("all", None)
+    )
+    assert len(chosen) == 15 and choose_init_states("reporting", 4, range(15)) == (15, 16, 17, 18)
+    assert choose_init_states("reporting", 2) == (0, 1) and len(choose_init_states("selection", None)) == 20
     with pytest.raises(ConfigError, match="1 to 15"):
-        starts("selection", 16, range(15))
+        choose_init_states("selection", 16, range(15))
     with pytest.raises(ConfigError, match="valid: all, selection, reporting"):
-        starts("test", None)
+        choose_init_states("test", None)
 
 
 def test_protocols_know_every_suite():
@@ -220,9 +222,9 @@ def test_from_the_command_line_with_a_policy_of_ones_own(module, tmp_path, capsy
 
 def test_what_cannot_be_evaluated_is_told_in_one_line(module, tmp_path, capsys):
     for argv, said in (
-        ([f"{module}:make"], "which tasks?"),
+        ([f"{module}:make"], "no tasks are given"),
         ([f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"], "Valid: libero, openpi"),
-        ([str(tmp_path / "no_run")], "no run's directory"),
+        ([str(tmp_path / "no_run")], "no run directory"),
     ):
         assert cli.main(["eval", *argv]) == 2
         err = capsys.readouterr().err
