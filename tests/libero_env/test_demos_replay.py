@@ -48,7 +48,7 @@ def test_fixtures_are_recorded_where_they_stood(path):
         np.testing.assert_allclose(fixture_poses(rounded, scene, ""), pose, atol=1e-5)
     bare = replace(episodes[0], fixtures=None, attrs={})
     np.testing.assert_array_equal(fixture_poses(bare, scene, ""), scene.fixture_poses)
-    with pytest.raises(DemoError, match="no XML"):
+    with pytest.raises(DemoError, match="not XML"):
         fixture_poses(replace(bare, attrs={"model_file": "<mujoco"}), scene, "x")
     with pytest.raises(DemoError, match="no body"):
         fixture_poses(replace(bare, attrs={"model_file": "<mujoco/>"}), scene, "x")
