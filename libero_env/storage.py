@@ -3,12 +3,13 @@
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 PART_SUFFIX = ".part"  # of files and folders that are not yet complete
@@ -53,6 +54,12 @@ def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:
     """Write a UTF-8 text file in one step; see `atomic_path`."""
     with atomic_path(target, fsync=fsync) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def atomic_write_npz(target: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a compressed npz file in one step; see `atomic_path`."""
+    with atomic_path(target) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 @contextmanager

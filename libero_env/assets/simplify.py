@@ -11,7 +11,7 @@ import numpy as np
 from libero_env.errors import LiberoError
 from libero_env.geometry import quat_to_mat
 from libero_env.paths import cache_dir
-from libero_env.storage import atomic_path
+from libero_env.storage import atomic_write_npz
 
 _CACHE_VERSION = 3  # in the digests of `lod-*.npz`
 _MERGE_CACHE_VERSION = 2  # in the digests of `merge_and_simplify`
@@ -74,7 +74,7 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
     else:
         whole = _load(file, scale)
         arrays = whole if len(whole[1]) <= faces else decimate(*whole, faces)
-        _store(path, arrays)
+        atomic_write_npz(path, {f"a{i}": array for i, array in enumerate(arrays)})
     return arrays if len(arrays[1]) else None
 
 
@@ -106,8 +106,7 @@ def _merged(
             return [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(groups))]
     meshes = [_merge(sources, faces) for sources in groups]
     arrays = {k: a for i, (v, f) in enumerate(meshes) for k, a in ((f"v{i}", v), (f"f{i}", f))}
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
+    atomic_write_npz(path, arrays)
     return meshes
 
 
@@ -127,12 +126,6 @@ def _merge(sources: tuple[MeshSource, ...], faces: int) -> tuple[np.ndarray, np.
     whole.update_faces(whole.nondegenerate_faces())
     whole.remove_unreferenced_vertices()
     return np.asarray(whole.vertices, np.float64), np.asarray(whole.faces, np.int32)
-
-
-def _store(path: Path, arrays: Arrays) -> None:
-    vertices, triangles, texcoords, indices = arrays
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, a0=vertices, a1=triangles, a2=texcoords, a3=indices)
 
 
 def _load(file: str, scale: tuple[float, ...]) -> Arrays:

@@ -105,7 +105,8 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         options = options or {}
         check_options(options, valid=("init_state", "reset_mask"))
         request = ResetRequest.from_arguments(self.num_envs, seed, options)
-        ids = request.ids
+        if not (ids := request.ids).size:
+            return self._observe(ids), self._info()
         for i in ids:
             if (new_seed := request.seeds[i]) is not None:
                 self._generators[i] = np.random.Generator(np.random.PCG64(new_seed))

@@ -1,11 +1,10 @@
 """The fixed initial states of each task: complete, settled, and valid for the model that they were made for."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +17,7 @@ from libero_env.parallel import spawn_pool
 from libero_env.paths import cache_dir
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
-from libero_env.storage import atomic_path
+from libero_env.storage import atomic_write_npz
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50
@@ -79,7 +78,7 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
         with np.load(path, allow_pickle=False) as stored:
             return stored["states"]
     states = generate_init_states(task, scene)
-    _write(path, {"states": states})
+    atomic_write_npz(path, {"states": states})
     return states
 
 
@@ -110,7 +109,7 @@ def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
         generated = zip(tasks, pool.map(_generate, tasks), strict=True)
         for task, (states, digest) in tqdm(generated, unit="task", desc="initial states", total=len(tasks)):
             arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
-    _write(path, arrays)
+    atomic_write_npz(path, arrays)
 
 
 def _generate(task: Task) -> tuple[np.ndarray, str]:
@@ -147,9 +146,3 @@ def _packaged(suite: str) -> dict[str, tuple[str, np.ndarray]]:
     with np.load(path, allow_pickle=False) as stored:
         names = [name for name in stored.files if not name.endswith(".digest")]
         return {name: (str(stored[f"{name}.digest"]), stored[name]) for name in names}
-
-
-def _write(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays to an npz file in one step."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)

@@ -172,6 +172,16 @@ def test_finished_simulations_do_not_move_until_reset():
     batch.close()
 
 
+def test_a_reset_of_no_simulation_changes_nothing():
+    batch = BatchEnv(TASK, 2, cameras=())
+    batch.reset(seed=0)
+    before = batch.get_state(0), batch.get_state(1)
+    for start in ({}, {"init_state": 0}):
+        batch.reset(options={"reset_mask": [False, False], **start})
+    np.testing.assert_array_equal((batch.get_state(0), batch.get_state(1)), before)
+    batch.close()
+
+
 def test_a_batch_is_a_gymnasium_vector_environment():
     batch = BatchEnv(TASK, 2, **SMALL)
     assert isinstance(batch, gymnasium.vector.VectorEnv)

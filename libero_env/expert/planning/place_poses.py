@@ -263,7 +263,8 @@ def _shrunk(box: Box) -> Box:
     """Return a box that is smaller by a margin, where it is not flat."""
     centre, mat, size = box
     half = np.abs(mat @ size)
-    return centre, mat, np.where(np.abs(size) > 0.012, np.maximum(size - 0.1 * half.min(), 0.7 * size), size)
+    smaller = np.maximum(size - 0.1 * half.min(), 0.7 * size)
+    return Box(centre, mat, np.where(np.abs(size) > 0.012, smaller, size))
 
 
 def _find_entries(
