@@ -1,4 +1,4 @@
-"""Sum up certificates in the README: a line for each suite, and the tasks that are not perfect.
+"""Summarise certificates in the README: a row for each suite, and the tasks with failures.
 
 libero tasks certify libero_spatial libero_object libero_goal libero_10 libero_90 --out experiments/expert/builtin
 python experiments/expert/summary.py
@@ -15,7 +15,7 @@ MARKS = "<!-- {}: results -->", "<!-- {}: end of results -->"
 
 
 def table(results: dict) -> Iterator[str]:
-    """Lines: each suite, all of them, and what failed."""
+    """Yield the lines of the summary: a table of the suites, and the tasks with failures."""
     yield "| suite | success | weakest task | steps, median of tasks (longest success) | retries |"
     yield "| --- | ---: | ---: | ---: | ---: |"
     rows = results["tasks"]
@@ -31,7 +31,7 @@ def table(results: dict) -> Iterator[str]:
         )
     yield ""
     perfect = sum(r["successes"] == r["states"] for r in rows)
-    yield f"{perfect} of {len(rows)} tasks from every start. The others:"
+    yield f"{perfect} of {len(rows)} tasks are solved from every initial state. The others:"
     yield ""
     for r in sorted(rows, key=lambda r: r["successes"] / r["states"]):
         if r["successes"] < r["states"]:

@@ -1,9 +1,9 @@
-"""Demonstrations per hour, with and without pictures, on all cores or so many processes.
+"""Measure demonstrations per hour, with and without images, on all cores or the given number of processes.
 
 python experiments/expert/throughput.py [--suites libero_object libero_10] [--n 10] [--size 128] [--workers 2]
 
-Each line is one `libero demos generate` into an empty folder, start of the processes, compilation of the scenes and
-writing of the files included; the two kinds take turns, and the best of `--rounds` counts.
+Each figure is one recording into an empty folder: starting the processes, compiling the scenes and writing the files
+included. Both kinds take turns, and the best of `--rounds` counts.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from libero_env.tasks import get_suite
 
 
 def seconds(suite: str, n: int, size: int, workers: int, images: bool) -> float:
-    """Wall time of recording n demonstrations of each task."""
+    """Return the wall time of recording n demonstrations of each task, [s]."""
     with tempfile.TemporaryDirectory() as folder:
         rendered = {} if images else {"cameras": (), "modalities": ()}
         configs = [DemoConfig(task, (size, size), **rendered) for task in get_suite(suite).tasks]
@@ -44,7 +44,7 @@ def main() -> None:
     args = parser.parse_args()
     workers = args.workers or cpu_count()
     print(
-        f"| suite, {workers} processes | without pictures, demos/h | two {args.size}x{args.size} views | ratio |"
+        f"| suite, {workers} processes | without images, demos/h | two {args.size}x{args.size} views | ratio |"
     )
     print("| --- | ---: | ---: | ---: |")
     for suite in args.suites:

@@ -5,7 +5,7 @@ import numpy as np
 from libero_env.expert.arm.kinematics import limit_elbow_extension
 from libero_env.expert.arm.servo import OPEN
 from libero_env.expert.planning.goal_plan import JOINT_STATES, Step, plan_goal
-from libero_env.expert.planning.pick_plan import is_graspable
+from libero_env.expert.planning.pick_planner import is_graspable
 from libero_env.expert.shapes import Shapes
 from libero_env.expert.skills.drag import Drag
 from libero_env.expert.skills.drop_into_container import DropIntoContainer
@@ -22,6 +22,16 @@ class Expert:
 
     It plans again whenever a skill is done, so that an object that slipped or was pushed is put right.
 
+    Args:
+        task: Task to solve.
+        rng: Generator of the motion style; the same state gives the same behaviour.
+        shapes: Shapes of the task's scene, to share between experts of the same task; computed at the first action
+            if None.
+        style: Motion style; sampled from `rng` if None.
+
+    Attributes:
+        skill: Skill that acts now; None before the first action and where nothing is left to do.
+
     Example:
         >>> import numpy as np
         >>> from libero_env import Expert, LiberoEnv
@@ -34,16 +44,6 @@ class Expert:
         >>> terminated
         True
         >>> env.close()
-
-    Args:
-        task: Task to solve.
-        rng: Generator of the motion style; the same state gives the same behaviour.
-        shapes: Shapes of the task's scene, to share between experts of the same task; computed at the first action
-            if None.
-        style: Motion style; sampled from `rng` if None.
-
-    Attributes:
-        skill: Skill that acts now; None before the first action and where nothing is left to do.
     """
 
     def __init__(

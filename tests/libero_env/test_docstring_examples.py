@@ -1,18 +1,19 @@
-"""The examples in the docstrings of environments run, and give what they show."""
+"""The examples in docstrings run, and give what they show."""
 
 import doctest
 
 import pytest
 
 from libero_env.envs import BatchEnv, LiberoEnv, SubprocEnv
+from libero_env.expert import Expert
 
 pytestmark = pytest.mark.sim
 
 
-@pytest.mark.parametrize("environment", [LiberoEnv, BatchEnv, SubprocEnv], ids=lambda cls: cls.__name__)
-def test_the_example_runs(environment):
+@pytest.mark.parametrize("cls", [LiberoEnv, BatchEnv, SubprocEnv, Expert], ids=lambda cls: cls.__name__)
+def test_the_example_runs(cls):
     finder = doctest.DocTestFinder(recurse=False)
-    (example,) = finder.find(environment, globs={environment.__name__: environment})
+    (example,) = finder.find(cls, globs={cls.__name__: cls})
     assert len(example.examples) >= 5
     report: list[str] = []
     result = doctest.DocTestRunner().run(example, out=report.append)

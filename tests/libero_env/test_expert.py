@@ -1,4 +1,4 @@
-"""The expert: shapes, grasps and motion by their properties; every task reached; slips mended."""
+"""The expert: shapes, grasps and motion by their properties; every task is reached; slips are corrected."""
 
 import mujoco
 import numpy as np
@@ -12,7 +12,8 @@ from libero_env.expert.arm.kinematics import limit_elbow_extension
 from libero_env.expert.arm.servo import action_toward, downward
 from libero_env.expert.grasping.costs import finger_offset, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, find_grasps
-from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt, plan_pick, plan_place
+from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
+from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.rollout import run_experts
 from libero_env.expert.skills.transport import Move, Transport
 from libero_env.geometry import Pose, rotation_between, surface_points
@@ -117,7 +118,7 @@ def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
 
 
 @pytest.mark.parametrize("aside", [-0.02, 0.0, 0.015])
-def test_fingers_know_how_far_off_the_middle_they_close(aside):
+def test_the_finger_offset_is_that_of_the_body_between_the_pads(aside):
     cloud, mat = box((0.03, 0.01, 0.02)), downward(np.pi / 2, X_AXIS)
     pos = np.array([0.0, 0.0, 0.02]) + aside * mat[:, 0]
     assert finger_offset(cloud, pos, mat) == pytest.approx(-aside, abs=1e-6)
@@ -148,12 +149,12 @@ def test_rotations():
     np.testing.assert_allclose(turn, [0, 0, 0.5], atol=1e-9)
 
 
-def test_manners_are_drawn_from_the_generator_alone():
+def test_motion_styles_depend_on_the_generator_alone():
     first, second, other = (MotionStyle.sample(np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert first == second != other
 
 
-def test_a_disturbance_leaves_the_gripper_alone_and_can_be_switched_off():
+def test_action_noise_leaves_the_gripper_alone_and_can_be_switched_off():
     noise = ActionNoise(np.random.default_rng(0))
     action = np.array([0.5, 0, 0, 0, 0, 0, 1.0])
     assert all(noise.apply(action)[6] == 1.0 for _ in range(50))
@@ -163,7 +164,7 @@ def test_a_disturbance_leaves_the_gripper_alone_and_can_be_switched_off():
 
 @pytest.fixture
 def view_of():
-    """Opens a task at its first stored start; closes what it opened."""
+    """Return a function that opens a task at its first stored initial state."""
     opened = []
 
     def open_(task_id):
@@ -243,10 +244,10 @@ def test_a_bowl_is_taken_by_its_wall(view_of):
 def test_at_a_place_the_atom_would_hold(task_id, view_of):
     view = view_of(task_id)
     (step,) = plan_goal(get_task(task_id).problem.goal, view)
-    way = plan_pick(view, Shapes(view.scene), step.atom)
-    np.testing.assert_allclose(way.release_mat @ way.release_mat.T, np.eye(3), atol=1e-9)
+    plan = plan_pick(view, Shapes(view.scene), step.atom)
+    np.testing.assert_allclose(plan.release_mat @ plan.release_mat.T, np.eye(3), atol=1e-9)
     test = contains if step.atom.predicate == "In" else is_over
-    assert any(test(box, way.place.pos + [0, 0, 0.003]) for box in region_boxes(view, step.atom.args[1]))
+    assert any(test(box, plan.place.pos + [0, 0, 0.003]) for box in region_boxes(view, step.atom.args[1]))
 
 
 @pytest.mark.sim
@@ -256,8 +257,8 @@ def test_what_failed_is_not_tried_again_the_same_way(view_of):
     first = plan_pick(view, shapes, atom)
     failures = [FailedAttempt.from_plan(first, placed=True)]
     for _ in range(2):
-        way = plan_pick(view, shapes, atom, failures=failures)
-        tried = FailedAttempt.from_plan(way, placed=True)
+        plan = plan_pick(view, shapes, atom, failures=failures)
+        tried = FailedAttempt.from_plan(plan, placed=True)
         assert not any(SEARCH.is_same(tried.grasp, failure.grasp) for failure in failures)
         failures.append(tried)
     assert np.linalg.norm(plan_pick(view, shapes, atom).grasp.pos_world - first.grasp.pos_world) == 0.0
@@ -280,15 +281,15 @@ def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     view = view_of("libero_90/73")
     (step,) = plan_goal(get_task("libero_90/73").problem.goal, view)
     shapes = Shapes(view.scene)
-    way = plan_pick(view, shapes, step.atom)
-    assert way.place.entry[2] < -0.5
-    transport = Transport(view, step.atom, way, style=MotionStyle(), shapes=shapes)
+    plan = plan_pick(view, shapes, step.atom)
+    assert plan.place.entry[2] < -0.5
+    transport = Transport(view, step.atom, plan, style=MotionStyle(), shapes=shapes)
     low = shapes.height_range(view, step.atom.args[0])[0]
     rim = shapes.height_range(view, "desk_caddy_1")[1]
     move = transport.next_move(view, np.ones(3))
     assert isinstance(move, Move)
-    assert move.pos[2] - view.eef_pos[2] + low > way.place.pos[2] + 0.04  # not yet where it will stand
-    assert rim > way.place.pos[2] + 0.04
+    assert move.pos[2] - view.eef_pos[2] + low > plan.place.pos[2] + 0.04  # not yet where it will stand
+    assert rim > plan.place.pos[2] + 0.04
 
 
 @pytest.mark.sim
@@ -296,23 +297,23 @@ def test_the_arm_keeps_its_elbow_bent(view_of):
     view = view_of("libero_goal/1")
     arm, start = Shapes(view.scene).arm, view.simulations.fields["qpos"][view.index][:7]
     down = downward(0.0, X_AXIS)
-    near, miss = arm.solve(start, Pose(np.array([0.0, 0.0, 1.0]), down))
-    assert miss == 0.0 and near[3] < -0.9
-    far, miss = arm.solve(
+    near, error = arm.solve(start, Pose(np.array([0.0, 0.0, 1.0]), down))
+    assert error == 0.0 and near[3] < -0.9
+    far, error = arm.solve(
         start, Pose(np.array([0.35, 0.0, 1.0]), down)
     )  # could be touched with a straight arm
-    assert miss > 0.0 and far[3] <= -0.9
+    assert error > 0.0 and far[3] <= -0.9
 
 
 @pytest.mark.sim
-def test_a_nearly_straight_arm_is_held_back(view_of):
+def test_the_elbow_is_not_straightened_further(view_of):
     view = view_of("libero_goal/1")
     qpos, outward = view.simulations.fields["qpos"][view.index], np.array([1.0, 0, 0, 0.2, 0, 0, -1.0])
     np.testing.assert_array_equal(limit_elbow_extension(view, outward), outward)  # bent, as it starts
     elbow = view.scene.model.joint("robot0_joint4").qposadr[0]
     qpos[elbow] = -0.75
-    held = limit_elbow_extension(view, outward)
-    assert held[0] < 0.3 and np.array_equal(held[3:], outward[3:])
+    limited = limit_elbow_extension(view, outward)
+    assert limited[0] < 0.3 and np.array_equal(limited[3:], outward[3:])
     np.testing.assert_array_equal(limit_elbow_extension(view, -outward), -outward)  # back is free
 
 
@@ -335,10 +336,10 @@ def test_a_nearly_straight_arm_is_held_back(view_of):
 )
 def test_narrow_places_leaning_hands_and_small_knobs(task_id, start):
     task = get_task(task_id)
-    manner, _ = np.random.SeedSequence([task.index, start]).spawn(2)
+    style_seed, _ = np.random.SeedSequence([task.index, start]).spawn(2)
     env = BatchEnv(task, 1, cameras=())
     env.reset(options={"init_state": start})
-    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(manner))])
+    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(style_seed))])
     env.close()
     assert attempt.success and attempt.retries < 4, attempt.reason
 
@@ -392,7 +393,7 @@ def test_what_one_simulation_does_depends_on_no_other():
 
 
 @pytest.mark.sim
-def test_a_slip_is_mended():
+def test_an_object_that_slipped_is_picked_again():
     task = get_task("libero_object/7")
     env = LiberoEnv(task, cameras=())
     env.reset(options={"init_state": 3})
@@ -413,10 +414,13 @@ def test_a_slip_is_mended():
 def test_a_finger_on_the_rim_goes_up_again():
     """A push leaves a finger standing on a wide can; pressing on would last for seventy steps."""
     task = get_task("libero_object/0")
-    manner, pushes = np.random.SeedSequence([0, 8]).spawn(2)
+    style_seed, noise_seed = np.random.SeedSequence([0, 8]).spawn(2)
     env = BatchEnv(task, 1, cameras=())
     env.reset(options={"init_state": 8})
-    expert, noise = Expert(task, np.random.default_rng(manner)), ActionNoise(np.random.default_rng(pushes))
+    expert, noise = (
+        Expert(task, np.random.default_rng(style_seed)),
+        ActionNoise(np.random.default_rng(noise_seed)),
+    )
     (attempt,) = run_experts(env, [expert], [noise])
     env.close()
     assert attempt.success and len(attempt) < 160

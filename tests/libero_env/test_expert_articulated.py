@@ -126,7 +126,7 @@ def test_it_moves_and_stays(tmp_path, case):
     assert held >= least * SEEDS, [(skill.phase, skill.failure_reason) for skill in skills]
 
 
-def test_the_same_manner_gives_the_same_actions(tmp_path):
+def test_the_same_motion_style_gives_the_same_actions(tmp_path):
     task, address = make_task(tmp_path, *CASES[0])
     taken = []
     for _ in range(2):
@@ -137,7 +137,7 @@ def test_the_same_manner_gives_the_same_actions(tmp_path):
     np.testing.assert_array_equal(*taken)
 
 
-def test_what_is_done_already_needs_no_hand(tmp_path):
+def test_a_reached_state_needs_no_motion(tmp_path):
     task, address = make_task(tmp_path, *CASES[3])
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
@@ -146,7 +146,7 @@ def test_what_is_done_already_needs_no_hand(tmp_path):
     env.close()
 
 
-def test_a_fixture_without_the_joint_is_said(tmp_path):
+def test_a_fixture_without_the_joint_is_reported(tmp_path):
     task, _ = make_task(tmp_path, *CASES[0])
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
@@ -193,13 +193,13 @@ def test_the_wrist_bends_as_inverse_kinematics_says():
     expected = wrist_bend(pos, mat, base)
     found = [arm.solve(np.array(REST_QPOS), Pose(p, m)) for p, m in zip(pos, mat, strict=True)]
     errors = np.array(
-        [angles[5] - e for (angles, miss), e in zip(found, expected, strict=True) if miss == 0.0]
+        [angles[5] - e for (angles, error), e in zip(found, expected, strict=True) if error == 0.0]
     )
     assert len(errors) > 30
     assert np.median(np.abs(errors)) < 0.04 and np.quantile(np.abs(errors), 0.8) < 0.2
 
 
-def test_ease_is_the_same_wherever_the_robot_stands():
+def test_the_posture_cost_does_not_depend_on_where_the_robot_stands():
     pos, mat = poses(30)
     base, shift = np.array([-0.66, 0.0, 0.912]), np.array([0.3, -0.2, 0.1])
     np.testing.assert_allclose(posture_cost(pos + shift, mat, base + shift), posture_cost(pos, mat, base))
@@ -207,7 +207,7 @@ def test_ease_is_the_same_wherever_the_robot_stands():
     assert (far > 0.4).all() and (reach_violation(pos, mat, base) < far).all()
 
 
-def test_a_hand_meets_what_is_in_it():
+def test_the_collision_depth_of_the_hand():
     pose = Pose(np.array([0.1, 0.2, 0.3]), downward(0.4, np.array([1.0, 0.0, 0.0])))
 
     def depth(x, y, z):  # in the frame of the hand: along the fingers, across them, and where they point

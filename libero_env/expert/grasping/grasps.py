@@ -8,7 +8,7 @@ import numpy as np
 from libero_env.errors import LiberoError
 from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.arm.servo import downward
-from libero_env.expert.grasping import kernels
+from libero_env.expert.grasping import collision_kernels, kernels
 
 WALL_COST = 0.5  # cost of a grasp at a wall, compared with one around the whole body
 _NUM_YAWS, _NUM_TILTED_YAWS = 18, 8  # yaws that are tried, from above and from another side
@@ -134,7 +134,7 @@ def choose_grasp(
 def collision_depth(obstacles: np.ndarray, pos_world: np.ndarray, mat: np.ndarray) -> float:
     """Return how deep obstacles (M, 3) reach into the open fingers and the palm, [m]; 0 without a collision."""
     hand = GRIPPER
-    return kernels.open_hand_collision_depth(
+    return collision_kernels.open_hand_collision_depth(
         obstacles,
         pos_world,
         mat,

@@ -6,7 +6,8 @@ from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.arm.servo import CLOSE, OPEN, lateral_ramp
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.grasping.grasps import GraspError
-from libero_env.expert.grasping.handle_grasps import HandleGrasp, grasp_handle, grasp_knob
+from libero_env.expert.grasping.handle_candidates import HandleGrasp
+from libero_env.expert.grasping.handle_grasps import grasp_handle, grasp_knob
 from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
 from libero_env.expert.planning.goal_plan import JointState
 from libero_env.expert.skills.skill import Skill

@@ -8,7 +8,8 @@ from libero_env.expert.arm.servo import CLOSE, OPEN, lateral_ramp
 from libero_env.expert.clearance import hand_extent_below, obstacle_height
 from libero_env.expert.grasping.costs import finger_offset
 from libero_env.expert.grasping.grasps import collision_depth
-from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan, plan_pick, plan_place
+from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan
+from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.skills.transport import Move, Transport

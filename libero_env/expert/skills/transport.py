@@ -7,7 +7,8 @@ import numpy as np
 
 from libero_env.expert.arm.servo import lateral_ramp
 from libero_env.expert.clearance import hand_extent_below, obstacle_height
-from libero_env.expert.planning.pick_plan import ENTRY_DISTANCE, PickPlan
+from libero_env.expert.planning.pick_plan import PickPlan
+from libero_env.expert.planning.reachability import ENTRY_DISTANCE
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
