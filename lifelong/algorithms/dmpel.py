@@ -13,8 +13,8 @@ from torch.utils.hooks import RemovableHandle
 
 from lifelong.algorithms.base import Algorithm, WindowDataset
 from lifelong.errors import ConfigError
-from lifelong.nn.adapters import freeze_statistics, start_pair
-from lifelong.nn.experts import Router, change, expert_shape, routed_layers
+from lifelong.nn.adapters import freeze_statistics, initial_pair
+from lifelong.nn.experts import Router, expert_output, expert_shape, routed_layers
 from lifelong.nn.tokens import standardise
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Observation
@@ -259,7 +259,7 @@ class DMPEL(Algorithm):
             pairs = [of_task[name] for of_task in self._library.values()]
             rank = pairs[0]["a"].shape[0] // self.experts
             weights = self.scale * self._now[:, group, 1:].repeat_interleave(rank, dim=1)
-            return output + change(layer, args[0], pairs, weights)
+            return output + expert_output(layer, args[0], pairs, weights)
 
         return add
 
@@ -286,14 +286,14 @@ class DMPEL(Algorithm):
         return torch.cat(found), of_window
 
     def _make_router(self, groups: int, queries: Tensor, draws: torch.Generator) -> Router:
-        enter, _ = start_pair(1, queries.shape[1], self.hidden, draws)
+        enter, _ = initial_pair(1, queries.shape[1], self.hidden, draws)
         keys, bias = torch.zeros(1, groups, self.hidden), torch.zeros(1, groups)
         return Router(enter=enter, keys=keys, bias=bias, top_k=self.top_k).to(queries.device)
 
     def _make_experts(self, layer: nn.Module, draws: torch.Generator) -> dict[str, Tensor]:
         out, inputs = expert_shape(layer)
         rank = min(self.rank, out, inputs)
-        a, b = start_pair(out, inputs, self.experts * rank, draws)
+        a, b = initial_pair(out, inputs, self.experts * rank, draws)
         device = next(layer.parameters()).device
         return {"a": nn.Parameter(a.to(device)), "b": nn.Parameter(b.to(device))}
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, WindowDataset
 from lifelong.errors import ConfigError
-from lifelong.nn.adapters import check_found, freeze_statistics, matches, start_pair
+from lifelong.nn.adapters import check_matches, freeze_statistics, initial_pair, matches
 from lifelong.policies.base import Policy
 
 
@@ -80,7 +80,7 @@ class LoRA(Algorithm):
             if not matches(name, self.own):
                 out, inputs = base.flatten(1).shape
                 rank = min(self.rank, out, inputs)
-                a, b = start_pair(out, inputs, rank, draws)
+                a, b = initial_pair(out, inputs, rank, draws)
                 pairs[name] = {"a": nn.Parameter(a.to(base.device)), "b": nn.Parameter(b.to(base.device))}
         _put(policy, self._base)
         policy.zero_grad()  # the optimiser, which does it at each step, has the matrices no longer
@@ -178,7 +178,7 @@ class LoRA(Algorithm):
         learned = {n: p for n, p in policy.named_parameters() if p.requires_grad}
         matrices = [n for n, p in learned.items() if p.dim() >= 2 and not matches(n, self.own)]
         found = [n for n in matrices if matches(n, self.adapted)]
-        check_found(found, self.adapted, matrices, "matrix")
+        check_matches(found, self.adapted, matrices, "matrix")
         return [n for n in learned if n in found or matches(n, self.own)]
 
     @torch.no_grad()

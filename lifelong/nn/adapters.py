@@ -1,4 +1,4 @@
-"""Low-rank adapters: which weights get them, how they start, what frozen layers must not do."""
+"""Low-rank adapters: which weights have them, how they are initialised, what frozen layers must not do."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
@@ -11,35 +11,35 @@ from lifelong.errors import ConfigError
 _WITH_STATISTICS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._InstanceNorm)
 
 
-def start_pair(out: int, inputs: int, rank: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """A (rank, inputs) at random and B (out, rank) zero, so that B A is zero at first (Hu et al. 2022, section 4.1).
+def initial_pair(out: int, inputs: int, rank: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw A (rank, inputs); B (out, rank) is zero, so that B A is zero at first (Hu et al. 2022, section 4.1).
 
-    A is uniform within 1 / sqrt(inputs), as PyTorch starts linear layers.
+    A is uniform within 1 / sqrt(inputs), as PyTorch initialises linear layers.
     """
     a = (torch.rand(rank, inputs, generator=generator) * 2 - 1) / inputs**0.5
     return a, torch.zeros(out, rank)
 
 
 def matches(name: str, patterns: Sequence[str]) -> bool:
-    """Whether one of the patterns (`*`, `?`, `[...]`) fits the whole name."""
+    """Return whether one of the patterns (`*`, `?`, `[...]`) matches the whole name."""
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def check_found(found: Sequence[str], patterns: Sequence[str], names: Sequence[str], kind: str) -> None:
-    """Complain where patterns fit nothing.
+def check_matches(found: Sequence[str], patterns: Sequence[str], names: Sequence[str], kind: str) -> None:
+    """Raise an error where patterns match nothing.
 
     Raises:
-        ConfigError: `found` is empty; the message gives some of the names that there are.
+        ConfigError: `found` is empty; the message lists some of the names that exist.
     """
     if not found:
         some = ", ".join(list(names)[:5])
         raise ConfigError(
-            f"algo.adapted={list(patterns)} fits no {kind} of the policy, which has {some}, ..."
+            f"algo.adapted={list(patterns)} matches no {kind} of the policy, which has {some}, ..."
         )
 
 
 def freeze_statistics(policy: nn.Module) -> None:
-    """Put layers with running statistics in evaluation mode, so that training does not move these."""
+    """Put layers with running statistics in evaluation mode, so that training does not change these."""
     for module in policy.modules():
         if isinstance(module, _WITH_STATISTICS):
             module.eval()

@@ -1,4 +1,4 @@
-"""Image augmentation of whole batches: the same change for every frame of a window, drawn anew per window and view.
+"""Image augmentation of batches: one random change per window and view, the same for all of its frames.
 
 Shape legend: B batch, T time, V views, H W C image. Images are (B, T, V, H, W, C), uint8 in 0..255.
 """
@@ -15,44 +15,52 @@ from lifelong.types import Batch
 
 
 class Augmentation(ABC):
-    """A random change of a batch's images; the batch given is left as it was."""
+    """Random change of a batch's images; the given batch is not modified."""
 
     @abstractmethod
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Changed images, of the same shape and dtype.
+        """Return changed images, of the same shape and dtype.
 
         Args:
-            images: (B, T, V, H, W, C) uint8.
-            generator: a CPU generator; None draws from torch's default one, as dropout does.
+            images: Images (B, T, V, H, W, C) uint8.
+            generator: CPU generator; None draws from torch's default one, as dropout does.
         """
 
     def __call__(self, batch: Batch, generator: torch.Generator | None = None) -> Batch:
-        """The batch with changed images."""
+        """Return the batch with changed images."""
         images = self.images(batch.observation.images, generator)
         return replace(batch, observation=replace(batch.observation, images=images))
 
 
 class Compose(Augmentation):
-    """Several augmentations in order."""
+    """Several augmentations in order.
+
+    Args:
+        augmentations: Augmentations to apply, the first one first.
+    """
 
     def __init__(self, augmentations: Sequence[Augmentation]) -> None:
         self.augmentations = tuple(augmentations)
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """See `Augmentation`."""
+        """Return changed images; see `Augmentation`."""
         for augmentation in self.augmentations:
             images = augmentation.images(images, generator)
         return images
 
 
 class RandomShift(Augmentation):
-    """Shifts by up to `pixels` in each direction, repeating the border (Kostrikov et al., DrQ, ICLR 2021)."""
+    """Random shift that repeats the border (Kostrikov et al., DrQ, ICLR 2021).
+
+    Args:
+        pixels: Largest shift in each direction.
+    """
 
     def __init__(self, pixels: int = 4) -> None:
         self.pixels = pixels
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """See `Augmentation`."""
+        """Return changed images; see `Augmentation`."""
         b, _, v, h, w, _ = images.shape
         shifts = torch.randint(0, 2 * self.pixels + 1, (b, v, 2), generator=generator).tolist()
         padded = _repeat_border(images, self.pixels)
@@ -64,7 +72,7 @@ class RandomShift(Augmentation):
 
 
 def _repeat_border(images: Tensor, pixels: int) -> Tensor:
-    """(..., H, W, C) -> (..., H + 2 pixels, W + 2 pixels, C)."""
+    """Pad images (..., H, W, C) to (..., H + 2 pixels, W + 2 pixels, C)."""
     if not pixels:
         return images
     *lead, h, w, c = images.shape
@@ -85,9 +93,11 @@ class ColorJitter(Augmentation):
     per window does it. Applied in the order hue, saturation, contrast, brightness.
 
     Args:
-        brightness, contrast, saturation: largest relative change.
-        hue: largest turn, as a fraction of the colour circle.
-        keep: chance that a window is left as it is.
+        brightness: Largest relative change of brightness.
+        contrast: Largest relative change of contrast.
+        saturation: Largest relative change of saturation.
+        hue: Largest rotation of hue, as a fraction of the colour circle.
+        keep: Chance that a window stays unchanged.
     """
 
     def __init__(
@@ -102,7 +112,7 @@ class ColorJitter(Augmentation):
         self.hue, self.keep = hue, keep
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """See `Augmentation`."""
+        """Return changed images; see `Augmentation`."""
         b, t, v, h, w, c = images.shape
         matrix, contrast, brightness = self._draw(b * v, generator)
         x = images.to(torch.float32).transpose(1, 2).reshape(b * v, t * h * w, c)
@@ -113,7 +123,7 @@ class ColorJitter(Augmentation):
         return changed.view(b, v, t, h, w, c).transpose(1, 2).contiguous()
 
     def _draw(self, n: int, generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour matrices (n, 3, 3) to multiply from the right, contrast and brightness factors (n, 1, 1)."""
+        """Draw colour matrices (n, 3, 3) to multiply from the right, contrast and brightness factors (n, 1, 1)."""
         uniform = torch.rand(5, n, 1, 1, generator=generator)
         drawn = torch.where(uniform[4] < self.keep, torch.zeros(4, n, 1, 1), 2 * uniform[:4] - 1)
         limits = torch.tensor([self.brightness, self.contrast, self.saturation, 2 * math.pi * self.hue])

@@ -1,4 +1,4 @@
-"""A library of low-rank experts on the layers of a network, mixed anew for every row of a batch.
+"""Low-rank experts on the layers of a network, mixed differently for every row of a batch.
 
 Shape legend: B batch, G groups of layers, N choices (the base and every expert), Q query, r rank.
 """
@@ -11,23 +11,23 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lifelong.errors import PolicyError
-from lifelong.nn.adapters import check_found, matches
+from lifelong.nn.adapters import check_matches, matches
 
-_GAP = 7.0  # e^-7: a choice has less than a thousandth of the weight of the best one
-_RIDGE = 1e-4
+_GAP = 7.0  # [nat] below the best logit: e^-7 is less than a thousandth of its weight
+_RIDGE = 1e-4  # regularisation of the least squares
 
 
 class Router(nn.Module):
-    """From a query to how much of each expert every group of layers takes.
+    """Network from a query to the coefficients of the experts in every group of layers.
 
     A hidden layer, a key for each choice and group, and a softmax over the `top_k` best choices. Choice 0 is the
     base alone; experts are appended with `grow`.
 
     Args:
-        enter: (hidden, Q) weight of the hidden layer.
-        keys: (N, G, hidden).
-        bias: (N, G).
-        top_k: so many choices share the weight; 0: all.
+        enter: Weight of the hidden layer (hidden, Q).
+        keys: Keys of the choices (N, G, hidden).
+        bias: Biases of the choices (N, G).
+        top_k: Number of choices that share the weight; 0: all.
     """
 
     def __init__(self, *, enter: Tensor, keys: Tensor, bias: Tensor, top_k: int) -> None:
@@ -36,17 +36,17 @@ class Router(nn.Module):
         self.keys, self.bias = nn.Parameter(keys), nn.Parameter(bias)
 
     def hidden(self, query: Tensor) -> Tensor:
-        """(B, Q) -> (B, hidden), float32."""
+        """Map queries (B, Q) to the hidden layer's output (B, hidden), float32."""
         with torch.autocast(query.device.type, enabled=False):
             return functional.gelu(query.float() @ self.enter.T)
 
     def logits(self, query: Tensor) -> Tensor:
-        """(B, Q) -> (B, G, N), float32."""
+        """Map queries (B, Q) to logits (B, G, N), float32."""
         with torch.autocast(query.device.type, enabled=False):
             return torch.einsum("bh,ngh->bgn", self.hidden(query), self.keys) + self.bias.T
 
     def forward(self, query: Tensor) -> Tensor:
-        """(B, Q) -> coefficients (B, G, N), which sum to one over N and are zero beyond the best."""
+        """Map queries (B, Q) to coefficients (B, G, N), which sum to one over N and are zero beyond the best."""
         logits = self.logits(query)
         if 0 < self.top_k < logits.shape[-1]:
             least = logits.topk(self.top_k, dim=-1).values[..., -1:]
@@ -55,19 +55,24 @@ class Router(nn.Module):
 
     @torch.no_grad()
     def grow(self, count: int, queries: Tensor, earlier: Tensor) -> None:
-        """Append `count` choices, with keys that fit two wishes by weighted least squares.
+        """Append choices whose keys fit two targets by weighted least squares.
 
-        On the new task's queries (B, Q) they start level with the best choice there is, on earlier ones (M, Q)
-        `_GAP` below it. Keys of zero would disturb earlier tasks, and replay would then drive the new choices
-        out on all queries before the router learned to tell these apart.
+        On the new task's queries their logit starts equal to that of the best choice, on earlier queries `_GAP`
+        below it. Keys of zero would disturb earlier tasks, and replay would then suppress the new choices on all
+        queries before the router learned to tell these apart.
+
+        Args:
+            count: Number of choices to append.
+            queries: Queries of the new task (B, Q).
+            earlier: Queries of earlier tasks (M, Q).
         """
         both = torch.cat([queries, earlier])
-        wished = self.logits(both).amax(-1)  # (B + M, G)
-        wished[len(queries) :] -= _GAP
+        target = self.logits(both).amax(-1)  # (B + M, G)
+        target[len(queries) :] -= _GAP
         hidden = functional.pad(self.hidden(both), (0, 1), value=1.0).double()
         weight = torch.cat([q.new_full((len(q), 1), 1 / max(1, len(q))) for q in (queries, earlier)]).double()
         gram = hidden.T @ (weight * hidden) + _RIDGE * torch.eye(hidden.shape[1]).to(hidden)
-        solved = torch.linalg.solve(gram, hidden.T @ (weight * wished.double())).to(
+        solved = torch.linalg.solve(gram, hidden.T @ (weight * target.double())).to(
             self.keys
         )  # (hidden + 1, G)
         keys, bias = solved[:-1].T.expand(count, -1, -1), solved[-1].expand(count, -1)
@@ -76,7 +81,7 @@ class Router(nn.Module):
 
 
 def routed_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:
-    """The linear layers and convolutions whose weight's name fits one of the patterns, by name.
+    """Return the linear layers and convolutions whose weight's name matches one of the patterns, by name.
 
     Raises:
         ConfigError: There is none.
@@ -87,24 +92,26 @@ def routed_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Mo
         if isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and module.groups == 1)
     }
     found = [name for name in layers if matches(f"{name}.weight", patterns)]
-    check_found(found, patterns, [f"{name}.weight" for name in layers], "linear layer or convolution")
+    check_matches(found, patterns, [f"{name}.weight" for name in layers], "linear layer or convolution")
     return {name: layers[name] for name in found}
 
 
 def expert_shape(layer: nn.Module) -> tuple[int, int]:
-    """Rows and columns of a layer's weight as a matrix."""
+    """Return rows and columns of a layer's weight as a matrix."""
     out, inputs = layer.weight.flatten(1).shape  # type: ignore[operator, union-attr]
     return out, inputs
 
 
-def change(layer: nn.Module, x: Tensor, pairs: Sequence[Mapping[str, Tensor]], weights: Tensor) -> Tensor:
-    """What the experts add to a layer's output: `sum_i c_i B_i A_i x`, another mixture for each row.
+def expert_output(
+    layer: nn.Module, x: Tensor, pairs: Sequence[Mapping[str, Tensor]], weights: Tensor
+) -> Tensor:
+    """Return what the experts add to a layer's output: `sum_i c_i B_i A_i x`, another mixture for each row.
 
     Args:
-        layer: Linear or convolution.
-        x: Its input; the first axis has B rows, or a multiple with the rows of one sample adjacent.
-        pairs: For one task's experts each, `a` (experts r, inputs) and `b` (out, experts r).
-        weights: (B, sum of experts r), c with each coefficient repeated r times.
+        layer: Linear layer or convolution.
+        x: Input of the layer; the first axis has B rows, or a multiple with the rows of one sample adjacent.
+        pairs: For the experts of each task, `a` (experts r, inputs) and `b` (out, experts r).
+        weights: Coefficients c, each repeated r times, (B, sum of experts r).
 
     Raises:
         PolicyError: The first axis is no multiple of B.
@@ -112,7 +119,7 @@ def change(layer: nn.Module, x: Tensor, pairs: Sequence[Mapping[str, Tensor]], w
     rows, samples = len(x), len(weights)
     if rows % samples:
         raise PolicyError(
-            f"a layer has {rows} rows for {samples} samples: their experts cannot be told apart"
+            f"a layer has {rows} rows for {samples} samples: rows cannot be assigned to samples"
         )
     a, b = torch.cat([p["a"] for p in pairs]), torch.cat([p["b"] for p in pairs], dim=1)
     weights = weights.repeat_interleave(rows // samples, dim=0)

@@ -1,6 +1,6 @@
 """Flow matching: a chunk of actions from noise, by integrating a learned velocity.
 
-Shape legend: B batch, T time, H chunk, E latent, A action, N latents (any leading shape, flattened).
+Shape legend: B batch, T time, H chunk, E latent, A action.
 """
 
 import math
@@ -13,7 +13,7 @@ from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead
 
 _EVAL_SEED = 0
-_OCTAVES = 6  # of the code of the time
+_OCTAVES = 6  # frequencies that encode the time
 
 
 class FlowHead(ActionHead):
@@ -24,8 +24,8 @@ class FlowHead(ActionHead):
     network's velocity from s = 0 to 1 by Euler steps.
 
     A window holds actions only up to its end. The chunk of its step t therefore has min(H, T - t) of its slots
-    filled; the network is told which, the others are zero and count in no loss. Whole chunks are learned at the first
-    T - H + 1 steps of a window only: a policy that acts must not look back further than that.
+    filled; the network is given a mask of them, the others are zero and count in no loss. Whole chunks are learned at
+    the first T - H + 1 steps of a window only: a policy that acts must not look back further than that.
 
     In training, noise and times come from torch's default generator, as dropout's do. In eval mode they are the same
     for every window, so that a window's loss depends neither on chance nor on its batch.
@@ -33,13 +33,14 @@ class FlowHead(ActionHead):
     Args:
         in_dim: E.
         action_dim: A.
-        chunk: H.
-        execute: actions of a chunk that are carried out before the next one is asked for.
-        steps: of Euler's method.
-        hidden, layers: width and residual blocks of the network.
+        chunk: H, the number of actions planned at once.
+        execute: Number of actions of a chunk that are executed before the next chunk is planned.
+        steps: Number of Euler steps of the integration.
+        hidden: Width of the network.
+        layers: Number of residual blocks of the network.
 
     Raises:
-        PolicyError: not 1 <= execute <= chunk, or no step.
+        PolicyError: Not 1 <= execute <= chunk, or no step.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class FlowHead(ActionHead):
         )
 
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
-        """Latents of windows (B, T, E) or of single steps (B, E), for which nothing ends.
+        """Return the parameters for latents of windows (B, T, E) or of single steps (B, E), which have no end.
 
         Returns:
             `latent` as given, and `slots` (B, T, H) or (B, H) float32: 1 where an action of the chunk exists.
@@ -78,7 +79,7 @@ class FlowHead(ActionHead):
         return {"latent": latent, "slots": slots}
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Squared error of the velocity at one random time, mean over what a chunk holds; (B, T, A) -> (B, T)."""
+        """Return the velocity's squared error at a random time, mean over a chunk's actions, (B, T, A) -> (B, T)."""
         latent, slots = params["latent"], params["slots"]
         chunks = self._chunks(actions.float())
         noise, time = self._draw(chunks)
@@ -88,14 +89,14 @@ class FlowHead(ActionHead):
         return error.sum(-1) / slots.sum(-1)
 
     def _chunks(self, actions: Tensor) -> Tensor:
-        """(B, T, A) -> (B, T, H, A): each step's action and those after it; beyond the window whatever is last."""
+        """Gather each step's action and those after it, (B, T, A) -> (B, T, H, A), repeating the window's last."""
         t = actions.shape[1]
         step = torch.arange(t, device=actions.device)[:, None]
         index = (step + torch.arange(self.chunk, device=actions.device)).clamp(max=t - 1)
         return actions[:, index]
 
     def _draw(self, chunks: Tensor) -> tuple[Tensor, Tensor]:
-        """Noise (B, T, H, A) and times (B, T) in [0, 1)."""
+        """Draw noise (B, T, H, A) and times (B, T) in [0, 1)."""
         if self.training:
             return torch.randn_like(chunks), torch.rand(chunks.shape[:2], device=chunks.device)
         draws = torch.Generator().manual_seed(_EVAL_SEED)
@@ -103,7 +104,7 @@ class FlowHead(ActionHead):
         return noise, torch.rand(chunks.shape[1], generator=draws).to(chunks.device).expand(chunks.shape[:2])
 
     def integrate(self, params: dict[str, Tensor], noise: Tensor) -> Tensor:
-        """The chunk that the flow carries `noise` (..., H, A) to; same shape, float32, with gradients."""
+        """Carry `noise` (..., H, A) along the flow to a chunk of the same shape, float32, with gradients."""
         x = noise
         for k in range(self.steps):
             time = x.new_full(x.shape[:-2], k / self.steps)
@@ -111,25 +112,25 @@ class FlowHead(ActionHead):
         return x
 
     def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """The first action of the chunk that no noise leads to: the exact mean where actions are Gaussian."""
+        """Return the first action of the chunk from zero noise: the exact mean where actions are Gaussian."""
         return self.mean(params)
 
     def mean(self, params: dict[str, Tensor]) -> Tensor:
-        """The first action of the chunk that no noise leads to, (..., A), with gradients through all steps.
+        """Return the first action of the chunk from zero noise, (..., A), with gradients through all steps.
 
         One evaluation at s = 0 would be the distribution's exact mean, but it lies between the choices where there
-        are several, and distilling it would hold the network at s = 0 only, not along the way actions take.
+        are several, and distilling it would constrain the network at s = 0 only, not along the path of actions.
         """
         return self.integrate(params, torch.zeros_like(self._empty(params)))[..., 0, :]
 
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
-        """The first action of a random chunk, (..., A)."""
+        """Draw a chunk and return its first action, (..., A)."""
         shape, device = self._empty(params).shape, params["latent"].device
         noise = torch.randn(shape, generator=generator).to(device)
         return self.integrate(params, noise)[..., 0, :]
 
     def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
-        """See `ActionHead`; the first `execute` actions of a chunk, (B, execute, A)."""
+        """Return the first `execute` actions of a chunk, (B, execute, A); see `ActionHead`."""
         noise = torch.zeros_like(self._empty(params))
         if generators is not None:
             draws = [torch.randn(noise.shape[1:], generator=generator) for generator in generators]
@@ -137,19 +138,20 @@ class FlowHead(ActionHead):
         return self.integrate(params, noise)[:, : self.execute]
 
     def _empty(self, params: dict[str, Tensor]) -> Tensor:
-        """Uninitialised chunks, (..., H, A) float32."""
+        """Return uninitialised chunks, (..., H, A) float32."""
         slots = params["slots"]
         return slots.new_empty(*slots.shape, self.action_dim)
 
 
 class VelocityField(nn.Module):
-    """The velocity of a chunk on its way from noise, given the latent: residual blocks, normalised first.
+    """Velocity of a chunk on its path from noise, given the latent: pre-norm residual blocks.
 
     Args:
         in_dim: E.
         action_dim: A.
         chunk: H.
-        hidden, layers: width and number of blocks.
+        hidden: Width of the network.
+        layers: Number of residual blocks.
     """
 
     def __init__(self, *, in_dim: int, action_dim: int, chunk: int, hidden: int, layers: int) -> None:
@@ -164,16 +166,16 @@ class VelocityField(nn.Module):
         self.leave = nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, chunk * action_dim))
 
     def forward(self, x: Tensor, time: Tensor, latent: Tensor, slots: Tensor) -> Tensor:
-        """The velocity at `x`.
+        """Return the velocity at `x`.
 
         Args:
-            x: (..., H, A).
-            time: (...) in [0, 1].
-            latent: (..., E).
-            slots: (..., H), 1 where an action exists.
+            x: Chunks (..., H, A).
+            time: Position on the path (...), in [0, 1].
+            latent: Latents (..., E).
+            slots: Mask (..., H), 1 where an action exists.
 
         Returns:
-            (..., H, A) float32, zero where no action exists.
+            Velocities (..., H, A) float32, zero where no action exists.
         """
         flat = (x * slots[..., None]).flatten(-2)
         h = self.enter(torch.cat([latent.float(), flat, slots, _time_code(time)], dim=-1))
@@ -183,6 +185,6 @@ class VelocityField(nn.Module):
 
 
 def _time_code(time: Tensor) -> Tensor:
-    """(...) in [0, 1] -> (..., 2 octaves): sine and cosine of a quarter turn and its doublings."""
+    """Encode times (...) in [0, 1] as sine and cosine of a quarter turn and its doublings, (..., 2 octaves)."""
     angle = time[..., None] * (0.5 * math.pi * 2.0 ** torch.arange(_OCTAVES, device=time.device))
     return torch.cat([angle.sin(), angle.cos()], dim=-1)

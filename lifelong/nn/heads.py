@@ -1,4 +1,4 @@
-"""Latents to actions.
+"""Action heads: from latents to actions.
 
 Shape legend: B batch, T time, E latent, K modes, A action.
 """
@@ -13,43 +13,45 @@ from torch.nn import functional
 
 
 class ActionHead(nn.Module, ABC):
-    """From latents (..., E) to actions in [-1, 1]^A.
+    """Distribution of actions in [-1, 1]^A, given latents (..., E).
 
-    `forward` gives the parameters of a distribution; the other methods read them. `chunk` is the number of actions
-    a latent answers for: its own step's and the following ones'.
+    `forward` returns the parameters of the distribution, the other methods read them.
+
+    Attributes:
+        chunk: Number of actions that a latent predicts: that of its own step and of the following ones.
     """
 
     chunk: int = 1
 
     @abstractmethod
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
-        """(..., E) -> the parameters, float32."""
+        """Return the distribution's parameters, float32, for latents (..., E)."""
 
     @abstractmethod
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Loss of each action (..., A) -> (...)."""
+        """Return the loss of each action, (..., A) -> (...)."""
 
     @abstractmethod
     def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """The most likely action (..., A)."""
+        """Return the most likely action, (..., A)."""
 
     @abstractmethod
     def mean(self, params: dict[str, Tensor]) -> Tensor:
-        """The mean of the distribution (..., A), with gradients."""
+        """Return the mean of the distribution, (..., A), with gradients."""
 
     @abstractmethod
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
-        """A random action (..., A)."""
+        """Draw an action, (..., A)."""
 
     def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
-        """The actions to execute before the next latent is asked.
+        """Return the actions to execute before the next latent is needed.
 
         Args:
-            params: of one latent per environment, (B, E).
-            generators: one CPU generator per environment to draw with; None: the most likely actions.
+            params: Parameters for one latent per environment, (B, E).
+            generators: One CPU generator per environment to draw with; None takes the most likely actions.
 
         Returns:
-            (B, n, A), n the same for all.
+            Actions (B, n, A), n the same for all environments.
         """
         if generators is None:
             return self.mode(params)[:, None]
@@ -62,9 +64,9 @@ class ActionHead(nn.Module, ABC):
 
 
 def _trunk(in_dim: int, hidden: int, layers: int, norm: bool) -> nn.Sequential:
-    """`layers` hidden layers and one linear layer; ReLU as in the original's heads, or with `norm` LayerNorm and GELU.
+    """Build hidden layers and a linear layer: with ReLU as in the original's heads, or with LayerNorm and GELU.
 
-    Under ReLU nearly all units of a small head are dead after a few tasks at a high rate; normalised, they stay alive
+    With ReLU nearly all units of a small head are dead after a few tasks at a high rate; normalised, they stay alive
     (Lyle et al., "Understanding plasticity in neural networks", ICML 2023).
     """
     modules: list[nn.Module] = []
@@ -83,11 +85,13 @@ class GMMHead(ActionHead):
     Args:
         in_dim: E.
         action_dim: A.
-        modes: K.
-        hidden, layers, norm: sizes of the shared trunk, and whether its layers are normalised.
-        min_std: smallest standard deviation. The original's 1e-4 lets likelihoods of saturated dimensions
+        modes: K, the number of Gaussians.
+        hidden: Width of the shared trunk.
+        layers: Number of hidden layers of the trunk.
+        norm: Whether the hidden layers have LayerNorm and GELU instead of ReLU.
+        min_std: Smallest standard deviation. The original's 1e-4 lets likelihoods of saturated dimensions
             grow without bound; 0.02 or so balances dimensions when data and time are short.
-        low_eval_noise: sample with `min_std` instead of the learned deviation in eval mode.
+        low_eval_noise: Whether to sample with `min_std` instead of the learned deviation in eval mode.
     """
 
     def __init__(
@@ -111,7 +115,7 @@ class GMMHead(ActionHead):
         self.logits = nn.Linear(hidden, modes)
 
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
-        """(..., E) -> `means` (..., K, A) in (-1, 1), `stds` (..., K, A), `logits` (..., K); float32."""
+        """Return `means` (..., K, A) in (-1, 1), `stds` (..., K, A) and `logits` (..., K), float32."""
         h = self.trunk(latent)
         shape = (*latent.shape[:-1], self.modes, self.action_dim)
         raw_stds = self.stds(h).float().view(shape)
@@ -122,7 +126,7 @@ class GMMHead(ActionHead):
         }
 
     def log_prob(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """log sum_k w_k prod_a N(action_a; mean_ka, std_ka) of actions (..., A) -> (...)."""
+        """Return log sum_k w_k prod_a N(action_a; mean_ka, std_ka) of actions, (..., A) -> (...)."""
         with torch.autocast(actions.device.type, enabled=False):
             z = (actions.float().unsqueeze(-2) - params["means"]) / params["stds"]
             per_mode = (-0.5 * z.square() - params["stds"].log()).sum(-1)  # (..., K)
@@ -130,19 +134,19 @@ class GMMHead(ActionHead):
             return torch.logsumexp(params["logits"].log_softmax(-1) + per_mode, dim=-1)
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Negative log-likelihood of each action, (..., A) -> (...)."""
+        """Return the negative log-likelihood of each action, (..., A) -> (...)."""
         return -self.log_prob(params, actions)
 
     def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """Mean of the heaviest component, (..., A)."""
+        """Return the mean of the heaviest component, (..., A)."""
         return _take_mode(params["means"], params["logits"].argmax(-1))
 
     def mean(self, params: dict[str, Tensor]) -> Tensor:
-        """Mean of the mixture, sum_k w_k mean_k; unlike the heaviest component's it is smooth in the parameters."""
+        """Return sum_k w_k mean_k, (..., A); unlike the heaviest component's mean it is smooth in the parameters."""
         return (params["logits"].softmax(-1).unsqueeze(-1) * params["means"]).sum(-2)
 
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
-        """A draw from the mixture, (..., A)."""
+        """Draw an action from the mixture, (..., A)."""
         weights = params["logits"].softmax(-1)
         flat = weights.reshape(-1, self.modes)
         choice = torch.multinomial(flat, 1, generator=generator).view(weights.shape[:-1])
@@ -154,7 +158,7 @@ class GMMHead(ActionHead):
 
 
 def _take_mode(values: Tensor, index: Tensor) -> Tensor:
-    """Picks `values` (..., K, A) at `index` (...) -> (..., A)."""
+    """Select the modes `index` (...) of `values` (..., K, A), -> (..., A)."""
     index = index[..., None, None].expand(*index.shape, 1, values.shape[-1])
     return values.gather(-2, index).squeeze(-2)
 
@@ -165,6 +169,13 @@ class DeterministicHead(ActionHead):
     Absolute rather than squared, because small errors near a grasp decide about success and large ones, where the
     phase changes, do not (Kim et al., "Fine-tuning vision-language-action models: optimizing speed and success",
     RSS 2025).
+
+    Args:
+        in_dim: E.
+        action_dim: A.
+        hidden: Width of the trunk.
+        layers: Number of hidden layers of the trunk.
+        norm: Whether the hidden layers have LayerNorm and GELU instead of ReLU.
     """
 
     def __init__(
@@ -175,21 +186,21 @@ class DeterministicHead(ActionHead):
         self.means = nn.Linear(hidden, action_dim)
 
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
-        """(..., E) -> `means` (..., A), float32."""
+        """Return `means` (..., A), float32."""
         return {"means": self.means(self.trunk(latent)).float().tanh()}
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Absolute error, mean over the action's dimensions, (..., A) -> (...)."""
+        """Return the absolute error, mean over the action's dimensions, (..., A) -> (...)."""
         return (actions.float() - params["means"]).abs().mean(-1)
 
     def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """The action itself."""
+        """Return the action, (..., A)."""
         return params["means"]
 
     def mean(self, params: dict[str, Tensor]) -> Tensor:
-        """The action itself."""
+        """Return the action, (..., A)."""
         return params["means"]
 
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
-        """The action itself: this head is not random."""
+        """Return the action, (..., A): this head is not random."""
         return params["means"]

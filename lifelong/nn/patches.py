@@ -1,4 +1,4 @@
-"""Images and instruction to one token per frame: patches, and a transformer over all of them.
+"""Image patches, and a transformer that mixes them with the instruction to one token per frame.
 
 Shape legend: N frames, M windows, V views, P patches per view, H W image, E token.
 """
@@ -13,17 +13,19 @@ from lifelong.nn.vision import make_norm
 
 
 class PatchEncoder(nn.Module):
-    """A strided convolution and then one linear map per patch of its output.
+    """Tokens of an image's patches: a strided convolution, then one linear map per patch of its output.
 
     Args:
         image_size: H, W in pixels.
         dim: E.
-        width, stem_kernel, stem_stride: of the convolution.
-        patch: side of a patch, in cells of the convolution's output.
-        norm: see `make_norm`.
+        width: Channels of the convolution.
+        stem_kernel: Side of the convolution's kernel.
+        stem_stride: Stride of the convolution.
+        patch: Side of a patch, in cells of the convolution's output.
+        norm: Normalisation, see `make_norm`.
 
     Raises:
-        PolicyError: an unknown norm, or an image that patches do not tile.
+        PolicyError: An unknown norm, or an image that patches do not tile.
     """
 
     def __init__(
@@ -56,24 +58,28 @@ class PatchEncoder(nn.Module):
         self.to(memory_format=torch.channels_last)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(N, H, W, 3) uint8 -> (N, P, E), row by row."""
+        """Encode images (N, H, W, 3) uint8 to tokens (N, P, E), row by row."""
         h = images.movedim(-1, 1).to(torch.float32).mul_(2.0 / 255.0).sub_(1.0)
         h = functional.relu(self.norm(self.project(self.stem(h))), inplace=True)
         return h.flatten(2).transpose(1, 2)
 
 
 class SpatialTransformer(nn.Module):
-    """What a frame shows, seen with the instruction: ViLT (Kim, Son and Kim, ICML 2021) with LIBERO's sizes.
+    """Transformer over the patches of a frame and its instruction: ViLT (Kim, Son and Kim, ICML 2021).
 
-    The patches of all views and the instruction's token see each other, without order in time; what is read is an
-    extra token of its own.
+    The patches of all views and the instruction's token attend to each other; the output is read from a learned
+    token. The defaults are LIBERO's sizes.
 
     Args:
         views: V.
         patches: P of every view.
         dim: E.
-        out_dim: size of the output.
-        layers, heads, head_dim, mlp_dim, dropout: see `TransformerLayer`.
+        out_dim: Size of the output.
+        layers: Number of layers.
+        heads: Number of attention heads.
+        head_dim: Size of a head.
+        mlp_dim: Width of the feed-forward networks.
+        dropout: Dropout after attention and in the feed-forward networks.
     """
 
     def __init__(
@@ -100,19 +106,19 @@ class SpatialTransformer(nn.Module):
         self.project = nn.Linear(dim, out_dim)
 
     def forward(self, patches: Tensor, language: Tensor) -> Tensor:
-        """Mixes the patches of each frame with its instruction.
+        """Mix the patches of each frame with its instruction.
 
         Args:
-            patches: (N, V, P, E).
-            language: (M, E); N = M T with the T frames of a window adjacent.
+            patches: Tokens of patches (N, V, P, E).
+            language: Tokens of instructions (M, E); N = M T with the T frames of a window adjacent.
 
         Returns:
-            (N, out_dim).
+            One vector per frame (N, out_dim).
         """
         n = len(patches)
         seen = (patches + self.positions + self.modalities[:-1, None]).flatten(1, 2)
-        told = (language + self.modalities[-1]).repeat_interleave(n // len(language), dim=0)
-        x = torch.cat([self.read.expand(n, 1, -1), told[:, None], seen], dim=1)
+        instruction = (language + self.modalities[-1]).repeat_interleave(n // len(language), dim=0)
+        x = torch.cat([self.read.expand(n, 1, -1), instruction[:, None], seen], dim=1)
         for layer in self.layers:
             x = layer(x)
         return self.project(x[:, 0])

@@ -1,4 +1,4 @@
-"""Language and proprioception to tokens.
+"""Tokens of the instruction and of proprioception.
 
 Shape legend: B batch, T time, L language embedding, D one modality's dimension, E token.
 """
@@ -19,13 +19,13 @@ _CENTRE_AND_SCALE: dict[str, tuple[tuple[float, ...], float]] = {
 
 
 class ProprioScaling(nn.Module):
-    """Readings brought to order one, and in training some of them hidden.
+    """Scaling of readings to order one, and dropout of whole modalities.
 
     Args:
-        proprio: name -> D, in order.
-        normalise: bring known modalities to order one (the original feeds raw radians and metres, in which the
-            gripper's 0.04 m all but vanish).
-        dropout: chance, in training, that a whole modality of a whole window is zeroed, so that the policy
+        proprio: Name -> D, in order.
+        normalise: Whether to bring known modalities to order one (the original feeds raw radians and metres, in
+            which the gripper's 0.04 m all but vanish).
+        dropout: Chance, in training, that a whole modality of a whole window is zeroed, so that the policy
             does not learn to read the action off the arm's pose alone.
     """
 
@@ -40,7 +40,7 @@ class ProprioScaling(nn.Module):
             self.register_buffer(f"scale_{name}", torch.tensor(scale), persistent=False)
 
     def forward(self, proprio: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """name -> (B, T, D) to the same, scaled, in order."""
+        """Scale the readings, name -> (B, T, D); in order."""
         scaled = {}
         for name in self.names:
             x = (proprio[name] - getattr(self, f"centre_{name}")) / getattr(self, f"scale_{name}")
@@ -54,9 +54,10 @@ class ProprioTokens(nn.Module):
     """One token per modality: a linear map of the scaled reading.
 
     Args:
-        proprio: name -> D, in order.
+        proprio: Name -> D, in order.
         dim: E.
-        normalise, dropout: see `ProprioScaling`.
+        normalise: Whether to bring known modalities to order one, see `ProprioScaling`.
+        dropout: Chance that a modality is zeroed, see `ProprioScaling`.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class ProprioTokens(nn.Module):
         self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
 
     def forward(self, proprio: Mapping[str, Tensor]) -> Tensor:
-        """name -> (B, T, D) to (B, T, number of modalities, E)."""
+        """Map readings, name -> (B, T, D), to tokens (B, T, number of modalities, E)."""
         scaled = self.scaling(proprio)
         return torch.stack([linear(scaled[name]) for name, linear in self.linears.items()], dim=2)
 
@@ -80,12 +81,12 @@ class LanguageToken(nn.Module):
         self.linear = nn.Linear(language_dim, dim)
 
     def forward(self, language: Tensor) -> Tensor:
-        """(B, L) -> (B, E)."""
+        """Map embeddings (B, L) to tokens (B, E)."""
         return self.linear(language)
 
 
 def standardise(language: Tensor) -> Tensor:
-    """(B, L) embeddings with mean 0 and variance 1 over L.
+    """Return embeddings (B, L) with mean 0 and variance 1 over L.
 
     Sentence encoders give unit vectors, whose 384 entries are of order 0.05; BERT's are of order one. This
     makes a learning rate mean the same for all of them.

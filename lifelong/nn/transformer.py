@@ -11,9 +11,12 @@ from torch.nn import functional
 
 
 def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
-    """(length, dim) sine and cosine codes (Vaswani et al., 2017, section 3.5).
+    """Return sine and cosine position codes, (length, dim) (Vaswani et al., 2017, section 3.5).
 
-    `factor` stands where the paper has 10000: windows are of ten steps, not of a thousand words.
+    Args:
+        length: Number of positions.
+        dim: Size of a code.
+        factor: The paper's 10000; smaller here, because windows have ten steps, not a thousand words.
     """
     position = torch.arange(length, dtype=torch.float32)[:, None]
     rate = torch.exp(torch.arange(0, dim, 2, dtype=torch.float32) * (-math.log(factor) / dim))
@@ -24,7 +27,7 @@ def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
 
 
 def block_causal_mask(length: int, tokens: int) -> Tensor:
-    """(T M, T M) bool, True where a token may look: at its own time step and earlier ones."""
+    """Return a mask (T M, T M) bool, True where a token attends: to its own time step and earlier ones."""
     step = torch.arange(length).repeat_interleave(tokens)
     return step[None, :] <= step[:, None]
 
@@ -35,7 +38,7 @@ def attend(qkv: Tensor, heads: int, mask: Tensor | None = None, dropout: float =
     Args:
         qkv: Queries, keys and values of all heads, (B, S, 3 * heads * head_dim).
         heads: Number of heads.
-        mask: (S, S), True where a token may attend; None: everywhere.
+        mask: Mask (S, S), True where a token attends; None: everywhere.
         dropout: Probability that an attention weight is dropped.
     """
     b, s, _ = qkv.shape
@@ -45,7 +48,15 @@ def attend(qkv: Tensor, heads: int, mask: Tensor | None = None, dropout: float =
 
 
 class TransformerLayer(nn.Module):
-    """Pre-norm self-attention and feed-forward; torch's own layer ties the head size to E / heads, this does not."""
+    """Pre-norm self-attention and feed-forward network; unlike torch's layer it leaves the head size free.
+
+    Args:
+        dim: E.
+        heads: Number of attention heads.
+        head_dim: Size of a head.
+        mlp_dim: Width of the feed-forward network.
+        dropout: Dropout of attention weights, after attention and in the feed-forward network.
+    """
 
     def __init__(self, *, dim: int, heads: int, head_dim: int, mlp_dim: int, dropout: float) -> None:
         super().__init__()
@@ -63,7 +74,7 @@ class TransformerLayer(nn.Module):
         )
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, S, E), mask (S, S) -> (B, S, E); without a mask every token sees every other."""
+        """Map tokens (B, S, E) to the same shape; `mask` (S, S) is True where a token attends, None everywhere."""
         dropout = self.dropout if self.training else 0.0
         mixed = attend(self.qkv(self.attention_norm(x)), self.heads, mask, dropout)
         x = x + self.drop(self.out(mixed))
@@ -71,12 +82,18 @@ class TransformerLayer(nn.Module):
 
 
 class TemporalTransformer(nn.Module):
-    """Decoder-only transformer in which all tokens of a time step see each other and everything before.
+    """Decoder-only transformer in which the tokens of a time step attend to each other and to everything before.
+
+    The defaults are LIBERO's sizes.
 
     Args:
         dim: E.
-        layers, heads, head_dim, mlp_dim, dropout: sizes; the defaults are LIBERO's.
-        max_length: longest window, T.
+        layers: Number of layers.
+        heads: Number of attention heads.
+        head_dim: Size of a head.
+        mlp_dim: Width of the feed-forward networks.
+        dropout: Dropout of attention weights, after attention and in the feed-forward networks.
+        max_length: Longest window, T.
     """
 
     def __init__(
@@ -91,12 +108,14 @@ class TemporalTransformer(nn.Module):
         max_length: int = 10,
     ) -> None:
         super().__init__()
-        sizes = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim, "dropout": dropout}
-        self.layers = nn.ModuleList(TransformerLayer(**sizes) for _ in range(layers))
+        self.layers = nn.ModuleList(
+            TransformerLayer(dim=dim, heads=heads, head_dim=head_dim, mlp_dim=mlp_dim, dropout=dropout)
+            for _ in range(layers)
+        )
         self.register_buffer("positions", sinusoidal_positions(max_length, dim), persistent=False)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, T, M, E) -> (B, T, M, E); every token of a time step carries that step's position code."""
+        """Map tokens (B, T, M, E) to the same shape; those of a time step carry that step's position code."""
         b, t, m, e = tokens.shape
         mask = block_causal_mask(t, m).to(tokens.device)
         x = (tokens + self.positions[:t, None]).reshape(b, t * m, e)

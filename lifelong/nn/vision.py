@@ -1,4 +1,4 @@
-"""Images to latents: a ResNet of basic blocks, each modulated by the instruction, read out as keypoints.
+"""Image encoder: a ResNet of basic blocks, each modulated by the instruction, read out as keypoints.
 
 Shape legend: N images, C channels, H W image, K keypoints, L language embedding, E latent.
 """
@@ -13,15 +13,15 @@ from lifelong.errors import PolicyError
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:
-    """Normalisation after a convolution.
+    """Build the normalisation after a convolution.
 
     Args:
-        kind: `group` (8 channels a group; no state, so it neither depends on the batch nor drifts from
-            task to task), `batch` (the original's; keeps running statistics) or `none`.
+        kind: Kind of normalisation: `group` (8 channels a group; no state, so it neither depends on the batch nor
+            drifts from task to task), `batch` (the original's; keeps running statistics) or `none`.
         channels: C.
 
     Raises:
-        PolicyError: for another kind.
+        PolicyError: Another kind.
     """
     if kind == "group":
         return nn.GroupNorm(max(1, channels // 8), channels)
@@ -46,7 +46,7 @@ class FiLM(nn.Module):
         nn.init.zeros_(self.project.bias)
 
     def forward(self, h: Tensor, language: Tensor) -> Tensor:
-        """Modulates `h` (N, C, H, W) by `language` (M, L); N is a multiple of M, frames of a window adjacent."""
+        """Modulate `h` (N, C, H, W) by `language` (M, L); N is a multiple of M, frames of a window adjacent."""
         gamma, beta = self.project(language).to(h.dtype).chunk(2, dim=-1)
         n, c, height, width = h.shape
         frames = n // language.shape[0]
@@ -71,14 +71,14 @@ class BasicBlock(nn.Module):
             self.shortcut = nn.Sequential(conv, make_norm(norm, channels))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C_in, H, W) -> (N, C, H / stride, W / stride)."""
+        """Map features (N, C_in, H, W) to (N, C, H / stride, W / stride)."""
         h = functional.relu(self.norm1(self.conv1(x)), inplace=True)
         h = self.norm2(self.conv2(h))
         return functional.relu(h + self.shortcut(x), inplace=True)
 
 
 class SpatialSoftmax(nn.Module):
-    """Expected image position of each of K learned heat maps.
+    """Expected position in the image under each of K learned heat maps.
 
     Finn et al., Deep spatial autoencoders (ICRA 2016). Computed in float32: bfloat16 positions would be
     coarser than a pixel.
@@ -87,7 +87,7 @@ class SpatialSoftmax(nn.Module):
         channels: C.
         size: H, W of the feature map.
         keypoints: K.
-        temperature: divides the heat. At 1 (the original) an untrained layer averages over the whole map, so that
+        temperature: Divisor of the heat. At 1 (the original) an untrained layer averages over the whole map, so that
             its positions hardly depend on the image and learning starts slowly; at 0.1 they move fifteen times as
             much.
     """
@@ -103,7 +103,7 @@ class SpatialSoftmax(nn.Module):
         self.register_buffer("grid", grid.reshape(-1, 2).T.contiguous(), persistent=False)
 
     def forward(self, h: Tensor) -> Tensor:
-        """(N, C, H, W) -> (N, 2 K) positions x, y in [-1, 1], x rightwards and y downwards."""
+        """Return positions x, y in [-1, 1], (N, C, H, W) -> (N, 2 K), x rightwards and y downwards."""
         heat = self.heat(h.permute(0, 2, 3, 1)).flatten(1, 2)  # (N, H W, K), as it lies in memory
         with torch.autocast(h.device.type, enabled=False):
             positions = self.grid @ (heat.float() / self.temperature).softmax(dim=1)  # (N, 2, K)
@@ -113,14 +113,14 @@ class SpatialSoftmax(nn.Module):
 class FlatReadout(nn.Module):
     """The whole feature map, reduced to a few channels and read by one linear layer.
 
-    Where a thing is can be read off its pixels linearly. In a short training this localises better than keypoints
-    (experiments/laptop); it has more weights, and they belong to one image size.
+    An object's position is a linear function of where its features are. In a short training this localises better
+    than keypoints (experiments/laptop); it has more weights, and they fit one image size only.
 
     Args:
         channels: C.
         size: H, W of the feature map.
-        features: K, of the output.
-        reduced: channels that are read.
+        features: K, the size of the output.
+        reduced: Number of channels that the linear layer reads.
     """
 
     def __init__(self, *, channels: int, size: tuple[int, int], features: int, reduced: int = 8) -> None:
@@ -130,12 +130,12 @@ class FlatReadout(nn.Module):
         self.norm = nn.LayerNorm(features)  # keeps the features alive from task to task
 
     def forward(self, h: Tensor) -> Tensor:
-        """(N, C, H, W) -> (N, K)."""
+        """Map features (N, C, H, W) to (N, K)."""
         return functional.gelu(self.norm(self.read(self.reduce(h).flatten(1))))
 
 
 class ResNetFiLMEncoder(nn.Module):
-    """The image encoder of ResNet-T: ResNet-18's first stages, FiLM after every block, keypoints, one linear map.
+    """Image encoder of ResNet-T: ResNet-18's first stages, FiLM after every block, keypoints, one linear map.
 
     The defaults are LIBERO's (Liu et al., NeurIPS 2023, appendix A): stem and first two stages of ResNet-18,
     64-d latent from 32 keypoints. Every size is an argument, so that a small one runs on a laptop.
@@ -144,16 +144,18 @@ class ResNetFiLMEncoder(nn.Module):
         image_size: H, W in pixels.
         language_dim: L.
         latent_dim: E.
-        width: channels of the stem and the first stage; each further stage doubles them.
-        stage_blocks: basic blocks per stage; every stage but the first halves the resolution.
-        stem_kernel, stem_stride, stem_pool: first convolution, and whether a 3x3 stride 2 max pool follows.
-        keypoints: K; None: E / 2.
-        temperature: of the keypoints, see `SpatialSoftmax`.
-        readout: how positions leave the feature map: `keypoints` (K of them), or `flat` with 2 K features.
-        norm: see `make_norm`.
+        width: Channels of the stem and the first stage; each further stage doubles them.
+        stage_blocks: Number of basic blocks per stage; every stage but the first halves the resolution.
+        stem_kernel: Side of the first convolution's kernel.
+        stem_stride: Stride of the first convolution.
+        stem_pool: Whether a 3x3 max pool of stride 2 follows the first convolution.
+        keypoints: K, the number of keypoints; None takes E / 2.
+        temperature: Temperature of the keypoints' softmax, see `SpatialSoftmax`.
+        readout: How the feature map is read: `keypoints` (K of them), or `flat` with 2 K features.
+        norm: Normalisation after convolutions: `group`, `batch` or `none`, see `make_norm`.
 
     Raises:
-        PolicyError: an unknown readout, or an image too small for the number of stages.
+        PolicyError: An unknown readout, or an image too small for the number of stages.
     """
 
     def __init__(
@@ -201,7 +203,7 @@ class ResNetFiLMEncoder(nn.Module):
         self.to(memory_format=torch.channels_last)
 
     def _map_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the feature map that positions are read from."""
+        """Return height and width of the feature map that the readout reads."""
         conv, pools = self.stem[0], sum(isinstance(m, nn.MaxPool2d) for m in self.stem)
         size = []
         for n in image_size:
@@ -218,14 +220,14 @@ class ResNetFiLMEncoder(nn.Module):
         return size[0], size[1]
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
-        """Encodes images.
+        """Encode images.
 
         Args:
-            images: (N, H, W, 3) uint8.
-            language: (M, L); N = M T with the T frames of a window adjacent.
+            images: Images (N, H, W, 3) uint8.
+            language: Embeddings (M, L); N = M T with the T frames of a window adjacent.
 
         Returns:
-            (N, E) latents.
+            Latents (N, E).
         """
         h = images.movedim(-1, 1)  # a view; already channels-last in memory
         h = self.stem(h.to(torch.float32).mul_(2.0 / 255.0).sub_(1.0))

@@ -12,7 +12,7 @@ from lifelong.algorithms import DMPEL, LoRA
 from lifelong.algorithms.dmpel import _padded
 from lifelong.data.windows import WindowSubset
 from lifelong.errors import ConfigError, PolicyError
-from lifelong.nn.experts import Router, change
+from lifelong.nn.experts import Router, expert_output
 from lifelong.seeding import generator, seeded
 from lifelong.streams import StageWindows
 from lifelong.training.fit import fit
@@ -295,7 +295,7 @@ def test_dmpel_changes_each_sample_by_its_own_weights(layer):
     ]
     c = torch.rand(2, 4, generator=draws)  # two samples; two experts of rank 2 for each of two tasks
     x = torch.randn(6, *((5, 4) if isinstance(layer, nn.Linear) else (4, 5, 5)), generator=draws)
-    given = layer(x) + change(layer, x, tasks, c.repeat_interleave(2, dim=1))
+    given = layer(x) + expert_output(layer, x, tasks, c.repeat_interleave(2, dim=1))
     for sample in range(2):
         dense, weight = copy.deepcopy(layer), layer.weight.detach().flatten(1)
         for expert in range(4):
@@ -306,7 +306,7 @@ def test_dmpel_changes_each_sample_by_its_own_weights(layer):
         mine = slice(3 * sample, 3 * sample + 3)
         torch.testing.assert_close(given[mine], dense(x[mine]), rtol=1e-4, atol=1e-4)
     with pytest.raises(PolicyError, match="5 rows for 2 samples"):
-        change(layer, x[:5], tasks, c.repeat_interleave(2, dim=1))
+        expert_output(layer, x[:5], tasks, c.repeat_interleave(2, dim=1))
 
 
 def test_dmpel_coefficients_are_shares_of_the_best_choices():
