@@ -100,7 +100,7 @@ def _group(name: str, files: list[Path], default: str | None) -> str:
     listed = [f"- `{name}={f.stem}`{' (default)' if f.stem == default else ''}{_about(f)}" for f in files]
     whole, targets = [], {}
     for file in files:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+        values = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
         if "_target_" not in values or any(isinstance(x, dict) for x in values.get("augmentations", ())):
             whole.append(f"`configs/{name}/{file.name}`\n\n```yaml\n{file.read_text(encoding='utf-8')}```")
         else:

@@ -73,8 +73,15 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
     Args:
         config: A run's config.yaml, or the part of it that a pretraining keeps, as plain data; it is not modified.
     """
-    upgrades: dict[str, Callable[[Mapping[str, Any]], Node]] = {"policy": upgrade_policy}
-    return {key: upgrades[key](node) if key in upgrades else node for key, node in config.items()}
+    upgrades: dict[str, Callable[[Mapping[str, Any]], Node]] = {
+        "policy": upgrade_policy,
+        "algo": upgrade_algorithm,
+    }
+    return {
+        key: upgrades[key](node) if key in upgrades else node
+        for key, node in config.items()
+        if key != "compat"
+    }
 
 
 def upgrade_policy(node: Mapping[str, Any]) -> Node:
@@ -93,3 +100,36 @@ def upgrade_policy(node: Mapping[str, Any]) -> Node:
         values = {new: node[old] for old, new in keys.items() if old in node}
         upgraded[name] = {"_target_": f"lifelong.nn.{target}", "_partial_": True, **values}
     return upgraded
+
+
+def upgrade_algorithm(node: Mapping[str, Any]) -> Node:
+    """Return the node of an algorithm with components in place of `compat` and of the keys that went with it.
+
+    Args:
+        node: The `algo` node; nodes of other algorithms and of today come back unchanged.
+    """
+    upgraded, target = dict(node), node.get("_target_", "")
+    libero = upgraded.pop("compat", None) == "libero"
+    if target in ("lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM") and "memory" not in node:
+        budget, per_task = upgraded.pop("budget", 10_000), upgraded.pop("per_task", 1000)
+        kind, windows = ("FirstWindows", per_task) if libero else ("ReplayMemory", budget)
+        upgraded["memory"] = {"_target_": f"lifelong.data.memory.{kind}", "budget": windows}
+        if target.endswith("AGEM"):
+            upgraded["augment_reference"] = libero
+    elif target == "lifelong.algorithms.ewc.EWC" and "estimator" not in node:
+        upgraded["estimator"] = _estimator(upgraded, libero)
+    elif target == "lifelong.algorithms.packnet.PackNet" and "masks_only" not in node:
+        upgraded["masks_only"] = libero
+    return upgraded
+
+
+def _estimator(node: Node, libero: bool) -> Node:
+    """Take EWC's earlier keys out of its node; return the estimator that they describe."""
+    kind = node.pop("fisher", None) or ("batch" if libero else "per_sample")
+    windows, batch_size = node.pop("fisher_windows", None), node.pop("fisher_batch_size", 32)
+    if windows is None:
+        windows = 0 if libero else 512
+    estimator = {"windows": windows, "augment": libero}
+    if kind == "per_sample":
+        return {"_target_": "lifelong.algorithms.importance.SampleFisher", **estimator}
+    return {"_target_": "lifelong.algorithms.importance.BatchFisher", **estimator, "batch_size": batch_size}

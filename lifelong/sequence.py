@@ -17,8 +17,9 @@ from torch import Tensor
 
 from libero_env.timing import CONTROL_PERIOD
 from lifelong import checkpoints
-from lifelong.algorithms.base import Phase, WindowDataset
+from lifelong.algorithms.base import Phase
 from lifelong.context import RunContext
+from lifelong.data.windows import TaskWindows
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import generator, seeded
@@ -65,7 +66,7 @@ class TaskSequence:
         datasets: Windows of each task, by position; each is read when first used.
     """
 
-    def __init__(self, context: RunContext, datasets: Mapping[int, WindowDataset]):
+    def __init__(self, context: RunContext, datasets: Mapping[int, TaskWindows]):
         self.context = context
         self.log = context.directory.log
         self.stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
@@ -140,7 +141,7 @@ class TaskSequence:
             offset += epochs
         return phases
 
-    def _train(self, phase: TrainingPhase, dataset: WindowDataset, resume: dict[str, Any] | None) -> None:
+    def _train(self, phase: TrainingPhase, dataset: TaskWindows, resume: dict[str, Any] | None) -> None:
         """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""
         context = self.context
         if resume is None:
@@ -233,7 +234,7 @@ class TaskSequence:
         checkpoints.save(self.context.directory.progress_path, state)
         self._saved = time.monotonic()
 
-    def _end_task(self, task: int, dataset: WindowDataset) -> None:
+    def _end_task(self, task: int, dataset: TaskWindows) -> None:
         """Let the algorithm end the task, record the costs, and write the task's checkpoint."""
         policy, algorithm, seed = self.context.policy, self.context.algorithm, self.context.seed
         began = time.perf_counter()

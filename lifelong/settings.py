@@ -25,7 +25,6 @@ class RunSettings:
     progress: bool | None
     deterministic: bool
     init_from: str | None
-    compat: str | None
 
 
 @dataclass(frozen=True)

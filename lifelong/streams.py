@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.windows import JoinedWindows, WindowDataset, WindowSubset
+from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from lifelong.types import Batch
@@ -126,7 +126,7 @@ class StageWindows(JoinedWindows):
 
 
 @dataclass(frozen=True)
-class StageData(Mapping[int, WindowDataset]):
+class StageData(Mapping[int, TaskWindows]):
     """The windows that are learned in each stage, by its last task.
 
     Attributes:
@@ -136,12 +136,12 @@ class StageData(Mapping[int, WindowDataset]):
         seed: Seed of the run, which decides the windows that are learned in neighbouring stages.
     """
 
-    datasets: Mapping[int, WindowDataset]
+    datasets: Mapping[int, TaskWindows]
     stages: Stages
     settings: StreamSettings
     seed: int
 
-    def __getitem__(self, last: int) -> WindowDataset:
+    def __getitem__(self, last: int) -> TaskWindows:
         ends = list(self)
         if last not in ends:
             raise KeyError(last)
@@ -157,7 +157,7 @@ class StageData(Mapping[int, WindowDataset]):
     def __len__(self) -> int:
         return len(self.stages)
 
-    def _own(self, place: int) -> WindowDataset:
+    def _own(self, place: int) -> TaskWindows:
         """Return all windows of a stage's tasks."""
         stage = self.stages[place]
         if len(stage) == 1:

@@ -1,57 +1,49 @@
 """Averaged gradient episodic memory."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm, WindowDataset, as_libero
-from lifelong.data.dataset import SequenceVLDataset
-from lifelong.data.memory import FirstWindows, ReplayMemory
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.memory import ReplayMemory
+from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
 
 class AGEM(Algorithm):
-    """Take out of each gradient what would raise the loss on a sample of earlier tasks.
+    """Remove from each gradient the component that would raise the loss on a sample of earlier tasks.
 
     With g the gradient on the present task and g_ref that on windows drawn from the memory: where
     `g . g_ref < 0`, `g <- g - (g . g_ref / g_ref . g_ref) g_ref` (Chaudhry et al. 2019, "Efficient lifelong
-    learning with A-GEM", eq. 11). The memory is ER's; its windows are taken without augmentation.
+    learning with A-GEM", eq. 11). The memory is ER's; its windows are used without augmentation.
 
-    With `compat="libero"` it is the memory of LIBERO's code (see `ER`), and its windows are augmented. No results of
-    that are published.
+    LIBERO's code has `FirstWindows` as memory and augments its windows. No results of that are published.
     """
 
-    def __init__(
-        self, *, budget: int = 10_000, ratio: float = 1.0, per_task: int = 1000, compat: str | None = None
-    ):
-        """Make the algorithm.
+    def __init__(self, *, memory: ReplayMemory, ratio: float = 1.0, augment_reference: bool = False):
+        """Create the algorithm.
 
         Args:
-            budget: Largest number of windows kept over all tasks; not used with `compat="libero"`.
-            ratio: Windows of the reference for each window of the batch; more make g_ref less noisy.
-            per_task: Windows kept of each task with `compat="libero"`; not used without.
-            compat: None, or `libero` for the choices of LIBERO's code.
-
-        Raises:
-            ConfigError: Another `compat`.
+            memory: Memory of earlier tasks' windows, `ReplayMemory` or `FirstWindows`.
+            ratio: Number of reference windows for each window of the batch; more make g_ref less noisy.
+            augment_reference: Whether the reference windows are augmented as in training.
         """
-        self.ratio, self.compat = ratio, compat
-        self.memory = FirstWindows(per_task) if as_libero(compat) else ReplayMemory(budget)
-        self._reference: Batch | None = None  # drawn by `mix`, used up by `after_backward`
+        self.memory, self.ratio, self.augment_reference = memory, ratio, augment_reference
+        self._reference: Batch | None = None  # drawn by `mix`, used by `after_backward`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """The batch as it is; the windows of the reference are drawn here."""
+        """Return the batch unchanged; the reference windows are drawn here."""
         if len(self.memory):
             self._reference = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
-            if self.compat and self.augment is not None:
+            if self.augment_reference and self.augment is not None:
                 self._reference = self.augment(self._reference, generator)
         return batch
 
     def after_backward(self, policy: Policy) -> None:
-        """Project the gradient, unless it agrees with the reference already."""
+        """Project the gradient where it disagrees with the reference."""
         if self._reference is None:
             return
         params = [p for p in policy.parameters() if p.requires_grad]
@@ -60,25 +52,25 @@ class AGEM(Algorithm):
         project(params, torch.autograd.grad(loss, params, allow_unused=True))
 
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
-        """Take the task's windows in; the earlier tasks' shares shrink."""
-        self.memory.add(cast(SequenceVLDataset, dataset), generator)
+        """Add the task's windows to the memory."""
+        self.memory.add(dataset, generator)
 
     def state_dict(self) -> dict[str, Any]:
-        """Which windows are kept; their frames are read again from the demonstrations."""
+        """Return which windows are kept; their frames are read again from the demonstrations."""
         return {"memory": self.memory.state_dict()}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
-        """Take up what `state_dict` gave; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], cast(Mapping[int, SequenceVLDataset], datasets))
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned; the frames come from the datasets."""
+        self.memory.load_state_dict(state["memory"], datasets)
 
 
 @torch.no_grad()
 def project(params: list[Tensor], reference: tuple[Tensor | None, ...]) -> None:
-    """Make the parameters' gradients agree with the reference: no negative product is left.
+    """Project the parameters' gradients so that their product with the reference is not negative.
 
-    A missing gradient, on either side, counts as zero. Gradients that agree already are not touched.
+    A missing gradient, on either side, counts as zero. Where the product is not negative, nothing changes.
     """
     used = [(p, r) for p, r in zip(params, reference, strict=True) if r is not None]
     products = [(p.grad * r).sum() for p, r in used if p.grad is not None]

@@ -19,8 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lifelong.data.windows import WindowDataset
-from lifelong.errors import ConfigError
+from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -38,17 +37,6 @@ class Phase:
     name: str = "train"
     share: float = 1.0
     measures_transfer: bool = True
-
-
-def as_libero(compat: str | None) -> bool:
-    """Whether an algorithm's `compat` setting asks for the choices of LIBERO's code.
-
-    Raises:
-        ConfigError: It is neither None nor `libero`.
-    """
-    if compat not in (None, "libero"):
-        raise ConfigError(f"compat is {compat!r}; valid: null, libero")
-    return compat == "libero"
 
 
 class Algorithm:
@@ -72,7 +60,7 @@ class Algorithm:
         """
         return tuple((task,) for task in range(tasks))
 
-    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Before the first step on a task (position `task_index` in the sequence)."""
 
     def phases(self) -> tuple[Phase, ...]:
@@ -112,7 +100,7 @@ class Algorithm:
         """After the last step of a phase, with the weights that are kept."""
 
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """After training on a task, with the final weights."""
 
@@ -125,7 +113,7 @@ class Algorithm:
         """Everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""
         return {}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave.
 
         Args:

@@ -1,14 +1,14 @@
 """Dark experience replay, with labels: DER++."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
-from lifelong.data.dataset import SequenceVLDataset
+from lifelong.algorithms.base import Algorithm
 from lifelong.data.memory import ReplayMemory
+from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -72,10 +72,10 @@ class DERpp(Algorithm):
         return parts
 
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Take the task's windows in with what the policy answers on them."""
-        self.memory.add(cast(SequenceVLDataset, dataset), generator)
+        self.memory.add(dataset, generator)
         before, self._kept = set(self._kept), self._held()
         for task, kept in self._kept.items():
             if task in before:  # a smaller share is the beginning of the larger one
@@ -87,9 +87,9 @@ class DERpp(Algorithm):
         """Which windows are kept, and the outputs stored with them: nothing later could compute these again."""
         return {"memory": self.memory.state_dict(), "outputs": dict(self._outputs)}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], cast(Mapping[int, SequenceVLDataset], datasets))
+        self.memory.load_state_dict(state["memory"], datasets)
         self._kept, self._outputs = self._held(), dict(state["outputs"])
 
     def _held(self) -> dict[int, Tensor]:
@@ -97,7 +97,7 @@ class DERpp(Algorithm):
 
 
 @torch.no_grad()
-def _answers(policy: Policy, dataset: WindowDataset, windows: Tensor) -> Tensor:
+def _answers(policy: Policy, dataset: TaskWindows, windows: Tensor) -> Tensor:
     """The policy's actions on windows, in evaluation mode, (n, T, A)."""
     was_training, device = policy.training, _device(policy)
     policy.eval()

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.hooks import RemovableHandle
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.nn.adapters import freeze_statistics, initial_pair
 from lifelong.nn.experts import Router, expert_output, expert_shape, routed_layers
@@ -104,7 +105,7 @@ class DMPEL(Algorithm):
 
     # --- hooks
 
-    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Note the episodes' contexts; after the base, add experts and choices of the router."""
         self.task_index, layers = task_index, routed_layers(policy, self.adapted)
         queries, of_window = self._contexts(dataset)
@@ -164,7 +165,7 @@ class DMPEL(Algorithm):
 
     @torch.no_grad()
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Keep some of the task's contexts, with the coefficients that they are answered with."""
         queries = self._episodes["queries"]
@@ -313,7 +314,7 @@ class DMPEL(Algorithm):
         kept = {"memory": _copied(self._memory), "episodes": dict(self._episodes)}
         return {**place, "library": library, "router": router, **kept}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave."""
         self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
         self._seed = int(state["seed"])

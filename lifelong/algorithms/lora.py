@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.nn.adapters import check_matches, freeze_statistics, initial_pair, matches
 from lifelong.policies.base import Policy
@@ -65,7 +66,7 @@ class LoRA(Algorithm):
         self._pairs: dict[int, dict[str, dict[str, Tensor]]] = {}  # task -> name -> a (r, in), b (out, r)
         self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
-    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the base when it is learned, and start the task's adapter from it."""
         self.task_index = task_index
         names = self._choose(policy) if not self._base else []
@@ -122,7 +123,7 @@ class LoRA(Algorithm):
         _put(policy, {name: self._sum(name, pair) for name, pair in pairs.items()})
 
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Keep the task's own copies; its A and B are kept already."""
         self._seed = int(torch.randint(2**62, (), generator=generator))
@@ -163,7 +164,7 @@ class LoRA(Algorithm):
         place = {"task_index": self.task_index, "base_left": self._base_left, "base_last": self._base_last}
         return {**place, "seed": self._seed, **state}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave."""
         self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
         self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -58,7 +59,7 @@ class LwF(Algorithm):
         return self.strength * (policy.predict(batch) - answers).square().sum(-1).mean()
 
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """The present weights become the teacher's; the task's instruction joins the earlier ones."""
         self._weights = {n: t.detach().clone() for n, t in policy.state_dict().items()}
@@ -69,7 +70,7 @@ class LwF(Algorithm):
         """The teacher's weights and the instructions learned."""
         return {"weights": dict(self._weights), "languages": dict(self._languages)}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave."""
         self._weights, self._languages = dict(state["weights"]), dict(state["languages"])
         self._teacher = None

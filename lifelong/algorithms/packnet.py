@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lifelong.algorithms.base import Algorithm, Phase, WindowDataset, as_libero
+from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, ConfigError
 from lifelong.policies.base import Policy
 
@@ -24,7 +25,7 @@ class PackNet(Algorithm):
     the first task and are then frozen. After each step of the optimiser, whatever is not free is put back,
     so weight decay and momentum cannot move it; a task's outputs stay bit-identical for ever.
 
-    With `compat="libero"` it is as in LIBERO's code, and they do not. Only weights of linear layers and convolutions
+    With `masks_only` it is as in LIBERO's code, and they do not. Only weights of linear layers and convolutions
     are divided. Gradients of those that are not free are zeroed, and always those of these layers' biases and of
     batch and layer norms; weight decay still shrinks them all. Everything else (recurrent weights, group norms,
     embeddings) learns with every task. With that go the results of Liu et al., table 8 (FWT / NBT / AUC of ResNet-T:
@@ -32,18 +33,18 @@ class PackNet(Algorithm):
     yet: there, gradients are clipped before they are zeroed, and retraining keeps the epoch with the best success.
     """
 
-    def __init__(self, *, prune_perc: float = 0.75, post_prune_share: float = 1.0, compat: str | None = None):
+    def __init__(self, *, prune_perc: float = 0.75, post_prune_share: float = 1.0, masks_only: bool = False):
         """Make the algorithm.
 
         Args:
             prune_perc: Share of the free weights given back after a task; the task keeps the rest.
             post_prune_share: Epochs of retraining after pruning, as a share of the epochs of training.
-            compat: None, or `libero` for the choices of LIBERO's code.
+            masks_only: Whether only gradients are masked, as in LIBERO's code, instead of weights being put back.
 
         Raises:
-            ConfigError: A share outside its range, or another `compat`.
+            ConfigError: A share outside its range.
         """
-        self.masks_only = as_libero(compat)
+        self.masks_only = masks_only
         if not 0 < prune_perc < 1:
             raise ConfigError(f"algo.prune_perc is {prune_perc}; it must lie between 0 and 1, e.g. 0.75")
         self.prune_perc = prune_perc
@@ -58,7 +59,7 @@ class PackNet(Algorithm):
         """Training on all free weights, then retraining of those the task keeps."""
         return (Phase("train"), Phase("retrain", self.post_prune_share, measures_transfer=False))
 
-    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Open the free weights to the new task."""
         self.task_index = task_index
         self._pruned = False
@@ -137,7 +138,7 @@ class PackNet(Algorithm):
         """Owners of all weights, and where in the task it stands."""
         return {"task_index": self.task_index, "pruned": self._pruned, "owner": dict(self._owner)}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave."""
         self.task_index = int(state["task_index"])
         self._pruned = bool(state["pruned"])

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.anchor import Anchor
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 
 
@@ -40,14 +41,13 @@ class SI(Algorithm):
         self._way: dict[str, Tensor] = {}  # Delta
         self._step: dict[str, tuple[Tensor, Tensor]] = {}  # of one step: gradient, weights before it
 
-    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """A new path begins."""
         self._omega, self._way = {}, {}
 
     def penalty(self, policy: Policy) -> Tensor | None:
         """`strength * sum Omega (theta - anchor)^2`, a scalar; None during the first task."""
-        surrogate = self.anchor.penalty(policy)
-        return None if surrogate is None else self.strength * surrogate
+        return self.anchor.penalty(policy, self.strength)
 
     @torch.no_grad()
     def after_backward(self, policy: Policy) -> None:
@@ -71,7 +71,7 @@ class SI(Algorithm):
         self._step = {}
 
     def end_task(
-        self, task_index: int, dataset: WindowDataset, policy: Policy, generator: torch.Generator
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Turn the path into importance and move the anchor to the present weights."""
         added = {n: torch.zeros_like(v) for n, v in self.anchor.importance.items()}
@@ -84,7 +84,7 @@ class SI(Algorithm):
         """Importance and anchor, and the path of the task being learned."""
         return {"anchor": self.anchor.state_dict(), "omega": dict(self._omega), "way": dict(self._way)}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave."""
         self.anchor.load_state_dict(state["anchor"])
         self._omega, self._way = dict(state["omega"]), dict(state["way"])

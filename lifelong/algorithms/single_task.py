@@ -6,7 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 
 
@@ -22,13 +23,13 @@ class SingleTask(Algorithm):
         self._initial: dict[str, Tensor] | None = None
         self._learned: dict[int, dict[str, Tensor]] = {}  # position -> weights and buffers
 
-    def begin_task(self, task_index: int, dataset: WindowDataset, policy: Policy) -> None:
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Put the first weights back; at the first task, note them."""
         if self._initial is None:
             self._initial = _copy(policy)
         policy.load_state_dict(self._initial)
 
-    def end_task(self, task_index: int, dataset: WindowDataset, policy: Policy, generator: Any) -> None:
+    def end_task(self, task_index: int, dataset: TaskWindows, policy: Policy, generator: Any) -> None:
         """Keep the task's weights."""
         self._learned[task_index] = _copy(policy)
 
@@ -49,7 +50,7 @@ class SingleTask(Algorithm):
         """The first weights and those of every task learned."""
         return {"initial": self._initial, "learned": dict(self._learned)}
 
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, WindowDataset]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Take up what `state_dict` gave."""
         self._initial = state["initial"]
         self._learned = dict(state["learned"])

@@ -119,12 +119,12 @@ class FirstWindows(ReplayMemory):
     A thousand of them are the first eight or so demonstrations, not a sample of the task.
 
     Args:
-        per_task: Number of windows kept of each task.
+        budget: Number of windows kept of each task.
     """
 
-    def __init__(self, per_task: int) -> None:
-        super().__init__(per_task)
-        self.per_task = per_task
+    def __init__(self, budget: int) -> None:
+        super().__init__(budget)
+        self.per_task = budget
 
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""

@@ -12,9 +12,10 @@ from omegaconf import OmegaConf
 
 from libero_env.tasks import Task
 from lifelong import checkpoints
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
 from lifelong.build import build
 from lifelong.data.settings import DataSettings
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, LifelongError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
@@ -155,13 +156,13 @@ def _read_config(file: Path) -> dict[str, Any]:
     return config
 
 
-class _NoWindows(Mapping[int, WindowDataset]):
+class _NoWindows(Mapping[int, TaskWindows]):
     """Raises an error if an algorithm reads demonstrations, which are not available for acting."""
 
     def __init__(self, path: Path):
         self._path = path
 
-    def __getitem__(self, task: int) -> WindowDataset:
+    def __getitem__(self, task: int) -> TaskWindows:
         raise CheckpointError(f"{self._path}: the algorithm needs the demonstrations of task {task} to act")
 
     def __iter__(self) -> Iterator[int]:

@@ -16,9 +16,10 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
 from lifelong.data.fake import fake_batch
 from lifelong.data.memory import ReplayMemory
+from lifelong.data.windows import WindowDataset
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator, seeded
 

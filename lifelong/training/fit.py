@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lifelong.algorithms.base import Algorithm, WindowDataset
+from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import load_weights
+from lifelong.data.windows import WindowDataset
 from lifelong.errors import TrainingError
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator, seeded

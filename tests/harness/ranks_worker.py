@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
 from lifelong import checkpoints
+from lifelong.build import build
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.nn.augmentation import RandomShift
 from lifelong.results.log import ResultLog
@@ -20,10 +19,10 @@ from lifelong.seeding import seeded
 from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
+from tests.harness.configs import CONFIGS, composed
 from tests.harness.policies import small_transformer
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "algo"
-ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("*.yaml"))
+ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("algo/*.yaml"))
 STEPS, TASKS = 12, 2
 # Seven windows: two processes get three and four. One step is an epoch, so that records hold every step's loss.
 FIT = FitSettings(
@@ -37,8 +36,7 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
 
     Without dropout: its masks are each rank's own.
     """
-    config = OmegaConf.create({"compat": None, "algo": OmegaConf.load(CONFIGS / f"{algo}.yaml")})
-    walk.ALGORITHMS[algo] = lambda: instantiate(config.algo)
+    walk.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}").algo)
     with seeded(7):
         policy = small_transformer(walk.SPEC, dropout=0.0)
     context = replace(

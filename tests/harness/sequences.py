@@ -10,6 +10,7 @@ from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet, Sequential
 from lifelong.context import RunContext
 from lifelong.data import SequenceVLDataset
+from lifelong.data.memory import ReplayMemory
 from lifelong.data.settings import DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
@@ -29,7 +30,12 @@ SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2
 TASKS = 3
 
 
-ALGORITHMS = {"sequential": Sequential, "er": lambda: ER(budget=12), "ewc": EWC, "packnet": PackNet}
+ALGORITHMS = {
+    "sequential": Sequential,
+    "er": lambda: ER(memory=ReplayMemory(12)),
+    "ewc": EWC,
+    "packnet": PackNet,
+}
 
 
 class FakeEnv:

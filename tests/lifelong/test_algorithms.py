@@ -7,6 +7,8 @@ import torch
 
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet, Sequential
+from lifelong.algorithms.importance import BatchFisher, SampleFisher
+from lifelong.data.memory import ReplayMemory
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from tests.harness.algorithms import by_hand, learn, outputs
@@ -16,7 +18,7 @@ from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 
 def test_er_is_never_over_budget_and_replays_earlier_tasks_only():
-    policy, algorithm, draws = LinearPolicy(), ER(budget=25), generator(0)
+    policy, algorithm, draws = LinearPolicy(), ER(memory=ReplayMemory(25)), generator(0)
     for task in range(4):
         batch = Windows(task).batch(torch.arange(8))
         mixed = algorithm.mix(batch, draws)
@@ -35,9 +37,9 @@ def test_ewc_has_no_penalty_before_the_first_task_ends():
     assert EWC().penalty(LinearPolicy()) is None
 
 
-@pytest.mark.parametrize("fisher", ["per_sample", "batch"])
-def test_ewc_penalty_is_zero_at_the_anchor_and_only_there(fisher):
-    policy, algorithm = LinearPolicy(), EWC(fisher=fisher)
+@pytest.mark.parametrize("estimator", [SampleFisher(), BatchFisher()])
+def test_ewc_penalty_is_zero_at_the_anchor_and_only_there(estimator):
+    policy, algorithm = LinearPolicy(), EWC(estimator=estimator)
     learn(algorithm, policy, 0)
     assert algorithm.penalty(policy).item() == 0
     with torch.no_grad():
@@ -47,14 +49,13 @@ def test_ewc_penalty_is_zero_at_the_anchor_and_only_there(fisher):
 
 def test_fisher_per_sample_is_the_mean_squared_gradient_of_single_windows():
     policy, data = LinearPolicy(), Windows(size=7)
-    fisher = EWC(fisher="per_sample", fisher_windows=0).estimate(data, policy, generator(0))
+    fisher = SampleFisher(windows=0).estimate(data, policy, generator(0))
     torch.testing.assert_close(fisher["linear.weight"], by_hand(policy, data).square().mean(0))
 
 
 def test_fisher_of_one_batch_is_the_squared_mean_gradient():
     policy, data = LinearPolicy(), Windows(size=8)
-    algorithm = EWC(fisher="batch", fisher_windows=0, fisher_batch_size=8)
-    fisher = algorithm.estimate(data, policy, generator(0))
+    fisher = BatchFisher(windows=0, batch_size=8).estimate(data, policy, generator(0))
     torch.testing.assert_close(fisher["linear.weight"], by_hand(policy, data).mean(0).square())
 
 
@@ -62,14 +63,14 @@ def test_fisher_per_sample_ignores_dropout_and_leaves_no_trace():
     policy, data = DeepPolicy(), Windows()
     policy.train()
     before = copy.deepcopy(policy.state_dict())
-    first, second = (EWC().estimate(data, policy, generator(s)) for s in (0, 0))
+    first, second = (SampleFisher().estimate(data, policy, generator(s)) for s in (0, 0))
     assert all(torch.equal(first[n], second[n]) for n in first)
     assert policy.training and all(p.grad is None for p in policy.parameters())
     assert all(torch.equal(v, before[n]) for n, v in policy.state_dict().items())
 
 
 def test_ewc_old_importance_fades_by_gamma():
-    policy, algorithm = LinearPolicy(), EWC(gamma=0.5, fisher_windows=0)
+    policy, algorithm = LinearPolicy(), EWC(gamma=0.5, estimator=SampleFisher(windows=0))
     data = Windows(size=6)
     algorithm.end_task(0, data, policy, generator(0))
     algorithm.end_task(1, data, policy, generator(0))
@@ -77,9 +78,9 @@ def test_ewc_old_importance_fades_by_gamma():
     torch.testing.assert_close(algorithm.state_dict()["importance"]["linear.weight"], expected)
 
 
-def test_ewc_names_the_valid_estimates():
-    with pytest.raises(ConfigError, match="per_sample, batch"):
-        EWC(fisher="diagonal")
+def test_an_estimate_without_windows_is_refused():
+    with pytest.raises(ConfigError, match="valid: 0 .all. or more, at least 1"):
+        BatchFisher(batch_size=0)
 
 
 # --- PackNet
@@ -139,7 +140,7 @@ def test_packnet_policy_for_leaves_the_policy_as_it_was():
 # --- all of them
 
 
-@pytest.mark.parametrize("make", [Sequential, lambda: ER(budget=25), EWC, PackNet])
+@pytest.mark.parametrize("make", [Sequential, lambda: ER(memory=ReplayMemory(25)), EWC, PackNet])
 def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
     torch.manual_seed(1)
     policy, algorithm = DeepPolicy(), make()

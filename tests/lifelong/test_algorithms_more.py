@@ -8,6 +8,7 @@ import torch
 from lifelong import checkpoints
 from lifelong.algorithms import AGEM, MAS, SI, Algorithm, DERpp, LwF, Multitask, SingleTask
 from lifelong.algorithms.agem import project
+from lifelong.data.memory import ReplayMemory
 from lifelong.data.windows import JoinedWindows
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
@@ -19,7 +20,7 @@ from tests.harness.algorithms import SETTINGS, killed_again_and_again, learn
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 ALL = {
-    "agem": lambda: AGEM(budget=25),
+    "agem": lambda: AGEM(memory=ReplayMemory(25)),
     "derpp": lambda: DERpp(budget=25, alpha=0.5),
     "lwf": LwF,
     "mas": MAS,
@@ -222,7 +223,7 @@ def test_agem_counts_missing_gradients_as_zero():
 
 
 def test_agem_steps_do_not_raise_the_loss_on_the_reference_to_first_order():
-    policy, algorithm, draws = Linear(), AGEM(budget=20), generator(0)
+    policy, algorithm, draws = Linear(), AGEM(memory=ReplayMemory(20)), generator(0)
     torch.nn.init.zeros_(policy.linear.weight)
     torch.nn.init.zeros_(policy.linear.bias)
     algorithm.end_task(0, Windows(0), policy, draws)
@@ -361,7 +362,7 @@ def test_si_omega_leaves_the_pull_of_the_penalty_out():
 def test_mas_importance_is_the_mean_size_of_single_windows_gradients():
     policy, data = Linear(), Windows(size=7)
     policy.train()
-    importance = MAS(windows=0).estimate(data, policy, generator(0))
+    importance = MAS(windows=0).estimator.estimate(data, policy, generator(0))
     out = data.features @ policy.linear.weight.T + policy.linear.bias  # (N, A); |out|^2 by W: 2 out x^T
     by_hand = 2 * (out[:, :, None] * data.features[:, None, :]).abs().mean(0)
     torch.testing.assert_close(importance["linear.weight"], by_hand)

@@ -5,20 +5,26 @@ import dataclasses
 
 import pytest
 import torch
-from hydra.utils import instantiate
 
+from libero_env.errors import UnknownNameError
 from lifelong import checkpoints
-from lifelong.algorithms import AGEM, ER, EWC, PackNet
-from lifelong.errors import ConfigError
+from lifelong.algorithms.importance import BatchFisher
+from lifelong.build import build
+from lifelong.launch import check_choices
 from lifelong.seeding import generator
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences as walk
 from tests.harness.algorithms import by_hand, killed_again_and_again, learn, outputs
-from tests.harness.configs import FILES, composed
+from tests.harness.configs import CONFIGS, FILES, composed
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 WITH_COMPAT = ("er", "agem", "ewc", "packnet")
+
+
+def made(name: str, compat: str, *overrides: str):
+    """An algorithm as the configuration builds it."""
+    return build(composed(f"algo={name}", f"compat={compat}", *overrides).algo)
 
 
 def mirrored(batch, draws):
@@ -29,9 +35,9 @@ def mirrored(batch, draws):
 # --- ER and A-GEM
 
 
-@pytest.mark.parametrize("make", [ER, AGEM])
-def test_memory_is_the_first_windows_of_each_task_in_file_order(make):
-    ours, theirs = make(budget=14), make(per_task=7, compat="libero")
+@pytest.mark.parametrize("name", ["er", "agem"])
+def test_memory_is_the_first_windows_of_each_task_in_file_order(name):
+    ours, theirs = made(name, "none", "algo.memory.budget=14"), made(name, "libero", "algo.memory.budget=7")
     for task in range(3):
         for algorithm in (ours, theirs):
             algorithm.end_task(task, Windows(task), LinearPolicy(), generator(task))
@@ -43,11 +49,11 @@ def test_memory_is_the_first_windows_of_each_task_in_file_order(make):
 
 
 def test_memory_may_be_longer_than_a_task_and_is_taken_up_again():
-    algorithm = ER(per_task=30, compat="libero")
+    algorithm = made("er", "libero", "algo.memory.budget=30")
     algorithm.end_task(0, Windows(0, size=20), LinearPolicy(), generator(0))
     algorithm.end_task(1, Windows(1, size=40), LinearPolicy(), generator(0))
     assert algorithm.memory.shares == {0: 20, 1: 30}
-    other = ER(per_task=30, compat="libero")
+    other = made("er", "libero", "algo.memory.budget=30")
     other.load_state_dict(algorithm.state_dict(), {0: Windows(0, size=20), 1: Windows(1, size=40)})
     batch = Windows(2).batch(torch.arange(8))
     mixed = [a.mix(batch, generator(5)) for a in (algorithm, other)]
@@ -56,14 +62,14 @@ def test_memory_may_be_longer_than_a_task_and_is_taken_up_again():
     assert other.memory.shares == {0: 20, 1: 30, 2: 30}
 
 
-@pytest.mark.parametrize("compat", [None, "libero"])
+@pytest.mark.parametrize("compat", ["none", "libero"])
 def test_agem_augments_its_reference_as_the_original_only(compat):
-    algorithm = AGEM(budget=20, per_task=20, compat=compat)
+    algorithm = made("agem", compat, "algo.memory.budget=20")
     algorithm.set_augmentation(mirrored)
     algorithm.end_task(0, Windows(0), LinearPolicy(), generator(0))
     algorithm.mix(Windows(1).batch(torch.arange(20)), generator(0))
     reference, stored = algorithm._reference, Windows(0)
-    sign = -1 if compat else 1
+    sign = -1 if compat == "libero" else 1
     assert torch.equal(reference.actions[:, 0], sign * stored.targets[reference.window_ids])
 
 
@@ -71,19 +77,21 @@ def test_agem_augments_its_reference_as_the_original_only(compat):
 
 
 def test_ewc_strength_goes_with_the_estimate():
-    assert EWC().strength == 1500 and EWC(fisher="batch").strength == 5e4
-    theirs = EWC(compat="libero")
-    assert (theirs.strength, theirs.gamma, theirs.fisher, theirs.fisher_windows) == (5e4, 0.9, "batch", 0)
-    assert EWC(compat="libero", strength=3.0, fisher="per_sample").strength == 3.0
+    assert (
+        made("ewc", "none").strength == 1500 and made("ewc", "none", "algo/estimator=batch").strength == 5e4
+    )
+    theirs = made("ewc", "libero")
+    assert (theirs.strength, theirs.gamma) == (5e4, 0.9)
+    assert (type(theirs.estimator), theirs.estimator.windows) == (BatchFisher, 0)
+    assert made("ewc", "libero", "algo.strength=3.0").strength == 3.0
 
 
 def test_ewc_fisher_is_of_augmented_batches_of_all_windows_in_training_mode():
     policy, data, modes = LinearPolicy(), Windows(size=600), []
     loss = policy.loss
     policy.loss = lambda batch: modes.append((policy.training, len(batch))) or loss(batch)
-    theirs = EWC(compat="libero", fisher_batch_size=300)
-    theirs.set_augmentation(mirrored)
-    fisher = theirs.estimate(data, policy.eval(), generator(0))
+    theirs = made("ewc", "libero", "algo.estimator.batch_size=300").estimator
+    fisher = theirs.estimate(data, policy.eval(), generator(0), mirrored)
     assert modes == [(True, 300), (True, 300)] and not policy.training
     order = torch.randperm(600, generator=generator(0))
     data.targets.neg_()
@@ -91,21 +99,19 @@ def test_ewc_fisher_is_of_augmented_batches_of_all_windows_in_training_mode():
     torch.testing.assert_close(fisher["linear.weight"], (halves[0] + halves[1]) / 2)
 
     modes.clear()
-    ours = EWC(fisher="batch", fisher_batch_size=300)
-    ours.set_augmentation(mirrored)
-    assert not torch.allclose(
-        ours.estimate(data, policy, generator(0))["linear.weight"], fisher["linear.weight"]
-    )
+    ours = made("ewc", "none", "algo/estimator=batch", "algo.estimator.batch_size=300").estimator
+    estimate = ours.estimate(data, policy, generator(0), mirrored)
+    assert not torch.allclose(estimate["linear.weight"], fisher["linear.weight"])
     assert [size for _, size in modes] == [300, 212]
 
 
 # --- PackNet
 
 
-def learned(compat, weight_decay: float, tasks: int = 2):
+def learned(compat: str, weight_decay: float, tasks: int = 2):
     """A policy after so many tasks, what it was before each, and the algorithm."""
     torch.manual_seed(0)
-    policy, algorithm, states = DeepPolicy(), PackNet(prune_perc=0.5, compat=compat), []
+    policy, algorithm, states = DeepPolicy(), made("packnet", compat, "algo.prune_perc=0.5"), []
     settings = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=weight_decay, precision="fp32")
     for task in range(tasks):
         states.append((copy.deepcopy(policy.state_dict()), copy.deepcopy(algorithm)))
@@ -119,9 +125,9 @@ def learned(compat, weight_decay: float, tasks: int = 2):
 
 
 def test_packnet_divides_weights_of_linear_layers_and_image_convolutions_only():
-    owners = {c: set(learned(c, 0.0, tasks=1)[1].state_dict()["owner"]) for c in (None, "libero")}
+    owners = {c: set(learned(c, 0.0, tasks=1)[1].state_dict()["owner"]) for c in ("none", "libero")}
     assert owners["libero"] == {"head.weight"}  # the convolution of the fake policy has one dimension
-    assert owners[None] > {"head.weight", "inner.weight", "memory.weight_hh_l0", "place.weight"}
+    assert owners["none"] > {"head.weight", "inner.weight", "memory.weight_hh_l0", "place.weight"}
 
 
 def test_packnet_masks_keep_frozen_weights_but_for_weight_decay():
@@ -131,7 +137,7 @@ def test_packnet_masks_keep_frozen_weights_but_for_weight_decay():
         before, after = states[1][0]["head.weight"][owned], policy.head.weight[owned]
         assert torch.equal(before, after) == (decay == 0.0)
         assert (after.abs() <= before.abs()).all()
-        ours, algorithm, states = learned(None, decay)
+        ours, algorithm, states = learned("none", decay)
         owned = algorithm.state_dict()["owner"]["head.weight"] == 1
         assert torch.equal(states[1][0]["head.weight"][owned], ours.head.weight[owned])
 
@@ -145,22 +151,21 @@ def test_packnet_never_trains_biases_and_layer_norms_but_all_else_with_every_tas
         assert not torch.equal(fresh[name], first[name]) and not torch.equal(first[name], second[name]), name
 
 
-@pytest.mark.parametrize("compat", [None, "libero"])
+@pytest.mark.parametrize("compat", ["none", "libero"])
 def test_packnet_forgets_as_the_original_only(compat):
     policy, algorithm, states = learned(compat, 0.1)
     then, before = states[1]
     old = DeepPolicy()
     old.load_state_dict(then)
-    assert torch.equal(outputs(before, old, 0), outputs(algorithm, policy, 0)) == (compat is None)
+    assert torch.equal(outputs(before, old, 0), outputs(algorithm, policy, 0)) == (compat == "none")
 
 
 # --- all of them
 
 
-@pytest.mark.parametrize("make", [ER, AGEM, EWC, PackNet])
-def test_another_choice_is_refused(make):
-    with pytest.raises(ConfigError, match="valid: null, libero"):
-        make(compat="robomimic")
+def test_another_choice_is_refused():
+    with pytest.raises(UnknownNameError, match="Valid: libero, none"):
+        check_choices(["algo=er", "compat=robomimic"], [CONFIGS])
 
 
 def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
@@ -169,16 +174,16 @@ def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
     assert context.algorithm.augment is mirrored
 
 
-@pytest.mark.parametrize("make", [lambda: ER(per_task=5, compat="libero"), lambda: PackNet(compat="libero")])
-def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+@pytest.mark.parametrize("overrides", [("er", "libero", "algo.memory.budget=5"), ("packnet", "libero")])
+def test_a_state_taken_up_between_tasks_changes_nothing(overrides, tmp_path):
     torch.manual_seed(1)
-    policy, algorithm = DeepPolicy(), make()
+    policy, algorithm = DeepPolicy(), made(*overrides)
     learn(algorithm, policy, 0)
     checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
     learn(algorithm, policy, 1)
 
     state = checkpoints.load(tmp_path / "s")
-    other_policy, other = DeepPolicy(), make()
+    other_policy, other = DeepPolicy(), made(*overrides)
     other_policy.load_state_dict(state["policy"])
     other.load_state_dict(state["algorithm"], {0: Windows(0)})
     learn(other, other_policy, 1)
@@ -188,7 +193,7 @@ def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
     """EWC's estimate needs the augmentation even where a process was killed just before it."""
     run_context = walk.run_context
-    monkeypatch.setitem(walk.ALGORITHMS, "ewc", lambda: EWC(compat="libero"))
+    monkeypatch.setitem(walk.ALGORITHMS, "ewc", lambda: made("ewc", "libero"))
     monkeypatch.setattr(
         walk, "run_context", lambda *a: dataclasses.replace(run_context(*a), augment=mirrored)
     )
@@ -209,17 +214,14 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
 def test_one_flag_sets_every_choice(name, preset):
     config = composed(f"algo={name}", f"preset={preset}", "compat=libero")
     assert config.eval.selection == "reporting" and config.eval.select == "best" and config.policy.stochastic
-    assert ("compat" in config.algo) == (name in WITH_COMPAT)
-    assert config.algo.get("compat", "libero") == "libero"
-    instantiate(config.algo, _convert_="all")
+    assert (config.algo != composed(f"algo={name}", f"preset={preset}").algo) == (name in WITH_COMPAT)
+    build(config.algo)
 
 
 def test_without_it_choices_are_ours():
     for name in WITH_COMPAT:
         config = composed(f"algo={name}")
-        assert (
-            config.algo.compat is None and config.eval.selection == "apart" and not config.policy.stochastic
-        )
+        assert config.eval.selection == "apart" and not config.policy.stochastic
 
 
 def test_values_on_the_command_line_win_over_it():

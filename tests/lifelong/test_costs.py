@@ -12,6 +12,7 @@ from lifelong.algorithms import EWC, Algorithm, Sequential
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.er import ER
 from lifelong.data import SequenceVLDataset
+from lifelong.data.memory import ReplayMemory
 from lifelong.nn import TemporalLSTM
 from lifelong.policies import BCTransformer
 from lifelong.seeding import generator, seeded
@@ -58,7 +59,7 @@ def test_attention_and_recurrence_count_as_the_products_they_are():
     assert counted(lambda: linear(x[0]).sum().backward()) == 2 * (2 * 3 * 5 * 4)  # no gradient of the input
 
 
-KINDS = [Sequential(), ER(budget=9), AGEM(budget=9), EWC()]
+KINDS = [Sequential(), ER(memory=ReplayMemory(9)), AGEM(memory=ReplayMemory(9)), EWC()]
 
 
 @pytest.mark.parametrize("algorithm", KINDS, ids=lambda a: type(a).__name__)
@@ -83,7 +84,7 @@ def test_a_step_of_any_size_is_told_by_two_small_ones(algorithm: Algorithm):
 def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
     policy, first, second = transformer(), dataset(0), dataset(1)
     costs = {}
-    for algorithm in (Sequential(), ER(budget=9)):
+    for algorithm in (Sequential(), ER(memory=ReplayMemory(9))):
         algorithm.end_task(0, first, policy, generator(0))
         costs[type(algorithm)] = step_costs(policy, algorithm, second, 8)["flops_per_step"]
     assert costs[ER] == 2 * costs[Sequential]
@@ -92,7 +93,7 @@ def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
 
 
 def test_count_flops_changes_neither_policy_nor_algorithm():
-    policy, algorithm, windows = transformer(), AGEM(budget=9), dataset(1)
+    policy, algorithm, windows = transformer(), AGEM(memory=ReplayMemory(9)), dataset(1)
     algorithm.end_task(0, dataset(0), policy, generator(0))
     policy.train()
     before, state = copy.deepcopy(policy.state_dict()), torch.random.get_rng_state()
@@ -133,7 +134,7 @@ def test_what_is_stored():
     ewc.end_task(0, first, policy, generator(0))
     weights = 4 * sum(p.numel() for p in policy.parameters())
     assert stored_bytes(ewc) == pytest.approx(2 * weights, rel=0.01)  # Fisher and anchor
-    er = ER(budget=9)
+    er = ER(memory=ReplayMemory(9))
     er.end_task(0, first, policy, generator(0))
     window = 3 * (16 * 16 * 3 + 4 * 2 + 4 * 7)
     assert stored_bytes(er) == 9 * (window + 8)  # and an index each

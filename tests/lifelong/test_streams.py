@@ -15,6 +15,7 @@ from libero_env.tasks import get_suite
 from lifelong import checkpoints
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
 from lifelong.context import RunContext
+from lifelong.data.memory import ReplayMemory
 from lifelong.errors import CheckpointError, ConfigError
 from lifelong.pretraining import load_initial_weights, pretraining_context
 from lifelong.report.page import write_report
@@ -121,7 +122,7 @@ def test_the_seed_alone_decides_what_is_blurred() -> None:
 
 def test_a_memory_of_stages_is_found_again_by_what_batches_say() -> None:
     data = stage_data(0.3, group_size=2)
-    memory, draws = ER(budget=30).memory, torch.Generator().manual_seed(0)
+    memory, draws = ER(memory=ReplayMemory(30)).memory, torch.Generator().manual_seed(0)
     for last in data:
         memory.add(data[last], draws)
     batch = memory.sample(30, draws)

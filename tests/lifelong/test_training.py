@@ -10,6 +10,7 @@ from torch import nn
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Sequential
 from lifelong.data import fake_batch
+from lifelong.data.memory import ReplayMemory
 from lifelong.errors import ConfigError, TrainingError
 from lifelong.seeding import generator
 from lifelong.training.distributed import Ranks
@@ -117,7 +118,7 @@ def test_a_callers_own_step_and_loader_take_part_in_the_same_loop():
 
 
 def test_augmentation_sees_the_mixed_batch():
-    sizes, algorithm = [], ER(budget=4)
+    sizes, algorithm = [], ER(memory=ReplayMemory(4))
     algorithm.end_task(0, Windows(), LinearPolicy(), torch.Generator())
 
     def augment(batch, generator):

@@ -4,6 +4,7 @@ from typing import Any
 
 from libero.lifelong.algos.er import ER
 from lifelong import algorithms
+from lifelong.data.memory import ReplayMemory
 
 
 class AGEM(ER):
@@ -11,4 +12,4 @@ class AGEM(ER):
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
         """See `Sequential`."""
-        return algorithms.AGEM(budget=cfg.lifelong.n_memories)
+        return algorithms.AGEM(memory=ReplayMemory(cfg.lifelong.n_memories))

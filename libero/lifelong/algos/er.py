@@ -6,6 +6,7 @@ from torch.utils.data import Dataset
 
 from libero.lifelong.algos.base import Sequential
 from lifelong import algorithms
+from lifelong.data.memory import ReplayMemory
 
 
 class ER(Sequential):
@@ -16,7 +17,7 @@ class ER(Sequential):
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
         """See `Sequential`."""
-        return algorithms.ER(budget=cfg.lifelong.n_memories)
+        return algorithms.ER(memory=ReplayMemory(cfg.lifelong.n_memories))
 
     def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
         """Add the task's windows to the memory, whose native budget is that of all tasks together."""

@@ -4,6 +4,7 @@ from typing import Any
 
 from libero.lifelong.algos.base import Sequential
 from lifelong import algorithms
+from lifelong.algorithms.importance import BatchFisher
 
 
 class EWC(Sequential):
@@ -17,7 +18,5 @@ class EWC(Sequential):
         return algorithms.EWC(
             strength=float(cfg.lifelong.e_lambda),
             gamma=cfg.lifelong.gamma,
-            fisher="batch",
-            fisher_windows=0,
-            fisher_batch_size=cfg.train.batch_size,
+            estimator=BatchFisher(windows=0, batch_size=cfg.train.batch_size),
         )

@@ -1,0 +1,159 @@
+"""Estimates of how much each weight matters for a task, from gradients on the task's windows."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from lifelong.data.windows import WindowDataset
+from lifelong.errors import ConfigError
+from lifelong.policies.base import Policy
+from lifelong.types import Batch
+
+
+class ImportanceEstimator(ABC):
+    """Mean over windows of a non-negative function of gradients.
+
+    A subclass says of what the gradient is taken (`objective`) and how it counts (`accumulate`).
+
+    Args:
+        windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
+        batch_size: Number of windows per gradient.
+        augment: Whether the windows are augmented as in training.
+
+    Attributes:
+        training: Whether the policy is in training mode meanwhile.
+        strength: Strength of a penalty that goes with the estimate.
+
+    Raises:
+        ConfigError: A negative number of windows, or an empty batch.
+    """
+
+    training = False
+    strength = 1.0
+
+    def __init__(self, *, windows: int = 512, batch_size: int = 1, augment: bool = False):
+        if windows < 0 or batch_size < 1:
+            raise ConfigError(
+                f"an estimate from {windows} windows in batches of {batch_size}; valid: 0 (all) or more, at least 1"
+            )
+        self.windows, self.batch_size, self.augment = windows, batch_size, augment
+
+    @abstractmethod
+    def objective(self, policy: Policy, batch: Batch) -> Tensor:
+        """Return the scalar whose gradient is taken."""
+
+    @abstractmethod
+    def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
+        """Add the importance of a gradient, times a weight, to the total in place."""
+
+    def estimate(
+        self,
+        dataset: WindowDataset,
+        policy: Policy,
+        generator: torch.Generator,
+        augment: Callable[[Batch, torch.Generator], Batch] | None = None,
+    ) -> dict[str, Tensor]:
+        """Estimate the importance of a policy's weights for a task.
+
+        Args:
+            dataset: Windows of the task.
+            policy: Policy with the weights after the task; its mode is restored.
+            generator: Generator of the windows' order and of their augmentation.
+            augment: Augmentation of training, for estimators that augment.
+
+        Returns:
+            Parameter name -> tensor of the parameter's shape.
+        """
+        count = min(self.windows, len(dataset)) if self.windows else len(dataset)
+        batches = torch.randperm(len(dataset), generator=generator)[:count].split(self.batch_size)
+        named = {n: p for n, p in policy.named_parameters() if p.requires_grad}
+        total = {n: torch.zeros_like(p, memory_format=torch.preserve_format) for n, p in named.items()}
+        device = next(iter(named.values())).device
+        was_training = policy.training
+        policy.train(self.training)
+        for indices in batches:
+            batch = dataset.batch(indices)
+            if self.augment and augment is not None:
+                batch = augment(batch, generator)
+            objective = self.objective(policy, batch.to(device))
+            grads = torch.autograd.grad(objective, list(named.values()), allow_unused=True)
+            for name, grad in zip(named, grads, strict=True):
+                if grad is not None:
+                    self.accumulate(total[name], grad, 1 / len(batches))
+        policy.train(was_training)
+        return total
+
+
+class SampleFisher(ImportanceEstimator):
+    """Diagonal Fisher information: mean squared gradient of single windows' losses, in evaluation mode.
+
+    It does not depend on the batch size of training.
+
+    Args:
+        windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
+        augment: Whether the windows are augmented as in training.
+    """
+
+    strength = 1500.0
+
+    def __init__(self, *, windows: int = 512, augment: bool = False):
+        super().__init__(windows=windows, augment=augment)
+
+    def objective(self, policy: Policy, batch: Batch) -> Tensor:
+        """Return the policy's loss."""
+        return policy.loss(batch)
+
+    def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
+        """Add the squared gradient."""
+        total.addcmul_(grad, grad, value=weight)
+
+
+class BatchFisher(ImportanceEstimator):
+    """Mean squared gradient of batches' mean losses, in training mode: the estimate of LIBERO's code.
+
+    Its expectation near an optimum is that of `SampleFisher` divided by the batch size, so the published strength of
+    5e4 at batch size 32 corresponds to about 5e4 / 32 = 1500 per sample.
+
+    Args:
+        windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
+        batch_size: Number of windows per gradient.
+        augment: Whether the windows are augmented as in training.
+    """
+
+    training = True
+    strength = 5e4
+
+    def __init__(self, *, windows: int = 512, batch_size: int = 32, augment: bool = False):
+        super().__init__(windows=windows, batch_size=batch_size, augment=augment)
+
+    def objective(self, policy: Policy, batch: Batch) -> Tensor:
+        """Return the policy's loss."""
+        return policy.loss(batch)
+
+    def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
+        """Add the squared gradient."""
+        total.addcmul_(grad, grad, value=weight)
+
+
+class ActionSensitivity(ImportanceEstimator):
+    """Mean absolute gradient of the squared actions of single windows, in evaluation mode.
+
+    Aljundi et al. 2018, section 4.1: `|d |h(x)|^2 / d theta|`, h being the policy's deterministic actions, their
+    square summed over dimensions and averaged over the window's steps. No labels are needed.
+
+    Args:
+        windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
+    """
+
+    def __init__(self, *, windows: int = 512):
+        super().__init__(windows=windows)
+
+    def objective(self, policy: Policy, batch: Batch) -> Tensor:
+        """Return the squared length of the actions, mean over steps."""
+        return policy.predict(batch).square().sum(-1).mean()
+
+    def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
+        """Add the gradient's absolute value."""
+        total.add_(grad.abs(), alpha=weight)
