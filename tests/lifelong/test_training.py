@@ -207,7 +207,9 @@ def test_no_more_windows_are_computed_at_once_than_asked_for(parts, expected):
 
 def test_a_policy_that_normalises_over_the_batch_refuses_to_have_it_cut():
     cut = FitSettings(epochs=1, accumulate=2)
-    with pytest.raises(ConfigError, match=r"norm takes its statistics over the batch.*policy\.encoder\.norm=group"):
+    with pytest.raises(
+        ConfigError, match=r"norm takes its statistics over the batch.*policy\.encoder\.norm=group"
+    ):
         fit(DeepPolicy(), Windows(), Sequential(), settings=cut, seed=(0,))
     with pytest.raises(ConfigError, match="several processes"):
         fit(

@@ -91,10 +91,10 @@ class DeterministicHead(_Head):
         action_squash: bool = True,
         loss_coef: float = 1.0,
     ):
-        sizes = {"hidden": hidden_size, "layers": num_layers}
-        super().__init__(
-            heads.DeterministicHead(in_dim=input_size, action_dim=output_size, **sizes), loss_coef
+        head = heads.DeterministicHead(
+            in_dim=input_size, action_dim=output_size, hidden=hidden_size, layers=num_layers
         )
+        super().__init__(head, loss_coef)
         self.action_squash = action_squash
 
     def forward(self, x: Tensor) -> Tensor:
