@@ -69,8 +69,14 @@ def contains(box: Box, point: np.ndarray) -> bool:
     return bool((point > low).all() and (point < high).all())
 
 
-def is_over(box: Box, point: np.ndarray) -> bool:
-    """Return whether a point (3,) is on top of a box; as in the original, rotated by R instead of its inverse."""
+def is_over(box: Box, point: np.ndarray, above: float = _ON_ABOVE) -> bool:
+    """Return whether a point (3,) is on top of a box; as in the original, rotated by R instead of its inverse.
+
+    Args:
+        box: Box.
+        point: Point in the world.
+        above: Largest height of the point above the box, m.
+    """
     centre, mat, size = box
     delta = mat @ (point - centre)
-    return bool(size[2] - _ON_BELOW < delta[2] < size[2] + _ON_ABOVE and (np.abs(delta[:2]) < size[:2]).all())
+    return bool(size[2] - _ON_BELOW < delta[2] < size[2] + above and (np.abs(delta[:2]) < size[:2]).all())

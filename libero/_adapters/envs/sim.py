@@ -16,22 +16,9 @@ from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.simulation import LoopSimulations
 
 # Kind of element in robosuite -> kind in MuJoCo.
-KINDS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "site": mujoco.mjtObj.mjOBJ_SITE,
-    "light": mujoco.mjtObj.mjOBJ_LIGHT,
-    "camera": mujoco.mjtObj.mjOBJ_CAMERA,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
-    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
-    "mesh": mujoco.mjtObj.mjOBJ_MESH,
-}
-_COUNTS = {
-    kind: {"body": "nbody", "joint": "njnt", "camera": "ncam", "actuator": "nu"}.get(kind, f"n{kind}")
-    for kind in KINDS
-}
+_NAMES = ("body", "joint", "geom", "site", "light", "camera", "actuator", "sensor", "tendon", "mesh")
+KINDS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in _NAMES}
+_COUNTS = {"body": "nbody", "joint": "njnt", "camera": "ncam", "actuator": "nu"}  # the others are `n<kind>`
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 
 
@@ -98,7 +85,7 @@ class MjModel:
         return (start, start + length) if self._model.jnt_type[joint] == _FREE else start
 
     def _names(self, kind: str) -> list[str]:
-        count = getattr(self._model, _COUNTS[kind])
+        count = getattr(self._model, _COUNTS.get(kind, f"n{kind}"))
         return [mujoco.mj_id2name(self._model, KINDS[kind], i) or "" for i in range(count)]
 
     def _id(self, kind: str, name: str) -> int:

@@ -34,9 +34,10 @@ TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz
 # Arguments of robosuite or the original that have no effect: the task file decides, or they are about a window.
 WITHOUT_EFFECT = """
-    arena_type custom_material env_name hard_reset mount_types render_collision_mesh render_gpu_device_id
-    render_visual_mesh renderer renderer_config robot_configs scene_properties scene_xml table_friction table_full_size
-    table_offset visualization_sites_list workspace_name workspace_offset z_offset
+    arena_type custom_material env_configuration env_name gripper_types hard_reset has_offscreen_renderer mount_types
+    object_property_initializers render_collision_mesh render_gpu_device_id render_visual_mesh renderer renderer_config
+    robot_configs scene_properties scene_xml table_friction table_full_size table_offset use_latch
+    visualization_sites_list workspace_name workspace_offset z_offset
 """.split()  # noqa: SIM905
 
 
@@ -82,19 +83,14 @@ class BDDLBaseDomain:
         self,
         bddl_file_name: str,
         robots: Any = ("Panda",),
-        env_configuration: str = "default",
         controller_configs: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
-        gripper_types: Any = "default",
         initialization_noise: Any = "default",
-        use_latch: bool = False,
         use_camera_obs: bool = True,
         use_object_obs: bool = True,
         reward_scale: float | None = 1.0,
         reward_shaping: bool = False,
         placement_initializer: Any = None,
-        object_property_initializers: Any = None,
         has_renderer: bool = False,
-        has_offscreen_renderer: bool = True,
         render_camera: str = "frontview",
         control_freq: float = CONTROL_FREQ,
         horizon: int = 1000,
@@ -111,9 +107,7 @@ class BDDLBaseDomain:
                 "argument", unknown[0], [*signature(BDDLBaseDomain).parameters, *WITHOUT_EFFECT]
             )
         if control_freq != CONTROL_FREQ:
-            raise LiberoError(
-                f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz; leave it out"
-            )
+            raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
         self.problem = BDDLUtils.read_problem(bddl_file_name)
         self.parsed_problem = BDDLUtils.robosuite_parse_problem(bddl_file_name)
@@ -131,26 +125,26 @@ class BDDLBaseDomain:
         self.camera_names = [camera.name for camera in self.camera_list]
         self.rng = np.random.default_rng()
         self.timestep, self.cur_time, self.done = 0, 0.0, False
+        self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
         self._load_model()
         self._setup_references(controller_configs, robots)
-        self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
 
     # Hooks of subclasses ------------------------------------------------------------------------------------
 
     def _load_fixtures_in_arena(self, mujoco_arena: Any) -> None:
-        """Hook: called with the scene before it is compiled, its fixtures in place."""
+        """Change the scene before it is compiled; its fixtures are in place."""
 
     def _load_objects_in_arena(self, mujoco_arena: Any) -> None:
-        """Hook: called with the scene before it is compiled, its objects in place."""
+        """Change the scene before it is compiled; its objects are in place."""
 
     def _load_sites_in_arena(self, mujoco_arena: Any) -> None:
-        """Hook: called with the scene before it is compiled, its regions in place."""
+        """Change the scene before it is compiled; its regions are in place."""
 
     def _setup_camera(self, mujoco_arena: Any) -> None:
-        """Hook: called with the scene before it is compiled; `mujoco_arena.set_camera` moves a camera."""
+        """Change the cameras of the scene before it is compiled, with `mujoco_arena.set_camera`."""
 
     def _add_placement_initializer(self) -> None:
-        """Hook: called once, before the first reset; may set `placement_initializer`."""
+        """Set `placement_initializer`, if at all; called once, before the first reset."""
 
     def _load_model(self) -> None:
         pack = select_pack()

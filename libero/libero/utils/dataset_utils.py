@@ -29,10 +29,7 @@ def get_dataset_info(
     with open_demo_file(path) as file:
         names, data = demo_names(file, path), file["data"]
         if filter_key is not None:
-            if (masks := file.get("mask")) is None or filter_key not in masks:
-                known = ", ".join(masks or ()) or "none"
-                raise DemoError(f"{path}: no subset {filter_key!r} in mask; valid: {known}")
-            names = [name.decode() for name in masks[filter_key][()]]
+            names = _subset(file, filter_key)
         lengths = np.array([len(data[name]["actions"]) for name in names])
         actions = np.concatenate([data[name]["actions"][()] for name in names])
         info = {
@@ -52,6 +49,14 @@ def get_dataset_info(
         if key != "structure":
             print(f"{key}: {value}")
     return info
+
+
+def _subset(file: Any, filter_key: str) -> list[str]:
+    """Return the names of the demonstrations in a subset."""
+    if (masks := file.get("mask")) is None or filter_key not in masks:
+        known = ", ".join(masks or ()) or "none"
+        raise DemoError(f"{file.filename}: no subset {filter_key!r} in mask; valid: {known}")
+    return [name.decode() for name in masks[filter_key][()]]
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.sim.regions import Box, contains, is_over
+
 
 class SiteObject:
     """A region that is a box around a named site.
@@ -34,15 +36,13 @@ class SiteObject:
 
     def in_box(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
         """Return whether a point is in the box of half size |R size| around the site, or up to 1 cm below it."""
-        half = np.abs(np.asarray(this_mat).reshape(3, 3) @ self.size)
-        low, high = np.asarray(this_position) - half, np.asarray(this_position) + half
-        low[2] -= 0.01
-        return bool((other_position > low).all() and (other_position < high).all())
+        return contains(self._box(this_position, this_mat), np.asarray(other_position))
 
     def under(
         self, this_position: Any, this_mat: Any, other_position: Any, other_height: float = 0.10
     ) -> bool:
         """Return whether a point is above the box, by less than `other_height`, m."""
-        delta = np.asarray(this_mat).reshape(3, 3) @ (np.asarray(other_position) - np.asarray(this_position))
-        over = self.size[2] - 0.005 < delta[2] < self.size[2] + other_height
-        return bool(over and (np.abs(delta[:2]) < self.size[:2]).all())
+        return is_over(self._box(this_position, this_mat), np.asarray(other_position), other_height)
+
+    def _box(self, position: Any, mat: Any) -> Box:
+        return Box(np.asarray(position), np.asarray(mat).reshape(3, 3), self.size)
