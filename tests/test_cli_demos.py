@@ -1,4 +1,4 @@
-"""`libero demos`: options mean what they say, and every tool runs on what was recorded."""
+"""`libero demos`: options take effect, and every tool runs on a recorded file."""
 
 import argparse
 from pathlib import Path
@@ -58,11 +58,11 @@ def test_every_tool_runs(file, tmp_path, capsys):
 
     assert "2 demonstrations, 24 steps, 16x24 pixels" in ran("info", file)
     assert "12-12 steps (mean 12), 2 of 2 successful" in ran("check", file)
-    told = ran("replay", file, "--demo", 1, "--video", tmp_path / "film.gif", "--size", 32, status=1)
+    output = ran("replay", file, "--demo", 1, "--video", tmp_path / "replay.gif", "--size", 32, status=1)
     assert (
-        "demo_1: no success after 12 steps, largest drift: objects 0.00 mm" in told
+        "demo_1: no success after 12 steps, largest drift: objects 0.00 mm" in output
     )  # said to be one, and is none
-    assert (tmp_path / "film.gif").stat().st_size > 1000
+    assert (tmp_path / "replay.gif").stat().st_size > 1000
     assert "16x16 pixels" in ran("rerender", file, tmp_path / "new.hdf5", "--size", 16)
     assert set(read_demos(tmp_path / "new.hdf5")[0].obs) >= {"agentview_rgb", "eye_in_hand_rgb"}
     assert "12-12 steps" in ran("filter", file, tmp_path / "kept.hdf5", "--success", "--no-ops")
@@ -110,7 +110,7 @@ def test_sizes_are_one_number_or_two():
         (["export", "nowhere.hdf5", "--out", "set"], "nowhere.hdf5"),
     ],
 )
-def test_wrong_input_is_one_line_and_a_status(argv, hint, tmp_path, monkeypatch, capsys):
+def test_invalid_input_gives_one_line_and_a_status(argv, hint, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))
     assert cli.main(["demos", *argv]) == 2
@@ -119,7 +119,7 @@ def test_wrong_input_is_one_line_and_a_status(argv, hint, tmp_path, monkeypatch,
     assert len(lines) == 1 and hint in lines[0]
 
 
-def test_pictures_can_be_left_out_and_drawn_later(tmp_path, monkeypatch):
+def test_images_can_be_left_out_and_rendered_later(tmp_path, monkeypatch):
     monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     argv = ["demos", "generate", "--task", "libero_goal/3", "--n", "1", "--no-images", "--workers", "1"]
     assert cli.main([*argv, "--folder", str(tmp_path)]) == 0

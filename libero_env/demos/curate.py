@@ -289,7 +289,7 @@ def describe(file: Path) -> str:
         steps = [len(data[name]["actions"]) if "actions" in data[name] else 0 for name in names]
         obs = data[names[0]].get("obs", {}) if names else {}
         colours = [key for key in obs if key.endswith("_rgb")]
-        images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no pictures"
+        images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no images"
         failed = data.attrs.get("num_failed_attempts", "unknown")
         pairing = data.attrs.get("pairing", "libero")
     parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", images, f"failed attempts: {failed}")

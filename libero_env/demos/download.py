@@ -65,7 +65,7 @@ def download_demos(
     files = remote_files(names)
     remote: dict[str, Remote] = {}
     for suite in dict.fromkeys(file.partition("/")[0] for file in files):
-        remote |= dict(_listing(suite, revision))
+        remote |= dict(_list_suite(suite, revision))
     if absent := [file for file in files if file not in remote]:
         raise DownloadError(f"{REPO} at revision {revision} has no {absent[0]}")
     missing = [file for file in files if not remote[file].matches(folder / file)]
@@ -92,7 +92,7 @@ def _partial_size(path: Path) -> int:
     return partial.stat().st_size if partial.is_file() else 0
 
 
-def _listing(suite: str, revision: str) -> Iterator[tuple[str, Remote]]:
+def _list_suite(suite: str, revision: str) -> Iterator[tuple[str, Remote]]:
     """Yield the files that the server has of a suite, with their sizes and digests."""
     url = f"{_endpoint()}/api/datasets/{REPO}/tree/{quote(revision, safe='')}/{suite}?recursive=true"
     try:

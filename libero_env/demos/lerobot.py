@@ -18,17 +18,17 @@ from tqdm import tqdm
 
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.lerobot_files import (
-    DATA,
     DATA_MB,
+    DATA_PATH,
     FILES_PER_CHUNK,
-    VIDEO,
     VIDEO_MB,
+    VIDEO_PATH,
     CameraVideo,
     ParquetTable,
     import_arrow,
 )
 from libero_env.demos.read import BrokenDemoError
-from libero_env.demos.statistics import Histogram, Moments
+from libero_env.demos.statistics import ImageStatistics, NumberStatistics
 from libero_env.demos.video import PIXEL_FORMAT, import_av
 from libero_env.demos.write import Episode
 from libero_env.errors import DemoError
@@ -36,7 +36,7 @@ from libero_env.storage import atomic_folder
 from libero_env.timing import CONTROL_HZ
 
 VERSION = "v3.0"
-_EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+_EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 _STATE = ("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "finger1", "finger2")
 _ACTION = ("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "gripper")
 _CAMERAS = {"agentview": "image", "eye_in_hand": "image2"}
@@ -116,11 +116,11 @@ def _exported(where: str, episode: Episode, pairing: str, labels: str) -> _Expor
     if not len(actions):
         raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
     state = np.concatenate([obs["ee_pos"], obs["ee_ori"], obs["gripper_states"]], axis=1).astype(np.float32)
-    images = {feature_of(key): values for key, values in obs.items() if key.endswith("_rgb")}
+    images = {feature_name(key): values for key, values in obs.items() if key.endswith("_rgb")}
     return _ExportedEpisode(state, actions.astype(np.float32), episode.success, images, where)
 
 
-def feature_of(key: str) -> str:
+def feature_name(key: str) -> str:
     """Return the data set's name of a camera's images: `eye_in_hand_rgb` -> `observation.images.image2`."""
     camera = key.removesuffix("_rgb")
     return f"observation.images.{_CAMERAS.get(camera, camera)}"
@@ -139,7 +139,7 @@ class _DatasetWriter:
         self._videos: dict[str, CameraVideo] = {}
         self._video_mb = video_mb
         self._data = ParquetTable(root)
-        self._stats: dict[str, Any] = {}  # Moments or Histogram
+        self._stats: dict[str, Any] = {}  # NumberStatistics or ImageStatistics
 
     def add(self, episode: _ExportedEpisode, language: str) -> None:
         """Append an episode."""
@@ -176,8 +176,8 @@ class _DatasetWriter:
         self, columns: dict[str, np.ndarray], images: dict[str, np.ndarray]
     ) -> dict[str, Any]:
         """Return the statistics of an episode, and add them to those of the data set."""
-        own: dict[str, Any] = {key: Moments.from_values(values) for key, values in columns.items()}
-        own |= {key: Histogram.from_frames(frames) for key, frames in images.items()}
+        own: dict[str, Any] = {key: NumberStatistics.from_values(values) for key, values in columns.items()}
+        own |= {key: ImageStatistics.from_frames(frames) for key, frames in images.items()}
         for key, stats in own.items():
             self._stats[key] = stats if key not in self._stats else self._stats[key] + stats
         return {f"stats/{key}/{name}": v for key, stats in own.items() for name, v in stats.summary().items()}
@@ -193,8 +193,8 @@ class _DatasetWriter:
         if not self._episodes:
             raise DemoError("no demonstrations to export")
         pa, meta = self._pa, self.root / "meta"
-        (self.root / _EPISODES).parent.mkdir(parents=True)
-        self._pq.write_table(pa.Table.from_pylist(self._episodes), self.root / _EPISODES)
+        (self.root / _EPISODES_PATH).parent.mkdir(parents=True)
+        self._pq.write_table(pa.Table.from_pylist(self._episodes), self.root / _EPISODES_PATH)
         self._pq.write_table(self._task_table(), meta / "tasks.parquet")
         _write_json(meta / "stats.json", {key: stats.summary() for key, stats in self._stats.items()})
         _write_json(meta / "info.json", self._info())
@@ -241,8 +241,8 @@ class _DatasetWriter:
             "video_files_size_in_mb": VIDEO_MB,
             "fps": CONTROL_HZ,
             "splits": {"train": f"0:{len(self._episodes)}"},
-            "data_path": DATA,
-            "video_path": VIDEO if self._shapes else None,
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH if self._shapes else None,
             "features": features,
         }
 

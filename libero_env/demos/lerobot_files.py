@@ -13,8 +13,8 @@ from libero_env.timing import CONTROL_HZ
 
 FILES_PER_CHUNK = 1000
 DATA_MB, VIDEO_MB = 100, 200  # [MiB] size from which a file is continued in the next one
-DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
 
 def import_arrow() -> tuple[ModuleType, ModuleType]:
@@ -60,7 +60,7 @@ class ParquetTable:
             self._file, self._bytes = self._file + 1, 0
         place = chunk_and_file(self._file)
         if self._writer is None:
-            path = self._root / DATA.format(**place)
+            path = self._root / DATA_PATH.format(**place)
             path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = self._pq.ParquetWriter(path, table.schema, compression="snappy")
         self._writer.write_table(table)
@@ -99,7 +99,7 @@ class CameraVideo:
             self.file += 1
         place = chunk_and_file(self.file)
         if self.writer is None:
-            path = self.root / VIDEO.format(video_key=self.key, **place)
+            path = self.root / VIDEO_PATH.format(video_key=self.key, **place)
             path.parent.mkdir(parents=True, exist_ok=True)
             self.writer = Mp4Writer(path, CONTROL_HZ)
         first = self.writer.frames

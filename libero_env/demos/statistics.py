@@ -9,18 +9,22 @@ _NAMES = tuple(f"q{round(100 * q):02d}" for q in QUANTILES)
 
 
 @dataclass(frozen=True)
-class Moments:
-    """Statistics of numbers, over the first axis."""
+class NumberStatistics:
+    """Statistics of numbers, over the first axis.
 
-    samples: tuple[np.ndarray, ...]  # each (N, D) float64
+    Attributes:
+        samples: The numbers, each array (N, D) float64.
+    """
+
+    samples: tuple[np.ndarray, ...]
 
     @classmethod
-    def from_values(cls, values: np.ndarray) -> "Moments":
+    def from_values(cls, values: np.ndarray) -> "NumberStatistics":
         """Return the statistics of values (N,) or (N, D)."""
         return cls((values.reshape(len(values), -1).astype(np.float64),))
 
-    def __add__(self, other: "Moments") -> "Moments":
-        return Moments(self.samples + other.samples)
+    def __add__(self, other: "NumberStatistics") -> "NumberStatistics":
+        return NumberStatistics(self.samples + other.samples)
 
     def summary(self) -> dict[str, list]:
         """Return each statistic as D numbers, by name; `count` is one number."""
@@ -31,20 +35,25 @@ class Moments:
 
 
 @dataclass(frozen=True)
-class Histogram:
-    """Histogram of each colour channel over the 256 values, from which all statistics follow exactly."""
+class ImageStatistics:
+    """Statistics of the colours of images, which follow exactly from the histograms of the channels.
 
-    counts: np.ndarray  # (3, 256) int64
+    Attributes:
+        counts: Number of pixels of each channel and value, (3, 256) int64.
+        frames: Number of images.
+    """
+
+    counts: np.ndarray
     frames: int
 
     @classmethod
-    def from_frames(cls, frames: np.ndarray) -> "Histogram":
-        """Return the histogram of frames (T, H, W, 3) uint8."""
+    def from_frames(cls, frames: np.ndarray) -> "ImageStatistics":
+        """Return the statistics of frames (T, H, W, 3) uint8."""
         counts = [np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)]
         return cls(np.array(counts, np.int64), len(frames))
 
-    def __add__(self, other: "Histogram") -> "Histogram":
-        return Histogram(self.counts + other.counts, self.frames + other.frames)
+    def __add__(self, other: "ImageStatistics") -> "ImageStatistics":
+        return ImageStatistics(self.counts + other.counts, self.frames + other.frames)
 
     def summary(self) -> dict[str, list]:
         """Return each statistic as nested lists (3, 1, 1) in [0, 1], by name; `count` is the number of frames."""

@@ -17,25 +17,18 @@ from libero_env.errors import LiberoError, RenderError
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.predicates import glowing_sites
 from libero_env.teleop.devices import GRIPPER, HELP, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
-from libero_env.teleop.session import Status
+from libero_env.teleop.session import Screen, Status
 from libero_env.timing import CONTROL_HZ
 
 SCREENS = ("auto", "window", "terminal")
 _ESCAPE = "\x1b"
 _ESCAPE_KEY = 256  # number of the key in GLFW
+_MAX_GEOMS = 2000  # geoms that the window can show
 _STEPS_PER_IMAGE = 4  # [control steps] between two images in a terminal
 
 
-class OpenScreen(Protocol):
+class ClosableScreen(Screen, Protocol):
     """A `Screen` that can be closed."""
-
-    def poll(self, world: World) -> None:
-        """See `Screen`."""
-        ...
-
-    def show(self, world: World, status: Status) -> None:
-        """See `Screen`."""
-        ...
 
     def close(self) -> None:
         """Close the screen and restore what it changed."""
@@ -44,7 +37,7 @@ class OpenScreen(Protocol):
 
 def open_screen(
     kind: str, keyboard: Keyboard, camera: str = "agentview", reader: "MouseReader | None" = None
-) -> OpenScreen:
+) -> ClosableScreen:
     """Open a window, or use the terminal if no window can be opened.
 
     Args:
@@ -57,16 +50,12 @@ def open_screen(
         RenderError: No screen of this kind works here; the message states why.
     """
     problems = []
-    if kind in ("auto", "window"):
-        try:
-            return Window(keyboard, camera, reader)
-        except RenderError as error:
-            problems.append(str(error))
-    if kind in ("auto", "terminal"):
-        try:
-            return Terminal(keyboard, camera, reader)
-        except RenderError as error:
-            problems.append(str(error))
+    for name, screen in (("window", Window), ("terminal", Terminal)):
+        if kind in ("auto", name):
+            try:
+                return screen(keyboard, camera, reader)
+            except RenderError as error:
+                problems.append(str(error))
     raise RenderError("; ".join(problems) or f"screen {kind!r}; valid: {', '.join(SCREENS)}")
 
 
@@ -160,15 +149,10 @@ class Window:
         model, data = world.simulations.model, world.simulations.data(0)
         self.glfw.make_context_current(self.window)
         if self.context is None:
-            self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
-            self.scene, self.option = mujoco.MjvScene(model, 2000), mujoco.MjvOption()
-            self.option.geomgroup[0] = 0  # collision shapes
-            self.view = mujoco.MjvCamera()
-            self.view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-            self.view.fixedcamid = model.camera(self.camera).id
+            self.context = self._make_context(model)
         area = mujoco.MjrRect(0, 0, *self.glfw.get_framebuffer_size(self.window))
         mujoco.mj_camlight(model, data)
-        self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(world.views[0]))  # a stove that is on
+        self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(world.views[0]))  # glows while a stove is on
         mujoco.mjv_updateScene(
             model, data, self.option, None, self.view, mujoco.mjtCatBit.mjCAT_ALL, self.scene
         )
@@ -179,6 +163,14 @@ class Window:
         )
         self.glfw.swap_buffers(self.window)
         self.clock.wait()
+
+    def _make_context(self, model: mujoco.MjModel) -> mujoco.MjrContext:
+        self.scene, self.option = mujoco.MjvScene(model, _MAX_GEOMS), mujoco.MjvOption()
+        self.option.geomgroup[0] = 0  # collision shapes are hidden
+        self.view = mujoco.MjvCamera()
+        self.view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self.view.fixedcamid = model.camera(self.camera).id
+        return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
 
     def close(self) -> None:
         """Close the window."""

@@ -33,7 +33,7 @@ class SequenceVLDataset:
     end, the last frame and action repeat (robomimic's SequenceDataset with pad_seq_length). Frames are stored
     once: windows are indices, and a batch is one gather per array.
 
-    Build one with `from_file` or `from_demos`.
+    Build one with `from_file`, `from_source` or `from_demos`.
 
     Attributes:
         images: (F, V, H, W, C) uint8, upright.
@@ -90,8 +90,13 @@ class SequenceVLDataset:
             DataError: The file is valid but does not fit the spec.
         """
         source = DemoSource(Path(path), spec, limit, pairing, labels)
-        language, lengths = check_language(language, spec), source.lengths()
-        return cls._filled(source.demos(), lengths, spec, language, task_id)
+        return cls.from_source(source, language=language, task_id=task_id)
+
+    @classmethod
+    def from_source(cls, source: DemoSource, *, language: Tensor, task_id: int = 0) -> "SequenceVLDataset":
+        """Read what a source describes into memory; see `from_file`."""
+        language = check_language(language, source.spec)
+        return cls._filled(source.demos(), source.lengths(), source.spec, language, task_id)
 
     @classmethod
     def from_demos(

@@ -49,7 +49,7 @@ def open_mapped(source: DemoSource, *, language: Tensor, task_id: int = 0) -> Se
         DataError: The file does not fit the spec, or there is not enough space on the disk.
     """
     language = check_language(language, source.spec)
-    folder = _ensure(source)
+    folder = _ensure_folder(source)
     index = json.loads((folder / "index.json").read_text())
     with np.load(folder / "arrays.npz", allow_pickle=False) as file:
         arrays = {name: torch.from_numpy(file[name]) for name in file.files}
@@ -68,10 +68,10 @@ def cache_root() -> Path:
     return cache_dir() / "frames"
 
 
-def _ensure(source: DemoSource) -> Path:
+def _ensure_folder(source: DemoSource) -> Path:
     """Return the folder of a source, after building it if it does not exist."""
     fingerprint = _fingerprint(source.path)
-    made_from = {"source": str(source.path.resolve()), "file": fingerprint, "read": _settings(source)}
+    made_from = {"source": str(source.path.resolve()), "file": fingerprint, "read": _array_settings(source)}
     digest = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()[:24]
     root = cache_root()
     folder = root / f"{source.path.stem}-{digest}"
@@ -139,7 +139,7 @@ def _fingerprint(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _settings(source: DemoSource) -> dict[str, Any]:
+def _array_settings(source: DemoSource) -> dict[str, Any]:
     """Return the settings that determine the arrays; `seq_len` does not, since windows are made from them later."""
     spec = asdict(source.spec)
     read = {key: spec[key] for key in ("views", "image_size", "proprio", "action_dim")}

@@ -28,7 +28,7 @@ BACKENDS = ("native", "robomimic")
 
 _GPU_RESERVE = 0.4  # [share of GPU memory] kept free for training
 _HOST_RESERVE = 0.25  # [share of host memory] kept free for everything else
-_HOST_RESERVE_BYTES = 2**30  # [bytes] of host memory that are kept free at least
+_HOST_RESERVE_BYTES = 2**30  # [bytes] host memory kept free at least
 
 
 def open_windows(
@@ -68,15 +68,7 @@ def open_windows(
     if memory == "mmap":
         dataset = frame_cache.open_mapped(source, language=language, task_id=task_id)
     else:
-        dataset = SequenceVLDataset.from_file(
-            source.path,
-            spec=source.spec,
-            language=language,
-            task_id=task_id,
-            limit=source.limit,
-            pairing=source.pairing,
-            labels=source.labels,
-        )
+        dataset = SequenceVLDataset.from_source(source, language=language, task_id=task_id)
     if memory == "device":
         return dataset.to(device)
     pin = device.type == "cuda" and memory in ("pinned", "mmap")
@@ -103,13 +95,13 @@ def host_memory() -> tuple[int, int]:
     if meminfo.exists():
         lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
         free = int(lines["MemAvailable"].split()[0]) * 1024
-    limit, used = (_cgroup(name) for name in ("memory.max", "memory.current"))
+    limit, used = (_cgroup_value(name) for name in ("memory.max", "memory.current"))
     if limit is not None and used is not None and limit < total:
         return min(free, max(limit - used, 0)), limit
     return free, total
 
 
-def _cgroup(name: str) -> int | None:
+def _cgroup_value(name: str) -> int | None:
     """Return a value of this process's container (cgroup v2); None where there is none."""
     try:
         text = (Path("/sys/fs/cgroup") / name).read_text().strip()

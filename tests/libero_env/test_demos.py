@@ -30,10 +30,10 @@ def test_written_is_read_back_upright(path):
     demos = read_demos(path)
     assert [demo.name for demo in demos] == ["demo_0", "demo_1", "demo_2"]
     for i, demo in enumerate(demos):
-        wanted = episode(i)
-        np.testing.assert_array_equal(demo.actions, wanted.expert_actions)
-        np.testing.assert_array_equal(demo.states, wanted.states)
-        for key, values in wanted.obs.items():
+        expected = episode(i)
+        np.testing.assert_array_equal(demo.actions, expected.expert_actions)
+        np.testing.assert_array_equal(demo.states, expected.states)
+        for key, values in expected.obs.items():
             np.testing.assert_array_equal(demo.obs[key], values)
         assert demo.success and demo.dones.tolist() == [0] * 10 + [1] and demo.pairing == "aligned"
     np.testing.assert_array_equal(read_demos(path, labels="executed")[1].actions, episode(1).actions)
@@ -156,7 +156,7 @@ def test_truncated_and_absent_files_are_named(path):
         read_demos(path)
 
 
-def test_recording_goes_on_where_it_was(path):
+def test_an_interrupted_recording_is_resumed(path):
     writer = DemoWriter(path, header())
     assert writer.recorded() == {0, 1, 2}
     writer.write(3, episode(3))
@@ -165,7 +165,7 @@ def test_recording_goes_on_where_it_was(path):
     assert len(read_demos(path)) == 4 and not writer.parts.exists()
 
 
-def test_a_file_made_otherwise_is_refused(path):
+def test_a_file_of_another_configuration_is_refused(path):
     with pytest.raises(DemoError, match="seed = 1, not 2"):
         DemoWriter(path, header(seed=2)).recorded()
 

@@ -35,8 +35,8 @@ def whole(tmp_path_factory):
     return generate(TASK, 3, path=tmp_path_factory.mktemp("demos") / "whole.hdf5", workers=1, **KINDS)
 
 
-def same(a, b):
-    """Whether two files hold the same demonstrations."""
+def check_same(a, b):
+    """Check that two files hold the same demonstrations."""
     for x, y in zip(read_demos(a), read_demos(b), strict=True):
         assert x.name == y.name
         np.testing.assert_array_equal(x.states, y.states)
@@ -46,7 +46,7 @@ def same(a, b):
 
 
 def test_observations_are_those_of_the_environment(whole):
-    """Each is what was seen before its action, and replaying the executed actions leads through the same states."""
+    """Each is the observation before its action, and replaying the executed actions leads through the same states."""
     demo = read_demos(whole, limit=1, labels="executed")[0]
     env = LiberoEnv(TASK, camera_size=SIZE)
     obs = env.set_state(demo.states[0])
@@ -61,7 +61,7 @@ def test_observations_are_those_of_the_environment(whole):
     assert terminated and demo.success
 
 
-def test_the_file_says_how_it_was_made(whole):
+def test_the_file_states_how_it_was_recorded(whole):
     with h5py.File(whole) as handle:
         attrs, demo = handle["data"].attrs, handle["data/demo_0"]
         assert (
@@ -84,7 +84,7 @@ def test_demonstrations_differ_and_are_disturbed(whole):
     assert all(np.abs(a.actions - b.actions).max() > 0.05 for a, b in zip(demos, executed, strict=True))
 
 
-def test_the_libero_pairing_shows_what_came_after():
+def test_the_libero_pairing_stores_observations_after_the_action():
     """The same attempt rendered both ways differs by one step."""
     recorder = DemoRecorder(DemoConfig(TASK, SIZE, pairing="libero"))
     ((_, attempt),) = recorder.attempt([(0, 0)])
@@ -95,13 +95,13 @@ def test_the_libero_pairing_shows_what_came_after():
     np.testing.assert_allclose(after.obs["joint_states"], attempt.states[1:, arm], atol=1e-12)
 
 
-def test_more_demonstrations_are_added_to_those_there_are(whole, tmp_path):
+def test_more_demonstrations_are_added_to_existing_ones(whole, tmp_path):
     path = generate(TASK, 1, path=tmp_path / "grown.hdf5", workers=1, **KINDS)
     assert len(read_demos(path)) == 1
-    same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
+    check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
 
-def test_a_killed_recording_goes_on_to_the_same_file(whole, tmp_path):
+def test_a_killed_recording_is_resumed_to_the_same_file(whole, tmp_path):
     script = f"""
         import sys
         from libero_env.demos.generate import generate
@@ -118,15 +118,15 @@ def test_a_killed_recording_goes_on_to_the_same_file(whole, tmp_path):
     assert not path.exists() and len(read_demos(parts)) >= 1
     for part in sorted(parts.glob("demo_*.hdf5"))[3:]:
         part.unlink()
-    same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
+    check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
 
-def test_a_file_made_otherwise_is_refused(whole):
+def test_a_file_of_another_configuration_is_refused(whole):
     with pytest.raises(DemoError, match="seed = 0, not 1"):
         generate(TASK, 3, path=whole, seed=1, workers=1, **KINDS)
 
 
-def test_files_are_made_once_and_found_again(whole, tmp_path):
+def test_files_are_recorded_once_and_found_again(whole, tmp_path):
     kept = demo_path(tmp_path, DemoConfig(TASK, SIZE))
     kept.parent.mkdir(parents=True)
     os.link(whole, kept)
@@ -171,10 +171,10 @@ def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_
     for name, episode in read_episodes(whole):
         writer.write(int(name[5:]), episode)
     assert not path.exists()
-    same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
+    check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
 
-def test_what_an_older_scene_left_is_recorded_anew(whole, tmp_path):
+def test_a_file_of_an_older_scene_is_recorded_again(whole, tmp_path):
     kept = demo_path(tmp_path, DemoConfig(TASK, SIZE))
     kept.parent.mkdir(parents=True)
     kept.write_bytes(whole.read_bytes())
@@ -188,7 +188,7 @@ def test_what_an_older_scene_left_is_recorded_anew(whole, tmp_path):
 def test_the_number_of_processes_does_not_matter(whole, tmp_path):
     path = generate(TASK, 7, path=tmp_path / "two.hdf5", workers=2, **KINDS)
     assert path.exists()
-    same(generate(TASK, 7, path=tmp_path / "one.hdf5", workers=1, **KINDS), path)
+    check_same(generate(TASK, 7, path=tmp_path / "one.hdf5", workers=1, **KINDS), path)
 
 
 @pytest.mark.slow
@@ -197,13 +197,13 @@ def test_no_worker_outlives_a_killed_recording(tmp_path):
         import multiprocessing, sys, threading, time
         from libero_env.demos.generate import generate
 
-        def tell():
+        def print_workers():
             while len(multiprocessing.active_children()) < 2:
                 time.sleep(0.01)
             print(*[child.pid for child in multiprocessing.active_children()], flush=True)
 
         if __name__ == "__main__":
-            threading.Thread(target=tell, daemon=True).start()
+            threading.Thread(target=print_workers, daemon=True).start()
             generate({TASK!r}, 50, path=sys.argv[1], workers=2, camera_size={SIZE}, progress=False)
     """
     file = tmp_path / "record.py"
@@ -232,12 +232,12 @@ def _runs(pid: int) -> bool:
 def test_failed_attempts_are_counted_and_left_out(tmp_path, monkeypatch):
     calls = []
 
-    def sometimes(stage, experts, noise, max_steps):
+    def fail_first(env, experts, noise, max_steps):
         calls.append(len(experts))
         first = len(calls) == 1
-        return run_experts(stage, experts, noise, max_steps=5 if first else max_steps)
+        return run_experts(env, experts, noise, max_steps=5 if first else max_steps)
 
-    monkeypatch.setattr("libero_env.demos.record.run_experts", sometimes)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", fail_first)
     path = generate(TASK, 1, path=tmp_path / "x.hdf5", seed=3, workers=1, **KINDS)
     with h5py.File(path) as handle:
         assert handle["data"].attrs["num_failed_attempts"] == 1 and handle["data"].attrs["num_demos"] == 1

@@ -17,12 +17,12 @@ STEPS, SIZE = (9, 14, 11), 32
 
 
 def smooth(seed, steps, size=SIZE):
-    """An episode whose pictures are as calm as a film, so that H.264 keeps them."""
+    """Return an episode whose images change slowly, so that H.264 preserves them."""
     one = episode(seed, steps, size)
     ramp = np.linspace(0, 200, size)[:, None] * np.ones((1, size))
     for k, key in enumerate(("agentview_rgb", "eye_in_hand_rgb")):
-        film = np.stack([ramp + 4 * t + 10 * seed + 5 * k for t in range(steps)]) % 256
-        one.obs[key] = np.repeat(np.minimum(film, 255).astype(np.uint8)[..., None], 3, axis=3)
+        frames = np.stack([ramp + 4 * t + 10 * seed + 5 * k for t in range(steps)]) % 256
+        one.obs[key] = np.repeat(np.minimum(frames, 255).astype(np.uint8)[..., None], 3, axis=3)
     return one
 
 
@@ -51,7 +51,7 @@ def episodes(root):
     return parquet.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
 
 
-def test_the_numbers_are_those_of_the_files(root, files):
+def test_numbers_equal_those_of_the_files(root, files):
     table = parquet.read_table(root / "data/chunk-000/file-000.parquet")
     demos = [demo for file in files for demo in read_demos(file)]
     action = np.array(table["action"].to_pylist())
@@ -67,7 +67,7 @@ def test_the_numbers_are_those_of_the_files(root, files):
     np.testing.assert_allclose(table["timestamp"].to_numpy(), table["frame_index"].to_numpy() / 20, atol=1e-6)
 
 
-def test_every_column_is_declared_and_every_declared_column_is_there(root, info):
+def test_every_column_is_declared_and_every_declared_column_exists(root, info):
     schema = parquet.read_schema(root / "data/chunk-000/file-000.parquet")
     declared = {key: f for key, f in info["features"].items() if f["dtype"] != "video"}
     assert set(schema.names) == declared.keys()
@@ -79,7 +79,7 @@ def test_every_column_is_declared_and_every_declared_column_is_there(root, info)
         assert feature["names"] is None or len(feature["names"]) == shape[0]
 
 
-def test_the_whole_is_counted(info, episodes):
+def test_totals_are_those_of_the_episodes(info, episodes):
     assert info["codebase_version"] == "v3.0" and info["fps"] == 20
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, sum(STEPS), 2)
     assert [e["length"] for e in episodes] == list(STEPS) and info["splits"] == {"train": "0:3"}
@@ -87,7 +87,7 @@ def test_the_whole_is_counted(info, episodes):
     assert ends == [(0, 9), (9, 23), (23, 34)]
 
 
-def test_frames_are_found_where_the_episodes_say(root, info, episodes, files):
+def test_frames_are_where_the_episode_table_says(root, info, episodes, files):
     demos = [demo for file in files for demo in read_demos(file)]
     for feature, key in (
         ("observation.images.image", "agentview_rgb"),
@@ -105,7 +105,7 @@ def test_frames_are_found_where_the_episodes_say(root, info, episodes, files):
                 assert np.abs(frame.astype(int) - demo.obs[key][t]).mean() < 4.0
 
 
-def test_a_full_video_goes_on_in_the_next_file(files, tmp_path):
+def test_a_full_video_is_continued_in_the_next_file(files, tmp_path):
     export_lerobot(files, tmp_path / "set", video_mb=0.0, progress=False)
     videos = sorted(p.name for p in (tmp_path / "set/videos/observation.images.image/chunk-000").iterdir())
     rows = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -150,7 +150,7 @@ def test_the_original_pairing_is_shifted(tmp_path):
     )
 
 
-def test_what_does_not_fit_leaves_nothing(files, tmp_path):
+def test_files_that_do_not_fit_leave_no_data_set(files, tmp_path):
     other = write(tmp_path / "other.hdf5", [smooth(0, 5, 16)])
     with pytest.raises(DemoError, match=r"other.hdf5: demo_0 has images .*16"):
         export_lerobot([files[0], other], tmp_path / "set", progress=False)

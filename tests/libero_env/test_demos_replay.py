@@ -28,14 +28,14 @@ TASK, SIZE = "libero_goal/3", (24, 32)
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """Two recordings of a scene with fixtures, without an expert."""
+    """Record two demonstrations of a scene with fixtures, without an expert."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("libero_env.demos.record.run_experts", wander)
         out = tmp_path_factory.mktemp("demos") / "goal.hdf5"
         return generate(TASK, 2, path=out, camera_size=SIZE, workers=1, progress=False)
 
 
-def test_fixtures_are_recorded_where_they_stood(path):
+def test_poses_of_fixtures_are_recorded(path):
     scene = LiberoEnv(TASK, cameras=()).world.scene
     episodes = [episode for _, episode in read_episodes(path)]
     poses = [episode.fixtures for episode in episodes]
@@ -63,8 +63,8 @@ def test_actions_replay_to_the_same_states(path):
         assert result.recorded and not result.success  # a random walk reaches nothing
 
 
-def test_with_fixtures_elsewhere_it_would_not_be_the_same_scene(path, tmp_path):
-    """Pictures depend on where fixtures stand, so that it is seen when they are forgotten."""
+def test_images_depend_on_the_poses_of_fixtures(path, tmp_path):
+    """So the other tests would fail if the poses were ignored."""
     renderer = StateRenderer(get_task(TASK), RenderConfig(("agentview",), SIZE))
     _, episode = next(read_episodes(path))
     seen, _ = renderer.render_states(episode.states[:1], episode.fixtures)
@@ -74,7 +74,7 @@ def test_with_fixtures_elsewhere_it_would_not_be_the_same_scene(path, tmp_path):
     assert np.abs(seen["agentview_rgb"].astype(int) - moved["agentview_rgb"]).mean() > 1.0
 
 
-def test_states_replay_with_a_film(path):
+def test_states_replay_with_images(path):
     results = list(
         replay(path, by="state", demos=["demo_1"], cameras=("agentview", "frontview"), size=(16, 24))
     )
@@ -86,7 +86,7 @@ def test_states_replay_with_a_film(path):
         list(replay(path, by="magic"))
 
 
-def test_rendering_anew_gives_the_same_where_nothing_is_changed(path, tmp_path):
+def test_rendering_again_with_the_same_settings_gives_the_same_images(path, tmp_path):
     out = rerender(path, tmp_path / "same.hdf5", RenderConfig(size=SIZE), progress=False)
     for a, b in zip(read_demos(path), read_demos(out), strict=True):
         assert a.name == b.name and a.obs.keys() == b.obs.keys()
@@ -94,7 +94,7 @@ def test_rendering_anew_gives_the_same_where_nothing_is_changed(path, tmp_path):
             np.testing.assert_array_equal(a.obs[key], b.obs[key], err_msg=key)
 
 
-def test_rendering_anew_with_other_cameras_depth_and_segmentation(path, tmp_path):
+def test_rendering_again_with_other_cameras_depth_and_segmentation(path, tmp_path):
     config = RenderConfig(("agentview", "frontview"), (16, 20), ("rgb", "depth", "segmentation_instance"))
     out = rerender(path, tmp_path / "other.hdf5", config, progress=False)
     demo = read_demos(out)[0]
@@ -128,7 +128,7 @@ def test_states_of_another_scene_are_refused(path, tmp_path):
 
 
 def original(source, out):
-    """A file as the original writes it, from recorded states: observations after their action, a path of its own."""
+    """Write states as the original does: observations after their action, and another path of the task file."""
     task = get_task(TASK)
     renderer = StateRenderer(task, RenderConfig(size=SIZE))
     with h5py.File(out, "w") as handle:
@@ -170,9 +170,9 @@ def test_files_of_the_original_work_with_every_tool(path, tmp_path):
         theirs.obs["agentview_rgb"], ours.obs["agentview_rgb"][1:]
     )  # upright, one later
     again = rerender(file, tmp_path / "aligned.hdf5", RenderConfig(size=SIZE), progress=False)
-    (anew,) = read_demos(again)
-    assert anew.pairing == "aligned"
-    np.testing.assert_array_equal(anew.obs["agentview_rgb"], ours.obs["agentview_rgb"][:-1])
+    (rendered,) = read_demos(again)
+    assert rendered.pairing == "aligned"
+    np.testing.assert_array_equal(rendered.obs["agentview_rgb"], ours.obs["agentview_rgb"][:-1])
     pytest.importorskip("av")
     pytest.importorskip("pyarrow")
     assert export_lerobot([file], tmp_path / "set", progress=False) == (1, STEPS - 2)
@@ -184,13 +184,13 @@ def test_recorded_models_have_the_joints_of_the_states(path):
     assert all(f'name="{model.joint(j).name}"' in episode.attrs["model_file"] for j in range(model.njnt))
 
 
-def test_a_task_beyond_the_expert_stops_no_other(tmp_path, monkeypatch):
-    class Choosy:
+def test_a_task_that_the_expert_cannot_do_stops_no_other(tmp_path, monkeypatch):
+    class PartialExpert:
         def __init__(self, task, *args, **kwargs):
             if task.id == TASK:
                 raise UnsupportedGoalError("no skill for that")
 
-    monkeypatch.setattr("libero_env.demos.record.Expert", Choosy)
+    monkeypatch.setattr("libero_env.demos.record.Expert", PartialExpert)
     monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     jobs = [
         RecordingJob(DemoConfig(t, (8, 8)), tmp_path / f"{t[-6:].replace('/', '')}.hdf5")
@@ -204,8 +204,8 @@ def test_a_task_beyond_the_expert_stops_no_other(tmp_path, monkeypatch):
         generate(TASK, 1, path=tmp_path / "again.hdf5", camera_size=(8, 8), workers=1, progress=False)
 
 
-def test_an_expert_that_always_fails_is_given_up(tmp_path, monkeypatch):
-    def idle(stage, experts, noise, max_steps):
+def test_recording_ends_if_the_expert_always_fails(tmp_path, monkeypatch):
+    def idle(env, experts, noise, max_steps):
         return [
             Attempt(False, np.zeros((1, 9)), *[np.zeros((0, 7))] * 2, 0, "it did nothing") for _ in experts
         ]
@@ -228,7 +228,7 @@ def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
         np.testing.assert_array_equal(episode.fixtures, env.world.simulations.fixtures[0])
 
 
-def test_a_task_file_of_ones_own_is_recorded(tmp_path, monkeypatch):
+def test_a_user_defined_task_file_is_recorded(tmp_path, monkeypatch):
     monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     file = tmp_path / "my_task.bddl"
     file.write_text(get_task("libero_object/9").bddl_text)

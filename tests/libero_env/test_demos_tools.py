@@ -1,4 +1,4 @@
-"""What is done with whole files: the task they name, what is counted, what is left out, and other readers."""
+"""Tools for demonstration files: their task, their statistics, filtering, and reading with robomimic."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 
 from libero_env.demos.curate import examine, filter_demos, noop_steps, read_episodes, recorded_task
 from libero_env.demos.read import read_demos
-from libero_env.demos.statistics import QUANTILES, Histogram, Moments
+from libero_env.demos.statistics import QUANTILES, ImageStatistics, NumberStatistics
 from libero_env.errors import DemoError
 from libero_env.tasks import get_task
 from tests.harness.demos import episode, write
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.unit
 
 
 def with_noops(seed):
-    """An episode whose steps 3 and 4 want nothing; the fingers begin to close in step 7, where nothing moves."""
+    """Return an episode with no-ops in steps 3 and 4; in step 7 the gripper begins to close without motion."""
     one = episode(seed)
     one.expert_actions[:, 6] = -1.0
     one.expert_actions[7:, 6] = 1.0
@@ -30,19 +30,21 @@ def path(tmp_path):
     return write(tmp_path / "a_demo.hdf5", [with_noops(0), replace(episode(1), success=False), with_noops(2)])
 
 
-def test_a_no_op_neither_moves_nor_grips():
+def test_a_no_op_neither_moves_nor_changes_the_gripper():
     actions = with_noops(0).expert_actions
     assert np.flatnonzero(noop_steps(actions)).tolist() == [3, 4]
-    assert noop_steps(actions, threshold=2.0).sum() == len(actions) - 1  # the one that grips is left
+    assert (
+        noop_steps(actions, threshold=2.0).sum() == len(actions) - 1
+    )  # the step with the gripper command remains
 
 
-def test_files_are_counted(path):
+def test_statistics_of_a_file(path):
     stats = examine(path)
     assert stats.lengths == (11, 11, 11) and stats.successes == 2 and stats.noops == 4 and not stats.faults
     assert "2 of 3 successful" in str(stats) and f"{100 * 4 / 33:.1f} % no-ops" in str(stats)
 
 
-def test_what_is_odd_is_named(path):
+def test_faults_are_named(path):
     with h5py.File(path, "r+") as handle:
         handle["data/demo_1/actions"][0, 0] = 3.0
         handle["data/demo_2/obs/ee_pos"][4] = np.nan
@@ -58,7 +60,7 @@ def test_what_is_odd_is_named(path):
         assert words in faults, faults
 
 
-def test_filtering_keeps_what_is_wanted_as_it_was(path, tmp_path):
+def test_filtering_keeps_the_chosen_steps_unchanged(path, tmp_path):
     stats = filter_demos(path, tmp_path / "b.hdf5", success_only=True, without_noops=True)
     assert stats.lengths == (9, 9) and stats.successes == 2 and stats.noops == 0
     kept, whole = read_demos(tmp_path / "b.hdf5"), read_demos(path)
@@ -81,7 +83,7 @@ def test_filtering_nothing_changes_nothing(path, tmp_path):
         assert all(np.array_equal(a.obs[key], b.obs[key]) for key in a.obs)
 
 
-def test_nothing_is_overwritten_nor_written_empty(path, tmp_path):
+def test_existing_files_are_not_overwritten_and_empty_ones_not_written(path, tmp_path):
     with pytest.raises(DemoError, match="exists"):
         filter_demos(path, path)
     failed = write(tmp_path / "failures.hdf5", [replace(episode(1), success=False)])
@@ -93,7 +95,7 @@ def test_nothing_is_overwritten_nor_written_empty(path, tmp_path):
 @pytest.mark.parametrize(
     ("key", "words"), [("states", "demo_1/states is missing"), ("actions", "demo_1/actions is missing")]
 )
-def test_what_is_missing_is_named(path, key, words):
+def test_missing_keys_are_named(path, key, words):
     with h5py.File(path, "r+") as handle:
         del handle[f"data/demo_1/{key}"]
     with pytest.raises(DemoError, match=words) as caught:
@@ -117,17 +119,17 @@ def test_the_task_is_found_by_name_and_by_text(tmp_path):
 
 
 def test_statistics_add_up():
-    """Those of parts together are those of the whole, and those of a histogram those of the pixels."""
+    """Statistics of parts add up to those of all data, and those of a histogram equal those of the pixels."""
     rng = np.random.default_rng(0)
     values = rng.normal(size=(90, 3))
-    whole = (Moments.from_values(values[:40]) + Moments.from_values(values[40:])).summary()
+    whole = (NumberStatistics.from_values(values[:40]) + NumberStatistics.from_values(values[40:])).summary()
     np.testing.assert_allclose(whole["std"], values.std(axis=0))
     np.testing.assert_allclose(whole["q10"], np.quantile(values, 0.1, axis=0))
     frames = np.clip(rng.normal(100, 60, (20, 8, 8, 3)), 0, 255).astype(np.uint8)
-    found = (Histogram.from_frames(frames[:7]) + Histogram.from_frames(frames[7:])).summary()
+    found = (ImageStatistics.from_frames(frames[:7]) + ImageStatistics.from_frames(frames[7:])).summary()
     pixels = frames.reshape(-1, 3) / 255.0
     quantiles = np.quantile(pixels, QUANTILES, axis=0, method="inverted_cdf")
-    for name, wanted in {
+    for name, expected in {
         "min": pixels.min(0),
         "max": pixels.max(0),
         "mean": pixels.mean(0),
@@ -136,7 +138,7 @@ def test_statistics_add_up():
         "q50": quantiles[2],
         "q99": quantiles[4],
     }.items():
-        np.testing.assert_allclose(np.ravel(found[name]), wanted, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(np.ravel(found[name]), expected, atol=1e-9, err_msg=name)
         assert np.shape(found[name]) == (3, 1, 1)
     assert found["count"] == [20]
 

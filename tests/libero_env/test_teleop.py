@@ -1,4 +1,4 @@
-"""Teleoperation without hands: key events of a scripted user become actions, episodes and a demonstration file."""
+"""Teleoperation by a scripted user: key events become actions, episodes and a demonstration file."""
 
 import io
 import json
@@ -30,13 +30,13 @@ def test_a_key_moves_along_one_axis(key):
     keyboard = Keyboard()
     keyboard.press(key.upper())
     entry, direction = MOTIONS[key]
-    wanted = np.zeros(7)
-    wanted[entry], wanted[6] = direction * (1.0 if entry < 3 else 0.15), -1.0
-    assert np.allclose(keyboard.action(), wanted)
+    expected = np.zeros(7)
+    expected[entry], expected[6] = direction * (1.0 if entry < 3 else 0.15), -1.0
+    assert np.allclose(keyboard.action(), expected)
 
 
 @pytest.mark.unit
-def test_keys_are_robosuites():
+def test_keys_are_those_of_robosuite():
     """Its keyboard device: w, a, f towards smaller coordinates; the rotation vector as `input2action` turns it."""
     down = {key for key, (_, direction) in MOTIONS.items() if direction < 0}
     assert down == set("wafzgc")
@@ -65,9 +65,9 @@ def test_taps_and_held_keys():
 @pytest.mark.unit
 def test_gripper_and_commands():
     keyboard = Keyboard()
-    for wanted in (1.0, -1.0, 1.0):
+    for expected in (1.0, -1.0, 1.0):
         keyboard.press(GRIPPER)
-        assert keyboard.action()[6] == wanted
+        assert keyboard.action()[6] == expected
     keyboard.restart()
     assert keyboard.action()[6] == -1.0
     for key in (RESET, QUIT):
@@ -112,7 +112,7 @@ def test_keys_of_windows_and_terminals():
 
 
 @pytest.mark.unit
-def test_pictures_as_text():
+def test_images_as_text():
     picture = np.zeros((4, 2, 3), np.uint8)
     picture[1, 0] = (1, 2, 3)
     lines = as_text(picture).split("\n")
@@ -137,7 +137,7 @@ def test_without_a_screen(monkeypatch):
 
 
 class User:
-    """Somebody who looks where the gripper is and taps one key for each control step."""
+    """Scripted user that looks at the position of the gripper and taps one key per control step."""
 
     def __init__(self, keyboard, way=WAY, give_up_after=1000, resets_at=()):
         self.keyboard, self.way, self.goals, self.clock = keyboard, way, list(way), 0
@@ -194,7 +194,7 @@ def test_an_episode_ends_when_the_goal_has_held(session):
 
 
 @pytest.mark.sim
-def test_starting_again_forgets_and_stopping_ends(session):
+def test_restarting_drops_the_episode_and_stopping_ends_the_session(session):
     teleop = session(resets_at=(5,))
     recording = teleop.episode()
     steps = [status.step for status in teleop.screen.shown]
@@ -206,7 +206,7 @@ def test_starting_again_forgets_and_stopping_ends(session):
 
 
 @pytest.mark.sim
-def test_what_is_recorded_is_a_demonstration(session, tmp_path):
+def test_recorded_episodes_are_demonstrations(session, tmp_path):
     choose_backend()
     file, lines = tmp_path / "by_hand.hdf5", []
     assert record_session(session(), file, 1, size=(16, 16), report=lines.append) == 1

@@ -9,7 +9,7 @@ from lifelong import checkpoints
 from lifelong.errors import CheckpointError
 
 
-def test_a_tree_comes_back_as_it_was(tmp_path):
+def test_a_tree_is_loaded_as_it_was_saved(tmp_path):
     net = torch.nn.Linear(3, 2)
     optimizer = torch.optim.AdamW(net.parameters(), lr=0.1)
     net(torch.ones(1, 3)).sum().backward()

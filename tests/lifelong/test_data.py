@@ -31,7 +31,7 @@ def make_dataset(task_id: int = 0, lengths: tuple[int, ...] = LENGTHS, seed: int
 
 
 def write_hdf5(path: Path, demos: list[Demo]) -> Path:
-    """A file in the original's layout: images upside down, each action with the observation after it."""
+    """Write a file in the original's layout: images upside down, each action with the observation after it."""
     with h5py.File(path, "w") as file:
         for demo in demos:
             group = file.create_group(f"data/{demo.name}")
@@ -67,7 +67,7 @@ def test_every_window_equals_a_naive_reference() -> None:
     assert torch.equal(batch.observation.language, torch.arange(4.0).expand(len(dataset), 4))
 
 
-def test_a_batch_keeps_the_order_asked_for_and_is_a_copy() -> None:
+def test_a_batch_keeps_the_requested_order_and_is_a_copy() -> None:
     dataset = make_dataset()
     indices = torch.tensor([9, 0, 9, 3])
     batch = dataset.batch(indices)
@@ -85,7 +85,7 @@ def test_window_indices_out_of_range_are_refused(index: int) -> None:
 
 
 @pytest.mark.parametrize("drop_last", [True, False])
-def test_a_pass_sees_each_window_once_in_an_order_that_the_generator_alone_decides(drop_last: bool) -> None:
+def test_a_pass_has_each_window_once_in_an_order_that_only_the_generator_decides(drop_last: bool) -> None:
     dataset = make_dataset()
     global_state = torch.random.get_rng_state()
     run = lambda seed: [  # noqa: E731
@@ -159,7 +159,7 @@ def test_memory_is_never_over_budget_and_splits_it_evenly(budget: int) -> None:
         assert len(memory.sample(9, generator)) == 9
 
 
-def test_what_small_tasks_leave_unused_goes_to_the_others() -> None:
+def test_shares_that_small_tasks_do_not_need_are_given_to_the_others() -> None:
     memory, generator = ReplayMemory(20), torch.Generator().manual_seed(0)
     memory.add(make_dataset(0, lengths=(3,)), generator)
     memory.add(make_dataset(1), generator)
@@ -206,7 +206,7 @@ def test_memory_round_trip() -> None:
     assert torch.equal(draw(memory).actions, draw(other).actions)  # a failed load changes nothing
 
 
-def test_wrong_uses_of_memory_are_refused() -> None:
+def test_invalid_uses_of_memory_are_refused() -> None:
     with pytest.raises(DataError, match="budget"):
         ReplayMemory(0)
     memory, generator = ReplayMemory(4), torch.Generator()

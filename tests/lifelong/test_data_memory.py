@@ -38,7 +38,7 @@ def write_file(
     pairing: str = "libero",
     expert: bool = False,
 ) -> Path:
-    """A demonstration file in the original's layout, with pictures upside down."""
+    """Write a demonstration file in the original's layout, with images upside down."""
     rng = np.random.default_rng(seed)
     with h5py.File(path, "w") as file:
         file.create_group("data").attrs["pairing"] = pairing
@@ -73,7 +73,7 @@ def assert_same(one: Batch, other: Batch) -> None:
 
 
 def everything(dataset) -> Batch:
-    """All windows, in another order than the file's."""
+    """Return all windows, in another order than that of the file."""
     return dataset.batch(torch.randperm(len(dataset), generator=torch.Generator().manual_seed(1)))
 
 
@@ -104,7 +104,7 @@ def test_batches_are_the_same_on_a_gpu(path: Path, memory: str) -> None:
         assert_same(batch, plain.batch(torch.arange(4) + k % 8))
 
 
-def test_batches_go_where_they_are_wanted(path: Path) -> None:
+def test_batches_are_on_the_requested_device(path: Path) -> None:
     held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, device="meta", memory="host")
     batch = held.batch(torch.arange(3))
     assert held.images.device == CPU
@@ -125,7 +125,7 @@ def test_frames_are_written_once_and_found_again(path: Path, monkeypatch: pytest
     assert not list(cache_root().glob("*.part")) and not list(cache_root().glob(".*.part"))
 
 
-def test_other_settings_are_other_frames(path: Path) -> None:
+def test_other_settings_have_other_frames(path: Path) -> None:
     expert = write_file(path.with_name("other_demo.hdf5"), expert=True)
     kinds = [{}, {"limit": 2}, {"pairing": "stored"}, {"labels": "executed"}]
     for kind in kinds:
@@ -135,7 +135,7 @@ def test_other_settings_are_other_frames(path: Path) -> None:
     assert len(list(cache_root().glob("other_demo-*"))) == len(kinds)
 
 
-def test_a_file_that_was_recorded_anew_is_read_anew(path: Path) -> None:
+def test_a_file_that_was_recorded_again_is_read_again(path: Path) -> None:
     source = DemoSource(path, SPEC)
     before = open_windows(source, language=LANGUAGE, memory="mmap")
     kept, stat = before.images.clone(), path.stat()
@@ -149,7 +149,7 @@ def test_a_file_that_was_recorded_anew_is_read_anew(path: Path) -> None:
     assert len(list(cache_root().glob("task_demo-*"))) == 1
 
 
-def test_what_a_killed_process_left_is_not_taken_for_whole(
+def test_files_of_a_killed_process_are_not_taken_as_complete(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = DemoSource(path, SPEC)
@@ -170,7 +170,7 @@ def test_what_a_killed_process_left_is_not_taken_for_whole(
 
 
 def build(path: Path, counter: Path) -> None:
-    """In a process of its own: map the frames, and say so where they had to be written."""
+    """Map the frames, in another process, and report if they had to be written."""
     write = frame_cache._write_arrays
 
     def counted(source: DemoSource, folder: Path) -> tuple[int, ...]:
@@ -184,7 +184,7 @@ def build(path: Path, counter: Path) -> None:
 
 
 @pytest.mark.slow
-def test_of_several_processes_one_writes(path: Path, tmp_path: Path) -> None:
+def test_one_of_several_processes_writes(path: Path, tmp_path: Path) -> None:
     counter, context = tmp_path / "written", multiprocessing.get_context("spawn")
     processes = [context.Process(target=build, args=(path, counter)) for _ in range(3)]
     for process in processes:
@@ -195,7 +195,7 @@ def test_of_several_processes_one_writes(path: Path, tmp_path: Path) -> None:
     assert counter.read_text() == "written\n"
 
 
-def test_a_full_disk_is_told_and_leaves_nothing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = type("Usage", (), {"free": 10})
     monkeypatch.setattr(frame_cache.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(DataError, match=r"cannot be written.*LIBERO_CACHE.*data\.memory=host"):
@@ -228,7 +228,7 @@ def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
     assert choose_memory(21 * gib, GPU if gpu else CPU) == expected
 
 
-def test_the_memory_of_this_machine_is_known() -> None:
+def test_the_memory_of_this_machine_is_measured() -> None:
     free, total = loading.host_memory()
     assert 0 < free < total
 
@@ -243,7 +243,7 @@ def test_unknown_memories_and_backends_name_the_valid_ones(path: Path) -> None:
         open_windows(source, language=LANGUAGE, memory="pinned")
 
 
-def test_a_memory_of_past_tasks_takes_windows_held_on_disk(path: Path) -> None:
+def test_replay_memory_accepts_windows_held_on_disk(path: Path) -> None:
     def drawn(memory: str) -> Batch:
         replay, draws = ReplayMemory(9), torch.Generator().manual_seed(0)
         replay.add(open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory), draws)
@@ -300,7 +300,7 @@ def test_without_robomimic_the_remedy_is_named(path: Path, monkeypatch: pytest.M
         open_windows(DemoSource(path, SPEC), language=LANGUAGE, backend="robomimic")
 
 
-def test_the_index_says_what_frames_were_made_from(path: Path) -> None:
+def test_the_index_states_what_frames_were_made_from(path: Path) -> None:
     open_windows(DemoSource(path, SPEC, limit=2), language=LANGUAGE, memory="mmap")
     (index,) = cache_root().glob("*/index.json")
     found = json.loads(index.read_text())
