@@ -1,8 +1,8 @@
-"""Types and options that several subcommands share."""
+"""Argument types and options that several commands share."""
 
 import argparse
 
-Subparsers = argparse._SubParsersAction  # argparse has no public name for it
+Subparsers = argparse._SubParsersAction  # argparse has no public name for the type
 
 
 def positive(text: str) -> int:

@@ -1,30 +1,32 @@
-"""`libero assets`: fetch the original's models, say which models are in use, check that they are complete."""
+"""`libero assets`: download the original's models, report which models are used, check that they are complete."""
 
 import argparse
 from pathlib import Path
 
+from libero_env.cli.arguments import Subparsers
 
-def register(subparsers: "argparse._SubParsersAction") -> None:
-    """`libero assets download|info|check`"""
-    parser = subparsers.add_parser("assets", help="the original's models: fetch them, check them")
+
+def register(subparsers: Subparsers) -> None:
+    """Add the command `libero assets`."""
+    parser = subparsers.add_parser("assets", help="download and check the original's models")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     download = commands.add_parser(
-        "download", help="fetch the original's models (420 MB); goes on where it was stopped"
+        "download", help="download the original's models (420 MB); resumes where it was stopped"
     )
-    download.add_argument("--dest", type=Path, help="the folder (default: assets in the cache)")
+    download.add_argument("--dest", type=Path, help="folder (default: assets in the cache)")
     download.add_argument(
         "--revision", help="commit, tag or branch of the data set (default: a pinned commit)"
     )
     download.set_defaults(run=run_download)
-    info = commands.add_parser("info", help="which models scenes are built from, and why")
+    info = commands.add_parser("info", help="print which models scenes are built from, and why")
     info.set_defaults(run=run_info)
-    check = commands.add_parser("check", help="whether every model's files are there")
-    check.add_argument("folder", nargs="?", type=Path, help="default: the models in use")
+    check = commands.add_parser("check", help="check that all files of the models exist and are unchanged")
+    check.add_argument("folder", nargs="?", type=Path, help="folder to check (default: the models in use)")
     check.set_defaults(run=run_check)
 
 
 def run_download(args: argparse.Namespace) -> None:
-    """Fetch, then say how to use it."""
+    """Download the models and print how to use them."""
     from libero_env.assets.download import REVISION, download
     from libero_env.assets.pack import VARIABLE
     from libero_env.paths import config_file
@@ -36,7 +38,7 @@ def run_download(args: argparse.Namespace) -> None:
 
 
 def run_info(args: argparse.Namespace) -> None:
-    """Return the name the models and the setting that chose them."""
+    """Print the models in use and the setting that chose them."""
     from libero_env.assets.download import default_folder, read_manifest
     from libero_env.assets.pack import chosen_assets, select_pack
 
@@ -44,15 +46,15 @@ def run_info(args: argparse.Namespace) -> None:
     pack = select_pack()
     root = getattr(pack, "root", None)
     print(f"models:  {pack.name}" + (f" in {root}" if root else ""))
-    print(f"because: {choice.reason} says {choice.value}")
+    print(f"because: {choice.reason} is {choice.value}")
     if root is None and choice.value != pack.name:
         print("         which does not exist")
     if record := read_manifest(Path(root or default_folder())):
-        print(f"fetched: {root or default_folder()}, revision {record[0]}")
+        print(f"downloaded: {root or default_folder()}, revision {record[0]}")
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """One line for each model that cannot be built and each file that differs; 1 where there is one."""
+    """Print a line for each model that cannot be built and each changed file; return 1 if there are any."""
     from libero_env.assets.check import problems
     from libero_env.assets.pack import select_pack
 

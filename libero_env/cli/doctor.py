@@ -1,4 +1,4 @@
-"""What this machine has and lacks: each finding with the way to mend it, and no crash."""
+"""Check of this machine for `libero doctor`: each finding states how to fix it, and no check raises an error."""
 
 import importlib.metadata
 import json
@@ -23,10 +23,10 @@ from libero_env.storage import show_bytes
 
 GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
 BACKENDS = ("egl", "osmesa", "glfw")
-PROBE_SECONDS = 60
+PROBE_SECONDS = 60  # after which the probe is stopped
 PACKAGE_ROOT = str(Path(__file__).parents[2])
 
-# Runs in a process of its own: a broken driver takes the process with it.
+# Runs in a separate process: a broken driver can crash it.
 _PROBE = """
 import json, sys, time
 import mujoco, numpy
@@ -52,7 +52,7 @@ try:
         except Exception:
             found["device"] = "unknown device"
     if not picture.any():
-        found = {"error": found["backend"] + " draws black pictures"}
+        found = {"error": found["backend"] + " renders black images"}
 except RenderError as error:
     found = {"error": str(error)}
 print(json.dumps(found), flush=True)
@@ -61,7 +61,15 @@ print(json.dumps(found), flush=True)
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing. Where it is not `ok`, `remedy` says how to mend it; an `essential` one stops the work."""
+    """Result of one check.
+
+    Attributes:
+        title: What was checked.
+        detail: What was found.
+        ok: Whether it is as required.
+        remedy: How to fix it.
+        essential: Whether the package does not work without it.
+    """
 
     title: str
     detail: str
@@ -71,7 +79,11 @@ class Finding:
 
 
 def examine(gl_only: bool = False) -> list[Finding]:
-    """Look at everything the benchmark needs; takes a few seconds, most of them for one rendered frame."""
+    """Return the findings about everything that the benchmark needs; this takes a few seconds.
+
+    Args:
+        gl_only: Whether to check rendering only.
+    """
     if gl_only:
         return [check_gl()]
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
@@ -79,14 +91,14 @@ def examine(gl_only: bool = False) -> list[Finding]:
 
 
 def check_python() -> Finding:
-    """Return the interpreter and the machine."""
+    """Check the version of Python."""
     detail = f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
     remedy = "use Python 3.11 or newer: make PYTHON=/path/to/python3.11 setup"
     return Finding("Python", detail, sys.version_info >= (3, 11), remedy)
 
 
 def check_package(name: str, remedy: str = "make setup", essential: bool = True) -> Finding:
-    """Return whether a package is installed, without importing it."""
+    """Check that a package is installed, without importing it."""
     try:
         return Finding(name, importlib.metadata.version(name), essential=essential)
     except importlib.metadata.PackageNotFoundError:
@@ -94,7 +106,7 @@ def check_package(name: str, remedy: str = "make setup", essential: bool = True)
 
 
 def check_robot_models() -> Finding:
-    """Return whether robosuite's MJCF files of the arm are found, without importing robosuite."""
+    """Check that robosuite's MJCF files of the arm are installed, without importing robosuite."""
     title = "robot models (robosuite)"
     try:
         robosuite_assets()
@@ -105,7 +117,7 @@ def check_robot_models() -> Finding:
 
 
 def check_gl() -> Finding:
-    """Draw two 128 x 128 frames with the backend that the environment would take, in a process of its own."""
+    """Render two 128 x 128 frames in a separate process, with the backend that environments would use."""
     chosen = os.environ.get("MUJOCO_GL", "")
     if chosen.lower() not in ("", *BACKENDS):
         remedy = f"unset MUJOCO_GL, or set it to one of {', '.join(BACKENDS)}"
@@ -124,7 +136,7 @@ def check_gl() -> Finding:
     lines = done.stdout.strip().splitlines()
     if not lines or not lines[-1].startswith("{"):
         reasons = [line for line in done.stderr.splitlines() if line]
-        detail = reasons[-1] if reasons else f"the process that drew ended with status {done.returncode}"
+        detail = reasons[-1] if reasons else f"the rendering process ended with status {done.returncode}"
         return Finding("GL", detail, False, GL_REMEDY)
     found = json.loads(lines[-1])
     if "error" in found:
@@ -134,9 +146,9 @@ def check_gl() -> Finding:
 
 
 def check_cache() -> Finding:
-    """Return the cache folder: where, how full, whether it can be written."""
+    """Check that the cache folder can be written and has enough free space."""
     path = cache_dir()
-    remedy = "set LIBERO_CACHE to a folder you can write to"
+    remedy = "set LIBERO_CACHE to a folder that you can write to"
     existing = next(parent for parent in [path, *path.parents] if parent.exists())
     free = shutil.disk_usage(existing).free
     detail = f"{path}, {show_bytes(folder_bytes(path))} used, {show_bytes(free)} free"
@@ -147,17 +159,17 @@ def check_cache() -> Finding:
 
 
 def check_demos() -> Finding:
-    """Return the demonstrations that are there."""
+    """Check which demonstrations exist."""
     path = demos_dir()
     files = sorted(path.rglob("*.hdf5"))
-    remedy = "training makes what it needs; or: libero demos generate --benchmark libero_object --n 50"
+    remedy = "training records those it needs; or: libero demos generate --benchmark libero_object --n 50"
     if not files:
         return Finding("demonstrations", f"none in {path}", False, remedy, essential=False)
     return Finding("demonstrations", f"{len(files)} files in {path}, {show_bytes(folder_bytes(path))}")
 
 
 def folder_bytes(path: Path) -> int:
-    """Bytes of all files below a folder; files that vanish meanwhile do not count."""
+    """Return the number of bytes of all files below a folder; files that are removed meanwhile do not count."""
     total = 0
     for folder, _, names in os.walk(path):
         for name in names:
@@ -169,7 +181,7 @@ def folder_bytes(path: Path) -> int:
 
 
 def render_findings(findings: Iterable[Finding]) -> str:
-    """Return the findings as text, one line each and a second one where something is to be mended."""
+    """Return the findings as text, one line each and a second one with the remedy."""
     rows = []
     for finding in findings:
         mark = "ok  " if finding.ok else ("FAIL" if finding.essential else "note")
@@ -180,5 +192,5 @@ def render_findings(findings: Iterable[Finding]) -> str:
 
 
 def is_broken(findings: Iterable[Finding]) -> bool:
-    """Return whether something essential is missing."""
+    """Return whether an essential check failed."""
     return any(finding.essential and not finding.ok for finding in findings)

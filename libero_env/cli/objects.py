@@ -1,39 +1,41 @@
-"""`libero objects`: objects made of files of one's own, kept where tasks find them."""
+"""`libero objects`: user-defined objects from files, stored where tasks find them."""
 
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from libero_env.cli.arguments import Subparsers
 
-def register(subparsers: "argparse._SubParsersAction") -> None:
-    """`libero objects add|list|show|preview|remove`"""
-    parser = subparsers.add_parser("objects", help="objects of your own, from mesh and MJCF files")
+
+def register(subparsers: Subparsers) -> None:
+    """Add the command `libero objects`."""
+    parser = subparsers.add_parser("objects", help="user-defined objects, from mesh and MJCF files")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _register_add(commands)
     listing = commands.add_parser(
-        "list", help="the objects of your own; with --all those of the benchmark too"
+        "list", help="list user-defined objects; with --all also those of the benchmark"
     )
-    listing.add_argument("--all", action="store_true", help="those of the benchmark too")
+    listing.add_argument("--all", action="store_true", help="also list those of the benchmark")
     listing.set_defaults(run=run_list)
     for name, run, text in (
-        ("show", run_show, "what is known of an object: size, mass, places, the gripper's hold"),
-        ("remove", run_remove, "remove objects of your own"),
+        ("show", run_show, "print the properties of an object: size, mass, places, grasp"),
+        ("remove", run_remove, "remove user-defined objects"),
     ):
         command = commands.add_parser(name, help=text)
         command.add_argument("names", nargs="+", metavar="NAME")
         command.set_defaults(run=run)
-    preview = commands.add_parser("preview", help="draw an object from all sides")
+    preview = commands.add_parser("preview", help="render an object from all sides")
     preview.add_argument("name", metavar="NAME")
     preview.add_argument("--out", type=Path, help="the picture (default: NAME.png here)")
     preview.set_defaults(run=run_preview)
 
 
-def _register_add(commands: "argparse._SubParsersAction") -> None:
-    add = commands.add_parser("add", help="make an object of a MJCF, OBJ, GLB, glTF, STL or PLY file")
+def _register_add(commands: Subparsers) -> None:
+    add = commands.add_parser("add", help="convert an MJCF, OBJ, GLB, glTF, STL or PLY file into an object")
     add.add_argument("file", type=Path)
     option = add.add_argument
-    option("--name", help="what task files call it (default: the file's name)")
+    option("--name", help="name in task files (default: the file's name)")
     option("--size", type=float, help="longest side, m (default: that of the file, whose unit is guessed)")
     option("--mass", type=float, help="kg (default: by density)")
     option("--density", type=float, help="kg/m^3 (default: 400)")
@@ -48,9 +50,9 @@ def _register_add(commands: "argparse._SubParsersAction") -> None:
         default="decompose",
         help="convex pieces, the convex hull, or boxes (default: decompose; without CoACD boxes)",
     )
-    option("--faces", type=int, default=3000, help="triangles that its look may have (default: 3000)")
-    option("--container", action="store_true", help="things can be put In it: adds the place contain_region")
-    option("--replace", action="store_true", help="replace an object of yours that has this name")
+    option("--faces", type=int, default=3000, help="largest number of triangles for display (default: 3000)")
+    option("--container", action="store_true", help="objects can be put In it: adds the place contain_region")
+    option("--replace", action="store_true", help="replace a user-defined object of this name")
     option(
         "--out",
         type=Path,
@@ -60,7 +62,7 @@ def _register_add(commands: "argparse._SubParsersAction") -> None:
 
 
 def run_add(args: argparse.Namespace) -> None:
-    """Make it, try it, and say what came of it."""
+    """Add an object and print its properties and notes."""
     from libero_env.design.objects import add_object
     from libero_env.paths import objects_dir
 
@@ -75,7 +77,7 @@ def run_add(args: argparse.Namespace) -> None:
 
 
 def describe(properties: Mapping[str, Any]) -> list[str]:
-    """Lines about an object, from its `object.yaml`."""
+    """Return lines about an object, from its `object.yaml`."""
     size, grasp, collision = (
         properties.get("size", ()),
         properties.get("grasp") or {},
@@ -88,17 +90,17 @@ def describe(properties: Mapping[str, Any]) -> list[str]:
         lines.append(f"  collision {collision['pieces']} shapes, by {collision['method']}")
     if grasp.get("width") is not None:
         lines.append(
-            f"  hold      {100 * grasp['width']:.1f} cm wide, {100 * grasp['height']:.1f} cm over the ground"
+            f"  grasp     {100 * grasp['width']:.1f} cm wide, {100 * grasp['height']:.1f} cm above the ground"
         )
     elif grasp:
-        lines.append(f"  hold      none: {grasp['reason']}")
+        lines.append(f"  grasp     none: {grasp['reason']}")
     if "stands" in properties:
         lines.append(f"  stands    {'yes' if properties['stands'] else 'no, it falls over or slides'}")
     return lines
 
 
 def run_list(args: argparse.Namespace) -> None:
-    """One line for each object."""
+    """Print a line for each object."""
     from libero_env.objects import folder, object_names
     from libero_env.paths import objects_dir
 
@@ -106,11 +108,11 @@ def run_list(args: argparse.Namespace) -> None:
     for name in object_names() if args.all else own:
         print(f"{name:28} {objects_dir() / name if name in own else ''}".rstrip())
     if not own and not args.all:
-        print(f"no objects in {objects_dir()}; make one: libero objects add FILE")
+        print(f"no objects in {objects_dir()}; add one: libero objects add FILE")
 
 
 def run_show(args: argparse.Namespace) -> None:
-    """Figures and places of objects."""
+    """Print the properties and places of objects."""
     from libero_env.objects import folder, get_object
     from libero_env.tasks.authoring import places_of
 
@@ -124,7 +126,7 @@ def run_show(args: argparse.Namespace) -> None:
 
 
 def run_preview(args: argparse.Namespace) -> None:
-    """Draw it and say where the picture is."""
+    """Render an object and print the path of the picture."""
     from libero_env.design.objects.trial import draw_object
     from libero_env.objects import get_object
 
@@ -132,7 +134,7 @@ def run_preview(args: argparse.Namespace) -> None:
 
 
 def run_remove(args: argparse.Namespace) -> None:
-    """Remove them; the first that is not there ends it."""
+    """Remove objects; stop at the first that does not exist."""
     from libero_env.objects import folder
 
     for name in args.names:

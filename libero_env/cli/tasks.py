@@ -17,7 +17,7 @@ LEVELS = ("error", "warning", "info")
 
 
 def register(subparsers: Subparsers) -> None:
-    """`libero tasks list|show|init-states|certify|lint|new|preview`"""
+    """Add the command `libero tasks`."""
     parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     listing = commands.add_parser("list", help="the tasks of one suite, or of all")
@@ -25,19 +25,19 @@ def register(subparsers: Subparsers) -> None:
     listing.add_argument("--order", type=int, default=0, help="one of the published sequences (0 to 20)")
     listing.set_defaults(run=run_tasks_list)
     show = commands.add_parser("show", help="the BDDL of a task")
-    show.add_argument("task", help="such as libero_object/3, the task's name, or a file of your own")
+    show.add_argument("task", help="such as libero_object/3, the task's name, or a task file")
     show.set_defaults(run=run_tasks_show)
     states = commands.add_parser(
-        "init-states", help="make the 50 stored initial states of a suite or task file anew"
+        "init-states", help="generate the 50 stored initial states of a suite or task file again"
     )
     states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
     states.add_argument(
         "--out",
         type=Path,
-        help="folder for the .npz files (default: those the package ships; of a file, the cache)",
+        help="folder for the .npz files (default: those in the package; for a file, the cache)",
     )
     states.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)"
+        "--jobs", type=int, default=os.cpu_count() or 1, help="number of processes (default: one per core)"
     )
     states.set_defaults(run=run_tasks_init_states)
     _register_checks(commands)
@@ -45,31 +45,33 @@ def register(subparsers: Subparsers) -> None:
 
 
 def _register_checks(commands: Subparsers) -> None:
-    """Add `libero tasks certify|lint`."""
-    certify = commands.add_parser("certify", help="let the expert try tasks; goes on where it was stopped")
+    """Add the commands `libero tasks certify` and `libero tasks lint`."""
+    certify = commands.add_parser(
+        "certify", help="measure the success of the expert; resumes where it was stopped"
+    )
     _add_tasks(certify)
     certify.add_argument(
-        "--states", type=_states, default=50, help="starts of each task, 1 to 50 (default: 50)"
+        "--states", type=_states, default=50, help="initial states of each task, 1 to 50 (default: 50)"
     )
-    certify.add_argument("--jobs", type=int, default=0, help="processes (default: one for each core)")
+    certify.add_argument("--jobs", type=int, default=0, help="number of processes (default: one per core)")
     certify.add_argument(
         "--out", type=Path, default=Path("certificates"), help="folder (default: certificates)"
     )
     certify.add_argument(
-        "--require", type=float, default=0.8, help="share of success each task needs (default: 0.8)"
+        "--require", type=float, default=0.8, help="success rate that each task must reach (default: 0.8)"
     )
-    certify.add_argument("--disturb", action="store_true", help="disturb the actions as demonstrations do")
-    certify.add_argument("--again", action="store_true", help="run what is in the folder too")
+    certify.add_argument(
+        "--disturb", action="store_true", help="add noise to the actions, as demonstrations do"
+    )
+    certify.add_argument("--again", action="store_true", help="run again what is in the folder")
     certify.set_defaults(run=run_certify)
-    lint = commands.add_parser(
-        "lint", help="what is wrong or doubtful in the design of tasks, and how to mend it"
-    )
+    lint = commands.add_parser("lint", help="report what is wrong or doubtful in tasks, and how to fix it")
     _add_tasks(lint)
     lint.add_argument(
-        "--level", choices=LEVELS, default="warning", help="the least that is told (default: warning)"
+        "--level", choices=LEVELS, default="warning", help="lowest level that is printed (default: warning)"
     )
     lint.add_argument(
-        "--starts", type=int, default=5, help="starts to look at; 0 simulates nothing (default: 5)"
+        "--starts", type=int, default=5, help="initial states to check; 0 simulates nothing (default: 5)"
     )
     lint.set_defaults(run=run_lint)
 
@@ -92,10 +94,10 @@ def _states(text: str) -> int:
 
 
 def find_tasks(names: Sequence[str]) -> list["Task"]:
-    """Return the tasks that are meant, each once: suites, tasks of suites, and task files.
+    """Return tasks, without duplicates, from names of suites, tasks of suites, and task files.
 
     Raises:
-        LiberoError: No such suite, task or file, or a file that is no task.
+        LiberoError: A suite, task or file does not exist, or a file is not a task.
     """
     from libero_env.tasks import get_suite, get_task, suite_names
     from libero_env.tasks.files import read_yaml_tasks
@@ -111,7 +113,7 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
 
 
 def run_certify(args: argparse.Namespace) -> int:
-    """Run what is missing, write the results and say which tasks fall short; 1 where one does."""
+    """Run missing attempts, write the results and print tasks below the required success; return 1 if there are any."""
     from libero_env.design.certify import certify
     from libero_env.design.certify_figure import write_results
     from libero_env.parallel import cpu_count
@@ -141,7 +143,7 @@ def run_certify(args: argparse.Namespace) -> int:
 
 
 def run_lint(args: argparse.Namespace) -> int:
-    """One line for each finding, and how many there are; 1 where one is an error."""
+    """Print a line for each finding and their numbers; return 1 if one is an error."""
     from collections import Counter
 
     counts, number = Counter[str](), 0
@@ -166,14 +168,14 @@ def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
             yield lint_file(name, pack, starts=args.starts)
             continue
         for task in find_tasks([name]):
-            if task.suite == "file":  # lines count in what `libero tasks show` prints
+            if task.suite == "file":  # line numbers refer to the text that `libero tasks show` prints
                 yield lint_text(task.bddl_text, name, task, pack, starts=args.starts)
             else:
                 yield lint_task(task, pack, starts=args.starts)
 
 
 def run_tasks_list(args: argparse.Namespace) -> None:
-    """One line per task."""
+    """Print a line for each task."""
     from libero_env.tasks import get_suite, suite_names
 
     names = [args.suite] if args.suite else suite_names()
@@ -183,14 +185,14 @@ def run_tasks_list(args: argparse.Namespace) -> None:
 
 
 def run_tasks_show(args: argparse.Namespace) -> None:
-    """Return the task file, as generated."""
+    """Print the generated task file."""
     from libero_env.tasks import get_task
 
     print(get_task(args.task).bddl_text, end="")
 
 
 def run_tasks_init_states(args: argparse.Namespace) -> None:
-    """Write the files, one for each suite that the tasks come from, and say where they are."""
+    """Write the files, one for each suite of the tasks, and print their paths."""
     from libero_env.init_states.store import cache_init_states, shipped_path, write_suite
     from libero_env.tasks import get_suite
     from libero_env.tasks.files import ENDINGS

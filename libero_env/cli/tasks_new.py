@@ -1,14 +1,16 @@
-"""`libero tasks new` and `libero tasks preview`: write a task of one's own, and look at it."""
+"""`libero tasks new` and `libero tasks preview`: write a user-defined task, and render it."""
 
 import argparse
 from pathlib import Path
 
+from libero_env.cli.arguments import Subparsers
 
-def register(commands: "argparse._SubParsersAction") -> None:
-    """`libero tasks new|preview`"""
-    new = commands.add_parser("new", help="write a task file of your own, to start from")
+
+def register(commands: Subparsers) -> None:
+    """Add the commands `libero tasks new` and `libero tasks preview`."""
+    new = commands.add_parser("new", help="write a template of a user-defined task")
     add = new.add_argument
-    add("name", help="of the task; the file is NAME.yaml")
+    add("name", help="name of the task; the file is NAME.yaml")
     add(
         "--scene",
         default="kitchen",
@@ -29,32 +31,38 @@ def register(commands: "argparse._SubParsersAction") -> None:
         metavar="ATOM",
         help="such as 'On red_cup_1 plate_1' (default: first on last)",
     )
-    add("--language", help="the instruction (default: of the goal)")
+    add("--language", help="the instruction (default: it describes the goal)")
     add("--out", type=Path, default=Path(), help="folder (default: here)")
-    add("--bddl", action="store_true", help="write the BDDL file too")
+    add("--bddl", action="store_true", help="also write the BDDL file")
     new.set_defaults(run=run_new)
-    preview = commands.add_parser("preview", help="pictures of a task's starts, and a video of the expert")
+    preview = commands.add_parser(
+        "preview", help="pictures of a task's initial states, and a video of the expert"
+    )
     add = preview.add_argument
     add("task", help="a file that ends in .yaml or .bddl, or such as libero_goal/3")
-    add("--starts", type=int, default=3, help="rows of the sheet (default: 3)")
-    add("--cameras", nargs="+", help="columns (default: agentview robot0_eye_in_hand birdview)")
+    add("--starts", type=int, default=3, help="number of initial states, one per row (default: 3)")
+    add("--cameras", nargs="+", help="one per column (default: agentview robot0_eye_in_hand birdview)")
     add("--size", type=int, default=256, help="pixels of a picture (default: 256)")
     add(
         "--video",
         nargs="?",
         const="webp",
         choices=("webp", "gif", "mp4"),
-        help="the expert too (default kind: webp)",
+        help="also write a video of the expert (default format: webp)",
     )
-    add("--out", type=Path, help="the sheet (default: TASK.png here); the video is put beside it")
+    add(
+        "--out",
+        type=Path,
+        help="file of the pictures (default: TASK.png here); the video is written beside it",
+    )
     preview.set_defaults(run=run_preview)
 
 
 def run_new(args: argparse.Namespace) -> None:
-    """Write the file and say how to go on.
+    """Write the file and print commands for the next steps.
 
     Raises:
-        LiberoError: A name that does not exist, or the file is there.
+        LiberoError: A name does not exist, or the file exists already.
     """
     from libero_env.design.template import task_template
     from libero_env.errors import LiberoError
@@ -63,7 +71,7 @@ def run_new(args: argparse.Namespace) -> None:
 
     path = args.out / f"{args.name}.yaml"
     if path.exists():
-        raise LiberoError(f"{path} is there already; choose another name, or remove it")
+        raise LiberoError(f"{path} exists already; choose another name, or remove it")
     text, _ = task_template(args.scene, args.objects, args.furniture, args.goal, args.language)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
@@ -81,7 +89,7 @@ def run_new(args: argparse.Namespace) -> None:
 
 
 def run_preview(args: argparse.Namespace) -> int:
-    """Draw, and say where the pictures are; 1 where the expert does not reach the goal."""
+    """Render, and print the paths of the files; return 1 if the expert does not reach the goal."""
     from libero_env.design.preview import CAMERAS, contact_sheet, expert_video
     from libero_env.tasks import get_task
 

@@ -1,4 +1,4 @@
-"""Embeddings of instructions by sentence encoders; those of the benchmark are shipped."""
+"""Embeddings of instructions by sentence encoders; those of the benchmark's instructions are part of the package."""
 
 import lazy_loader
 

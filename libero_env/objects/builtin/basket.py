@@ -6,12 +6,12 @@ from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft
 from libero_env.objects.builtin.paint import png
 
-COLUMNS, ROWS = 28, 14  # strands of the weave around and over the picture's height
-RIM_V = 0.88  # the braided rim takes the picture above
+COLUMNS, ROWS = 28, 14  # strands of the weave along the width and the height of the texture
+RIM_V = 0.88  # lower edge of the braided rim in the texture
 
 
 def basket() -> Appearance:
-    """Brown basket whose walls are where the collision boxes are."""
+    """Return the basket: brown basket whose walls are where the collision boxes are."""
     return Appearance(_basket_mesh(), png(_weave()), specular=0.05, shininess=0.1)
 
 
@@ -34,7 +34,7 @@ def _basket_mesh() -> Mesh:
 
 
 def _weave() -> np.ndarray:
-    """Over and under: each strand is bright in its middle, dark where it dives, (128, 256, 3) uint8."""
+    """Return the texture of the weave, strands bright in the middle and dark at crossings, (128, 256, 3) uint8."""
     height, width = 128, 256
     v = (np.arange(height)[::-1, None] + 0.5) / height  # first row on top
     u = (np.arange(width)[None] + 0.5) / width

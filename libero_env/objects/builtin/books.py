@@ -8,11 +8,11 @@ from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.paint import Canvas, Color
 from libero_env.objects.builtin.surfaces import painted, plain
 
-BOARD, OVERHANG = 0.0022, 0.0030  # thickness of the cover, metres; by how much it is larger than the pages
+BOARD, OVERHANG = 0.0022, 0.0030  # [m] thickness of the cover, and its overhang over the pages
 
 
 def black_book() -> Appearance:
-    """Black cloth, a golden frame, moon and stars."""
+    """Return the black book: black cloth, a golden frame, moon and stars."""
     black, gold = (26, 26, 30), (222, 180, 84)
     cover = Canvas(black)
     _frame(cover, gold, 0.06)
@@ -30,7 +30,7 @@ def black_book() -> Appearance:
 
 
 def yellow_book() -> Appearance:
-    """Yellow cover, a red sun over blue hills, a dark title."""
+    """Return the yellow book: yellow cover, a red sun over blue hills, a dark title."""
     yellow, ink, red = (247, 200, 38), (58, 44, 28), (214, 62, 40)
     cover = Canvas(yellow)
     cover.disc(0.5, 0.42, 0.24, 0.20, red)
@@ -85,7 +85,7 @@ def _bound(low, high, palette: Palette) -> Mesh:
 
 
 def _leaves(color: Color) -> np.ndarray:
-    """Edges of paper: fine lines, a gap here and there."""
+    """Return a tile of paper edges: fine lines with some gaps."""
     rng = np.random.default_rng(7)
     lines = 1.0 - 0.16 * rng.random(TILE // 2).repeat(2) - 0.25 * (rng.random(TILE // 2) > 0.88).repeat(2)
     shade = np.broadcast_to(lines, (TILE, TILE))[..., None]

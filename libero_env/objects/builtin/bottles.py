@@ -6,11 +6,11 @@ from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import Mesh, Ring, loft
 from libero_env.objects.builtin.paint import Canvas, Color
 
-CAP = 0.80  # the texture shows the body below, the cap above
+CAP = 0.80  # height in the texture that separates body and cap
 
 
 def ketchup() -> Appearance:
-    """Red squeeze bottle, white cap, white shield with a tomato."""
+    """Return the ketchup: red squeeze bottle, white cap, white shield with a tomato."""
     canvas = _bottle((196, 24, 16), cap=(240, 240, 236), groove=(198, 198, 196))
     for u in (0.0, 0.5, 1.0):
         canvas.disc(u, 0.36, 0.165, 0.24, (250, 246, 236))
@@ -22,7 +22,7 @@ def ketchup() -> Appearance:
 
 
 def salad_dressing() -> Appearance:
-    """White bottle with a waist, green cap, a leaf and the word RANCH."""
+    """Return the salad dressing: white bottle with a waist, green cap, a leaf and the word RANCH."""
     canvas = _bottle((246, 244, 236), cap=(22, 128, 58), groove=(12, 92, 40))
     for u in (0.0, 0.5, 1.0):
         canvas.disc(u, 0.36, 0.165, 0.25, (112, 178, 60))
@@ -35,7 +35,7 @@ def salad_dressing() -> Appearance:
 
 
 def bbq_sauce() -> Appearance:
-    """Brown bottle, orange cap, yellow label with flames."""
+    """Return the bbq sauce: brown bottle, orange cap, yellow label with flames."""
     canvas = _bottle((92, 36, 18), cap=(226, 84, 20), groove=(176, 56, 10))
     for u in (0.0, 0.5, 1.0):
         canvas.disc(u, 0.36, 0.165, 0.25, (250, 186, 44))
@@ -48,12 +48,12 @@ def bbq_sauce() -> Appearance:
 
 
 def new_salad_dressing() -> dict[str, Appearance]:
-    """Return the same bottle, on a body that stands beside its root."""
+    """Return the new salad dressing: the same bottle, on a body that stands beside its root."""
     return {"sald_dressing_body": salad_dressing()}
 
 
 def mayo() -> Appearance:
-    """Glass jar of cream, blue lid, blue label with a yellow band."""
+    """Return the mayo: glass jar of cream, blue lid, blue label with a yellow band."""
     canvas = _bottle((250, 243, 218), cap=(24, 66, 158), groove=(14, 44, 116))
     canvas.band(0.10, 0.58, (30, 84, 182))
     canvas.band(0.10, 0.13, (250, 204, 44))

@@ -1,4 +1,4 @@
-"""Packets: butter, cream cheese, pudding powder, cookies and popcorn lie, macaroni stand."""
+"""Packets: butter, cream cheese, pudding powder, cookies, popcorn (lying) and macaroni (standing)."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.mesh import box
 from libero_env.objects.builtin.paint import Canvas
 
-# Parts of the picture: the large face (also below), the long sides, the short ends.
+# Parts of the texture: the large faces, the long sides, the short ends.
 CELLS = {
     "top": (0.0, 0.0, 0.5, 1.0),
     "bottom": (0.0, 0.0, 0.5, 1.0),
@@ -15,7 +15,7 @@ CELLS = {
     "front": (0.5, 0.5, 1.0, 0.75),
     "back": (0.5, 0.5, 1.0, 0.75),
 }
-UPRIGHT = {  # a packet that stands: the large faces, the sides, the lid
+UPRIGHT = {  # of a standing packet: the large faces, the sides, the lid
     "front": (0.0, 0.0, 0.5, 1.0),
     "back": (0.0, 0.0, 0.5, 1.0),
     "left": (0.5, 0.0, 0.7, 1.0),
@@ -27,7 +27,7 @@ WHITE = (255, 252, 244)
 
 
 def butter() -> Appearance:
-    """Yellow packet, red ends, a pat of butter."""
+    """Return the butter: yellow packet, red ends, a pat of butter."""
     canvas = Canvas((250, 214, 70), (128, 128))
     canvas.rect(0.0, 0.0, 0.5, 0.30, (204, 40, 30))
     canvas.rect(0.0, 0.30, 0.5, 0.34, (255, 250, 235))
@@ -42,7 +42,7 @@ def butter() -> Appearance:
 
 
 def cream_cheese() -> Appearance:
-    """Pale silver-blue packet with a blue oval."""
+    """Return the cream cheese: pale silver-blue packet with a blue oval."""
     canvas = Canvas((206, 216, 236), (128, 128))
     for v in (0.04, 0.92):
         canvas.rect(0.0, v, 0.5, v + 0.04, (120, 146, 206))
@@ -57,7 +57,7 @@ def cream_cheese() -> Appearance:
 
 
 def chocolate_pudding() -> Appearance:
-    """Dark brown packet, a cup of pudding with cream, cream-coloured letters."""
+    """Return the chocolate pudding: dark brown packet, a cup of pudding with cream, cream-coloured letters."""
     canvas = Canvas((78, 40, 22), (128, 128))
     canvas.rect(0.0, 0.94, 0.5, 1.0, (214, 52, 34))
     canvas.text("PUDDING", (0.05, 0.36, 0.22, 0.92), (252, 224, 168), turn=90)
@@ -72,7 +72,7 @@ def chocolate_pudding() -> Appearance:
 
 
 def cookies() -> Appearance:
-    """Red and white checks, a heap of cookies with raisins."""
+    """Return the cookies: red and white checks, a heap of cookies with raisins."""
     red, brown = (206, 34, 40), (84, 36, 44)
     canvas = Canvas(WHITE, (192, 192))
     canvas.rect(0.0, 0.12, 0.5, 0.62, (246, 214, 150))
@@ -92,7 +92,7 @@ def cookies() -> Appearance:
 
 
 def popcorn() -> Appearance:
-    """Blue packet, white puffs, red letters on a yellow burst."""
+    """Return the popcorn: blue packet, white puffs, red letters on a yellow burst."""
     blue, yellow, red = (32, 92, 190), (252, 216, 48), (210, 30, 34)
     canvas = Canvas(blue, (192, 192))
     _burst(canvas, 0.25, 0.58, 0.245, 0.32, yellow)
@@ -116,7 +116,7 @@ def popcorn() -> Appearance:
 
 
 def macaroni_and_cheese() -> Appearance:
-    """Orange packet that stands, yellow letters, a blue bowl of macaroni."""
+    """Return the macaroni and cheese: orange packet that stands, yellow letters, a blue bowl of macaroni."""
     orange, yellow, blue = (232, 104, 22), (255, 220, 70), (28, 74, 150)
     canvas = Canvas(orange, (192, 192))
     canvas.rect(0.0, 0.0, 0.5, 0.12, (180, 52, 16))

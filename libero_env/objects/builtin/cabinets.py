@@ -11,13 +11,13 @@ DRAWERS = {
     "cabinet_top": 0.0698,
     "cabinet_middle": 0.0,
     "cabinet_bottom": -0.0686,
-}  # body -> height over the middle one
+}  # body -> [m] height above the middle drawer
 HANDLES = {"cabinet_top": 0.1839, "cabinet_middle": 0.1104, "cabinet_bottom": 0.0411}
 SHORT_DRAWERS = {"drawer_top": 0.0460, "drawer_middle": 0.0, "drawer_bottom": -0.0473}
 
 
 def wooden_cabinet() -> dict[str, Appearance]:
-    """Dark walnut, steel bars."""
+    """Return the wooden cabinet: dark walnut, steel bars."""
     board = wood((100, 69, 48), seed=3, depth=0.38)
     tiles = {
         "outside": board,
@@ -30,7 +30,7 @@ def wooden_cabinet() -> dict[str, Appearance]:
 
 
 def white_cabinet() -> dict[str, Appearance]:
-    """White paint with sunken panels, dark grey bars."""
+    """Return the white cabinet: white paint with sunken panels, dark grey bars."""
     paint = wood((232, 231, 226), seed=8, depth=0.04)
     tiles = {
         "outside": paint,
@@ -43,7 +43,7 @@ def white_cabinet() -> dict[str, Appearance]:
 
 
 def short_cabinet() -> dict[str, Appearance]:
-    """Low chest of rosewood with three flat drawers and bent handles."""
+    """Return the short cabinet: low chest of rosewood with three flat drawers and bent handles."""
     tiles = {
         "outside": wood((112, 66, 46), seed=13, depth=0.42),
         "side": wood((104, 55, 37), seed=14, depth=0.42),
@@ -58,7 +58,7 @@ def short_cabinet() -> dict[str, Appearance]:
 
 
 def slide_cabinet() -> dict[str, Appearance]:
-    """Blue-grey cupboard: one half closed, a sliding door with a bar before the other."""
+    """Return the slide cabinet: blue-grey cupboard: one half closed, a sliding door with a bar before the other."""
     paint = brushed((122, 138, 164), seed=20, depth=0.008)
     tiles = {
         "outside": paint,
@@ -140,7 +140,7 @@ def _chest_drawer(palette: Palette, shift: float, handle: float) -> Mesh:
 
 
 def _tray(low: Sequence[float], high: Sequence[float], wall: float, floor: float, cell: Cell) -> list[Mesh]:
-    """Sides, back and floor of a drawer without its front."""
+    """Return the sides, back and floor of a drawer without its front."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     return [
         block((x0, y0, z0), (x0 + wall, y1, z1), cell),

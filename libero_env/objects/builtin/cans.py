@@ -11,7 +11,7 @@ LABEL = (0.10, 0.80)  # part of the texture's height that the label takes
 
 
 def alphabet_soup() -> Appearance:
-    """Blue label, a bowl of orange soup with letters in it."""
+    """Return the alphabet soup: blue label, a bowl of orange soup with letters in it."""
     canvas = _tin((28, 78, 176))
     canvas.band(0.10, 0.22, (247, 190, 40))
     canvas.band(0.76, 0.80, (247, 190, 40))
@@ -24,7 +24,7 @@ def alphabet_soup() -> Appearance:
 
 
 def tomato_sauce() -> Appearance:
-    """Red label, a green band with the name, tomatoes on white."""
+    """Return the tomato sauce: red label, a green band with the name, tomatoes on white."""
     canvas = _tin((198, 28, 24))
     canvas.band(0.10, 0.36, (245, 240, 228))
     canvas.band(0.40, 0.60, (30, 130, 56))
@@ -37,7 +37,7 @@ def tomato_sauce() -> Appearance:
 
 
 def cherries() -> Appearance:
-    """Wide pink tin, cherries on a white oval, dark letters."""
+    """Return the cherries: wide pink tin, cherries on a white oval, dark letters."""
     canvas = _tin((244, 176, 194))
     canvas.band(0.10, 0.16, (142, 16, 56))
     canvas.band(0.56, 0.76, (142, 16, 56))
@@ -56,7 +56,7 @@ def cherries() -> Appearance:
 
 
 def corn() -> Appearance:
-    """Tall green tin, an ear of corn on cream, yellow letters."""
+    """Return the corn: tall green tin, an ear of corn on cream, yellow letters."""
     canvas = _tin((34, 124, 60))
     canvas.band(0.10, 0.14, (250, 206, 40))
     canvas.band(0.14, 0.50, (252, 244, 214))
@@ -108,7 +108,7 @@ def _tomato(canvas: Canvas, u: float, v: float, ru: float, rv: float) -> None:
 
 
 def _ear(canvas: Canvas, u: float, v: float) -> None:
-    """Lies along u: kernels in rows, husks on the left."""
+    """Draw an ear of corn along u: kernels in rows, husks on the left."""
     canvas.disc(u, v, 0.130, 0.105, (238, 176, 24))
     for row in (-2, -1, 0, 1, 2):
         reach = 0.115 * np.sqrt(1.0 - (row / 2.9) ** 2)

@@ -7,13 +7,13 @@ from libero_env.objects.builtin.mesh import Mesh, box, merge, quad
 from libero_env.objects.builtin.paint import Canvas
 
 HALF, BOTTOM, EAVES, RIDGE, TOP = 0.0266, -0.0698, 0.0370, 0.0600, 0.0705
-EAVES_V, RIDGE_V = 0.66, 0.86  # heights in the picture; four equal columns: left, front, right, back
+EAVES_V, RIDGE_V = 0.66, 0.86  # heights in the texture, whose four equal columns are left, front, right, back
 FRONTS = (0.375, 0.875)
 SIDES = (0.125, 0.625)
 
 
 def milk() -> Appearance:
-    """Red and white, the word MILK, a cow on green grass."""
+    """Return the milk: red and white, the word MILK, a cow on green grass."""
     canvas = Canvas((206, 30, 34), (256, 128))
     canvas.band(0.0, 0.40, (196, 226, 246))
     canvas.band(0.0, 0.08, (60, 150, 60))
@@ -32,7 +32,7 @@ def milk() -> Appearance:
 
 
 def orange_juice() -> Appearance:
-    """Yellow with a sliced orange and the word JUICE."""
+    """Return the orange juice: yellow with a sliced orange and the word JUICE."""
     canvas = Canvas((252, 208, 40), (256, 128))
     canvas.band(0.60, EAVES_V, (240, 120, 20))
     canvas.band(EAVES_V, RIDGE_V, (244, 136, 24))
@@ -95,7 +95,7 @@ def _cow(canvas: Canvas, u: float) -> None:
 
 
 def _orange_slice(canvas: Canvas, u: float, v: float, radius: float) -> None:
-    # The picture is twice as wide as high.
+    # The texture is twice as wide as high.
     for share, color in ((1.0, (236, 110, 10)), (0.88, (255, 226, 160)), (0.78, (248, 146, 26))):
         canvas.disc(u, v, radius * share, 1.7 * radius * share, color)
     for angle in np.arange(4) * np.pi / 4:

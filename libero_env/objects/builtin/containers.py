@@ -1,4 +1,4 @@
-"""Things to put things into: the tray of slats, the white storage box, the desk caddy."""
+"""Containers: the tray of slats, the white storage box, the desk caddy."""
 
 from libero_env.objects.builtin.assemble import Appearance
 from libero_env.objects.builtin.joinery import Palette, block, prism
@@ -9,7 +9,7 @@ BIRCH = (222, 196, 160)
 
 
 def wooden_tray() -> Appearance:
-    """Crate of pale boards: a floor of slats, corner posts, a grip at each end (x)."""
+    """Return the wooden tray: crate of pale boards: a floor of slats, corner posts, a grip at each end (x)."""
     palette = _birch(seed=50)
     side, post, grip = palette["side"], palette["post"], palette["grip"]
     parts = [
@@ -33,7 +33,7 @@ def wooden_tray() -> Appearance:
 
 
 def white_storage_box() -> Appearance:
-    """White cube with rounded edges along y, open at both ends."""
+    """Return the white storage box: white cube with rounded edges along y, open at both ends."""
     palette = Palette({"paint": plain((240, 240, 236))})
     left, right, low, high, wall, cut = -0.0699, 0.0701, 0.0012, 0.1420, 0.0125, 0.0060
     parts = []
@@ -58,7 +58,7 @@ def white_storage_box() -> Appearance:
 
 
 def desk_caddy() -> Appearance:
-    """Pale organiser: a tall cell at -y, two behind each other in the middle, a sloping one at +y; low side at -x."""
+    """Return the desk caddy: pale organiser: a tall cell at -y, two in the middle, a sloping one at +y, low at -x."""
     palette = _birch(seed=55)
     side, end = palette["side"], palette["end"]
     parts = [

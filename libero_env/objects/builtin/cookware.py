@@ -15,7 +15,7 @@ BIN_CENTER = (-0.003, -0.0054)
 
 
 def moka_pot() -> Appearance:
-    """Octagonal steel pot, spout to +y, black handle and knob."""
+    """Return the moka pot: octagonal steel pot, spout to +y, black handle and knob."""
     canvas = Canvas((196, 199, 204), (128, 256))
     canvas.gradient(0.08, 0.45, (160, 163, 169), (206, 209, 213))
     canvas.band(0.45, 0.52, (120, 123, 130))
@@ -42,7 +42,7 @@ def moka_pot() -> Appearance:
 
 
 def chefmate_8_frypan() -> Appearance:
-    """Black pan with a grey floor; its handle points to +y."""
+    """Return the chefmate 8 frypan: black pan with a grey floor; its handle points to +y."""
     canvas = Canvas((24, 24, 26), (64, 128))
     canvas.gradient(INNER_V, 0.60, (34, 34, 37), (44, 44, 47))
     canvas.gradient(0.60, FLOOR_V, (58, 58, 61), (74, 74, 77))
@@ -87,7 +87,7 @@ def chefmate_8_frypan() -> Appearance:
 
 
 def wine_bottle() -> Appearance:
-    """Dark green bottle with a cork and a pale label on both sides."""
+    """Return the wine bottle: dark green bottle with a cork and a pale label on both sides."""
     canvas = Canvas((14, 44, 24), (256, 256))
     canvas.gradient(0.0, 0.40, (10, 32, 18), (16, 54, 30))
     for u in (0.0, 0.5, 1.0):
@@ -123,7 +123,7 @@ def wine_bottle() -> Appearance:
 
 
 def bowl_drainer() -> Appearance:
-    """White bin with two compartments and handle slots in its walls."""
+    """Return the bowl drainer: white bin with two compartments and handle slots in its walls."""
     canvas = Canvas((240, 240, 240), (1024, 128))
     canvas.gradient(0.0, 0.44, (206, 207, 210), (244, 244, 244))
     canvas.gradient(0.52, 0.92, (240, 240, 240), (188, 190, 194))

@@ -12,7 +12,7 @@ SASHES = {
 
 
 def window() -> dict[str, Appearance | tuple[Appearance, ...]]:
-    """Brown wooden frame with a sill, two sashes with crossbars and bluish panes, a white handle."""
+    """Return the window: brown wooden frame with a sill, two sashes with crossbars and bluish panes, a white handle."""
     tiles = {
         "frame": wood((142, 92, 70), seed=60, depth=0.25),
         "post": wood((142, 92, 70), seed=61, depth=0.25, upright=True),
@@ -45,7 +45,7 @@ def window() -> dict[str, Appearance | tuple[Appearance, ...]]:
 
 
 def faucet() -> dict[str, Appearance]:
-    """Steel pillar whose red lever turns."""
+    """Return the faucet: steel pillar whose red lever turns."""
     palette = Palette(
         {"chrome": chrome((206, 210, 218)), "red": plain((190, 30, 28)), "dark": plain((58, 60, 66))}
     )
@@ -77,7 +77,7 @@ def faucet() -> dict[str, Appearance]:
 
 
 def basin_faucet() -> dict[str, Appearance]:
-    """Square mixer tap of polished steel; the lever on its top turns."""
+    """Return the basin faucet: square mixer tap of polished steel; the lever on its top turns."""
     palette = Palette(
         {
             "steel": brushed((212, 215, 220), seed=70, depth=0.02),

@@ -1,7 +1,7 @@
-"""Panels, bars and turned parts, painted with tiles of one picture: what furniture is made of.
+"""Parts of furniture (panels, bars, turned parts), textured with the tiles of one image.
 
-Meshes here stand in the frame of the object's root body, joints at zero: z up, metres. `in_body` takes them to the body
-that carries them.
+Meshes are in the frame of the object's root body with joints at zero: z up, metres. `in_body` transforms them into the
+frame of the body that they belong to.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from libero_env.objects.builtin.paint import png
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import ROOT_BODY
 
-TILE = 128  # pixels
+TILE = 128  # [pixels] side of a tile
 
 Cell = tuple[float, float, float, float]  # u0, v0, u1, v1
 
@@ -32,21 +32,21 @@ _FACES = {  # face -> (to the right, upwards), seen from outside
 
 @dataclass(frozen=True)
 class Palette:
-    """Tiles side by side in one picture.
+    """Tiles side by side in one image.
 
     Attributes:
-        tiles: Name -> (TILE, TILE, 3) uint8, first row on top.
+        tiles: Name -> image (TILE, TILE, 3) uint8, first row on top.
     """
 
     tiles: Mapping[str, np.ndarray]
 
     def __getitem__(self, name: str) -> Cell:
-        """Return where a tile is, a little inside its border: neighbours do not shine through."""
+        """Return the bounds of a tile, slightly inset so that its neighbours do not bleed in."""
         index, count, margin = list(self.tiles).index(name), len(self.tiles), 3.0 / TILE
         return ((index + margin) / count, margin, (index + 1 - margin) / count, 1.0 - margin)
 
     def png(self) -> bytes:
-        """Return the picture, encoded."""
+        """Return the image of all tiles as PNG."""
         return png(np.concatenate(list(self.tiles.values()), axis=1))
 
 
@@ -58,14 +58,14 @@ def block(
     bevel: float = 0.0,
     faces: Mapping[str, Cell] | None = None,
 ) -> Mesh:
-    """Box between two corners; each face shows the whole cell.
+    """Return a box between two corners; each face shows the whole cell.
 
     Args:
-        low: Corner (3,), metres.
-        high: Opposite corner (3,), metres.
-        cell: Part of the picture.
-        bevel: Width of the chamfer along the edges, metres; it catches the light.
-        faces: `x+`, `x-`, ... `z-` -> another part of the picture.
+        low: Corner, (3,) [m].
+        high: Opposite corner, (3,) [m].
+        cell: Part of the texture.
+        bevel: Width of the chamfer along the edges, [m].
+        faces: Face (`x+`, `x-`, ... `z-`) -> another part of the texture.
     """
     (bottom, top), cells = np.array([low, high], float), faces or {}
     center, half = 0.5 * (bottom + top), 0.5 * (top - bottom)
@@ -76,14 +76,14 @@ def block(
         corners = [middle + s * np.multiply(right, inner) + t * np.multiply(up, inner) for s, t in _CORNERS]
         pieces.append(_facet(corners, half, face, cells.get(face, cell)))
     for corners in _chamfers(half, inner) if bevel else ():
-        # A chamfer continues the picture of the face that it leans to most.
+        # A chamfer continues the texture of the face that is nearest in orientation.
         pieces.append(_facet(corners, half, _face_of(corners, half), cell))
     mesh = merge(pieces)
     return Mesh(mesh.vertices + center, mesh.faces, mesh.texcoords)
 
 
 def prism(outline: Sequence[tuple[float, float]], low: float, high: float, cell: Cell) -> Mesh:
-    """Return a convex outline of (x, z) points, counter-clockwise seen from -y, from y = low to y = high."""
+    """Return the prism from y = low to y = high of a convex outline (x, z), counter-clockwise seen from -y."""
     points = np.array(outline, float)
     near, far = (np.column_stack([points[:, 0], np.full(len(points), y), points[:, 1]]) for y in (low, high))
     corners = np.concatenate([near, far])
@@ -107,15 +107,15 @@ def turned(
     segments: int = 12,
     smooth: bool = False,
 ) -> Mesh:
-    """Body of revolution.
+    """Return a body of revolution.
 
     Args:
-        profile: (height, radius), metres, going up on the outside; its ends are joined to the axis.
-        cell: Part of the picture; its height is the way along the profile.
-        base: Where height 0 is, (3,), metres.
-        axis: Unit vector (3,) in which the height grows.
-        segments: Corners around.
-        smooth: Shade without edges.
+        profile: Points (height, radius) [m], upwards on the outside; the ends are connected to the axis.
+        cell: Part of the texture; its height is the distance along the profile.
+        base: Point of height 0, (3,) [m].
+        axis: Unit vector of increasing height, (3,).
+        segments: Number of corners around the axis.
+        smooth: Whether to shade without edges.
     """
     points, way = outline_of(profile)
     rings = [Ring(z, r, r, v, crease=not smooth) for (z, r), v in zip(points, way, strict=True)]
@@ -126,7 +126,7 @@ def turned(
 
 
 def outline_of(profile: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a profile from axis to axis, (n, 2), and how far along it each point lies, (n,) in 0..1."""
+    """Return a profile closed at the axis, (n, 2), and the share of its length at each point, (n,) in [0, 1]."""
     points = np.array([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return points, way / way[-1]
@@ -135,7 +135,7 @@ def outline_of(profile: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.n
 def bar(
     start: Sequence[float], end: Sequence[float], radius: float, cell: Cell, *, segments: int = 10, tip=None
 ) -> Mesh:
-    """Round bar between two points, (3,), metres; `tip`: chamfer at its ends, a fifth of the radius by default."""
+    """Return a round bar between two points, (3,) [m]; `tip` is the chamfer of its ends, by default radius / 5."""
     way = np.subtract(end, start)
     length = float(np.linalg.norm(way))
     tip = 0.2 * radius if tip is None else tip
@@ -146,7 +146,7 @@ def bar(
 def capsule(
     start: Sequence[float], end: Sequence[float], radius: float, cell: Cell, *, segments: int = 12
 ) -> Mesh:
-    """Bar with round ends; `start` and `end` are the centres of the ends, (3,), metres."""
+    """Return a bar with hemispherical ends, whose centres are `start` and `end`, (3,) [m]."""
     way = np.subtract(end, start)
     length = float(np.linalg.norm(way))
     turns = np.radians((-65, -40, 0))
@@ -156,7 +156,7 @@ def capsule(
 
 
 def in_body(mesh: Mesh, category: str, body: str) -> Mesh:
-    """Return the mesh, given in the frame of the root body, in that of the body which is to carry it."""
+    """Return a mesh, given in the frame of the root body, in the frame of another body of the object."""
     parts, chain = load_physics(category).parts, []
     while body != ROOT_BODY:
         chain.append(parts[body])
@@ -171,7 +171,7 @@ _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 def _chamfers(half: np.ndarray, inner: np.ndarray) -> list[list[np.ndarray]]:
-    """Twelve edges and eight corners of a box around the origin, cut off."""
+    """Return the chamfers of the twelve edges and eight corners of a box around the origin."""
     outer, cuts = np.diag(half - inner), []
     for one, two in combinations(range(3), 2):
         third = 3 - one - two
@@ -194,12 +194,12 @@ def _face_of(corners: Sequence[np.ndarray], half: np.ndarray) -> str:
 
 
 def _facet(corners: Sequence[np.ndarray], half: np.ndarray, face: str, cell: Cell) -> Mesh:
-    """Convex polygon of a body around the origin, turned outwards, with the picture of a face of its box."""
+    """Return a convex polygon of a body around the origin, facing outwards, with the texture of a face of its box."""
     points = np.array(corners, float)
     (ax, ay, az), (bx, by, bz) = points[1] - points[0], points[2] - points[0]
     normal = np.array(
         [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
-    )  # np.cross takes ten times as long
+    )  # ten times as fast as np.cross
     if normal @ points.mean(axis=0) < 0:
         points = points[::-1]
     share = 0.5 + 0.5 * points @ np.transpose(_FACES[face]) / (np.abs(_FACES[face]) @ half)

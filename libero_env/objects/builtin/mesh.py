@@ -1,8 +1,8 @@
 """Small textured triangle meshes: lofts along a vertical axis, and boxes.
 
-All shapes stand in the rest frame: z up, the front towards +x, metres. Texture coordinates are (u, v)
-with v = 0 at the lower edge of the picture; around a loft, u runs from the back (0) over the left of a
-viewer in front (-y), the front (0.5) and the right (+y) to the back again (1).
+All shapes are in the rest frame: z up, the front towards +x, metres. Texture coordinates are (u, v)
+with v = 0 at the lower edge of the texture; around a loft, u runs from the back (0) over -y (0.25), the
+front (0.5) and +y (0.75) to the back again (1).
 """
 
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ class Mesh:
     """Triangles with one texture coordinate per vertex.
 
     Attributes:
-        vertices: (n, 3) metres.
-        faces: (m, 3) vertex indices, counter-clockwise seen from outside.
-        texcoords: (n, 2).
+        vertices: Vertices, (n, 3) [m].
+        faces: Vertex indices, (m, 3), counter-clockwise seen from outside.
+        texcoords: Texture coordinates, (n, 2).
     """
 
     vertices: np.ndarray
@@ -28,7 +28,7 @@ class Mesh:
     texcoords: np.ndarray
 
     def rotated(self, quat: np.ndarray) -> "Mesh":
-        """Return the mesh turned by a quaternion wxyz (4,)."""
+        """Return the mesh rotated by a quaternion, (4,) wxyz."""
         return Mesh(self.vertices @ quat_to_mat(np.asarray(quat, float)).T, self.faces, self.texcoords)
 
 
@@ -37,12 +37,12 @@ class Ring:
     """One section of a loft: a superellipse in a horizontal plane.
 
     Attributes:
-        z: Height, metres.
-        depth: Half extent along x, metres.
-        width: Half extent along y, metres.
-        v: Texture height of the section.
-        round: Exponent: 2 is an ellipse, larger is boxier.
-        crease: The surface has an edge here, shaded sharp.
+        z: Height, [m].
+        depth: Half extent along x, [m].
+        width: Half extent along y, [m].
+        v: Texture coordinate of the section.
+        round: Exponent: 2 is an ellipse, a larger one is closer to a rectangle.
+        crease: Whether the surface has a sharp edge here.
     """
 
     z: float
@@ -54,12 +54,12 @@ class Ring:
 
 
 def loft(rings: Sequence[Ring], segments: int, center: tuple[float, float] = (0.0, 0.0)) -> Mesh:
-    """Skin over sections from bottom to top (or inside to outside); ends of size 0 close it.
+    """Return the surface through sections from bottom to top (or inside to outside); ends of size 0 close it.
 
     Args:
         rings: Sections in order; the outside is to the right of the path when the axis is on the left.
-        segments: Vertices around.
-        center: (x, y) of the axis, metres.
+        segments: Number of vertices of a section.
+        center: Position (x, y) of the axis, [m].
     """
     rows, coords, quads = [], [], []
     for index, ring in enumerate(rings):
@@ -75,12 +75,12 @@ def loft(rings: Sequence[Ring], segments: int, center: tuple[float, float] = (0.
 
 
 def box(half: Sequence[float], center: Sequence[float], cells: dict[str, tuple[float, ...]]) -> Mesh:
-    """Box whose faces show rectangles of the picture.
+    """Return a box whose faces show rectangles of the texture.
 
     Args:
-        half: Half extents (x, y, z), metres.
-        center: (x, y, z), metres.
-        cells: Face name (front, back, left, right, top, bottom) -> (u0, v0, u1, v1); faces are seen from
+        half: Half extents (x, y, z), [m].
+        center: Centre (x, y, z), [m].
+        cells: Face (front, back, left, right, top, bottom) -> (u0, v0, u1, v1); faces are seen from
             outside with z up, top and bottom with the front edge below; right is +y.
     """
     frames = {  # face -> (normal, to the right, upwards)
@@ -99,7 +99,7 @@ def box(half: Sequence[float], center: Sequence[float], cells: dict[str, tuple[f
 
 
 def quad(corners: Sequence[Sequence[float]], cell: tuple[float, ...]) -> Mesh:
-    """Four corners, counter-clockwise from the lower left, showing (u0, v0, u1, v1) of the picture."""
+    """Return a quadrilateral, corners counter-clockwise from the lower left, with (u0, v0, u1, v1) of the texture."""
     u0, v0, u1, v1 = cell
     texcoords = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1)], float)
     return Mesh(np.array(corners, float), np.array([(0, 1, 2), (0, 2, 3)]), texcoords)
@@ -113,14 +113,14 @@ def sweep(
     cell: tuple[float, ...],
     round: float = 2.0,
 ) -> Mesh:
-    """Skin along a path that stays in one plane: handles, cutlery.
+    """Return the surface along a path in a plane, for handles and cutlery.
 
     Args:
-        path: Points of the middle line (n, 3), metres.
-        half: Half extents of the section at each point (n, 2): along `across`, in the plane.
-        across: Unit normal of the plane (3,).
-        segments: Vertices around.
-        cell: (u0, v0, u1, v1) of the picture; u runs around, v along the path.
+        path: Points of the centre line, (n, 3) [m].
+        half: Half extents of the section at each point, (n, 2) [m]: along `across`, and in the plane.
+        across: Unit normal of the plane, (3,).
+        segments: Number of vertices of a section.
+        cell: Bounds (u0, v0, u1, v1) in the texture; u runs around, v along the path.
         round: Exponent of the section's superellipse, as in `Ring`.
     """
     points, across, (u0, v0, u1, v1) = np.asarray(path, float), np.asarray(across, float), cell
@@ -147,9 +147,9 @@ def sweep(
 
 
 def seamless(mesh: Mesh, segments: int) -> Mesh:
-    """Return a loft or sweep closed where its picture begins and ends, so that light shows no seam there.
+    """Return a loft or sweep whose vertices at the texture's seam are merged, so that shading is continuous there.
 
-    The picture then covers each half around, mirrored: u is 0 where the seam was and 1 opposite of it.
+    The texture then covers each half, mirrored: u is 0 at the former seam and 1 opposite to it.
     """
     row, column = np.divmod(np.arange(len(mesh.vertices)), segments + 1)
     index = row * segments + column % segments
@@ -160,7 +160,7 @@ def seamless(mesh: Mesh, segments: int) -> Mesh:
 
 
 def faceted(mesh: Mesh) -> Mesh:
-    """Return the mesh with flat triangles: none shares a vertex with another."""
+    """Return the mesh with flat shading: no two triangles share a vertex."""
     corners = mesh.faces.ravel()
     return Mesh(mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3), mesh.texcoords[corners])
 
@@ -179,11 +179,11 @@ _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 def _section(ring: Ring, segments: int, center: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    # The seam's column stands twice: u = 0 and u = 1.
+    # The column of the seam exists twice: u = 0 and u = 1.
     u = np.linspace(0.0, 1.0, segments + 1)
     angle = 2.0 * np.pi * (u - 0.5)
     bend = 2.0 / ring.round
-    # Rounded: a fractional power would blow the sine of pi up to something visible.
+    # Rounded: a fractional power would make the rounding error of sin(pi) visible.
     cosine, sine = np.round(np.cos(angle), 12), np.round(np.sin(angle), 12)
     x = np.sign(cosine) * np.abs(cosine) ** bend * ring.depth + center[0]
     y = np.sign(sine) * np.abs(sine) ** bend * ring.width + center[1]

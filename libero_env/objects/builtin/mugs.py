@@ -9,7 +9,7 @@ SEGMENTS = 22
 
 
 def red_coffee_mug() -> Appearance:
-    """Tall red mug, lighter inside."""
+    """Return the red coffee mug: tall red mug, lighter inside."""
     canvas = _glaze((186, 22, 20), inside=(206, 44, 36), depth=(112, 12, 12))
     outside = [
         (0.0, 0.0010),
@@ -49,7 +49,7 @@ def red_coffee_mug() -> Appearance:
 
 
 def porcelain_mug() -> Appearance:
-    """White mug with a round belly."""
+    """Return the porcelain mug: white mug with a round belly."""
     canvas = _glaze((243, 242, 240), inside=(240, 239, 236), depth=(186, 184, 180))
     canvas.gradient(0.04, 0.20, (206, 204, 200), (243, 242, 240))
     outside = [
@@ -90,7 +90,7 @@ def porcelain_mug() -> Appearance:
 
 
 def white_yellow_mug() -> Appearance:
-    """Mug that is white above and yellow below and inside, with a yellow handle."""
+    """Return the white yellow mug: mug that is white above and yellow below and inside, with a yellow handle."""
     white, yellow = (244, 242, 236), (240, 184, 36)
     canvas = _glaze(white, inside=yellow, depth=(176, 128, 20))
     canvas.band(0.0, 0.265, yellow)

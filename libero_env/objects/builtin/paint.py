@@ -1,4 +1,4 @@
-"""Labels: small pictures drawn with (u, v) coordinates, v upwards, as the meshes use them."""
+"""Textures: small images drawn in (u, v) coordinates, v upwards, as the meshes use them."""
 
 import io
 from collections.abc import Sequence
@@ -8,15 +8,15 @@ from PIL import Image, ImageDraw, ImageFont
 
 Color = tuple[int, int, int]
 
-_OVERSAMPLE = 4
+_OVERSAMPLE = 4  # drawn pixels per pixel, along a side
 
 
 class Canvas:
-    """A picture to paint on; edges are smoothed by drawing large and shrinking.
+    """An image to draw on, antialiased by oversampling.
 
     Args:
-        color: Background, RGB 0..255.
-        size: Width and height in pixels.
+        color: Background, RGB in [0, 255].
+        size: Width and height, [pixels].
     """
 
     def __init__(self, color: Color, size: tuple[int, int] = (128, 128)):
@@ -25,16 +25,16 @@ class Canvas:
         self._draw = ImageDraw.Draw(self._image)
 
     def rect(self, u0: float, v0: float, u1: float, v1: float, color: Color) -> None:
-        """Fills a rectangle."""
+        """Fill a rectangle."""
         (x0, y1), (x1, y0) = self._at(u0, v0), self._at(u1, v1)
         self._draw.rectangle((x0, y0, x1 - 1, y1 - 1), fill=color)
 
     def band(self, v0: float, v1: float, color: Color) -> None:
-        """Fills a band over the whole width."""
+        """Fill a band over the whole width."""
         self.rect(0.0, v0, 1.0, v1, color)
 
     def gradient(self, v0: float, v1: float, low: Color, high: Color) -> None:
-        """Fills a band over the whole width, from one color at v0 to another at v1."""
+        """Fill a band over the whole width, from one color at v0 to another at v1."""
         (_, y1), (x1, y0) = self._at(0.0, v0), self._at(1.0, v1)
         for y in range(round(y0), round(y1)):
             share = (y1 - y) / (y1 - y0)
@@ -42,16 +42,16 @@ class Canvas:
             self._draw.line((0, y, x1, y), fill=color)
 
     def disc(self, u: float, v: float, ru: float, rv: float, color: Color) -> None:
-        """Fills an ellipse with half axes (ru, rv)."""
+        """Fill an ellipse with half axes (ru, rv)."""
         (x0, y1), (x1, y0) = self._at(u - ru, v - rv), self._at(u + ru, v + rv)
         self._draw.ellipse((x0, y0, x1, y1), fill=color)
 
     def polygon(self, points: Sequence[tuple[float, float]], color: Color) -> None:
-        """Fills a polygon of (u, v) points."""
+        """Fill a polygon of (u, v) points."""
         self._draw.polygon([self._at(u, v) for u, v in points], fill=color)
 
     def line(self, points: Sequence[tuple[float, float]], width: float, color: Color) -> None:
-        """Draw a line; `width` is a share of the picture's width."""
+        """Draw a line; `width` is a share of the image's width."""
         pixels = max(1, round(width * self._image.width))
         self._draw.line([self._at(u, v) for u, v in points], fill=color, width=pixels, joint="curve")
 
@@ -67,7 +67,7 @@ class Canvas:
         self._image.paste(color, (round(x0), round(y0)), mask)
 
     def png(self) -> bytes:
-        """Return the picture, encoded."""
+        """Return the image as PNG."""
         return png(np.asarray(self._image.resize(self._size, Image.Resampling.BOX)))
 
     def _at(self, u: float, v: float) -> tuple[float, float]:
@@ -75,7 +75,7 @@ class Canvas:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """Return a picture (H, W, 3) uint8, first row on top, encoded for MuJoCo, whose v = 0 is a file's first row."""
+    """Return an image (H, W, 3) uint8, first row on top, as PNG for MuJoCo, where the first row of a file is v = 0."""
     stream = io.BytesIO()
     Image.fromarray(pixels[::-1]).save(stream, "png", compress_level=1)
     return stream.getvalue()

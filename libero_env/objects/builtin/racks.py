@@ -19,7 +19,7 @@ PEG = [(0.0165, 0.0039), (0.1034, 0.0036)]
 
 
 def wine_rack() -> Appearance:
-    """Mahogany post on an arched foot; it carries two shelves of oak slats, tilted towards -y."""
+    """Return the wine rack: mahogany post on an arched foot; it carries two shelves of oak slats, tilted towards -y."""
     tiles = {
         "foot": wood((96, 38, 22), seed=40, depth=0.45, upright=True),
         "post": wood((88, 34, 20), seed=41, depth=0.4, upright=True),
@@ -30,19 +30,19 @@ def wine_rack() -> Appearance:
     palette = Palette(tiles)
     post = block((-0.0090, -0.0100, -0.1600), (0.0090, 0.0100, 0.1590), palette["post"], bevel=0.0015)
     stretcher = block((-0.0665, -0.0930, 0.0021), (0.0665, 0.0930, 0.0111), palette["post"])
-    parts = [_arch(palette), stretcher, _placed(post, (0.00886, 0.17026), -np.arcsin(0.273))]
-    parts += [_placed(_slatted(palette), center, slope) for center, slope in SHELVES]
+    parts = [_arch(palette), stretcher, _rotate_and_move(post, (0.00886, 0.17026), -np.arcsin(0.273))]
+    parts += [_rotate_and_move(_slatted(palette), center, slope) for center, slope in SHELVES]
     return Appearance(merge(parts), palette.png(), specular=0.25, shininess=0.5, frame="body")
 
 
 def rack() -> Appearance:
-    """White block with two rows of steel-grey pegs."""
+    """Return the rack: white block with two rows of steel-grey pegs."""
     palette = Palette(
         {"block": edged(plain((232, 232, 228)), width=2, shade=0.9), "peg": plain((196, 200, 206))}
     )
     parts = [block((-0.07, -0.1390, -0.0173), (0.07, 0.1390, 0.0173), palette["block"], bevel=0.002)]
     for x in PEGS_X:
-        # Their lower ends are inside the block.
+        # The lower ends of the pegs are inside the block.
         parts += [turned(PEG, palette["peg"], base=(x, y, 0.0), segments=6) for y in PEGS_Y]
     return Appearance(merge(parts), palette.png(), specular=0.3, frame="body")
 
@@ -51,7 +51,7 @@ APPEARANCES = {"rack": rack, "wine_rack": wine_rack}
 
 
 def _slatted(palette: Palette) -> Mesh:
-    """Slats down the slope on two battens, a lip at the lower end; level, around its centre."""
+    """Return a horizontal shelf around its centre: slats on two battens, a lip at the lower end."""
     x, y, z = SHELF_HALF
     pitch = 2 * x / SLATS
     parts = []
@@ -65,14 +65,14 @@ def _slatted(palette: Palette) -> Mesh:
     return merge(parts)
 
 
-def _placed(mesh: Mesh, center: tuple[float, float], angle: float) -> Mesh:
-    """Turned about x by an angle, then moved to (y, z)."""
+def _rotate_and_move(mesh: Mesh, center: tuple[float, float], angle: float) -> Mesh:
+    """Return a mesh rotated about x by an angle and moved to (y, z)."""
     turned = mesh.rotated(np.array([np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]))
     return Mesh(turned.vertices + (0.0, *center), turned.faces, turned.texcoords)
 
 
 def _arch(palette: Palette) -> Mesh:
-    """Bent board along y, ends on the floor."""
+    """Return a bent board along y whose ends are on the floor."""
     length, height, thickness = ARCH
     y = np.linspace(-length, length, 9)
     top = height - (height - thickness) * np.abs(y / length) ** 1.5

@@ -9,7 +9,7 @@ OAK, OAK_LIGHT = (98, 70, 50), (150, 112, 78)
 
 
 def wooden_shelf() -> Appearance:
-    """Carcase under an overhanging top; two boards make three compartments."""
+    """Return the wooden shelf: carcase under an overhanging top; two boards make three compartments."""
     palette = _oak(seed=30)
     boards = [
         ((-0.1081, -0.0700, z0), (0.1159, 0.1080, z1)) for z0, z1 in ((0.0774, 0.0808), (0.1476, 0.1511))
@@ -26,7 +26,7 @@ def wooden_shelf() -> Appearance:
 
 
 def wooden_two_layer_shelf() -> Appearance:
-    """Wide and without a floor: a board halfway, an overhanging top."""
+    """Return the wooden two layer shelf: wide and without a floor: a board halfway, an overhanging top."""
     palette = _oak(seed=35)
     parts = [
         _sheet(palette, (-0.1708, -0.0790, 0.2055), (0.1807, 0.1117, 0.2100), "top", bevel=0.0015),
@@ -55,7 +55,7 @@ def _oak(seed: int) -> Palette:
 
 
 def _sheet(palette: Palette, low, high, name: str, *, bevel: float = 0.0) -> Mesh:
-    # The sawn front edge is paler: it tells the layers apart.
+    # The front edge is paler, so that the layers can be distinguished.
     return block(low, high, palette[name], bevel=bevel, faces={"y-": palette["edge"]})
 
 

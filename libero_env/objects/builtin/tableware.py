@@ -5,11 +5,11 @@ from libero_env.objects.builtin.mesh import Mesh, box, merge, sweep
 from libero_env.objects.builtin.paint import Canvas
 from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, vessel
 
-FLUTES = 14  # on each side
+FLUTES = 14  # number on each half
 
 
 def akita_black_bowl() -> Appearance:
-    """Black glazed bowl with a worn rim and brush strokes inside."""
+    """Return the akita black bowl: black glazed bowl with a worn rim and brush strokes inside."""
     canvas = Canvas((22, 22, 25), (128, 128))
     canvas.gradient(0.15, RIM_V, (16, 16, 18), (46, 46, 51))
     canvas.gradient(INNER_V, FLOOR_V, (40, 40, 44), (16, 16, 18))
@@ -40,7 +40,7 @@ def akita_black_bowl() -> Appearance:
 
 
 def white_bowl() -> Appearance:
-    """Small white bowl."""
+    """Return the white bowl: small white bowl."""
     canvas = Canvas((240, 239, 234), (64, 128))
     canvas.gradient(INNER_V, FLOOR_V, (240, 239, 234), (206, 204, 198))
     canvas.gradient(0.0, 0.25, (188, 186, 180), (240, 239, 234))
@@ -69,7 +69,7 @@ def white_bowl() -> Appearance:
 
 
 def plate() -> Appearance:
-    """White dinner plate with a red-brown rim and a fine line inside it."""
+    """Return the plate: white dinner plate with a red-brown rim and a fine line inside it."""
     canvas = Canvas((244, 242, 236), (64, 256))
     canvas.gradient(0.0, 0.28, (206, 204, 198), (244, 242, 236))
     rim = INNER_V - 0.01
@@ -99,7 +99,7 @@ def plate() -> Appearance:
 
 
 def glazed_rim_porcelain_ramekin() -> Appearance:
-    """White fluted ramekin with a smooth glazed rim."""
+    """Return the glazed rim porcelain ramekin: white fluted ramekin with a smooth glazed rim."""
     canvas = Canvas((246, 246, 246), (256, 128))
     canvas.gradient(INNER_V + 0.02, FLOOR_V, (236, 237, 240), (206, 208, 214))
     for index in range(FLUTES):
@@ -133,7 +133,7 @@ def glazed_rim_porcelain_ramekin() -> Appearance:
 
 
 def dining_set_group() -> Appearance:
-    """Fork and knife on the right of a place, two spoons on the left, and the linen cloth under it."""
+    """Return the dining set group: fork and knife, two spoons, and the linen cloth below."""
     canvas = Canvas((236, 232, 222), (128, 128))
     for u0, v0, u1, v1 in ((0.03, 0.05, 0.97, 0.08), (0.03, 0.92, 0.97, 0.95)):
         canvas.rect(u0, v0, u1, v1, (92, 116, 160))
@@ -160,7 +160,7 @@ _HANDLE_WIDTH = [0.0040, 0.0046, 0.0034, 0.0018, 0.0018]
 
 
 def _strip(x: float, line: list[tuple[float, float]], width: list[float], thick: float = 0.0009) -> Mesh:
-    # Flat metal along y: (y, z) points and half widths.
+    # flat metal along y, given by (y, z) points and half widths
     path = [(x, y, z) for y, z in line]
     return sweep(path, [(w, thick) for w in width], (1.0, 0.0, 0.0), 6, STEEL)
 

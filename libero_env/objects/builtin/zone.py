@@ -1,4 +1,4 @@
-"""The target zone: a coloured rectangle that marks a place and that nothing touches."""
+"""The target zone: a coloured rectangle that marks a place, without collisions."""
 
 import mujoco
 
@@ -9,7 +9,7 @@ COLOR = (0.85, 0.15, 0.15, 0.5)
 
 
 def target_zone() -> ObjectModel:
-    """Return a flat translucent rectangle; its site `default_site` is the place, a little higher than the picture."""
+    """Return a flat translucent rectangle; its site `default_site` is the place, slightly above the rectangle."""
     spec, box = mujoco.MjSpec(), mujoco.mjtGeom.mjGEOM_BOX
     spec.modelname = "target_zone"
     spec.compiler.degree = False
