@@ -2,9 +2,10 @@
 
 import contextlib
 import os
+import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import connection, get_context
 from multiprocessing.connection import Connection
@@ -144,6 +145,27 @@ class GymHost(Host):
         self.shared.write(observation)
 
 
+class CallHost(Host):
+    """Any environment in a worker: its methods and attributes."""
+
+    def open(self) -> None:
+        """Make the environment."""
+        self.env = self.make()
+
+    def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Call a method of the environment and return its result."""
+        return getattr(self.env, method)(*args, **kwargs)
+
+    def get(self, key: str) -> Any:
+        """Return an attribute of the environment."""
+        return getattr(self.env, key)
+
+    def set(self, key: str, value: Any) -> None:
+        """Set an attribute of the environment, or of its inner environment where only that has it."""
+        inner = getattr(self.env, "env", None)
+        setattr(inner if inner is not None and not hasattr(self.env, key) else self.env, key, value)
+
+
 @dataclass
 class Worker:
     """The parent's end of one worker.
@@ -153,12 +175,15 @@ class Worker:
         make: Factory of the environment, called in the worker.
         variables: Environment variables of the worker, such as the GPU to render on.
         host: Class whose methods are the commands; it is built with `make`, and has a command `open`.
+        run_main: Whether the process runs the script of this one again, without its main part. Factories that are
+            defined in the script do not need it.
     """
 
     task: str
     make: Callable[[], Any]
     variables: Mapping[str, str] = field(default_factory=dict)
     host: type[Host] = GymHost
+    run_main: bool = True
 
     def __post_init__(self) -> None:
         self.shared: Shared | None = None
@@ -171,7 +196,8 @@ class Worker:
         self.pipe, other = context.Pipe()
         arguments = (other, CloudpickleWrapper(self.make), self.variables, self.host)
         self.process = context.Process(target=serve, args=arguments, daemon=True)
-        self.process.start()
+        with contextlib.nullcontext() if self.run_main else _hidden_main():
+            self.process.start()
         other.close()
         self.opened = False
         self.send("open")
@@ -203,6 +229,18 @@ class Worker:
         if self.shared is not None:
             self.shared.close()
             self.shared = None
+
+
+@contextlib.contextmanager
+def _hidden_main() -> Iterator[None]:
+    """Hide the script of this process from processes that are started."""
+    main: dict[str, Any] = vars(sys.modules["__main__"])
+    hidden = {name: main.pop(name) for name in ["__file__", "__spec__"] if name in main}
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(hidden)
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,9 @@
 A worker answers requests in order: `send` starts one and `recv` waits for its answer, so several workers run at once.
 """
 
-import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from multiprocessing import connection
 from typing import Any
@@ -15,7 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import utils
 
-from libero_env.envs.worker import Host, Shared, Worker, shut_down, wait_for
+from libero_env.envs.worker import CallHost, Shared, Worker, shut_down, wait_for
 from libero_env.errors import LiberoError
 
 # Methods of the environment that a worker has, too: each sends the call and waits for the answer.
@@ -155,8 +153,7 @@ class SubprocEnvWorker(EnvWorker):
     def __init__(self, env_fn: Callable[[], Any], share_memory: bool = False, timeout: float | None = None):
         super().__init__(env_fn)
         self.share_memory, self._timeout, self._request = share_memory, timeout, ""
-        with _without_main():
-            self._worker = Worker("", env_fn, host=VectorHost)
+        self._worker = Worker("", env_fn, host=VectorHost, run_main=False)
         self.process, self.parent_remote = self._worker.process, self._worker.pipe
 
     def _send(self, command: str, *args: Any) -> None:
@@ -211,18 +208,14 @@ class SubprocEnvWorker(EnvWorker):
         return ready
 
 
-class VectorHost(Host):
-    """The commands of a worker: calls and attributes of any environment."""
+class VectorHost(CallHost):
+    """The commands of a worker, with observations in shared memory."""
 
     layout: Mapping[str, np.ndarray] = {}  # arrays of the first observation
 
-    def open(self) -> None:
-        """Make the environment."""
-        self.env = self.make()
-
     def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Call a method; None stands for arrays of an observation that are in shared memory."""
-        result = getattr(self.env, method)(*args, **kwargs)
+        result = super().call(method, args, kwargs)
         if observation := _observation(result):
             arrays = _arrays(observation)
             self.layout = self.layout or arrays
@@ -231,15 +224,6 @@ class VectorHost(Host):
                     view[...] = arrays[key]
                     observation[key] = None
         return result
-
-    def get(self, key: str) -> Any:
-        """Return an attribute."""
-        return getattr(self.env, key)
-
-    def set(self, key: str, value: Any) -> None:
-        """Set an attribute, of the inner environment where only that has it."""
-        inner = getattr(self.env, "env", None)
-        setattr(inner if inner is not None and not hasattr(self.env, key) else self.env, key, value)
 
     def attach(self, name: str) -> None:
         """Write observations to shared memory, laid out as the first observation was."""
@@ -254,15 +238,3 @@ def _observation(result: Any) -> dict[str, Any] | None:
 
 def _arrays(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {key: value for key, value in observation.items() if isinstance(value, np.ndarray)}
-
-
-@contextmanager
-def _without_main() -> Iterator[None]:
-    """Keep a spawned process from running the script again: what it needs comes with the factory."""
-    main = vars(sys.modules["__main__"])
-    hidden = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
-    main["__spec__"] = None
-    try:
-        yield
-    finally:
-        main.update(hidden)
