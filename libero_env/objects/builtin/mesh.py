@@ -5,7 +5,7 @@ with v = 0 at the lower edge of the texture; around a loft, u runs from the back
 front (0.5) and +y (0.75) to the back again (1).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +61,9 @@ def loft(rings: Sequence[Ring], segments: int, center: tuple[float, float] = (0.
         segments: Number of vertices of a section.
         center: Position (x, y) of the axis, [m].
     """
-    rows, coords, quads = [], [], []
+    rows: list[np.ndarray] = []
+    coords: list[np.ndarray] = []
+    quads: list[tuple[int, int]] = []
     for index, ring in enumerate(rings):
         if index:
             quads.append((len(rows) - 1, len(rows)))
@@ -74,7 +76,7 @@ def loft(rings: Sequence[Ring], segments: int, center: tuple[float, float] = (0.
     return Mesh(vertices, _without_degenerate(vertices, faces), np.concatenate(coords))
 
 
-def box(half: Sequence[float], center: Sequence[float], cells: dict[str, tuple[float, ...]]) -> Mesh:
+def box(half: Sequence[float], center: Sequence[float], cells: Mapping[str, tuple[float, ...]]) -> Mesh:
     """Return a box whose faces show rectangles of the texture.
 
     Args:
@@ -98,7 +100,7 @@ def box(half: Sequence[float], center: Sequence[float], cells: dict[str, tuple[f
     return merge(quads)
 
 
-def quad(corners: Sequence[Sequence[float]], cell: tuple[float, ...]) -> Mesh:
+def quad(corners: Sequence[Sequence[float] | np.ndarray], cell: tuple[float, ...]) -> Mesh:
     """Return a quadrilateral, corners counter-clockwise from the lower left, with (u0, v0, u1, v1) of the texture."""
     u0, v0, u1, v1 = cell
     texcoords = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1)], float)
@@ -123,7 +125,7 @@ def sweep(
         cell: Bounds (u0, v0, u1, v1) in the texture; u runs around, v along the path.
         round: Exponent of the section's superellipse, as in `Ring`.
     """
-    points, across, (u0, v0, u1, v1) = np.asarray(path, float), np.asarray(across, float), cell
+    points, normal, (u0, v0, u1, v1) = np.asarray(path, float), np.asarray(across, float), cell
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -132,8 +134,8 @@ def sweep(
     def add(index: int, size: float) -> None:
         ring = Ring(0.0, size * half[index][0], size * half[index][1], 0.0, round)
         section, texcoords = _section(ring, segments, (0.0, 0.0))
-        inwards = np.cross(along[index], across)
-        rows.append(points[index] + section[:, :1] * across + section[:, 1:2] * inwards)
+        inwards = np.cross(along[index], normal)
+        rows.append(points[index] + section[:, :1] * normal + section[:, 1:2] * inwards)
         v = v0 + (v1 - v0) * length[index] / length[-1]
         coords.append(np.column_stack([u0 + (u1 - u0) * texcoords[:, 0], np.full(segments + 1, v)]))
 

@@ -11,6 +11,8 @@ from typing import Any
 from libero_env.storage import parse_yaml
 
 Vector = tuple[float, ...]
+Vector3 = tuple[float, float, float]
+Range = tuple[float, float]
 
 # Contact parameters of the original's objects: as stiff as the timestep allows (refsafe).
 FRICTION: Vector = (0.95, 0.3, 0.1)
@@ -122,12 +124,12 @@ class Physics:
 
     root: Part
     parts: Mapping[str, Part]
-    rotation: Mapping[str, Vector]
+    rotation: Mapping[str, Range]
     rotation_axis: str | None
-    bottom_offset: Vector
-    top_offset: Vector
+    bottom_offset: Vector3
+    top_offset: Vector3
     horizontal_radius: float
-    articulation: Mapping[str, Vector] = field(default_factory=dict)
+    articulation: Mapping[str, Range] = field(default_factory=dict)
     friction: Vector = FRICTION
     solref: Vector = SOLREF
     solimp: Vector = SOLIMP
