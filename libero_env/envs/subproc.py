@@ -17,7 +17,8 @@ from gymnasium.vector.utils import batch_space
 
 from libero_env.envs.checks import ResetRequest, checked_actions
 from libero_env.envs.config import EnvConfig, EnvOptions, show_options
-from libero_env.envs.worker import Failure, Worker, checked_space, open_libero, shut_down, wait_for
+from libero_env.envs.worker import Failure, Worker, checked_space, shut_down, wait_for
+from libero_env.envs.worker_host import open_libero
 from libero_env.errors import LiberoError
 from libero_env.timing import CONTROL_HZ
 

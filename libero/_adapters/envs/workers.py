@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import utils
 
-from libero_env.envs.worker import CallHost, Shared, Worker, shut_down, wait_for
+from libero_env.envs.worker import Worker, shut_down, wait_for
+from libero_env.envs.worker_host import CallHost, Shared
 from libero_env.errors import LiberoError
 
 # Methods of the environment that a worker has, too: each sends the call and waits for the answer.
