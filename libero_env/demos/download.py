@@ -99,7 +99,7 @@ def _list_suite(suite: str, revision: str) -> Iterator[tuple[str, Remote]]:
         with urllib.request.urlopen(url, timeout=TIMEOUT) as response:
             entries = json.load(response)
     except urllib.error.HTTPError as error:
-        raise DownloadError(f"{url}: the server answered {error.code} {error.reason}") from error
+        raise DownloadError(f"{url}: the server answers {error.code} {error.reason}") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "reason", error)
         raise DownloadError(f"{url}: {reason}; no network? HF_ENDPOINT names another server") from error
