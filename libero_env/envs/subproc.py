@@ -152,7 +152,7 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         for i, info in answers.items():
             self._running[i], self._success[i] = True, bool(info.get("success", False))
             self._progress[i] = info.get("progress", {})
-        return self._checked((self._observe(), self._info()), failed | more)
+        return self._result((self._observe(), self._info()), failed | more)
 
     def step(self, actions: np.ndarray) -> Outcome:
         """Apply actions in every environment that is in an episode.
@@ -177,7 +177,7 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
             self._progress[i] = info.get("progress", {})
             self._running[i] = not (end or cut)
         truncated[list(failed)] = True
-        return self._checked((self._observe(), rewards, terminated, truncated, self._info()), failed)
+        return self._result((self._observe(), rewards, terminated, truncated, self._info()), failed)
 
     def call(self, name: str, *args: Any, indices: Sequence[int] | None = None, **kwargs: Any) -> list[Any]:
         """Return an attribute of each environment, or the result of calling it.
@@ -193,11 +193,11 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         """
         indices = list(range(self.num_envs)) if indices is None else [int(i) for i in indices]
         failed = self._reopen([i for i in indices if not self._workers[i].opened])
-        asked = [i for i in indices if i not in failed]
-        for i in asked:
+        called = [i for i in indices if i not in failed]
+        for i in called:
             self._workers[i].send("call", name, args, kwargs)
-        answers, more = self._collect(asked, self.timeout, keep_running=True)
-        return self._checked([answers.get(i) for i in indices], failed | more)
+        answers, more = self._collect(called, self.timeout, keep_running=True)
+        return self._result([answers.get(i) for i in indices], failed | more)
 
     def get_state(self, i: int) -> np.ndarray:
         """Return the state of environment i, as `LiberoEnv.get_state`."""
@@ -253,18 +253,19 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         self, ids: Sequence[int], timeout: float, keep_running: bool = False
     ) -> tuple[dict[int, Any], dict[int, str]]:
         """Return the answers, and the reasons of workers that gave none; lost processes are replaced."""
-        asked = {i: self._workers[i] for i in ids}
+        workers = {i: self._workers[i] for i in ids}
         try:
-            answers, failures = wait_for(asked, timeout)
+            answers, failures = wait_for(workers, timeout)
         except KeyboardInterrupt:
-            for worker in asked.values():  # or their answers would be taken for those to the next command
+            for worker in workers.values():  # or their answers would be taken for those to the next command
                 worker.process.kill()
             raise
         for i, failure in failures.items():
-            self._abandon(i, failure, keep_running)
+            self._handle_failure(i, failure, keep_running)
         return answers, {i: failure.reason for i, failure in failures.items()}
 
-    def _abandon(self, i: int, failure: Failure, keep_running: bool) -> None:
+    def _handle_failure(self, i: int, failure: Failure, keep_running: bool) -> None:
+        """Replace a worker whose process is lost; end its episode and clear its observation."""
         worker = self._workers[i]
         if failure.lost or not worker.opened:
             worker.restart()
@@ -291,7 +292,8 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         ]
         return {**info, "own": own} if any(own) else info
 
-    def _checked(self, outcome: Any, failed: Mapping[int, str]) -> Any:
+    def _result(self, outcome: Any, failed: Mapping[int, str]) -> Any:
+        """Return the outcome of a call, or raise an error that has it if some workers failed."""
         if failed:
             raise WorkerError(failed, self.tasks, outcome)
         return outcome

@@ -38,7 +38,6 @@ _FIELDS = (
     "qfrc_bias",
 )
 
-
 Indices = Sequence[int] | np.ndarray
 KinematicsHook = Callable[[mujoco.MjData], None]
 
@@ -163,16 +162,9 @@ class Simulations(ABC):
     @property
     def state_size(self) -> int:
         """Length of the vector of `get_state`."""
-        model = self.model
+        model, fixtures = self.model, 7 * len(self.fixture_bodies)
         warm_start = model.nv + model.nu
-        return (
-            1
-            + model.nq
-            + model.nv
-            + 7 * len(self.fixture_bodies)
-            + warm_start
-            + self.controller_state.controller.state_size
-        )
+        return 1 + model.nq + model.nv + fixtures + warm_start + self.controller_state.controller.state_size
 
     def _grip_site(self) -> tuple[np.ndarray, np.ndarray]:
         """Return position (num, 3) and orientation (num, 9) of the grip site."""
@@ -210,10 +202,12 @@ class LoopSimulations(Simulations):
         self._calls = [(self._inputs(v), v["ctrl"]) for v in self._views]
 
     def _view(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        """Return views of the fields of one simulation, (1, ...)."""
         views = {name: getattr(data, name)[None] for name in _FIELDS}
         return {**views, "site_xmat": data.site_xmat.reshape(1, self.model.nsite, 9)}
 
     def _gather(self, ids: np.ndarray) -> None:
+        """Copy the fields of simulations to `fields`, unless they are read in place."""
         if self.num > 1:
             for i in ids:
                 for name, array in self.fields.items():
