@@ -1,4 +1,4 @@
-"""The scripted expert: it observes the whole state and acts through the environment's seven-dimensional actions."""
+"""The scripted expert: it observes the whole state and acts as a policy does, with seven numbers."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from libero_env.tasks import Task
 
 
 class Expert:
-    """Reaches the goal of a task in one simulation, one skill after the other.
+    """Scripted expert that reaches the goal of a task in one simulation, one skill after the other.
 
     It plans again whenever a skill is done, so that an object that slipped or was pushed is put right.
 

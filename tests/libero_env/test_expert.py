@@ -1,9 +1,10 @@
-"""The expert: shapes, grasps and motion by their properties; every task is reached; slips are corrected."""
+"""The expert: properties of shapes, grasps and motion; every task is reached; slips are corrected."""
 
 import mujoco
 import numpy as np
 import pytest
 
+from libero_env.assets.robot import FINGER_JOINTS
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
@@ -15,6 +16,8 @@ from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, f
 from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.rollout import run_experts
+from libero_env.expert.skills.drop_into_container import DropIntoContainer
+from libero_env.expert.skills.pick_place import PickPlace
 from libero_env.expert.skills.transport import Move, Transport
 from libero_env.geometry import Pose, rotation_between, surface_points
 from libero_env.sim.predicates import atoms_of, evaluate
@@ -61,7 +64,7 @@ def test_surface_points_span_the_geom(geom):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.7, 1.5])
-def test_a_box_is_taken_across_its_narrow_side(angle):
+def test_a_box_is_grasped_across_its_narrow_side(angle):
     cloud = turned(box((0.04, 0.02, 0.015)), angle, (0.2, -0.1))
     grasp = choose_grasp(cloud, NOTHING, 0.0, X_AXIS)
     assert between(grasp.yaw, angle + np.pi / 2) < 0.06
@@ -70,7 +73,7 @@ def test_a_box_is_taken_across_its_narrow_side(angle):
     assert 0.012 < grasp.pos_world[2] < 0.03
 
 
-def test_the_hand_turns_as_little_as_it_can():
+def test_the_hand_rotates_as_little_as_possible():
     cube = box((0.02, 0.02, 0.02))
     for yaw in (0.1, -0.4, 1.2):
         axis = np.array([np.cos(yaw), np.sin(yaw), 0.0])
@@ -102,7 +105,7 @@ def test_what_is_too_wide_is_refused_with_its_width():
     assert f"{100 * GRIPPER.max_opening:.0f} cm" in str(caught.value)
 
 
-def test_a_firm_hold_has_much_between_its_pads_and_meets_faces_squarely():
+def test_the_grip_cost_is_low_with_much_between_the_pads_and_parallel_faces():
     cloud = box((0.03, 0.008, 0.03))
     middle = np.array([0.0, 0.0, 0.04])
     firm, corner, edge = (
@@ -211,7 +214,7 @@ def test_a_drawer_is_opened_before_and_closed_after(view_of):
 
 
 @pytest.mark.sim
-def test_what_carries_is_put_first(view_of):
+def test_an_object_is_placed_before_what_it_carries(view_of):
     view = view_of("libero_90/63")
     goal = get_task("libero_90/63").problem.goal
     for written in (goal, And(tuple(reversed(goal.parts)))):
@@ -219,7 +222,7 @@ def test_what_carries_is_put_first(view_of):
 
 
 @pytest.mark.sim
-def test_of_a_choice_the_easier_is_taken(view_of):
+def test_of_alternatives_the_one_with_less_to_do_is_planned(view_of):
     view = view_of("libero_goal/7")
     hard = And(
         (Atom("On", ("plate_1", "flat_stove_1_cook_region")), Atom("Open", ("wooden_cabinet_1_top_region",)))
@@ -230,7 +233,7 @@ def test_of_a_choice_the_easier_is_taken(view_of):
 
 
 @pytest.mark.sim
-def test_a_bowl_is_taken_by_its_wall(view_of):
+def test_a_bowl_is_grasped_by_its_wall(view_of):
     view = view_of("libero_goal/1")
     cloud = Shapes(view.scene).cloud(view, "akita_black_bowl_1")
     for grasp in find_grasps(cloud, 0.9, X_AXIS)[:5]:
@@ -251,7 +254,7 @@ def test_at_a_place_the_atom_would_hold(task_id, view_of):
 
 
 @pytest.mark.sim
-def test_what_failed_is_not_tried_again_the_same_way(view_of):
+def test_a_failed_grasp_is_not_planned_again(view_of):
     view = view_of("libero_goal/1")
     shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
     first = plan_pick(view, shapes, atom)
@@ -303,6 +306,28 @@ def test_the_arm_keeps_its_elbow_bent(view_of):
         start, Pose(np.array([0.35, 0.0, 1.0]), down)
     )  # could be touched with a straight arm
     assert error > 0.0 and far[3] <= -0.9
+
+
+@pytest.mark.sim
+def test_the_gripper_opens_as_far_as_its_model(view_of):
+    model = view_of("libero_object/0").scene.model
+    ranges = [model.joint(name).range for name in FINGER_JOINTS]
+    assert sum(float(np.ptp(limits)) for limits in ranges) == pytest.approx(GRIPPER.max_opening)
+
+
+@pytest.mark.sim
+def test_another_skill_takes_over_from_one_that_failed(view_of):
+    view = view_of("libero_object/0")
+    expert = Expert(get_task("libero_object/0"), np.random.default_rng(0))
+    expert.act(view)
+    dropping = expert.skill
+    assert isinstance(dropping, DropIntoContainer) and dropping.fallback() is None
+    dropping.failure_reason = "something is in the way"
+    assert expert.failure_reason == ""  # it can continue
+    expert.act(view)
+    assert isinstance(expert.skill, PickPlace) and expert.skill.atom == dropping.atom and expert.retries == 1
+    expert.skill.failure_reason = "no grasp"
+    assert expert.failure_reason == "no grasp" and expert.skill.fallback() is None
 
 
 @pytest.mark.sim

@@ -1,4 +1,4 @@
-"""Drawers, doors and knobs: every kind of fixture is opened, closed and turned, and stays so."""
+"""Drawers, doors and knobs: every kind of fixture is opened, closed or turned, and stays so."""
 
 import numpy as np
 import pytest
@@ -27,11 +27,10 @@ pytestmark = pytest.mark.sim
 
 SEEDS = 10
 STEPS = 300
-BACK, FRONT = (
-    3.14159,
-    0.0,
-)  # rad, yaw of a fixture whose front faces the middle from the right and from the left
-CASES = [  # category, region of the part or "", state, begins as, place (x, y) m, yaw rad
+# [rad] yaw of a fixture whose front faces the middle of the table from the right, and from the left
+BACK, FRONT = 3.14159, 0.0
+# category, region of the part or "", state, initial condition, position (x, y) [m], yaw [rad]
+CASES = [
     ("wooden_cabinet", "top_region", "open", None, (0.0, -0.28), BACK),
     ("wooden_cabinet", "middle_region", "open", None, (0.0, -0.28), BACK),
     ("wooden_cabinet", "bottom_region", "open", None, (0.0, -0.28), BACK),
@@ -56,10 +55,10 @@ PROBLEM = """
     (place (:target kitchen_table) (:ranges (({x0} {y0} {x1} {y1}))) (:yaw_rotation (({yaw} {yaw}))))
     {part}
   )
-  (:fixtures kitchen_table - kitchen_table thing_1 - {category})
+  (:fixtures kitchen_table - kitchen_table fixture_1 - {category})
   (:objects)
   (:obj_of_interest)
-  (:init (On thing_1 kitchen_table_place) {begin})
+  (:init (On fixture_1 kitchen_table_place) {begin})
   (:goal (And ({goal} {address})))
 )
 """
@@ -67,14 +66,14 @@ PROBLEM = """
 
 def make_task(tmp_path, category, region, state, begin, place, yaw):
     x, y = place
-    address = f"thing_1_{region}" if region else "thing_1"
+    address = f"fixture_1_{region}" if region else "fixture_1"
     text = PROBLEM.format(
         category=category,
         state=state,
         goal=state.capitalize(),
         address=address,
         yaw=yaw,
-        part=f"({region} (:target thing_1))" if region else "",
+        part=f"({region} (:target fixture_1))" if region else "",
         begin=f"({begin} {address})" if begin else "",
         x0=x - 0.01,
         y0=y - 0.01,
@@ -87,7 +86,7 @@ def make_task(tmp_path, category, region, state, begin, place, yaw):
 
 
 def run(env, skills, steps=STEPS):
-    """Each skill acts in its simulation; the actions taken (steps, num, 7), and whose goal was reached, (num,)."""
+    """Let each skill act in its simulation; return the actions (steps, num, 7) and which goals were reached (num,)."""
     reached = np.zeros(len(skills), bool)
     views, rest, taken = env.world.views, np.array([0.0] * 6 + [-1.0]), []
     for _ in range(steps):
@@ -102,7 +101,7 @@ def run(env, skills, steps=STEPS):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(filter(None, case[:3])))
-def test_it_moves_and_stays(tmp_path, case):
+def test_a_joint_is_moved_and_stays(tmp_path, case):
     task, address = make_task(tmp_path, *case)
     env = BatchEnv(task, SEEDS, num_threads=1, cameras=())
     env.reset(seed=0)
@@ -150,14 +149,14 @@ def test_a_fixture_without_the_joint_is_reported(tmp_path):
     task, _ = make_task(tmp_path, *CASES[0])
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
-    skill = MoveJoint("thing_1_top_side", "open")
+    skill = MoveJoint("fixture_1_top_side", "open")
     np.testing.assert_array_equal(skill.act(env.world.views[0])[:6], 0.0)
-    assert "thing_1_top_side" in skill.failure_reason
+    assert "fixture_1_top_side" in skill.failure_reason
     env.close()
 
 
 @pytest.mark.parametrize("case", [CASES[0], CASES[6]], ids=["bar that lies", "bar that stands"])
-def test_the_handle_is_in_front(tmp_path, case):
+def test_the_handle_is_found_in_front(tmp_path, case):
     task, address = make_task(tmp_path, *case)
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
@@ -175,7 +174,7 @@ def test_the_handle_is_in_front(tmp_path, case):
 
 
 def poses(number, seed=0):
-    """Poses of the grip site over the table, fingers down and leaning, (N, 3) and (N, 3, 3)."""
+    """Return random poses of the grip site over the table, fingers down and leaning, (N, 3) and (N, 3, 3)."""
     rng = np.random.default_rng(seed)
     pos = rng.uniform([-0.45, -0.3, 0.95], [0.1, 0.3, 1.15], (number, 3))
     mats = []
@@ -223,7 +222,7 @@ def test_the_collision_depth_of_the_hand():
     assert table_penetration(0.2, pose, True) == 0.0 and table_penetration(0.3, pose, True) > 0.01
 
 
-def test_a_hand_leans_over_a_knob_close_to_the_base():
+def test_the_hand_leans_over_a_knob_close_to_the_base():
     env = BatchEnv(get_task("libero_goal/7"), 1, num_threads=1, cameras=())
     env.reset(options={"init_state": 8})
     view = env.world.views[0]
@@ -237,7 +236,7 @@ def test_a_hand_leans_over_a_knob_close_to_the_base():
     env.close()
 
 
-def test_a_door_may_turn_under_the_hand(tmp_path):
+def test_a_door_may_rotate_under_the_hand(tmp_path):
     task, address = make_task(tmp_path, *next(c for c in CASES if c[0] == "short_fridge" and c[2] == "close"))
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)

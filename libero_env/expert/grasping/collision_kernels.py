@@ -22,7 +22,7 @@ def open_hand_collision_depth(
     palm_half_length: float,
     length: float,
 ) -> float:
-    """Return how deep points reach into open fingers and palm from the sides, [m]; 0 without a collision.
+    """Return how deep points reach into the sides of open fingers and of the palm, [m]; 0 without a collision.
 
     Args:
         points: Points on obstacles, (M, 3).

@@ -63,7 +63,5 @@ def _between_pads(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> np.nda
     """Return the points between the pads of open fingers, in the frame of the grip site, (M, 3)."""
     local = (cloud - pos) @ mat
     u, v, depth = local.T
-    pads = (
-        (np.abs(v) < GRIPPER.finger_half_width) & (depth > -GRIPPER.pad_above) & (depth < GRIPPER.pad_below)
-    )
-    return local[pads & (np.abs(u) < GRIPPER.half_opening)]
+    inside = (np.abs(u) < GRIPPER.half_opening) & (np.abs(v) < GRIPPER.finger_half_width)
+    return local[inside & (depth > -GRIPPER.pad_above) & (depth < GRIPPER.pad_below)]

@@ -37,7 +37,7 @@ def grasp_knob(view: StateView, part: Part, delta: float) -> HandleGrasp:
     obstacles = nearby_points(view, cloud.mean(axis=0), view.scene.entities, part.body)
     grasp = choose_grasp(upper, obstacles, cloud[:, 2].min(), finger_axis(view.eef_mat), "knob")
     fingers = np.array([np.cos(grasp.yaw), np.sin(grasp.yaw), 0.0])
-    leans = [(lean, sign) for lean, sign in product(_KNOB_LEANS, (1.0, -1.0))]
+    leans = list(product(_KNOB_LEANS, (1.0, -1.0)))
     mat = np.stack(
         [hinge_rotation(fingers, lean) @ downward(grasp.yaw, sign * fingers) for lean, sign in leans]
     )
@@ -159,7 +159,7 @@ class _CollisionCheck:
             grasp: Candidate, world frame.
             moved: Poses of the grip site while it moves the part.
             delta: Motion of the joint, [m] or [rad].
-            limit: Cost from which on the candidate is out of question; the search stops there.
+            limit: Cost at which the check stops early, as another candidate is better.
         """
         opening = GRIPPER.half_opening if self._gripping else 0.0
         surface_height = self._view.scene.workspace.surface_height

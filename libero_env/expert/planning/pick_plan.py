@@ -8,10 +8,8 @@ from libero_env.expert.grasping.grasps import Grasp
 from libero_env.expert.planning.place_poses import PlacePose
 from libero_env.geometry import Pose, rotation_between
 
-FLIPS = (
-    np.ones(3),
-    np.array([-1.0, -1.0, 1.0]),
-)  # signs of the hand's axes: as it is, and rotated by half a turn
+# signs of the axes of the hand as it is, and rotated by half a turn about its approach
+FLIPS = np.ones(3), np.array([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)

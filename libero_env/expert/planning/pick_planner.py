@@ -94,19 +94,13 @@ def is_graspable(view: StateView, shapes: Shapes, name: str) -> bool:
 
 def _candidate_places(placement: Placement, failures: Sequence[FailedAttempt]) -> list[PlacePose]:
     """Return the best places, some of each orientation of the object and each depth; failed ones cost more."""
-    places = find_place_poses(placement)
-    failed = [Pose(f.place.pos, f.place.mat) for f in failures if f.place]
-    if failed:
-        places = [
-            replace(
-                p,
-                cost=p.cost + SEARCH.retry_cost * sum(SEARCH.is_same(Pose(p.pos, p.mat), f) for f in failed),
-            )
-            for p in places
-        ]
-        places.sort(key=lambda place: place.cost)
+    failed = [failure.place.pose for failure in failures if failure.place]
+    places = []
+    for place in find_place_poses(placement):
+        repeats = sum(SEARCH.is_same(place.pose, other) for other in failed)
+        places.append(replace(place, cost=place.cost + SEARCH.retry_cost * repeats))
     groups: dict[tuple, list[PlacePose]] = {}
-    for place in places:
+    for place in sorted(places, key=lambda place: place.cost):
         orientation = np.round(place.mat[:2, :2].ravel(), 1)
         depth = round(float(place.pos @ place.entry) / SEARCH.depth_step)
         group = groups.setdefault((*orientation, *np.round(place.entry), depth), [])

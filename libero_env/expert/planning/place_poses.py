@@ -52,6 +52,11 @@ class PlacePose:
     cost: float
 
     @property
+    def pose(self) -> Pose:
+        """Pose of the object."""
+        return Pose(self.pos, self.mat)
+
+    @property
     def from_above(self) -> bool:
         """Whether the object comes in from above and not from a side."""
         return bool(self.entry[2] <= -0.5)
@@ -92,8 +97,8 @@ class Placement:
         return self.atom.args[1]
 
     @property
-    def on_table(self) -> bool:
-        """Whether the target is a region of a flat surface."""
+    def target_is_flat(self) -> bool:
+        """Whether the target is a rectangle on a surface, such as the table."""
         region = self.view.scene.problem.region(self.target)
         return region is not None and bool(region.ranges)
 
@@ -118,24 +123,17 @@ def find_place_poses(placement: Placement) -> list[PlacePose]:
     """
     on_entity = placement.view.is_entity(placement.target)
     overlap = 3 * _MAX_OVERLAP if on_entity else _MAX_OVERLAP
-    upright = [_Rotation(mat, 0.1 * abs(angle)) for angle, mat in _yaw_rotations(_NUM_YAWS)]
-    parallel = _parallel_rotations(placement.cloud, placement.sides[0])
-    found = _search(placement, upright, overlap)
-    if not found:
-        extra = [_Rotation(mat, 0.1 * abs(angle)) for angle, mat in parallel]
-        upright += extra
-        found = _search(placement, extra, overlap)
-    if not found and not placement.on_table:
-        yaws = [*parallel, *_yaw_rotations(_NUM_YAWS // 2)]
+    even = [_Rotation.about_vertical(yaw) for yaw in _even_yaws(_NUM_YAWS)]
+    parallel_yaws = _parallel_yaws(placement.cloud, placement.sides[0])
+    parallel = [_Rotation.about_vertical(yaw) for yaw in parallel_yaws]
+    found = _search(placement, even, overlap) or _search(placement, parallel, overlap)
+    if not found and not placement.target_is_flat:
+        yaws = [*parallel_yaws, *_even_yaws(_NUM_YAWS // 2)]
         for lean in _LEANS:
-            leaning = [
-                _Rotation(rotation_about(np.cross(side, UP), lean) @ mat, 0.1 * abs(angle), side)
-                for side in placement.sides
-                for angle, mat in yaws
-            ]
+            leaning = [_Rotation.leaning(yaw, lean, side) for side in placement.sides for yaw in yaws]
             found += _search(placement, leaning, overlap)
     if not found:
-        found = _search(placement, upright, 8 * overlap)
+        found = _search(placement, [*even, *parallel], 8 * overlap)
     if not found:
         name, args = placement.atom.args[0], " ".join(placement.atom.args)
         raise PlaceError(f"({placement.atom.predicate} {args}): there is no room for {name}")
@@ -150,7 +148,17 @@ class _Rotation:
 
     mat: np.ndarray  # (3, 3)
     cost: float
-    only_entry: np.ndarray | None = None  # the direction that a leaning object has to come in, (3,)
+    only_entry: np.ndarray | None = None  # the direction in which a leaning object has to come in, (3,)
+
+    @classmethod
+    def about_vertical(cls, yaw: float) -> "_Rotation":
+        return cls(rotation_about_z(yaw), 0.1 * abs(yaw))
+
+    @classmethod
+    def leaning(cls, yaw: float, lean: float, entry: np.ndarray) -> "_Rotation":
+        """Return a rotation about the vertical, after which the top leans back against the entry direction."""
+        tilt = rotation_about(np.cross(entry, UP), lean)
+        return cls(tilt @ rotation_about_z(yaw), 0.1 * abs(yaw), entry)
 
 
 @dataclass(frozen=True)
@@ -207,21 +215,19 @@ def _search_spots(
     return found
 
 
-def _yaw_rotations(number: int) -> list[tuple[float, np.ndarray]]:
-    """Return equally spaced rotations about the vertical: (angle, (3, 3))."""
+def _even_yaws(number: int) -> list[float]:
+    """Return equally spaced angles about the vertical, from -pi to pi, [rad]."""
     angles = [2 * np.pi * k / number for k in range(number)]
-    angles = [a - 2 * np.pi if a > np.pi else a for a in angles]
-    return [(a, rotation_about_z(a)) for a in angles]
+    return [a - 2 * np.pi if a > np.pi else a for a in angles]
 
 
-def _parallel_rotations(cloud: np.ndarray, side: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Return rotations about the vertical that put the narrowest width of an object along or across a direction."""
+def _parallel_yaws(cloud: np.ndarray, side: np.ndarray) -> list[float]:
+    """Return angles about the vertical that put the narrowest width of an object along or across a direction, [rad]."""
     plan = np.unique(np.round(cloud[:, :2], 3), axis=0)
     yaws = np.pi * np.arange(90) / 90
     widths = np.ptp(plan @ [np.cos(yaws), np.sin(yaws)], axis=0)
     first = np.arctan2(side[1], side[0]) - yaws[widths.argmin()]
-    angles = [(first + k * np.pi / 2 + np.pi) % (2 * np.pi) - np.pi for k in range(4)]
-    return [(a, rotation_about_z(a)) for a in angles]
+    return [(first + k * np.pi / 2 + np.pi) % (2 * np.pi) - np.pi for k in range(4)]
 
 
 def _target_spots(placement: Placement) -> Iterator[_Spots]:
@@ -244,7 +250,7 @@ def _target_spots(placement: Placement) -> Iterator[_Spots]:
         costs = 4.0 * np.linalg.norm(offsets - _slot_offset(half, placement.slot), axis=1)
         costs += _EDGE_COST * np.maximum(_EDGE_MARGIN - (half[:2] - np.abs(offsets)).min(axis=1), 0.0)
         below = centre[2] + (0.5 * half[2] if inside else 0.06)
-        if placement.on_table:
+        if placement.target_is_flat:
             below = view.scene.workspace.surface_height + 0.02
         yield _Spots(centre[:2] + offsets, costs, below, partial(test, _shrunk(box)))
 

@@ -1,4 +1,4 @@
-"""Which plans the arm reaches, by inverse kinematics."""
+"""The choice of a plan that the arm reaches, by inverse kinematics."""
 
 from dataclasses import replace
 
@@ -34,10 +34,8 @@ def first_reachable(
     trials = 0
     for candidate in plans:
         for side, signs in enumerate(FLIPS[: 1 + flip]):
-            grasp, key = (
-                replace(candidate.grasp, mat=candidate.grasp.mat * signs),
-                (id(candidate.grasp), side),
-            )
+            grasp = replace(candidate.grasp, mat=candidate.grasp.mat * signs)
+            key = id(candidate.grasp), side
             if key not in grasped:
                 pregrasp = Pose(grasp.pos_world - _PREGRASP_DISTANCE * grasp.mat[:, 2], grasp.mat)
                 grasped[key] = shapes.arm.follow(start, [pregrasp, Pose(grasp.pos_world, grasp.mat)])

@@ -21,9 +21,9 @@ DRAG_SPEED = 0.6  # factor on the speed
 
 
 class Drag(Skill):
-    """Makes an (On object region-of-the-table) true for an object with a hollow, such as a plate.
+    """Skill that makes an (On object region-of-the-table) true for an object with a hollow, such as a plate.
 
-    Phases: reach, carry, withdraw.
+    Phases: reach, carry, withdraw, rest.
 
     Args:
         atom: Atom to make true.

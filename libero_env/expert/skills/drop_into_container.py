@@ -33,11 +33,11 @@ HAND_ABOVE_RIM = 0.045  # [m] of the grip site, so that the palm stays above the
 
 
 class DropIntoContainer(Skill):
-    """Makes (In object region) true where the region belongs to a movable container, such as a basket.
+    """Skill that makes an (In object region) true where the region belongs to a movable container, such as a basket.
 
     It is shorter and more reliable than `PickPlace` where it applies, and its motion is easy to clone. `PickPlace`
     takes over where it fails. Phases: reach (down a funnel over the grasp), close, carry (up, over and a little down),
-    release. An object that slipped, tipped or fell beside the container is picked again.
+    release, rest. An object that slipped, tipped or fell beside the container is picked again.
 
     Args:
         atom: Atom to make true.
@@ -195,10 +195,8 @@ class DropIntoContainer(Skill):
         """
         now = pose_of(view, self._object)
         if self._plan is None or has_moved(self._plan[1], now):
-            cloud, obstacles = (
-                self.shapes.cloud(view, self._object),
-                self.shapes.obstacles(view, self._object),
-            )
+            cloud = self.shapes.cloud(view, self._object)
+            obstacles = self.shapes.obstacles(view, self._object)
             surface, axis = view.scene.workspace.surface_height, finger_axis(view.eef_mat)
             self._plan = None
             self._plan = choose_top_grasp(cloud, obstacles, surface, axis, self._object), now

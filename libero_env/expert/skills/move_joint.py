@@ -9,7 +9,7 @@ from libero_env.expert.grasping.grasps import GraspError
 from libero_env.expert.grasping.handle_candidates import HandleGrasp
 from libero_env.expert.grasping.handle_grasps import grasp_handle, grasp_knob
 from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
-from libero_env.expert.planning.goal_plan import JointState
+from libero_env.expert.planning.goal_plan import OPPOSITES, JointState
 from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
@@ -17,8 +17,6 @@ from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 from libero_env.timing import CONTROL_HZ
-
-_OPPOSITES = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}
 
 MAX_RETRIES = 5
 ARRIVED, ARRIVED_TURN = 0.008, 0.15  # [m], [rad] from where the fingers close
@@ -35,7 +33,7 @@ MAX_PHASE_STEPS, MAX_MOVE_STEPS = 90, 180  # of one phase, and of moving the par
 
 
 class MoveJoint(Skill):
-    """Brings the joints of a fixture, or of one of its parts, into a state.
+    """Skill that brings the joints of a fixture, or of one of its parts, into a state.
 
     To open, the hand grasps the handle and pulls; to close, closed fingers push; a knob is grasped from above and
     turned. The hand withdraws when the state holds with a margin, and begins again after a slip.
@@ -56,11 +54,8 @@ class MoveJoint(Skill):
         self._failed: list[Pose] = []  # pre-grasps of earlier attempts
         self._obstacles = np.zeros((0, 3))
         self._still_steps = 0
-        self._start_value, self._previous_value, self._target_value = (
-            0.0,
-            0.0,
-            0.0,
-        )  # of the joint, [m] or [rad]
+        # positions of the joint, [m] or [rad]
+        self._start_value, self._previous_value, self._target_value = 0.0, 0.0, 0.0
         self._pulled = False  # a door, as far as it is pulled by its handle
         self._release_pose = Pose(np.zeros(3), np.eye(3))  # where the hand let go
 
@@ -143,7 +138,7 @@ class MoveJoint(Skill):
         assert owner is not None
         ranges = view.scene.entities[owner].articulation
         low, high = sorted(ranges[self.state])
-        opposite = _OPPOSITES[self.state]
+        opposite = OPPOSITES[self.state.capitalize()].lower()
         upwards = opposite not in ranges or low + high > sum(ranges[opposite])
         return (low, high, high - low, 1.0) if upwards else (high, low, high - low, -1.0)
 
@@ -217,20 +212,15 @@ class MoveJoint(Skill):
         left = self._target_value - value
         contact = part.pose(view).to_world(grasp.contact)
         anchor, axis = part.axis(view)
-        radius = (
-            1.0 if part.slides else max(float(np.linalg.norm(np.cross(contact.pos - anchor, axis))), 0.03)
-        )
+        distance = float(np.linalg.norm(np.cross(contact.pos - anchor, axis)))
+        radius = 1.0 if part.slides else max(distance, 0.03)
         speed = np.sign(left) * (value - self._previous_value) * CONTROL_HZ
         self._previous_value = value
         slow = abs(speed) * max(radius, 0.2) < 0.01
         self._still_steps = self._still_steps + 1 if slow and self._steps > 5 else 0
         fully_pulled = self._is_fully_pulled(left)
-        if (
-            self._is_reached(view)
-            and self._is_settled(left, speed, slow)
-            or self._still_steps > 30
-            or fully_pulled
-        ):
+        finished = self._is_reached(view) and self._is_settled(left, speed, slow)
+        if finished or fully_pulled or self._still_steps > 30:
             self._pulled = fully_pulled
             return self._start("release", view)
         if grasp.gripping and np.linalg.norm(view.eef_pos - contact.pos) > MAX_SLIP:

@@ -34,10 +34,10 @@ MAX_PHASE_STEPS = 130
 
 
 class PickPlace(Skill):
-    """Makes an (On object place), (In object region) or (Stack object place) true.
+    """Skill that makes an (On object place), (In object region) or (Stack object place) true.
 
     Phases: reach (down a funnel along the hand's approach), close, carry (up, over, and in along the place's entry),
-    release, withdraw. An object that slipped, tipped or fell beside its place is picked again.
+    release, withdraw, rest. An object that slipped, tipped or fell beside its place is picked again.
 
     Args:
         atom: Atom to make true.
@@ -280,7 +280,7 @@ class PickPlace(Skill):
         lateral_scale: float = 1.0,
         speed_scale: float = 1.0,
     ) -> np.ndarray:
-        """Return the action as `_toward`; a hand that rises is kept over its spot, as one that rotates drifts."""
+        """Return the action of `Skill._toward`, with a rising hand kept over its spot: a hand that rotates drifts."""
         if lateral_scale > MAX_VERTICAL_SCALE or self._rise_xy is None:
             self._rise_xy = view.eef_pos[:2].copy()
         else:

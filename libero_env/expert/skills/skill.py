@@ -1,4 +1,4 @@
-"""The interface of skills, and the bookkeeping that they share."""
+"""The interface of skills, and what they have in common."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ _RESTING_FINGERS = 4e-4  # [m] of finger motion in one step, below which the fin
 
 
 class Skill(ABC):
-    """Acts until an atom of the goal holds.
+    """Base class of skills, which act until an atom of the goal holds.
 
     A skill moves through phases; a method of the same name gives the action of each. It plans when it begins, and
     begins again after a slip.
