@@ -72,12 +72,12 @@ def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, 
     styles_of(own, scene_properties)  # raises where a name is wrong
     chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
     scene = chosen.pop("scene", "base")
-    pictures = {**own, **load_styles()["scene"][scene], **chosen}
+    textures = {**own, **load_styles()["scene"][scene], **chosen}
     assets, world = read_file(scene_file(root, workspace.name, scene))
     for element in assets:
         for kind, name in _TEXTURE_NAMES.items():
             if element.tag == "texture" and element.get("name") == name:
-                element.set("file", str(root / "textures" / TEXTURES[kind][pictures[kind]]))
+                element.set("file", str(root / "textures" / TEXTURES[kind][textures[kind]]))
     for element in list(world):
         if element.tag in _EXCLUDED:
             world.remove(element)

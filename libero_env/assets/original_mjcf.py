@@ -97,9 +97,9 @@ def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Ele
     Raises:
         LiberoError: A required file is missing.
     """
-    wanted = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _REFERENCES}
-    wanted |= {("texture", a.get("texture")) for a in assets if (a.tag, a.get("name")) in wanted}
-    kept = [a for a in assets if (a.tag, a.get("name")) in wanted or a.get("type") == "skybox"]
+    needed = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _REFERENCES}
+    needed |= {("texture", a.get("texture")) for a in assets if (a.tag, a.get("name")) in needed}
+    kept = [a for a in assets if (a.tag, a.get("name")) in needed or a.get("type") == "skybox"]
     for asset in kept:
         if (file := asset.get("file")) and not Path(file).is_file():
             raise LiberoError(f"{file}: no such file; {REMEDY}")

@@ -8,6 +8,11 @@ from libero_env.cli.arguments import Subparsers
 
 def register(commands: Subparsers) -> None:
     """Add the commands `libero tasks new` and `libero tasks preview`."""
+    _register_new(commands)
+    _register_preview(commands)
+
+
+def _register_new(commands: Subparsers) -> None:
     new = commands.add_parser("new", help="write a template of a user-defined task")
     add = new.add_argument
     add("name", help="name of the task; the file is NAME.yaml")
@@ -35,6 +40,9 @@ def register(commands: Subparsers) -> None:
     add("--out", type=Path, default=Path(), help="folder (default: here)")
     add("--bddl", action="store_true", help="also write the BDDL file")
     new.set_defaults(run=run_new)
+
+
+def _register_preview(commands: Subparsers) -> None:
     preview = commands.add_parser(
         "preview", help="pictures of a task's initial states, and a video of the expert"
     )

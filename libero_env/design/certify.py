@@ -216,11 +216,11 @@ def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> lis
     try:
         env, shapes = _environment(task, pack)
         number = np.resize(states, env.num_envs)
-        drawn = task.suite == FILE
+        sampled = task.suite == FILE
         env.reset(
-            seed=number.tolist() if drawn else None,
+            seed=number.tolist() if sampled else None,
             options={"reset_mask": np.arange(env.num_envs) < len(states)}
-            | ({} if drawn else {"init_state": number}),
+            | ({} if sampled else {"init_state": number}),
         )
         seeds = [np.random.SeedSequence([task.index, i]).spawn(2) for i in states]
         experts = [Expert(task, np.random.default_rng(seed), shapes=shapes) for seed, _ in seeds]

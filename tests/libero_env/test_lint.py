@@ -66,7 +66,7 @@ FAULTS = [
     ("Open the top layer of the drawer and put the bowl inside", "put the bowl with the ketchup in the top drawer",
      "instruction", "warning", "names a ketchup, but there is none"),
     ("Open the top layer of the drawer and put the bowl inside", "put the bowl in the bottom drawer",
-     "instruction", "warning", "says bottom, but the goal top"),
+     "instruction", "warning", "names bottom, but the goal top"),
     ("main_table - table", "main_table - table\n    other_table - table", "workspace", "error", "2 workspaces"),
     ("(:init", "(:inti", "syntax", "error", "unknown section ':inti'"),
 ]  # fmt: skip

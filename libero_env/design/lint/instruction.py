@@ -68,12 +68,12 @@ def _check_goal_named(report: Report, problem: Problem, text: str, line: int, so
     for atom in atoms_of(problem.goal):
         for name in atom.args:
             region = problem.region(name)
-            thing = region.target if region is not None else name
-            category = {**problem.objects, **problem.fixtures}.get(thing)
+            entity = region.target if region is not None else name
+            category = {**problem.objects, **problem.fixtures}.get(entity)
             if category is None or category in WORKSPACES:
                 continue
-            said = [*_words_for(category), *(_tokens(region.name) if region is not None else ())]
-            if not any(_same(token, word) for token in said for word in words):
+            known = [*_words_for(category), *(_tokens(region.name) if region is not None else ())]
+            if not any(_same(token, word) for token in known for word in words):
                 what = f"no word of the instruction{source} names {name} of the goal's {spell(atom)}"
                 report.warning(
                     line, "instruction", what, f"name it {' '.join(_tokens(category))}, or fix the goal"
@@ -98,15 +98,15 @@ def _check_scene_has(report: Report, problem: Problem, text: str, line: int, sou
 def _check_sides(report: Report, problem: Problem, text: str, line: int, source: str) -> None:
     """Check that the goal does not require another side than the one that the instruction names."""
     words = _words(text)
-    told = {word for word, after in zip(words, [*words[1:], ""], strict=True) if after in _PARTS}
+    mentioned = {word for word, after in zip(words, [*words[1:], ""], strict=True) if after in _PARTS}
     regions = [
         r for atom in atoms_of(problem.goal) for n in atom.args if (r := problem.region(n)) is not None
     ]
     for sides in _SIDES:
         asked = {token for region in regions for token in _tokens(region.name)} & sides
-        named = told & sides
+        named = mentioned & sides
         if asked and named and not asked & named:
-            what = f"the instruction{source} says {_list(named)}, but the goal {_list(asked)}"
+            what = f"the instruction{source} names {_list(named)}, but the goal {_list(asked)}"
             report.warning(line, "instruction", what, "fix one of them")
 
 

@@ -135,7 +135,7 @@ def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarr
     away = np.linalg.norm(np.concatenate([corners, middle]) - base, axis=1)
     if ((near <= away) & (away <= far)).all():
         return
-    tell = (
+    add = (
         report.info
         if not needed
         else report.error
@@ -145,7 +145,7 @@ def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarr
     x, y = base - np.array(scene.workspace.offset[:2])
     what = f"{region.address} is {away.min():.2f} to {away.max():.2f} m from the robot"
     remedy = f"a hand that points down reaches {near:.2f} to {far:.2f} m from ({x:g}, {y:g}), in the region's frame"
-    tell(report.lines.of(region.address), "out-of-reach", what, remedy)
+    add(report.lines.of(region.address), "out-of-reach", what, remedy)
 
 
 def _corners(region: Region, workspace: Workspace) -> np.ndarray:

@@ -152,10 +152,10 @@ def _check_textures(path: Path) -> None:
             raise LiberoError(
                 f"{path}: its material file {library.name} is missing; put it beside it, or remove the line mtllib"
             )
-        for picture in _referenced_files(library, ("map_Kd",)):
-            if not picture.is_file():
+        for texture in _referenced_files(library, ("map_Kd",)):
+            if not texture.is_file():
                 raise LiberoError(
-                    f"{library}: its texture {picture.name} is missing; put it at {picture}, or remove the line map_Kd"
+                    f"{library}: its texture {texture.name} is missing; put it at {texture}, or remove the line map_Kd"
                 )
 
 

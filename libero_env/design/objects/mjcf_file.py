@@ -166,7 +166,7 @@ def _rename(spec: mujoco.MjSpec, name: str) -> None:
 
 
 def _gather_files(spec: mujoco.MjSpec, name: str, place: Path) -> None:
-    """Copy the meshes and pictures that are used into the folder."""
+    """Copy the meshes and textures in use into the folder."""
     for kind, elements in (("mesh", spec.meshes), ("texture", spec.textures)):
         for element in elements:
             if not element.file:

@@ -38,11 +38,11 @@ def microwave() -> dict[str, Appearance | tuple[Appearance, ...]]:
     glass = Palette({"glass": plain((18, 22, 28))})
     pane = block((-0.1310, -0.1050, 0.0336), (0.0448, -0.0960, 0.1581), glass["glass"])
     door, pane = (in_body(mesh, "microwave", "microdoorroot") for mesh in (_microwave_door(palette), pane))
-    picture = palette.png()
+    texture = palette.png()
     return {
-        "main": Appearance(_microwave_shell(palette), picture, specular=0.5, shininess=0.6, frame="body"),
+        "main": Appearance(_microwave_shell(palette), texture, specular=0.5, shininess=0.6, frame="body"),
         "microdoorroot": (
-            Appearance(door, picture, specular=0.5, shininess=0.6, frame="body"),
+            Appearance(door, texture, specular=0.5, shininess=0.6, frame="body"),
             Appearance(pane, glass.png(), specular=0.9, shininess=0.9, alpha=0.55, frame="body"),
         ),
     }
@@ -61,9 +61,9 @@ def short_fridge() -> dict[str, Appearance]:
     }
     palette = Palette(tiles)
     parts = {"base": _fridge_body(palette), "door": _fridge_door(palette)}
-    picture = palette.png()
+    texture = palette.png()
     return {
-        body: Appearance(in_body(mesh, "short_fridge", body), picture, specular=0.4, frame="body")
+        body: Appearance(in_body(mesh, "short_fridge", body), texture, specular=0.4, frame="body")
         for body, mesh in parts.items()
     }
 
@@ -83,10 +83,10 @@ def flat_stove() -> dict[str, Appearance]:
         "burner_plate": _burner_plate(palette),
         "button": _knob(palette),
     }
-    picture = palette.png()
+    texture = palette.png()
     return {
         body: Appearance(
-            in_body(mesh, "flat_stove", body), picture, specular=0.5, shininess=0.5, frame="body"
+            in_body(mesh, "flat_stove", body), texture, specular=0.5, shininess=0.5, frame="body"
         )
         for body, mesh in parts.items()
     }

@@ -145,9 +145,9 @@ def _add_visual(
     prefix = (category if root else f"{category}_{body.name}") + suffix
     # The category is a prefix of each name: scenes share one namespace for textures and materials.
     # A file in `assets`, not a buffer: MuJoCo cannot write buffers as XML.
-    picture = f"{prefix}.png"
-    spec.assets[picture] = appearance.image
-    texture = spec.add_texture(name=f"{prefix}_texture", type=mujoco.mjtTexture.mjTEXTURE_2D, file=picture)
+    image_file = f"{prefix}.png"
+    spec.assets[image_file] = appearance.image
+    texture = spec.add_texture(name=f"{prefix}_texture", type=mujoco.mjtTexture.mjTEXTURE_2D, file=image_file)
     material = spec.add_material(
         name=f"{prefix}_material",
         specular=appearance.specular,

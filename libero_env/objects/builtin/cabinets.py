@@ -83,9 +83,9 @@ APPEARANCES = {
 def _appearances(
     category: str, palette: Palette, parts: dict[str, Mesh], *, specular: float
 ) -> dict[str, Appearance]:
-    picture = palette.png()
+    texture = palette.png()
     return {
-        body: Appearance(in_body(mesh, category, body), picture, specular=specular, frame="body")
+        body: Appearance(in_body(mesh, category, body), texture, specular=specular, frame="body")
         for body, mesh in parts.items()
     }
 

@@ -8,7 +8,7 @@ from libero_env.objects.builtin.paint import Canvas
 from libero_env.objects.builtin.vessels import FLOOR_V, INNER_V, RIM_V, SPARE, vessel
 
 ACROSS = (1.0, 0.0, 0.0)  # normal of the planes of the handles
-BLACK = (0.0, 0.0, 1.0, 0.03)  # parts of the moka pot's picture, below the metal
+BLACK = (0.0, 0.0, 1.0, 0.03)  # parts of the moka pot's texture, below the metal
 BRASS = (0.0, 0.04, 1.0, 0.06)
 BOTTLE_TOP = 0.1586
 BIN_CENTER = (-0.003, -0.0054)

@@ -21,9 +21,9 @@ def window() -> dict[str, Appearance | tuple[Appearance, ...]]:
         "handle": plain((236, 236, 232)),
     }
     palette, glass = Palette(tiles), Palette({"glass": plain((150, 205, 225))})
-    picture = palette.png()
+    texture = palette.png()
     appearances: dict[str, Appearance | tuple[Appearance, ...]] = {
-        "main": Appearance(_window_frame(palette), picture, specular=0.2, frame="body")
+        "main": Appearance(_window_frame(palette), texture, specular=0.2, frame="body")
     }
     for body, ((x0, x1), y) in SASHES.items():
         sash = _sash(palette, x0, x1, y)
@@ -31,7 +31,7 @@ def window() -> dict[str, Appearance | tuple[Appearance, ...]]:
             sash = merge([sash, *_window_handle(palette)])
         pane = block((x0 + 0.008, y - 0.0030, -0.066), (x1 - 0.008, y - 0.0020, 0.066), glass["glass"])
         appearances[body] = (
-            Appearance(in_body(sash, "window", body), picture, specular=0.2, frame="body"),
+            Appearance(in_body(sash, "window", body), texture, specular=0.2, frame="body"),
             Appearance(
                 in_body(pane, "window", body),
                 glass.png(),
@@ -49,7 +49,7 @@ def faucet() -> dict[str, Appearance]:
     palette = Palette(
         {"chrome": chrome((206, 210, 218)), "red": plain((190, 30, 28)), "dark": plain((58, 60, 66))}
     )
-    steel, picture = palette["chrome"], palette.png()
+    steel, texture = palette["chrome"], palette.png()
     pillar = [
         (0.0, 0.0445),
         (0.0015, 0.0455),
@@ -68,10 +68,10 @@ def faucet() -> dict[str, Appearance]:
     )
     return {
         "main": Appearance(
-            turned([*pillar, (0.106, 0.0170)], steel, segments=20), picture, specular=0.8, frame="body"
+            turned([*pillar, (0.106, 0.0170)], steel, segments=20), texture, specular=0.8, frame="body"
         ),
         "faucet_link2": Appearance(
-            in_body(lever, "faucet", "faucet_link2"), picture, specular=0.7, frame="body"
+            in_body(lever, "faucet", "faucet_link2"), texture, specular=0.7, frame="body"
         ),
     }
 
@@ -86,7 +86,7 @@ def basin_faucet() -> dict[str, Appearance]:
             "red": plain((200, 44, 40)),
         }
     )
-    steel, hole, picture = palette["steel"], palette["hole"], palette.png()
+    steel, hole, texture = palette["steel"], palette["hole"], palette.png()
     stand = merge(
         [
             block((0.0141, -0.0212, -0.0541), (0.0568, 0.0212, -0.0486), steel, bevel=0.0015),
@@ -105,7 +105,7 @@ def basin_faucet() -> dict[str, Appearance]:
     )
     parts = {"base": stand, "movable": lever}
     return {
-        body: Appearance(mesh, picture, specular=0.8, shininess=0.7, frame="body")
+        body: Appearance(mesh, texture, specular=0.8, shininess=0.7, frame="body")
         for body, mesh in parts.items()
     }
 

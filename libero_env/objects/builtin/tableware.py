@@ -153,7 +153,7 @@ APPEARANCES = {
     "white_bowl": white_bowl,
 }
 
-STEEL = (0.0, 0.0, 1.0, 0.02)  # part of the cutlery's picture
+STEEL = (0.0, 0.0, 1.0, 0.02)  # part of the cutlery's texture
 _FACES = ("front", "back", "left", "right", "top", "bottom")
 _HANDLE = [(0.050, 0.0008), (0.030, 0.0016), (0.010, 0.0024), (-0.012, 0.0032), (-0.030, 0.0032)]
 _HANDLE_WIDTH = [0.0040, 0.0046, 0.0034, 0.0018, 0.0018]

@@ -13,7 +13,7 @@ RIM_V, INNER_V, FLOOR_V = (
     0.46,
     0.90,
 )  # v in the texture: outside up to RIM_V, then inside
-SPARE = (0.0, 0.94, 1.0, 0.99)  # part of the picture that the vessel itself does not show
+SPARE = (0.0, 0.94, 1.0, 0.99)  # part of the texture that the vessel itself does not show
 CREASE = np.radians(50.0)  # [rad] angle from which an edge of the profile is sharp
 
 
