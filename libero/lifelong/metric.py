@@ -5,8 +5,8 @@ Rollouts are those of `lifelong.evaluation.rollout`: many simulations at once in
 Shape legend: B episodes, C H W image, D dimension of a proprioceptive input, L language embedding.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -185,11 +185,9 @@ def mean_loss(algo: Any, dataset: Dataset, batch_size: int, num_workers: int) ->
     return float(np.mean([algo.eval_observe(data) for data in loader]))
 
 
-@contextmanager
-def acting(algo: Any, task_id: int) -> Iterator[Any]:
-    """Use, within the context, the weights that an algorithm acts with on a task."""
-    with algo.acting_on(task_id) if hasattr(algo, "acting_on") else nullcontext(algo) as actor:
-        yield actor
+def acting(algo: Any, task_id: int) -> AbstractContextManager[Any]:
+    """Return a context in which an algorithm has the weights that it acts with on a task."""
+    return algo.acting_on(task_id) if hasattr(algo, "acting_on") else nullcontext(algo)
 
 
 def native_task(task: Any, bddl_folder: str | None) -> Task:
@@ -225,15 +223,7 @@ class _PolicyActor:
 
 
 class _EvalEnv(BatchEnv):
-    """Simulations of a task that begin in the configured states.
-
-    Args:
-        cfg: Configuration.
-        task: Task of a benchmark.
-        num_envs: Number of simulations.
-        sim_states: One list for each simulation, to which [time, qpos, qvel] is appended at each step.
-        on_step: Function of the observations and of which episodes are over, called after each step.
-    """
+    """Simulations of a task that begin in the configured states; see `rollouts` for `sim_states` and `on_step`."""
 
     def __init__(self, cfg: Any, task: Any, num_envs: int, sim_states: list | None, on_step: Any):
         super().__init__(

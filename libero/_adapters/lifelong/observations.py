@@ -21,12 +21,7 @@ PROPRIO = {"use_joint": ("joint_states", 7), "use_gripper": ("gripper_states", 2
 
 
 def policy_spec(cfg: Any, shape_meta: Mapping[str, Any], history: int) -> PolicySpec:
-    """Return the spec of a policy.
-
-    Args:
-        cfg: Configuration; `data.use_*` select the inputs.
-        shape_meta: Shapes from `get_dataset`.
-        history: Number of frames that the policy keeps when it acts.
+    """Return the spec of a policy that keeps `history` frames when it acts; `data.use_*` select its inputs.
 
     Raises:
         PolicyError: There is a depth image, or images differ in size.
@@ -51,7 +46,7 @@ def policy_spec(cfg: Any, shape_meta: Mapping[str, Any], history: int) -> Policy
 
 
 def to_native(obs: Mapping[str, Tensor], task_emb: Tensor, spec: PolicySpec) -> Observation:
-    """Convert the original's dictionary to an `Observation`; images are rounded to 256 levels.
+    """Convert the original's dictionary to an `Observation`, with images rounded to 256 levels.
 
     Args:
         obs: View -> (B, T, C, H, W), proprioceptive input -> (B, T, D).

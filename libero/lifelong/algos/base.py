@@ -24,7 +24,7 @@ from libero.lifelong.utils import (
 )
 from lifelong import algorithms
 from lifelong.seeding import generator
-from lifelong.training.fit import fit
+from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 
@@ -37,11 +37,7 @@ def register_algo(algo_class: type["Sequential"]) -> None:
 
 
 def get_algo_class(algo_name: str) -> type["Sequential"]:
-    """Return the algorithm of a name, ignoring case.
-
-    Raises:
-        UnknownNameError: There is no algorithm of this name.
-    """
+    """Return the algorithm of a name, ignoring case; raise an UnknownNameError if there is none."""
     return lookup(REGISTERED_ALGOS, "algorithm", algo_name)
 
 
@@ -259,12 +255,11 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
             text = "" if success is None else f" | success {success:4.2f}"
             print(f"[info] epoch {epoch:3d} | loss {loss:7.3f}{text}", flush=True)
 
-        def end_epoch(end: Any) -> None:
-            if not end.epoch:
-                return
-            if self.scheduler is not None:
+        def end_epoch(end: EpochEnd) -> None:
+            if end.epoch and self.scheduler is not None:
                 self.scheduler.step()
-            evaluate(end.epoch, end.loss)
+            if end.epoch:
+                evaluate(end.epoch, end.loss)
 
         def step(batch: Any, draws: torch.Generator, _: float) -> tuple[Tensor, Tensor]:
             self.draws = draws
@@ -290,10 +285,6 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
 
 
 def _torch_class(name: str, module: Any) -> Callable[..., Any]:
-    """Return a class of a module of torch by the last part of its name.
-
-    Raises:
-        UnknownNameError: There is no class of this name.
-    """
+    """Return a class of a module of torch by the last part of its name; raise an UnknownNameError if there is none."""
     classes = {k: value for k, value in vars(module).items() if isinstance(value, type) and k[0].isupper()}
     return lookup(classes, module.__name__, name.rpartition(".")[2])

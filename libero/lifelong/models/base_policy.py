@@ -23,11 +23,7 @@ def register_policy(policy_class: type["BasePolicy"]) -> None:
 
 
 def get_policy_class(policy_name: str) -> type["BasePolicy"]:
-    """Return the policy of a name, ignoring case.
-
-    Raises:
-        UnknownNameError: There is no policy of this name.
-    """
+    """Return the policy of a name, ignoring case; raise an UnknownNameError if there is none."""
     return lookup(REGISTERED_POLICIES, "policy", policy_name)
 
 

@@ -30,19 +30,8 @@ class _Head(nn.Module):
 class GMMHead(_Head):
     """Mixture of K Gaussians over actions, with means squashed by tanh; see `lifelong.nn.heads.GMMHead`.
 
-    Args:
-        input_size: E.
-        output_size: A.
-        hidden_size: Size of the hidden layers.
-        num_layers: Number of hidden layers.
-        min_std: Smallest standard deviation.
-        num_modes: K.
-        activation: Activation of the deviations: `softplus`, the only one.
-        low_eval_noise: Whether deviations are `min_std` in evaluation mode.
-        loss_coef: Factor of the loss.
-
-    Raises:
-        PolicyError: Another activation.
+    `input_size` is E, `output_size` A, `num_modes` K. Standard deviations are at least `min_std`, and equal to it in
+    evaluation mode with `low_eval_noise`; their activation must be `softplus`. `loss_coef` is a factor of the loss.
     """
 
     def __init__(

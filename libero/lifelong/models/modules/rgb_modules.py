@@ -105,16 +105,9 @@ class ResnetEncoder(nn.Module):
 
 
 class PatchEncoder(nn.Module):
-    """Strided convolution and one linear map for each patch of it; see `lifelong.nn.patches.PatchEncoder`.
+    """Strided convolution and one linear map for each patch of its output; see `lifelong.nn.patches.PatchEncoder`.
 
-    Args:
-        input_shape: C, H, W.
-        patch_size: Equal sides of a patch, in cells of the convolution's output.
-        embed_size: E.
-        more: Other arguments of the network.
-
-    Raises:
-        PolicyError: Patches do not tile the image.
+    `patch_size` has two equal sides, in cells of the convolution's output. `more` are other arguments of the network.
     """
 
     def __init__(
