@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, default_collate, random_split
-from torch.utils.flop_counter import FlopCounterMode
 
 from libero._adapters.lifelong.config import Config, assign, plain
 from libero_env.paths import cache_dir
@@ -19,6 +18,7 @@ from libero_env.storage import atomic_path
 from lifelong.errors import CheckpointError
 from lifelong.language import embed
 from lifelong.results.metrics import wilson_interval
+from lifelong.training.costs import count_flops
 
 
 def control_seed(seed: int) -> None:
@@ -106,7 +106,7 @@ def compute_flops(algo: Any, dataset: Dataset, cfg: Any) -> tuple[float, float]:
     """Return the floating-point operations of one forward pass on a window, [1e9], and the parameters, [1e6]."""
     policy = copy.deepcopy(algo.policy).eval()
     window = algo.map_tensor_to_device(default_collate([dataset[0]]))
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+    with torch.no_grad(), count_flops() as counter:
         policy(policy.preprocess_input(window, train_mode=True))
     parameters = sum(p.numel() for p in policy.parameters())
     gflops, mparams = counter.get_total_flops() / 1e9, parameters / 1e6

@@ -38,7 +38,7 @@ TINY_TRANSFORMER = (
 
 
 class TwoTasks(Benchmark):
-    """The first two tasks of a suite, as users cut one down."""
+    """The first two tasks of a suite, as users shorten one."""
 
     def __init__(self, task_order_index: int = 0):
         super().__init__(task_order_index)
@@ -46,12 +46,12 @@ class TwoTasks(Benchmark):
 
 
 def tiny(*overrides: str) -> Config:
-    """A configuration that trains in a second."""
+    """Return a configuration that trains in a second."""
     return load_config(*TINY, *TINY_TRANSFORMER, *overrides)
 
 
 def write_demos(path: Path, lengths: tuple[int, ...] = (5, 4), seed: int = 0) -> Path:
-    """Demonstrations of noise with these lengths."""
+    """Write demonstrations of noise with the given lengths."""
     rng = np.random.default_rng(seed)
     writer = DemoWriter(path, {"pairing": "aligned"}, compression=None)
     for index, steps in enumerate(lengths):
@@ -69,7 +69,7 @@ def write_demos(path: Path, lengths: tuple[int, ...] = (5, 4), seed: int = 0) ->
 
 
 def windows(path: Path, cfg: Config, seed: int = 0) -> SequenceVLDataset:
-    """The windows of a file with an instruction; `cfg` learns its shapes."""
+    """Return the windows of a file with an instruction; `cfg` receives its shapes."""
     dataset, cfg.shape_meta = get_dataset(path, cfg.data.obs.modality, seq_len=cfg.data.seq_len)
     cfg.policy.language_encoder.network_kwargs.input_size = LANGUAGE
     return SequenceVLDataset(dataset, torch.randn(LANGUAGE, generator=torch.Generator().manual_seed(seed)))

@@ -1,4 +1,4 @@
-"""The facade's learning side: every public name of the original is there and does what it is for."""
+"""The facade's learning side: every public name of the original exists and works."""
 
 import importlib
 import json
@@ -69,7 +69,7 @@ def file(tmp_path_factory):
     return write_demos(tmp_path_factory.mktemp("demos") / "task_demo.hdf5")
 
 
-def test_windows_are_the_files_frames(file):
+def test_windows_hold_the_frames_of_the_file(file):
     dataset, shape_meta = get_dataset(file, MODALITY, seq_len=3)
     assert (len(dataset), dataset.n_demos, dataset.total_num_sequences) == (9, 2, 9)
     assert shape_meta["ac_dim"] == 7 and shape_meta["use_images"]
@@ -79,12 +79,12 @@ def test_windows_are_the_files_frames(file):
     with h5py.File(file) as stored:
         demo = stored["data/demo_0"]
         image, joints, actions = (demo[k][()] for k in ("obs/agentview_rgb", "obs/joint_states", "actions"))
-    wanted = [3, 4, 4]
+    frames = [3, 4, 4]
     seen = (window["obs"]["agentview_rgb"] * 255).round().to(torch.uint8)
     assert window["obs"]["agentview_rgb"].dtype == torch.float32
-    assert (seen.permute(0, 2, 3, 1).numpy() == image[wanted]).all(), "as stored, lowest row first"
-    assert np.allclose(window["obs"]["joint_states"], joints[wanted], atol=1e-6)
-    assert np.allclose(window["actions"], actions[wanted], atol=1e-6)
+    assert (seen.permute(0, 2, 3, 1).numpy() == image[frames]).all(), "as stored, bottom row first"
+    assert np.allclose(window["obs"]["joint_states"], joints[frames], atol=1e-6)
+    assert np.allclose(window["actions"], actions[frames], atol=1e-6)
     assert {k: tuple(v.shape) for k, v in window["obs"].items()} == {
         "agentview_rgb": (3, 3, SIZE, SIZE),
         "eye_in_hand_rgb": (3, 3, SIZE, SIZE),
@@ -93,7 +93,7 @@ def test_windows_are_the_files_frames(file):
     }
 
 
-def test_frames_may_be_stacked(file):
+def test_frame_stack_adds_earlier_frames(file):
     dataset, _ = get_dataset(file, ["rgb", "low_dim"], seq_len=2, frame_stack=3)
     window, plain = dataset[6], get_dataset(file, ["rgb", "low_dim"], seq_len=2)[0]
     joints = window["obs"]["joint_states"]
@@ -103,7 +103,7 @@ def test_frames_may_be_stacked(file):
     assert (joints[2:] == plain[6]["obs"]["joint_states"]).all()
 
 
-def test_a_subset_of_the_demonstrations(file, tmp_path):
+def test_filter_key_selects_demonstrations(file, tmp_path):
     path = tmp_path / "masked.hdf5"
     path.write_bytes(file.read_bytes())
     with h5py.File(path, "a") as stored:
@@ -114,24 +114,26 @@ def test_a_subset_of_the_demonstrations(file, tmp_path):
         get_dataset(path, MODALITY, filter_key="train")
 
 
-def test_wrong_demonstrations_are_refused(file, tmp_path):
+def test_invalid_demonstrations_raise(file, tmp_path):
     with pytest.raises(LiberoError, match="libero demos generate"):
         get_dataset(tmp_path / "absent.hdf5", MODALITY)
     with pytest.raises(LiberoError, match="frontview_rgb missing.*agentview_rgb"):
         get_dataset(file, {"rgb": ["frontview_rgb"], "low_dim": []})
 
 
-def test_instructions_groups_and_parts(file):
+def test_datasets_with_instructions_grouped_and_truncated(file):
     dataset, _ = get_dataset(file, MODALITY, seq_len=2)
     embs = torch.randn(2, LANGUAGE)
-    told = SequenceVLDataset(dataset, embs[0])
-    assert (told.n_demos, told.total_num_sequences, len(told)) == (2, 9, 9)
-    assert (told[1]["task_emb"] == embs[0]).all() and (told[1]["actions"] == dataset[1]["actions"]).all()
+    instructed = SequenceVLDataset(dataset, embs[0])
+    assert (instructed.n_demos, instructed.total_num_sequences, len(instructed)) == (2, 9, 9)
+    assert (instructed[1]["task_emb"] == embs[0]).all() and (
+        instructed[1]["actions"] == dataset[1]["actions"]
+    ).all()
     assert "task_emb" not in dataset[1]
     group = GroupedTaskDataset([dataset, dataset], embs)
     assert (len(group), group.n_demos, group.total_num_sequences) == (18, 4, 18)
     assert (group[10]["task_emb"] == embs[1]).all() and (group[10]["actions"] == dataset[1]["actions"]).all()
-    few = TruncatedSequenceDataset(told, 3)
+    few = TruncatedSequenceDataset(instructed, 3)
     assert [tuple(b["actions"].shape) for b in DataLoader(few, batch_size=2)] == [(2, 2, 7), (1, 2, 7)]
     with pytest.raises(IndexError):
         few[3]
@@ -168,7 +170,7 @@ def test_checkpoints_hold_data_only(tmp_path):
             utils.torch_load_model(broken)
 
 
-def test_json_of_numbers():
+def test_json_encoder_of_arrays():
     value = {"a": np.arange(2), "b": np.float32(0.5), "c": torch.ones(1), "d": np.bool_(True)}
     assert json.loads(json.dumps(value, cls=utils.NpEncoder)) == {
         "a": [0, 1],
@@ -180,7 +182,7 @@ def test_json_of_numbers():
         json.dumps(object(), cls=utils.NpEncoder)
 
 
-def test_loaders_part_a_dataset(file):
+def test_loaders_split_a_dataset(file):
     dataset, _ = get_dataset(file, MODALITY)
     train, test = utils.get_train_test_loader(dataset, 0.7, 2, 3)
     parts = [
@@ -189,7 +191,7 @@ def test_loaders_part_a_dataset(file):
     assert [len(p) for p in parts] == [6, 3] and not parts[0] & parts[1]
 
 
-def test_intervals_have_width():
+def test_confidence_intervals_are_wider_than_zero():
     assert utils.confidence_interval(0.5, 100) == pytest.approx(1.96 * 0.05, abs=0.002)
     assert utils.confidence_interval(0.0, 20) == pytest.approx(utils.confidence_interval(1.0, 20))
     assert utils.confidence_interval(0.0, 20) > 0.05
@@ -207,7 +209,7 @@ def test_task_embeddings():
         utils.get_task_embs(cfg, ["a"])
 
 
-def test_experiments_are_numbered(tmp_path, monkeypatch):
+def test_experiment_folders_are_numbered(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cfg = tiny("lifelong=er", "seed=7")
     assert (

@@ -1,4 +1,4 @@
-"""The original's algorithms, and classes that users derive from them. Success is given, so nothing is simulated."""
+"""The original's algorithms, and users' subclasses. Success rates are given, so nothing is simulated."""
 
 import copy
 
@@ -28,7 +28,7 @@ GROUPS = ("base", "single_task", "er", "agem", "ewc", "packnet")
 
 
 class Tasks:
-    """As much of a benchmark as learning asks for."""
+    """The part of a benchmark that learning uses."""
 
     n_tasks = 2
     task_embs = (None, None)
@@ -47,7 +47,7 @@ def workplace(tmp_path, monkeypatch):
 
 @pytest.fixture
 def succeed(monkeypatch):
-    """Successes to be told, one after the other; the calls that asked for them."""
+    """Return a function that sets the success rates of the next evaluations, and records the calls."""
     asked = []
 
     def give(*rates):
@@ -91,8 +91,8 @@ def test_registry():
         algos.get_algo_class("lwf2")
 
 
-def test_a_step_is_the_optimisers(files):
-    """observe is AdamW on the clipped gradient of the loss."""
+def test_observe_is_one_step_of_the_optimiser(files):
+    """The step is AdamW on the clipped gradient of the scaled loss."""
     algo, data, cfg = learner(
         files, "base", "train.grad_clip=0.1", "policy.transformer_dropout=0", "train.loss_scale=3"
     )
@@ -110,7 +110,7 @@ def test_a_step_is_the_optimisers(files):
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_two_tasks(group, files, succeed, capsys):
-    """Every algorithm learns two tasks, keeps the best epoch, and leaves what the original leaves."""
+    """Every algorithm learns two tasks, keeps the best epoch, and writes the original's files."""
     asked = succeed(*[0.0, 0.5, 1.0, 0.5] * 4)
     post = ("lifelong.post_prune_epochs=1", "lifelong.post_eval_every=1") if group == "packnet" else ()
     algo, data, cfg = learner(files, group, "train.n_epochs=3", *post)
@@ -147,7 +147,22 @@ def test_the_same_seed_gives_the_same_weights(files, succeed):
     assert same == [True, False]
 
 
-def test_er_rehearses_a_sample_of_each_task(files, succeed, monkeypatch):
+def test_windows_are_read_ahead_by_workers(files, succeed):
+    """Worker processes read the same batches, and every window is observed once in an epoch."""
+    succeed(*[0.0, 1.0] * 3)
+    results, seen = [], []
+    for workers in (0, 1):
+        algo, data, cfg = learner(files, "base", f"train.num_workers={workers}", "train.batch_size=3")
+        seen.clear()
+        observe = algo.observe
+        algo.observe = lambda batch, observe=observe: seen.extend(batch["actions"]) or observe(batch)
+        algo.learn_one_task(data[0], 0, Tasks(), {})
+        results.append(weights(algo))
+        assert sorted(x.sum().item() for x in seen) == sorted(w["actions"].sum().item() for w in data[0])
+    assert all(torch.equal(results[0][n], p) for n, p in results[1].items())
+
+
+def test_er_replays_a_sample_of_each_task(files, succeed, monkeypatch):
     succeed(*[0.0, 1.0] * 9)
     algo, data, _ = learner(files, "er", "lifelong.n_memories=3")
     algo.learn_one_task(data[0], 0, Tasks(), {})
@@ -163,7 +178,7 @@ def test_er_rehearses_a_sample_of_each_task(files, succeed, monkeypatch):
     assert algo.hooks.memory.shares == {0: 3, 1: 3}
 
 
-def test_ewc_pulls_back_and_agem_projects(files, succeed):
+def test_ewc_penalises_and_agem_projects(files, succeed):
     succeed(*[0.0, 1.0] * 9)
     algo, data, _ = learner(files, "ewc", "lifelong.e_lambda=7")
     algo.learn_one_task(data[0], 0, Tasks(), {})
@@ -179,7 +194,7 @@ def test_ewc_pulls_back_and_agem_projects(files, succeed):
     assert any(not torch.equal(before[n], p) for n, p in algo.policy.named_parameters())
 
 
-def test_packnet_forgets_nothing(files, succeed):
+def test_packnet_does_not_change_earlier_tasks(files, succeed):
     succeed(*[0.0, 1.0] * 9)
     algo, data, cfg = learner(files, "packnet", "lifelong.post_prune_epochs=1", "lifelong.post_eval_every=1")
     algo.learn_one_task(data[0], 0, Tasks(), {})
@@ -201,7 +216,7 @@ def test_packnet_forgets_nothing(files, succeed):
     assert torch.equal(means(fresh.get_eval_algo(0)), first), "and out of a checkpoint"
 
 
-def test_single_task_keeps_a_policy_for_each(files, succeed):
+def test_single_task_keeps_one_policy_for_each_task(files, succeed):
     succeed(*[0.0, 1.0] * 9)
     algo, data, _ = learner(files, "single_task")
     algo.learn_one_task(data[0], 0, Tasks(), {})
@@ -223,7 +238,7 @@ def test_multitask_learns_all_at_once(files, monkeypatch):
     assert all(torch.equal(best[n], kept[n]) for n in best)
 
 
-def test_schedules_and_optimisers_are_torchs(files):
+def test_schedulers_and_optimisers_are_torchs(files):
     algo, _, _ = learner(
         files,
         "base",
@@ -239,11 +254,11 @@ def test_schedules_and_optimisers_are_torchs(files):
         learner(files, "base", "train.optimizer.name=os.system")
 
 
-# --- what users derive
+# --- users' subclasses
 
 
 class MyTransformerPolicy(BasePolicy):
-    """A policy put together from the parts, as the original's guide to algorithms does."""
+    """A policy assembled from the modules, as in the original's guide to algorithms."""
 
     def __init__(self, cfg, shape_meta):
         super().__init__(cfg, shape_meta)
@@ -316,7 +331,7 @@ class MyTransformerPolicy(BasePolicy):
 
 
 class MyLifelongAlgo(algos.Sequential):
-    """Sees every batch and every task's end."""
+    """Records every loss and the end of every task."""
 
     def __init__(self, n_tasks, cfg, **policy_kwargs):
         super().__init__(n_tasks=n_tasks, cfg=cfg, **policy_kwargs)
@@ -331,7 +346,7 @@ class MyLifelongAlgo(algos.Sequential):
         self.datasets.append(dataset)
 
 
-def test_an_algorithm_and_a_policy_of_ones_own(files, succeed):
+def test_a_user_defined_algorithm_and_policy(files, succeed):
     succeed(*[0.0, 1.0] * 9)
     assert algos.get_algo_class("MyLifelongAlgo") is MyLifelongAlgo
     assert get_policy_class("MyTransformerPolicy") is MyTransformerPolicy
@@ -351,7 +366,7 @@ def test_an_algorithm_and_a_policy_of_ones_own(files, succeed):
 
 
 class CustomLifelongAlgorithm(algos.Sequential):
-    """A loop of one's own with replay and EWC, as a teacher of the original writes it."""
+    """A user-defined training loop with replay and EWC, as in a course on the original."""
 
     def __init__(self, n_tasks, **kwargs):
         super().__init__(n_tasks, **kwargs)
@@ -382,7 +397,7 @@ class CustomLifelongAlgorithm(algos.Sequential):
         )
 
 
-def test_a_loop_of_ones_own(files):
+def test_a_user_defined_training_loop(files):
     _, data, cfg = learner(files)
     algorithm = CustomLifelongAlgorithm(2, cfg=cfg)
     for task_id in range(2):
@@ -392,8 +407,8 @@ def test_a_loop_of_ones_own(files):
     assert algorithm.n_tasks == 2 and len(algorithm.replay_buffer) == 4
 
 
-def test_configurations_of_other_kinds(files, succeed):
-    """Hydra's own, as composed, and plain attribute dictionaries do as well."""
+def test_other_kinds_of_configurations(files, succeed):
+    """Hydra's configurations, closed to new keys, are accepted too."""
     succeed(*[0.0, 1.0] * 9)
     _, data, cfg = learner(files)
     composed = OmegaConf.create(plain(cfg))

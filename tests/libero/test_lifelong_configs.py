@@ -1,4 +1,4 @@
-"""The original's configuration: every file composes and binds, and every key is read or said to have no effect."""
+"""The original's configuration: every file composes and binds, and every key is read or listed as without effect."""
 
 import ast
 import inspect
@@ -59,7 +59,7 @@ def leaves(node, path=""):
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_every_key_is_read_or_explained(group):
+def test_every_key_is_read_or_listed(group):
     known = words()
     for file in (CONFIGS / group).glob("*.yaml"):
         config = load_config(f"{group}={file.stem}")
@@ -68,7 +68,7 @@ def test_every_key_is_read_or_explained(group):
             assert path in NO_EFFECT or mapped or key in known, f"{file}: {path} is read nowhere"
 
 
-def test_keys_without_effect_exist_and_are_told():
+def test_keys_without_effect_exist_and_are_reported():
     composed = load_config()
     paths = {path for path, _ in leaves(composed)}
     assert set(NO_EFFECT) <= paths
@@ -78,7 +78,7 @@ def test_keys_without_effect_exist_and_are_told():
 
 
 @pytest.mark.parametrize("file", PARTS, ids=str)
-def test_parts_bind(file):
+def test_modules_bind(file):
     node = yaml.safe_load((CONFIGS / "policy" / file).read_text())
     inspect.signature(NETWORKS[node["network"]]).bind_partial(
         **node["network_kwargs"], **node.get("loss_kwargs", {})
@@ -92,7 +92,7 @@ def test_names_are_of_classes():
         assert get_policy_class(yaml.safe_load(file.read_text())["policy_type"])
 
 
-def test_composed_as_the_guides_do():
+def test_composition_as_in_the_guides():
     hydra.core.global_hydra.GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         hydra_cfg = compose(config_name="config", overrides=["+reproduce_experiment=default_experiment"])
@@ -117,7 +117,7 @@ def test_attributes_are_keys():
     assert composed.new == "x"
 
 
-def test_hydras_state_is_as_before():
+def test_hydras_state_is_restored():
     hydra.core.global_hydra.GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         load_config("lifelong=er")

@@ -1,4 +1,4 @@
-"""The original's policies and their parts: sizes, learning, acting, and what they refuse."""
+"""The original's policies and their modules: sizes, learning, acting, and errors."""
 
 import copy
 
@@ -69,11 +69,11 @@ SMALL = {
 
 
 def small(group: str, file, *overrides: str):
-    """A policy with few weights, and windows for it."""
+    """Return a policy with few weights, and a batch of windows for it."""
     skip = ("policy.transformer", "policy.embed") if group == "bc_rnn_policy" else ()
     skip += ("policy.image_encoder",) if group == "bc_vilt_policy" else ()
-    wanted = [o for o in (*TINY, *TINY_TRANSFORMER) if not o.startswith(skip or ("-",))]
-    cfg = load_config(f"policy={group}", *wanted, *SMALL[group], *overrides)
+    chosen = [o for o in (*TINY, *TINY_TRANSFORMER) if not o.startswith(skip or ("-",))]
+    cfg = load_config(f"policy={group}", *chosen, *SMALL[group], *overrides)
     dataset = windows(file, cfg)
     torch.manual_seed(0)
     return models.get_policy_class(cfg.policy.policy_type)(cfg, cfg.shape_meta), next(
@@ -110,7 +110,7 @@ def _leaves(node):
 
 
 @pytest.mark.parametrize("group", SMALL)
-def test_acting_sees_what_training_saw(group, file):
+def test_acting_and_training_compute_the_same(group, file):
     """The distribution at the third of three frames that come one by one is that of the window's last step."""
     policy, batch = small(group, file)
     policy.eval()
@@ -126,7 +126,7 @@ def test_acting_sees_what_training_saw(group, file):
     assert torch.allclose(seen[-1].mean, whole.mean[:, -1], atol=1e-5)
 
 
-def test_the_rnn_carries_its_state_and_empties_it(file):
+def test_the_rnn_carries_its_state_and_resets_it(file):
     policy, batch = small("bc_rnn_policy", file)
     frame = {"obs": {k: v[:, 0] for k, v in batch["obs"].items()}, "task_emb": batch["task_emb"]}
     ages = []
@@ -140,7 +140,7 @@ def test_the_rnn_carries_its_state_and_empties_it(file):
 
 
 def test_weights_are_the_native_networks(file):
-    """A native checkpoint fits, and upright bytes there are the same pictures as floats upside down here."""
+    """A native checkpoint fits, and its upright uint8 images are the facade's flipped floats."""
     policy, batch = small("bc_transformer_policy", file)
     policy.eval()
     native = copy.deepcopy(policy.network)
@@ -182,7 +182,7 @@ def test_configured_variants(file):
         (["policy.color_aug.network=Blur"], "BatchWiseImgColorJitterAug"),
     ],
 )
-def test_what_cannot_be_followed_is_refused(overrides, message, file):
+def test_unsupported_configurations_raise(overrides, message, file):
     with pytest.raises(LiberoError, match=message):
         small("bc_transformer_policy", file, *overrides)
 
@@ -212,14 +212,14 @@ class OnePatch(nn.Module):
         return value[..., None].expand(*value.shape, 7)
 
 
-def test_perturbation_attention_finds_what_is_looked_at():
+def test_perturbation_attention_finds_the_patch_that_matters():
     obs = {"agentview_rgb": torch.rand(2, 3, 32, 32), "eye_in_hand_rgb": torch.rand(2, 3, 32, 32)}
     obs["agentview_rgb"][..., 8:16, 0:8] = 1.0
     found = bc_transformer_policy.PerturbationAttention(OnePatch(), (32, 32), (4, 4))({"obs": obs})
     heat = found["agentview_rgb"]
     assert heat.shape == (2, 32, 32) and not found["eye_in_hand_rgb"].any()
     places = [np.unravel_index(one.argmax(), one.shape) for one in heat]
-    assert all(4 <= y < 20 and x < 12 for y, x in places), "rows count from the lowest"
+    assert all(4 <= y < 20 and x < 12 for y, x in places), "rows count from the bottom"
     assert heat[:, 8:16, :8].min() > 0 and not heat[:, 26:].any() and not heat[:, :, 20:].any()
 
 

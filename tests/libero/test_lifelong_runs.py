@@ -1,4 +1,4 @@
-"""Whole runs of the original's configuration: from demonstrations to checkpoints, results, and their evaluation."""
+"""Whole runs of the original's configuration: from demonstrations to checkpoints, results and their evaluation."""
 
 import os
 import re
@@ -55,7 +55,7 @@ def config(folder: Path, *overrides: str):
     return tiny(*SMALL, f"folder={folder}", "benchmark_name=two_tasks", *overrides)
 
 
-def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
+def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
     path = run(
         config(folder, "lifelong=packnet", "lifelong.post_prune_epochs=1", "eval.save_sim_states=true")
     )
@@ -68,7 +68,7 @@ def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
         "S_fwd": (2,),
     }
     assert (result["L_conf_mat"] != 0).tolist() == [[True, False], [True, True]]
-    assert (result["S_conf_mat"] == 0).all(), "nobody succeeds in four steps"
+    assert (result["S_conf_mat"] == 0).all(), "no policy succeeds in four steps"
     for key in ("k1_p0", "k0_e1"):
         ((*states,),) = result[key]
         assert len(states) == metric.SETTLE_STEPS + 4 and states[0].shape == states[-1].shape
@@ -100,7 +100,7 @@ def test_a_run_and_the_evaluation_of_what_it_leaves(folder, capsys):
     assert "task0_model.pth, task1_model.pth" in capsys.readouterr().err
 
 
-def test_an_interrupted_run_goes_on_to_the_same_weights(folder):
+def test_an_interrupted_run_resumes_to_the_same_weights(folder):
     whole = run(config(folder, "lifelong=er", "eval.eval=false"))
     first = run(config(folder, "lifelong=er", "eval.eval=false"))
     for name in ("task1_state.safetensors", "task1_model.pth"):
@@ -118,8 +118,8 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(folder):
     assert all(torch.equal(kept[n], p) for n, p in states[0]["policy"].items())
 
 
-def test_demonstrations_that_are_not_there_are_recorded(folder, monkeypatch, capsys):
-    """The expert is asked for what the configuration needs; here it has noise at hand."""
+def test_missing_demonstrations_are_generated(folder, monkeypatch, capsys):
+    """The expert is asked for the demonstrations that the configuration needs; here it returns noise."""
     asked = []
 
     def record(tasks, count, *, camera_size):
@@ -137,7 +137,7 @@ def test_demonstrations_that_are_not_there_are_recorded(folder, monkeypatch, cap
 
 @pytest.mark.slow
 def test_from_the_command_line(folder, tmp_path):
-    """The script itself, with groups of tasks; its folder's modules do not stand for others of their names."""
+    """The script itself, with groups of tasks; modules of its folder do not shadow others of their names."""
     command = [
         sys.executable,
         str(ROOT / "libero/lifelong/main.py"),
@@ -164,7 +164,7 @@ def test_from_the_command_line(folder, tmp_path):
     assert torch.load(path / "result.pt")["S_conf_mat"].shape == (2, 2)
 
 
-def test_mistakes_are_told_in_a_line(folder, monkeypatch, capsys):
+def test_errors_are_printed_on_one_line(folder, monkeypatch, capsys):
     for override, message in (
         ("lifelong=hat", "lifelong 'hat'.*packnet"),
         ("benchmark_name=LIBERO_1", "libero_spatial"),
@@ -203,8 +203,8 @@ def test_success_is_measured_from_the_first_states(acting, monkeypatch):
     assert begun[2:] == [[47], [48], [49]], "one by one, in states that no report uses"
 
 
-def test_success_counts(acting, monkeypatch):
-    """A policy that is right from the start is: the goal is made to hold in two of three episodes."""
+def test_success_is_counted(acting, monkeypatch):
+    """The goal is made to hold in two of three episodes."""
     algo, cfg, suite = acting
     cfg.eval.use_mp, cfg.eval.num_procs = True, 3
     step = metric.BatchEnv.step
@@ -219,8 +219,8 @@ def test_success_counts(acting, monkeypatch):
     assert rates == pytest.approx([2 / 3])
 
 
-def test_what_the_original_environment_observes_is_what_rollouts_show(acting):
-    """`raw_obs_to_tensor_obs` of the facade's environment, beside what the policy is given in a rollout."""
+def test_observations_of_the_environment_are_those_of_rollouts(acting):
+    """`raw_obs_to_tensor_obs` of the facade's environment equals the input of the policy in a rollout."""
     algo, cfg, suite = acting
     seen, act = [], algo.policy.get_action
     algo.policy.get_action = lambda data: seen.append(data) or act(data)
@@ -246,7 +246,7 @@ def test_what_the_original_environment_observes_is_what_rollouts_show(acting):
     assert algo.policy.get_action(data).shape == (1, 7)
 
 
-def test_states_and_tasks_of_ones_own(acting, tmp_path):
+def test_user_defined_states_and_tasks(acting, tmp_path):
     """A folder with other initial states, and one with another task file of the same name."""
     algo, cfg, suite = acting
     task, states = suite.get_task(0), suite.get_task_init_states(0)

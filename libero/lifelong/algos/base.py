@@ -234,7 +234,9 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         measure: Callable[[int], float | None],
         phase: int = 0,
     ) -> LearningCurve:
-        """Train for some epochs, and load the weights of the best evaluation, which are in `path`.
+        """Train for some epochs with `lifelong.training.fit`, and load the weights of the best evaluation.
+
+        Unlike the original's loader, `fit` fills up the last batch of an epoch with further windows.
 
         Args:
             dataset: Windows to train on.
