@@ -1,4 +1,4 @@
-"""The `libero` command: what it prints, and one clear line where it cannot do what it is told."""
+"""The `libero` command: its output, and one clear line on errors."""
 
 import argparse
 import subprocess
@@ -89,7 +89,7 @@ def test_demonstrations_are_described_and_checked(demo_file, tmp_path, capsys):
     assert capsys.readouterr().out.startswith(f"ok    {demo_file}: 2 demonstrations, 4-4 steps (mean 4), ")
 
 
-def test_broken_demonstrations_are_told_apart(demo_file, tmp_path, capsys):
+def test_broken_demonstrations_are_distinguished(demo_file, tmp_path, capsys):
     cut = demo_file.with_name("cut_demo.hdf5")
     cut.write_bytes(demo_file.read_bytes()[:2000])
     assert cli.main(["demos", "check", str(tmp_path)]) == 1
@@ -118,7 +118,7 @@ def test_runs_as_a_process():
     assert done.stderr.startswith("libero: error: unknown task 'nope'") and "Traceback" not in done.stderr
 
 
-def test_doctor_says_what_is_broken_and_how_to_mend_it(monkeypatch, capsys):
+def test_doctor_reports_what_is_broken_and_how_to_fix_it(monkeypatch, capsys):
     broken = Finding("GL", "no picture", False, "install one")
     minor = Finding("demonstrations", "none", False, "make some", essential=False)
     monkeypatch.setattr(doctor, "examine", lambda gl_only: [minor])
@@ -131,7 +131,7 @@ def test_doctor_says_what_is_broken_and_how_to_mend_it(monkeypatch, capsys):
 
 
 @pytest.mark.sim
-def test_doctor_draws_a_frame(monkeypatch):
+def test_doctor_renders_a_frame(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     finding = doctor.check_gl()
     assert finding.ok, finding
@@ -154,7 +154,7 @@ def test_doctor_finds_what_is_not_installed():
     assert not finding.ok and finding.remedy == "make setup"
 
 
-def test_doctor_looks_at_folders(tmp_path, monkeypatch):
+def test_doctor_checks_folders(tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache" / "deep"))
     assert doctor.check_cache().detail.startswith(f"{tmp_path / 'cache' / 'deep'}, 0 B used")
     assert not doctor.check_demos().ok and not doctor.check_demos().essential

@@ -1,4 +1,4 @@
-"""Workspaces: the original's figures, and looks that stay light."""
+"""Workspaces: the original's parameters, and visuals that stay light."""
 
 import json
 from itertools import product
@@ -63,7 +63,7 @@ def test_collision_geometry_is_the_originals(measured):
         assert model.geom_group[g] == geom["group"]
 
 
-def test_named_looks_stand_where_the_originals_do(measured):
+def test_named_visuals_are_where_the_originals_are(measured):
     category, figures = measured
     model = compiled(category)
     data = mujoco.MjData(model)
@@ -97,7 +97,7 @@ def test_cameras_lights_and_robot_are_the_originals(measured):
 
 
 @pytest.mark.parametrize("category", WORKSPACES)
-def test_things_stand_on_the_surface(category):
+def test_objects_stand_on_the_surface(category):
     """A ray from above meets the table or the floor at the height that placement uses."""
     workspace, model = load_workspace(category), compiled(category)
     data = mujoco.MjData(model)
@@ -120,7 +120,7 @@ def test_rooms_are_light(category):
 
 
 @pytest.mark.parametrize("category", WORKSPACES)
-def test_every_style_compiles_and_only_looks_change(category):
+def test_every_style_compiles_and_changes_visuals_only(category):
     styles = load_styles()
     plain = compiled(category)
     solid = [plain.geom(g).name for g in range(plain.ngeom) if collides(plain, g)]

@@ -1,4 +1,4 @@
-"""Which pack is in use, and fetching the original's."""
+"""Selection of the pack, and download of the original's files."""
 
 import hashlib
 import json
@@ -201,7 +201,7 @@ def _contents(folder):
     return {name: (folder / name).read_bytes() for name in FILES}
 
 
-def test_everything_arrives_and_is_recorded(hub, tmp_path):
+def test_all_files_are_downloaded_and_recorded(hub, tmp_path):
     folder = download()
     assert folder == tmp_path / "cache" / "assets"
     assert _contents(folder) == FILES
@@ -209,14 +209,14 @@ def test_everything_arrives_and_is_recorded(hub, tmp_path):
     assert revision == REVISION and set(files) == set(FILES)
 
 
-def test_what_is_there_is_not_fetched_again(hub, tmp_path):
+def test_complete_files_are_not_downloaded_again(hub, tmp_path):
     folder = download(tmp_path / "there")
     hub.got.clear()
     assert download(folder) == folder
     assert hub.got == []
 
 
-def test_an_interrupted_download_goes_on(hub, tmp_path, monkeypatch):
+def test_an_interrupted_download_resumes(hub, tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 1 << 16)
     name, half = "articulated_objects/mesh.msh", len(LARGE) // 2
     hub.cut_once[name] = half
@@ -224,7 +224,7 @@ def test_an_interrupted_download_goes_on(hub, tmp_path, monkeypatch):
     assert [asked for file, asked in hub.got if file == name] == [None, f"bytes={half}-"]
 
 
-def test_a_file_that_arrives_changed_is_fetched_again(hub, tmp_path):
+def test_a_file_that_arrives_changed_is_downloaded_again(hub, tmp_path):
     hub.corrupt["articulated_objects/a.xml"] = 1
     folder = download(tmp_path / "there")
     assert _contents(folder) == FILES
@@ -237,7 +237,7 @@ def test_a_server_that_changes_files_is_found_out(hub, tmp_path):
     assert read_manifest(tmp_path / "there") is None
 
 
-def test_a_file_broken_afterwards_is_mended(hub, tmp_path):
+def test_a_file_broken_afterwards_is_replaced(hub, tmp_path):
     folder = download(tmp_path / "there")
     (folder / "scenes/room.xml").write_bytes(b"<mujock/>\n")
     hub.got.clear()
@@ -245,7 +245,7 @@ def test_a_file_broken_afterwards_is_mended(hub, tmp_path):
     assert [name for name, _ in hub.got] == ["scenes/room.xml"]
 
 
-def test_no_room_is_told_before_anything_is_fetched(hub, tmp_path, monkeypatch):
+def test_too_little_space_is_reported_before_the_download(hub, tmp_path, monkeypatch):
     usage = hub_module.shutil.disk_usage(tmp_path)._replace(free=1 << 20)
     monkeypatch.setattr(hub_module.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(DownloadError, match="MiB free"):
@@ -260,7 +260,7 @@ def test_names_outside_the_folder_are_refused(hub, tmp_path):
     assert not (tmp_path / "elsewhere.xml").exists()
 
 
-def test_without_network_the_message_says_how_to_resume(hub, tmp_path, monkeypatch):
+def test_without_network_the_message_states_how_to_resume(hub, tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(DownloadError, match="failed: .*again to resume"):
         download(tmp_path / "there")
@@ -271,18 +271,18 @@ def test_a_revision_that_does_not_exist_is_named(hub, tmp_path):
         download(tmp_path / "there", revision="f" * 40)
 
 
-def test_without_the_library_the_message_says_what_to_install(tmp_path, monkeypatch):
+def test_without_the_library_the_message_states_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(LiberoError, match="pip install huggingface_hub"):
         download(tmp_path / "there")
 
 
-def test_command_downloads_and_says_how_to_use_it(hub, tmp_path, capsys):
+def test_the_command_downloads_and_prints_how_to_use_it(hub, tmp_path, capsys):
     assert main(["assets", "download", "--dest", str(tmp_path / "there")]) == 0
     assert f"export LIBERO_ASSETS={tmp_path / 'there'}" in capsys.readouterr().out
 
 
-def test_command_tells_what_is_in_use(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_which_models_are_used(tmp_path, monkeypatch, capsys):
     assert main(["assets", "info"]) == 0
     assert "builtin" in capsys.readouterr().out
     monkeypatch.setenv("LIBERO_ASSETS", str(_folder(tmp_path / "assets")))

@@ -1,4 +1,4 @@
-"""Tasks of one's own: one YAML file or one call, what it amounts to, and what is refused."""
+"""User-defined tasks: one YAML file or one call, the resulting task, and errors."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -88,7 +88,7 @@ def test_a_file_a_call_and_the_bddl_written_are_the_same(tmp_path):
 
 @pytest.mark.parametrize("suite", [name for name in suite_names() if name != "libero_100"])
 def test_the_benchmarks_own_facts_mean_the_same_here(suite):
-    """One vocabulary: what the suites' files say, in a file of one's own."""
+    """The keys of the suites' files are valid in user-defined files."""
     facts = load_data(f"{suite}.yaml")
     for task, own in zip(get_suite(suite).tasks, facts["tasks"], strict=True):
         shared = {key: value for key, value in facts.items() if key != "tasks"}
@@ -121,12 +121,12 @@ def test_goals_are_atoms_in_any_notation(goal, expected):
     assert list(make_task(**said(goal=goal)).problem.goal.parts) == expected
 
 
-def test_goals_may_be_expressions_over_places_that_nothing_declares():
+def test_goals_may_be_expressions_over_undeclared_places():
     goal = make_task(**said(goal="(Or (Open wooden_cabinet_1_top_region) (Not (Up plate_1)))")).problem.goal
     assert goal == Or((Atom("Open", ("wooden_cabinet_1_top_region",)), Not(Atom("Up", ("plate_1",)))))
 
 
-def test_things_are_added_to_a_scene_and_its_own_can_be_moved():
+def test_objects_are_added_to_a_scene_and_those_of_the_scene_can_be_moved():
     task = make_task(
         scene="kitchen_scene1",
         objects=["plate", {"butter": 2}],
@@ -268,7 +268,7 @@ def test_the_settings_of_a_run_take_files(tmp_path):
     ],
     ids=str,
 )
-def test_templates_are_tasks_with_room_between_things(options):
+def test_templates_are_tasks_with_space_between_objects(options):
     text, task = task_template(**options)
     assert make_task(**yaml.safe_load(text)) == task
     if options.get("objects", ())[-1:] == ["basket"]:
@@ -304,7 +304,7 @@ def test_starts_of_a_file_are_kept_by_what_it_says(tmp_path, monkeypatch):
 
 
 @pytest.mark.sim
-def test_a_task_runs_by_the_name_of_its_file_and_is_drawn(tmp_path, capsys):
+def test_a_task_runs_by_the_name_of_its_file_and_is_rendered(tmp_path, capsys):
     assert (
         main(
             [

@@ -1,4 +1,4 @@
-"""Task files survive the way through `Problem`, and broken ones say where they are broken."""
+"""Task files are unchanged by parsing and writing, and errors state the line."""
 
 import dataclasses
 import math
@@ -129,7 +129,7 @@ def test_errors_name_file_line_and_remedy(change, line, message):
 
 
 @pytest.mark.parametrize("text", ["", "words", "(define (problem x))", "(define)", "()", "((("])
-def test_what_is_no_task_is_refused(text):
+def test_text_that_is_not_a_task_is_rejected(text):
     with pytest.raises(BDDLError, match=r"empty.bddl:1: .*; expected "):
         bddl.parse(text, "empty.bddl")
 

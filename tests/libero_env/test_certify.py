@@ -1,4 +1,4 @@
-"""Certificates: what is known is not run again, every start counts once, and the command's status says it."""
+"""Certificates: known outcomes are not run again, each initial state counts once, and the exit status is right."""
 
 import json
 from dataclasses import replace
@@ -63,7 +63,7 @@ def test_what_was_done_before_a_stop_is_kept(tried, tmp_path, monkeypatch):
 
 
 @pytest.mark.unit
-def test_another_scene_or_expert_is_tried_anew(tried, tmp_path, monkeypatch):
+def test_another_scene_or_expert_is_run_again(tried, tmp_path, monkeypatch):
     certify(TASKS[:1], 4, out=tmp_path, progress=False)
     monkeypatch.setattr(module, "_digest", lambda *args: "another")
     certify(TASKS[:1], 4, out=tmp_path, progress=False)
@@ -92,7 +92,7 @@ def test_figures_by_hand(tried):
 
 
 @pytest.mark.unit
-def test_the_status_says_whether_each_task_has_its_share(tried, tmp_path, capsys):
+def test_the_exit_status_tells_whether_each_task_reaches_the_rate(tried, tmp_path, capsys):
     words = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--out", str(tmp_path)]
     assert cli.main([*words, "--states", "4"]) == 1  # three of four
     assert "FAIL  libero_object/0" in capsys.readouterr().out
@@ -105,7 +105,7 @@ def test_the_status_says_whether_each_task_has_its_share(tried, tmp_path, capsys
 
 
 @pytest.mark.unit
-def test_without_matplotlib_there_is_no_picture_and_no_error(tried, tmp_path, capsys, monkeypatch):
+def test_without_matplotlib_there_is_no_figure_and_no_error(tried, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     argv = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--states", "2", "--out", str(tmp_path)]
     assert cli.main(argv) == 0

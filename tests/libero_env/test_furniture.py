@@ -66,7 +66,7 @@ def test_what_is_seen_is_where_the_collision_shapes_are(category, way):
     ("category", "site", "way"), [(c, *o) for c, several in OPENINGS.items() for o in several]
 )
 def test_compartments_are_open(category, site, way):
-    """From outside into the middle of a region nothing is in the way, neither seen nor solid."""
+    """No visual or collision geom is between the outside and the centre of a region."""
     model, data = posed(category)
     middle = data.site(site).xpos.copy()
     if site == "bottom_side":

@@ -1,4 +1,4 @@
-"""Kitchenware looks are where their collision boxes are: a hand must neither grasp air nor sink in."""
+"""Visuals of kitchenware match its collision boxes: a hand must neither grasp air nor sink in."""
 
 import mujoco
 import numpy as np
@@ -77,7 +77,7 @@ def test_handles_are_seen_where_they_are_felt(category):
             assert seen > 0 and seen == pytest.approx(felt, abs=0.003), (y, z)
 
 
-def test_vessels_can_be_told_apart():
+def test_vessels_can_be_distinguished():
     """Where two have nearly the same size, their mean colors differ."""
     size, color = {}, {}
     for category in WALLS:

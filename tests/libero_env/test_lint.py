@@ -1,4 +1,4 @@
-"""The linter: every fault put into a sound task is found, on its line; the benchmark's own tasks have none."""
+"""The linter finds every fault that is put into a correct task, on its line, and none in the benchmark's tasks."""
 
 import math
 import re
@@ -35,7 +35,7 @@ def found(text: str, rule: str, starts: int = 0) -> Finding:
     return hits[0]
 
 
-# what is replaced, by what; rule and level, and what the finding or its remedy says
+# old text, new text, rule, level, and a part of the finding or its remedy
 FAULTS = [
     ("plate_1 - plate", "plate_1 - plat", "unknown-category", "error", "did you mean plate"),
     ("main_table - table", "main_table - tabel", "unknown-category", "error", "did you mean .*table"),
@@ -74,7 +74,7 @@ FAULTS = [
 
 @pytest.mark.unit
 @pytest.mark.parametrize(("old", "new", "rule", "level", "says"), FAULTS, ids=lambda value: str(value)[:30])
-def test_a_fault_is_found_and_told(old, new, rule, level, says):
+def test_a_fault_is_reported(old, new, rule, level, says):
     text, line = mutated(old, new)
     finding = found(text, rule)
     assert finding.level == level and finding.remedy and re.search(says, f"{finding.what} {finding.remedy}")
@@ -84,7 +84,7 @@ def test_a_fault_is_found_and_told(old, new, rule, level, says):
 
 
 @pytest.mark.unit
-def test_every_undeclared_name_is_told_at_once():
+def test_all_undeclared_names_are_reported_at_once():
     text = SOUND.replace("(On plate_1 main", "(On plat_1 main").replace(GOAL, "(And (In bowl_9 nowhere))")
     findings = [f for f in lint_text(text, "mine.bddl", starts=0) if f.rule == "unknown-name"]
     assert [f.what.split()[0] for f in findings] == ["plat_1", "bowl_9", "nowhere"]
@@ -93,13 +93,13 @@ def test_every_undeclared_name_is_told_at_once():
 
 @pytest.mark.unit
 @pytest.mark.parametrize("text", ["", "(define", "hello", "(define (problem p))", SOUND[:300], "\x00"])
-def test_what_is_no_task_has_one_error_and_a_line(text):
+def test_text_that_is_not_a_task_has_one_error_with_a_line(text):
     (finding,) = lint_text(text, "mine.bddl")
     assert finding.level == "error" and finding.rule == "syntax" and finding.line >= 1
 
 
 @pytest.mark.unit
-def test_a_file_that_is_no_text_is_told(tmp_path):
+def test_a_file_that_is_not_text_is_reported(tmp_path):
     path = tmp_path / "mine.bddl"
     path.write_bytes(b"(define\n\xff)")
     (finding,) = lint_file(path)
@@ -107,7 +107,7 @@ def test_a_file_that_is_no_text_is_told(tmp_path):
 
 
 @pytest.mark.unit
-def test_a_file_named_by_something_else_than_its_instruction_is_noted(tmp_path):
+def test_a_file_whose_name_is_not_its_instruction_is_reported(tmp_path):
     path = tmp_path / "my_task.bddl"
     path.write_text(SOUND)
     (finding,) = [f for f in lint_file(path, starts=0) if f.rule == "language"]
@@ -135,7 +135,7 @@ def test_the_reach_is_a_ring_before_the_robot(category):
 
 
 @pytest.mark.sim
-def test_the_figures_of_the_arm_are_those_of_its_model():
+def test_the_dimensions_of_the_arm_are_those_of_its_model():
     from libero_env.design.lint import scene as lint_scene
 
     model = build_scene(get_task("libero_object/0").problem).model
@@ -187,14 +187,14 @@ PLACES = [
 
 @pytest.mark.sim
 @pytest.mark.parametrize(("old", "new", "rule", "level", "says"), PLACES, ids=lambda value: str(value)[:30])
-def test_a_fault_of_the_scene_is_found(old, new, rule, level, says):
+def test_a_fault_of_the_scene_is_reported(old, new, rule, level, says):
     text, _ = mutated(old, new)
     hits = [f for f in lint_text(text, "mine.bddl", starts=3) if f.rule == rule and re.search(says, str(f))]
     assert level in [f.level for f in hits], [str(f) for f in lint_text(text, "mine.bddl", starts=3)]
 
 
 @pytest.mark.sim
-def test_a_place_that_the_model_lacks_is_told_with_those_it_has():
+def test_a_missing_place_is_reported_with_the_existing_ones():
     text = SOUND.replace(
         "(top_region (:target wooden_cabinet_1))", "(upper_region (:target wooden_cabinet_1))"
     )

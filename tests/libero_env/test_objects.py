@@ -1,4 +1,4 @@
-"""Every object of the catalog: figures, stability, looks, and life inside a scene."""
+"""Every object of the catalog: parameters, stability, visuals, and behaviour in a scene."""
 
 import itertools
 import json
@@ -356,7 +356,7 @@ def advance(model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> None:
         mujoco.mj_step(model, data)
 
 
-def test_labels_tell_the_objects_apart():
+def test_labels_distinguish_the_objects():
     looks = {name: get_object(name).spec.compile().tex_data.reshape(-1, 3).mean(axis=0) for name in GROCERIES}
     for one, two in itertools.combinations(GROCERIES, 2):
         assert np.abs(looks[one] - looks[two]).max() > 8, (one, two)

@@ -130,7 +130,7 @@ def test_every_format_gives_the_same_shape(tmp_path, ending):
     assert signed_volume(vertices, faces) == pytest.approx(1.2e-4)
 
 
-def test_y_is_up_where_the_format_says_so(tmp_path):
+def test_y_is_up_where_the_format_specifies_it(tmp_path):
     sizes = {}
     for ending in (".glb", ".stl"):
         surfaces = read_mesh(box(tmp_path / f"box{ending}"), size=None, up=None, notify=print)
@@ -140,7 +140,7 @@ def test_y_is_up_where_the_format_says_so(tmp_path):
 
 
 @pytest.mark.parametrize(("scale", "unit"), [(1000, "millimetres"), (100, "centimetres"), (1, None)])
-def test_units_are_guessed_and_said(tmp_path, scale, unit):
+def test_units_are_guessed_and_reported(tmp_path, scale, unit):
     notes: list[str] = []
     path = box(tmp_path / "box.stl", np.array([0.04, 0.05, 0.08]) * scale)
     low, high = bounds(read_mesh(path, size=None, up=None, notify=notes.append))
@@ -210,7 +210,7 @@ def test_what_is_convex_is_its_hull_and_what_is_not_is_taken_apart(monkeypatch):
     assert np.ptp(np.concatenate(found.meshes), axis=0) == pytest.approx(np.ptp(vertices, axis=0))
 
 
-def test_without_coacd_boxes_stand_in_and_say_so(monkeypatch):
+def test_without_coacd_boxes_are_used_and_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "coacd", None)
     notes: list[str] = []
     mesh = cup()
@@ -368,7 +368,7 @@ def test_a_stored_object_that_is_broken_is_named(tmp_path):
         get_object("brick")
 
 
-def test_the_command_adds_lists_shows_draws_and_removes(tmp_path, capsys):
+def test_the_command_adds_lists_shows_renders_and_removes(tmp_path, capsys):
     path = str(box(tmp_path / "block.stl"))
     assert main(["objects", "add", path, "--name", "red_block", "--mass", "0.1"]) == 0
     said = capsys.readouterr().out

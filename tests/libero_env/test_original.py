@@ -158,7 +158,7 @@ def test_each_build_is_fresh(pack):
     assert not list(other.spec.joints)
 
 
-def test_what_the_original_never_published_is_said_to_be_missing(pack):
+def test_unpublished_models_are_reported_as_missing(pack):
     for category in ("cherries", "corn", "mayo"):
         with pytest.raises(LiberoError, match=f"no model of '{category}'.*builtin"):
             pack.build(category)

@@ -85,7 +85,7 @@ def digest(task) -> str:
     return hashlib.sha256(f"{task.name}\n{task.bddl_text}".encode()).hexdigest()[:16]
 
 
-def test_a_task_of_ones_own(tmp_path):
+def test_a_user_defined_task(tmp_path):
     file = tmp_path / "KITCHEN_SCENE1_cook_the_plate.bddl"
     file.write_text(bddl.write(build_problem(SCENE, TASK)))
     task = read_task(file)
@@ -109,7 +109,7 @@ def test_libero_100_is_90_then_10():
     assert get_task("libero_100/95") is get_task("libero_10/5")
 
 
-def test_every_scene_is_used_and_says_what_it_is():
+def test_every_scene_is_used_and_has_a_description():
     folder = Path(builder.__file__).parent / "data" / "scenes"
     facts = [load_data(f"{name}.yaml") for name in suite_names() if name != "libero_100"]
     used = {task.get("scene", suite.get("scene")) for suite in facts for task in suite["tasks"]}

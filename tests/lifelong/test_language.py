@@ -14,7 +14,7 @@ pytestmark = pytest.mark.unit
 TEXTS = ["turn on the stove", "close the microwave"]
 
 
-def test_shipped_embeddings_are_unit_vectors_that_tell_instructions_apart() -> None:
+def test_shipped_embeddings_are_unit_vectors_that_distinguish_instructions() -> None:
     vectors = torch.stack(list(shipped().values()))
     assert vectors.shape == (len(shipped()), 384)
     torch.testing.assert_close(vectors.norm(dim=-1), torch.ones(len(vectors)), atol=2e-3, rtol=0)
