@@ -13,7 +13,7 @@ from libero.libero.utils.dataset_utils import get_dataset_info
 from libero.scripts.command import option, script
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
-from libero_env.demos.read import LOW_DIM_KEYS
+from libero_env.demos.read import LOW_DIM_KEYS, demo_number
 from libero_env.demos.replay import rerender
 from libero_env.demos.write import DemoWriter
 
@@ -65,7 +65,7 @@ def acted(file: Path, target: Path) -> Path:
                 states.append(world.physics_state(0))
                 world.step([0], action[None])
             success = bool(world.check_goal(0)[0])
-            writer.write(int(name[5:]), replace(episode, states=np.array(states), success=success))
+            writer.write(demo_number(name), replace(episode, states=np.array(states), success=success))
     finally:
         renderer.close()
     return writer.finish()

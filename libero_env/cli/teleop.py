@@ -47,13 +47,10 @@ def run_teleop(args: argparse.Namespace) -> int:
     task = read_task(args.bddl) if args.bddl else get_task(args.task)
     out = args.out or Path(f"{task.name}_demo.hdf5")
     sensitivity = args.pos_sensitivity, args.rot_sensitivity
-    reader = None
+    device, reader = Keyboard(*sensitivity), None
     if args.device == "spacemouse":
-        device: Keyboard = SpaceMouse(*sensitivity)
-        assert isinstance(device, SpaceMouse)
-        reader = MouseReader(device, args.vendor_id, args.product_id)
-    else:
-        device = Keyboard(*sensitivity)
+        device = mouse = SpaceMouse(*sensitivity)
+        reader = MouseReader(mouse, args.vendor_id, args.product_id)
     print(f"{task.language}\n{HELP}")
     screen = open_screen(args.screen, device, args.camera, reader)
     try:

@@ -79,7 +79,7 @@ class DemoConfig:
         return read_task(self.source) if self.source.endswith(".bddl") else get_task(self.source)
 
     @property
-    def render(self) -> RenderConfig:
+    def render_config(self) -> RenderConfig:
         """What is rendered of each state."""
         return RenderConfig(self.cameras, self.camera_size, self.modalities)
 
@@ -96,22 +96,22 @@ class DemoConfig:
             language=task.language,
             bddl_name=f"{task.suite}/{task.name}.bddl",
             bddl_text=task.bddl_text,
-            env_kwargs=_env_kwargs(self.render),
+            env_kwargs=_env_kwargs(self.render_config),
             pairing=self.pairing,
             seed=self.seed,
             generator=GENERATOR,
             disturbed=self.disturb,
             model_digest=model_digest(task),
             versions=json.dumps(versions),
-            **self.render.header(),
+            **self.render_config.header(),
             **self.variation.header(),
         )
 
     def key(self) -> str:
         """Return a text that is the same for equal configurations of any task.
 
-        Folders of recorded demonstrations are named by a checksum of it. So the text must never change, names of
-        earlier versions included.
+        Folders of recorded demonstrations are named by a checksum of it, so it must never change. It contains the names
+        that classes and fields had when the first files were recorded.
         """
         v = self.variation
         variation = (

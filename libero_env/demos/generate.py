@@ -29,8 +29,9 @@ from libero_env.parallel import cpu_count, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.tasks import Task, get_suite
 
-_Chunk = tuple[int, list[int]]  # position of a job, and the demonstrations of it to record together
-_Reports = Generator[tuple[int, RecordingReport]]  # position of a job, and the report on a chunk of it
+# A chunk is the position of a job, and the demonstrations of it to record together; a report on it begins likewise.
+_Chunk = tuple[int, list[int]]
+_ChunkReports = Generator[tuple[int, RecordingReport], None, None]
 
 
 def generate(
@@ -140,9 +141,8 @@ def make_demos(
     with ExitStack() as locks:
         for folder in sorted({job.path.parent for job in missing}):
             locks.enter_context(_recording_lock(folder))
-        missing = [
-            job for job in missing if not _is_complete(job, n)
-        ]  # other processes may have recorded some
+        # another process may have recorded some of them before the folders were locked
+        missing = [job for job in missing if not _is_complete(job, n)]
         for job in missing if replace else ():
             _remove_outdated(job)
         if missing:
@@ -186,12 +186,13 @@ def _record(
         smoothing=0.1,
         disable=None if progress is None else not progress,
     )
-    workers = min(workers or cpu_count(), len(chunks))
     for writer, numbers in zip(writers, missing, strict=True):
         if not numbers:  # a process was killed after the last part
             writer.finish()
-    with bar, closing(_in_processes(jobs, chunks, workers) if workers > 1 else _here(jobs, chunks)) as done:
-        for j, report in done:
+    workers = min(workers or cpu_count(), len(chunks))
+    chunk_reports = _in_processes(jobs, chunks, workers) if workers > 1 else _here(jobs, chunks)
+    with bar, closing(chunk_reports):
+        for j, report in chunk_reports:
             reports[j].add(report)
             bar.update(report.recorded)
             bar.set_postfix(failed=sum(r.failure_reasons.total() for r in reports), refresh=False)
@@ -200,7 +201,7 @@ def _record(
     return {job.path: report for job, report in zip(jobs, reports, strict=True)}
 
 
-def _here(jobs: Sequence[RecordingJob], chunks: list[_Chunk]) -> _Reports:
+def _here(jobs: Sequence[RecordingJob], chunks: list[_Chunk]) -> _ChunkReports:
     """Record in this process and yield the report on each chunk. A job ends at its first error."""
     failed: set[int] = set()
     with closing(RecorderCache()) as recorders:
@@ -212,7 +213,7 @@ def _here(jobs: Sequence[RecordingJob], chunks: list[_Chunk]) -> _Reports:
                 yield j, report
 
 
-def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: int) -> _Reports:
+def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: int) -> _ChunkReports:
     """Record as `_here` does, in a pool of processes; chunks that have begun are finished after an error."""
     pool = spawn_pool(workers, initializer=initialize_worker)
     try:

@@ -195,7 +195,12 @@ def demo_names(handle: h5py.File, file: Path) -> list[str]:
             f"{file}: key data is missing; expected a group of demonstrations demo_0, demo_1, ..."
         )
     names = [name for name in handle["data"] if name.startswith("demo_") and name[5:].isdigit()]
-    return sorted(names, key=lambda name: int(name[5:]))
+    return sorted(names, key=demo_number)
+
+
+def demo_number(name: str) -> int:
+    """Return the number of a demonstration from its name: 3 from `demo_3`."""
+    return int(name.removeprefix("demo_"))
 
 
 def check_demo(group: h5py.Group, file: Path, name: str, obs_keys: Iterable[str]) -> None:

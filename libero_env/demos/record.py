@@ -49,7 +49,7 @@ class DemoRecorder:
     def __init__(self, config: DemoConfig):
         self.config, self.task = config, config.task
         self.env = BatchEnv(self.task, BATCH, num_threads=1, cameras=(), horizon=MAX_STEPS)
-        self.renderer = StateRenderer(self.task, config.render)
+        self.renderer = StateRenderer(self.task, config.render_config)
         self.shapes = Shapes(self.env.world.scene)
 
     def attempt(self, numbers: list[tuple[int, int]]) -> list[tuple[int, Attempt]]:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from libero_env.assets.pack import Pack
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
-from libero_env.demos.read import BrokenDemoError
+from libero_env.demos.read import BrokenDemoError, demo_number
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
 from libero_env.sim.observations import image_name
@@ -149,7 +149,7 @@ def rerender(
     try:
         disable = None if progress is None else not progress
         for name, episode in tqdm(read_episodes(file), unit="demo", disable=disable):
-            if (index := int(name[5:])) not in recorded:
+            if (index := demo_number(name)) not in recorded:
                 fixtures = _checked_fixtures(file, name, episode, renderer.scene)
                 obs, robot_states = renderer.render_states(episode.states, fixtures)
                 writer.write(index, replace(episode, obs=obs, robot_states=robot_states))

@@ -22,6 +22,7 @@ from libero_env.demos.read import (
     check_demo,
     demo_files,
     demo_names,
+    demo_number,
     is_image,
     open_demo_file,
 )
@@ -101,7 +102,7 @@ class DemoWriter:
         Raises:
             DemoError: They were recorded with another configuration (task, seed, camera size, ...).
         """
-        return {int(name[5:]) for _, name in self._sources()}
+        return {demo_number(name) for _, name in self._sources()}
 
     def write(self, index: int, episode: Episode) -> Path:
         """Write demonstration number `index`; it is complete on the disk when this returns.
@@ -136,7 +137,7 @@ class DemoWriter:
             with atomic_path(self.path, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
                 data = handle.create_group("data")
                 data.attrs.update(self.header)
-                for file, name in sorted(sources, key=lambda source: int(source[1][5:])):
+                for file, name in sorted(sources, key=lambda source: demo_number(source[1])):
                     with h5py.File(file, "r") as part:
                         part.copy(f"data/{name}", data)  # copies compressed bytes as they are
                 _write_counts(data)

@@ -149,7 +149,7 @@ def record_session(
     writer = DemoWriter(path, config.header() | {"generator": GENERATOR})
     recorded = writer.recorded()
     teleop.rng = np.random.default_rng([teleop.seed, len(recorded)])
-    renderer = StateRenderer(teleop.task, config.render)
+    renderer = StateRenderer(teleop.task, config.render_config)
     try:
         while len(recorded) < n and (episode := teleop.episode(len(recorded), n)) is not None:
             number = max(recorded, default=-1) + 1

@@ -15,7 +15,7 @@ import pytest
 from libero_env.demos.config import DemoConfig, RecordingJob, Variation
 from libero_env.demos.curate import read_episodes
 from libero_env.demos.generate import demo_path, ensure_demos, generate
-from libero_env.demos.read import read_demos
+from libero_env.demos.read import demo_number, read_demos
 from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv
@@ -169,7 +169,7 @@ def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_
     path = tmp_path / "unjoined.hdf5"
     writer = RecordingJob(DemoConfig(get_task(TASK), SIZE), path).writer()
     for name, episode in read_episodes(whole):
-        writer.write(int(name[5:]), episode)
+        writer.write(demo_number(name), episode)
     assert not path.exists()
     check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
