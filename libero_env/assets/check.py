@@ -9,16 +9,26 @@ from libero_env.assets.download import read_manifest
 from libero_env.assets.hub import broken_files
 from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack
-from libero_env.errors import LiberoError
+from libero_env.assets.robot import robosuite_assets
+from libero_env.errors import LiberoError, MissingPackageError
 
 
 def problems(pack: Pack) -> list[str]:
-    """Return a line for each object or room that does not compile and each downloaded file that has changed."""
-    found = [f"{what}: {error}" for what in pack.categories() if (error := _build_error(pack, what))]
+    """Return a line for each object or room that does not compile and each file that is missing or has changed."""
+    found = _robot_problems()
+    found += [f"{what}: {error}" for what in pack.categories() if (error := _build_error(pack, what))]
     found += [f"{what}: {error}" for what in WORKSPACES if (error := _arena_error(pack, what))]
     if isinstance(pack, OriginalPack) and (record := read_manifest(Path(pack.root))):
         found += [f"{name}: missing or changed" for name in broken_files(Path(pack.root), record[1])]
     return found
+
+
+def _robot_problems() -> list[str]:
+    try:
+        robosuite_assets()
+    except MissingPackageError as error:
+        return [f"robot: {error}"]
+    return []
 
 
 def _build_error(pack: Pack, category: str) -> str | None:

@@ -26,7 +26,7 @@ def _register_new(commands: Subparsers) -> None:
         nargs="+",
         default=(),
         metavar="CATEGORY",
-        help="such as red_cup plate (default: bowl, plate)",
+        help="such as red_coffee_mug plate (default: bowl, plate)",
     )
     add("--furniture", nargs="+", default=(), metavar="CATEGORY", help="such as wooden_cabinet")
     add(
@@ -34,7 +34,7 @@ def _register_new(commands: Subparsers) -> None:
         nargs="+",
         default=(),
         metavar="ATOM",
-        help="such as 'On red_cup_1 plate_1' (default: first on last)",
+        help="such as 'On red_coffee_mug_1 plate_1' (default: first on last)",
     )
     add("--language", help="the instruction (default: it describes the goal)")
     add("--out", type=Path, default=Path(), help="folder (default: here)")

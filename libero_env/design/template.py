@@ -55,7 +55,7 @@ def task_template(
 
 def _default_goal(names: Mapping[str, str]) -> list[str]:
     if len(names) < 2:
-        raise LiberoError("a goal is required: --goal 'On red_cup_1 plate_1'; or give two objects")
+        raise LiberoError("a goal is required: --goal 'On red_coffee_mug_1 plate_1'; or give two objects")
     first, *_, last = names
     inside = _INSIDE in places_of(names[last])
     return [f"In {first} {last}_{_INSIDE}" if inside else f"On {first} {last}"]

@@ -84,13 +84,13 @@ def make_task(name: str | None = None, **definition: Any) -> Task:
     Example:
         >>> task = make_task(
         ...     scene="kitchen",
-        ...     objects=["red_cup", "plate"],
-        ...     place={"red_cup_1": (0, 0), "plate_1": (0.05, 0.2)},
-        ...     goal=("On", "red_cup_1", "plate_1"),
-        ...     language="put the red cup on the plate",
+        ...     objects=["red_coffee_mug", "plate"],
+        ...     place={"red_coffee_mug_1": (0, 0), "plate_1": (0.05, 0.2)},
+        ...     goal=("On", "red_coffee_mug_1", "plate_1"),
+        ...     language="put the red mug on the plate",
         ... )
         >>> task.name
-        'put_the_red_cup_on_the_plate'
+        'put_the_red_mug_on_the_plate'
     """
     definition = {key: value for key, value in definition.items() if value is not None}
     return task_from_definition({**definition, **({"name": name} if name else {})}, "task", Path())
@@ -160,7 +160,7 @@ def _problem(definition: Definition, where: str, folder: Path) -> Problem:
     """Return the problem of a definition that may use the short forms."""
     expanded = _expand(definition, {}, where, folder)
     if "goal" not in expanded:
-        raise LiberoError(f"{where}: it has no goal; add one, such as `goal: On red_cup_1 plate_1`")
+        raise LiberoError(f"{where}: it has no goal; add one, such as `goal: On red_coffee_mug_1 plate_1`")
     entities = {**expanded["fixtures"], **_number(expanded["objects"], (), where)}
     placed = {
         words[1]

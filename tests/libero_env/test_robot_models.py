@@ -1,4 +1,4 @@
-"""Without robosuite's model files, whatever is started ends with one line that says what to type."""
+"""Without robosuite's model files, every entry point ends with one line that states what to type."""
 
 import importlib.util
 import os
@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from libero_env.assets.check import problems
+from libero_env.assets.pack import BuiltinPack
 from libero_env.assets.robot import robosuite_assets, robosuite_version
 from libero_env.cli import doctor
 from libero_env.errors import LiberoError, MissingPackageError
@@ -61,7 +63,7 @@ def test_an_installation_without_its_files_is_replaced(tmp_path, monkeypatch):
         robosuite_assets()
 
 
-def test_the_error_survives_the_way_out_of_a_worker():
+def test_the_error_can_be_sent_by_a_worker():
     error = MissingPackageError("files are missing", REMEDY)
     again = pickle.loads(pickle.dumps(error))  # noqa: S301
     assert str(again) == str(error) and again.remedy == REMEDY
@@ -72,6 +74,13 @@ def test_doctor_names_the_remedy(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     finding = doctor.check_robot_models()
     assert not finding.ok and finding.essential and finding.remedy == REMEDY
+
+
+@pytest.mark.sim
+def test_the_check_of_assets_reports_it(monkeypatch):
+    assert problems(BuiltinPack()) == []
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert problems(BuiltinPack()) == [f"robot: {MESSAGE}"]
 
 
 @pytest.mark.sim
