@@ -39,7 +39,7 @@ class TrainingPhase:
     Attributes:
         stage: Positions of the tasks.
         number: Number of the phase within the stage, from 0.
-        phase: Phase as the algorithm defines it.
+        kind: Phase as the algorithm defines it.
         epochs: Number of epochs of the phase.
         steps_per_epoch: Number of steps per epoch; None: every window once.
         offset: Number of epochs of the stage's earlier phases.
@@ -47,7 +47,7 @@ class TrainingPhase:
 
     stage: Sequence[int]
     number: int
-    phase: Phase
+    kind: Phase
     epochs: int
     steps_per_epoch: int | None
     offset: int
@@ -145,7 +145,7 @@ class TaskSequence:
         """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""
         context = self.context
         if resume is None:
-            context.algorithm.begin_phase(phase.phase, context.policy)
+            context.algorithm.begin_phase(phase.kind, context.policy)
         fit(
             context.policy,
             dataset,
@@ -156,13 +156,13 @@ class TaskSequence:
             augment=context.augment,
             on_epoch=lambda end: context.ranks.broadcast(self._after_epoch, phase, end),
             resume=resume,
-            label=f"task {phase.task + 1} {phase.phase.name}",
+            label=f"task {phase.task + 1} {phase.kind.name}",
             progress=context.progress,
             ranks=context.ranks,
         )
         if self._selects_best(phase):
             self._load_best(phase)
-        context.algorithm.end_phase(phase.phase, context.policy)
+        context.algorithm.end_phase(phase.kind, context.policy)
 
     def _after_epoch(self, phase: TrainingPhase, end: EpochEnd) -> None:
         """Record the loss, save, and evaluate a point of the learning curve if one is due."""
@@ -179,7 +179,7 @@ class TaskSequence:
         due = end.epoch in context.eval.curve_epochs(phase.epochs)
         if due or time.monotonic() - self._saved > SAVE_EVERY:
             self._save_progress(task, phase.number, end.state())
-        if not (due and phase.phase.measures_transfer):
+        if not (due and phase.kind.measures_transfer):
             return
         success = _mean_rate([self._evaluate("curve", task, member, epoch) for member in phase.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
@@ -199,7 +199,7 @@ class TaskSequence:
         return [p for p in self.context.algorithm.trained(self.context.policy) if id(p) not in of_policy]
 
     def _selects_best(self, phase: TrainingPhase) -> bool:
-        return self.context.eval.select == "best" and phase.phase.measures_transfer
+        return self.context.eval.select == "best" and phase.kind.measures_transfer
 
     def _best_epoch(self, phase: TrainingPhase, until: int) -> int:
         """Return the earliest epoch of the phase with the highest success on the learning curve so far."""

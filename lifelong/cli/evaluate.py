@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from libero_env.tasks import Task
     from lifelong.evaluation.actors import Actor
     from lifelong.evaluation.environments import VectorEnv
+    from lifelong.evaluation.protocols import EvalProtocol
     from lifelong.evaluation.restore import LoadedRun
-    from lifelong.evaluation.suite import EvalProtocol, SuiteEvaluation
+    from lifelong.evaluation.suite import SuiteEvaluation
 
 ROLLOUT = 4  # first word of the seeds of stochastic policies; those of runs are in lifelong.sequence
 POLICY_HELP = (
@@ -29,6 +30,11 @@ POLICY_HELP = (
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
     """Add the commands `libero eval POLICY` and `libero saliency RUN`."""
+    _add_eval(subparsers)
+    _add_saliency(subparsers)
+
+
+def _add_eval(subparsers: "argparse._SubParsersAction") -> None:
     parser = subparsers.add_parser("eval", help="success of a policy on tasks; resumes where it was stopped")
     parser.add_argument("policy", help=POLICY_HELP)
     parser.add_argument("--suite", nargs="+", metavar="SUITE", help="suites or tasks (default: the run's)")
@@ -61,6 +67,9 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
     )
     parser.add_argument("--again", action="store_true", help="repeat what is done already")
     parser.set_defaults(run=run_eval)
+
+
+def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
     parser = subparsers.add_parser("saliency", help="images of where a policy looks during a rollout")
     parser.add_argument(
         "policy", type=Path, metavar="RUN", help="a run's directory, or one of its checkpoints"
@@ -126,7 +135,8 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     """
     from libero_env.cli.tasks import find_tasks
     from libero_env.errors import UnknownNameError
-    from lifelong.evaluation.suite import PROTOCOLS, SuiteEvaluation, choose_init_states
+    from lifelong.evaluation.protocols import PROTOCOLS, choose_init_states
+    from lifelong.evaluation.suite import SuiteEvaluation
 
     if args.protocol not in PROTOCOLS:
         raise UnknownNameError("protocol", args.protocol, list(PROTOCOLS))
@@ -210,7 +220,7 @@ def _user_policy(args: argparse.Namespace) -> PolicyUnderTest:
     """Return a user-defined policy; see `lifelong.evaluation.actors.CallableActor` for its interface."""
     from libero_env.envs.batch import BatchEnv
     from lifelong.evaluation.actors import CallableActor
-    from lifelong.evaluation.suite import SELECTION
+    from lifelong.evaluation.protocols import SELECTION
 
     policy = load_callable(args.policy)
     cameras = tuple(getattr(policy, "cameras", ("agentview", "robot0_eye_in_hand")))

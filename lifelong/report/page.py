@@ -217,7 +217,7 @@ def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
 def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
     rows = []
     for task, (name, text) in enumerate(zip(run.record.tasks, run.record.instructions, strict=True)):
-        row = run.results.learned_with(task)
+        row = run.results.last_of_group(task)
         end, done = run.results.task_end(row), task < run.learned
         last = row == run.learned - 1
         rows.append(

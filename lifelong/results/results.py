@@ -76,8 +76,8 @@ class Results:
         """Return the record that closes a task; None while it is being learned."""
         return next((r for r in reversed(self.of(TaskEndRecord)) if r.task == task), None)
 
-    def learned_with(self, task: int) -> int:
-        """Return the task whose row of the matrix is the first after learning this one: the last of its group."""
+    def last_of_group(self, task: int) -> int:
+        """Return the last task of a task's group, whose row of the matrix is the first after learning it."""
         size = self.run.group_size
         return (task // size + 1) * size - 1
 
@@ -92,7 +92,7 @@ class Results:
         """Return the learning curve of each task that has one."""
         points: dict[int, dict[int, EvalRecord]] = {}
         for r in self.of(EvalRecord):
-            if r.phase == "curve" and r.learned == self.learned_with(r.task):
+            if r.phase == "curve" and r.learned == self.last_of_group(r.task):
                 points.setdefault(r.task, {})[r.epoch] = r
         return {task: _curve([by_epoch[e] for e in sorted(by_epoch)]) for task, by_epoch in points.items()}
 
@@ -125,7 +125,7 @@ class Results:
         curves = self.curves()
         best = {last: curve.epochs[curve.best] for last, curve in self._group_curves(curves).items()}
         for task, curve in curves.items():
-            row = self.learned_with(task)
+            row = self.last_of_group(task)
             measured = not math.isnan(rates[row, task])
             ended = self.task_end(row) is not None
             if row in best and ((diagonal == "curve" and measured) or (not measured and ended)):
@@ -155,7 +155,7 @@ class Results:
         """Return each group's learning curve by its last task, at the epochs where all its tasks were evaluated."""
         groups: dict[int, list[Curve]] = {}
         for task, curve in sorted(curves.items()):
-            groups.setdefault(self.learned_with(task), []).append(curve)
+            groups.setdefault(self.last_of_group(task), []).append(curve)
         size = self.run.group_size
         return {last: _mean_curve(found) for last, found in groups.items() if len(found) == size}
 

@@ -302,7 +302,7 @@ def test_forgetting_is_told_by_task_and_by_part_of_the_goal(compared: tuple[Path
     assert set(er["subgoals"]) == {"In", "Up"}  # the drawer is closed from the start
     assert found["groups"]["ewc"]["subgoals"]["In"]["forgotten"]["mean"] > 0.1
     text = Page(page.read_text()).text
-    assert "Forgetting by task" in text and "Differences of each two methods" in text and "task 2" not in text
+    assert "Forgetting by task" in text and "Differences between methods" in text and "task 2" not in text
 
 
 def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: Path):
@@ -315,7 +315,7 @@ def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: 
 
 def test_parts_of_the_goals_are_on_the_page_and_old_records_go_without(finished: Path, tmp_path: Path):
     text = Page((finished / "report.html").read_text()).text
-    assert "Parts of the goals" in text and "In thing_0 basket_1_contain_region" in text
+    assert "Subgoals" in text and "In thing_0 basket_1_contain_region" in text
     assert "held from the start" in text
     old = make_run(tmp_path / "old", tasks=2)
     lines = [json.loads(line) for line in (old / "results.jsonl").read_text().splitlines()]
@@ -323,17 +323,17 @@ def test_parts_of_the_goals_are_on_the_page_and_old_records_go_without(finished:
     (old / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in kept))
     assert load_run(old).results.problems == ()
     text = Page(write_report([old]).read_text()).text
-    assert "Parts of the goals" not in text and "Costs" not in text and "FWT" in text
+    assert "Subgoals" not in text and "Costs" not in text and "FWT" in text
 
 
 def test_where_the_policy_looks_is_on_the_page(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
-    assert "What the policy looks at" not in write_report([folder]).read_text()
+    assert "<h2>Saliency</h2>" not in write_report([folder]).read_text()
     (folder / "saliency").mkdir()
     Image.new("RGB", (8, 8)).save(folder / "saliency" / "task_01_after_01.png")
     (folder / "saliency" / "task_01_after_01.txt").write_text("at the cheese")
     text = Page(write_report([folder]).read_text()).text
-    assert "What the policy looks at" in text and "at the cheese" in text
+    assert "Saliency" in text and "at the cheese" in text
 
 
 def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Path):
@@ -391,7 +391,7 @@ def test_too_many_pictures_are_left_out_by_name(tmp_path: Path, monkeypatch: pyt
     (folder / "videos" / "a.txt").write_text("the first one")
     monkeypatch.setattr("lifelong.report.page.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
     raw = write_report([folder]).read_text()
-    assert "the first one" in raw and "Left out for their size: b.gif" in raw
+    assert "the first one" in raw and "Omitted because of their size: b.gif" in raw
     assert base64.b64encode((folder / "videos" / "a.gif").read_bytes()).decode() in raw
 
 

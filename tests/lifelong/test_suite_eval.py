@@ -14,7 +14,8 @@ from lifelong.cli import main as cli
 from lifelong.cli.evaluate import load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
-from lifelong.evaluation.suite import PROTOCOLS, EvalProtocol, SuiteEvaluation, choose_init_states, overall
+from lifelong.evaluation.protocols import PROTOCOLS, EvalProtocol, choose_init_states
+from lifelong.evaluation.suite import SuiteEvaluation, overall
 from lifelong.results.metrics import wilson_interval
 
 pytestmark = pytest.mark.unit
