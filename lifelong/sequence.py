@@ -120,11 +120,9 @@ class TaskSequence:
             context.algorithm.begin_task(task, dataset, context.policy)
         else:
             self._load_state(saved, str(context.directory.progress_path))
-        for phase in self._phases(stage):
-            if saved is not None and phase.number < saved["phase"]:
-                continue
-            resume = saved["fit"] if saved is not None and phase.number == saved["phase"] else None
-            self._train(phase, dataset, resume)
+        first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
+        for phase in self._phases(stage)[first:]:
+            self._train(phase, dataset, resume if phase.number == first else None)
             context.ranks.broadcast(self._save_progress, task, phase.number + 1)
         context.ranks.broadcast(self._end_task, task, dataset)
         if not context.ranks.first:

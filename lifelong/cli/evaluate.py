@@ -6,9 +6,10 @@ import importlib
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from lifelong.evaluation.actors import Actor
     from lifelong.evaluation.environments import VectorEnv
     from lifelong.evaluation.protocols import EvalProtocol
-    from lifelong.evaluation.restore import LoadedRun
     from lifelong.evaluation.suite import SuiteEvaluation
 
 ROLLOUT = 4  # first word of the seeds of stochastic policies; those of runs are in lifelong.sequence
@@ -91,27 +91,34 @@ def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
     parser.set_defaults(run=run_saliency)
 
 
-@dataclass(frozen=True)
-class PolicyUnderTest:
-    """A policy to be evaluated: that of a run, or a user-defined object.
+class PolicyUnderTest(ABC):
+    """A policy to be evaluated.
 
     Attributes:
         identity: Plain data that identify the policy.
         out: Default folder of the results.
         tasks: Tasks of its run, if it has one.
         selection: Initial states by which it may have been chosen.
-        protocol: Function that returns the protocol with the policy's own image size and steps.
-        env: Function that builds the environment of a task, given the number of simulations.
-        actor: Function that returns the context manager of a task's actor, given the initial states.
     """
 
     identity: Mapping[str, Any]
     out: Path
-    tasks: "Sequence[Task]"
+    tasks: "Sequence[Task]" = ()
     selection: Sequence[int]
-    protocol: "Callable[[EvalProtocol], EvalProtocol]"
-    env: "Callable[[Task, int, EvalProtocol], VectorEnv]"
-    actor: "Callable[[Task, Sequence[int], EvalProtocol], AbstractContextManager[Actor]]"
+
+    @abstractmethod
+    def protocol(self, base: "EvalProtocol") -> "EvalProtocol":
+        """Return a protocol with the policy's own image size and steps."""
+
+    @abstractmethod
+    def env(self, task: "Task", count: int, protocol: "EvalProtocol") -> "VectorEnv":
+        """Build the environment of a task with the given number of simulations."""
+
+    @abstractmethod
+    def actor(
+        self, task: "Task", states: Sequence[int], protocol: "EvalProtocol"
+    ) -> "AbstractContextManager[Actor]":
+        """Return the context manager of the task's actor, which starts in the given initial states."""
 
 
 def run_eval(args: argparse.Namespace) -> None:
@@ -140,7 +147,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
 
     if args.protocol not in PROTOCOLS:
         raise UnknownNameError("protocol", args.protocol, list(PROTOCOLS))
-    policy = _user_policy(args) if _is_callable(args.policy) else _run_policy(args)
+    policy = UserPolicy(args) if _is_callable(args.policy) else RunPolicy(args)
     tasks = find_tasks(args.suite) if args.suite else policy.tasks
     if not tasks:
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
@@ -165,92 +172,91 @@ def _is_callable(text: str) -> bool:
     return ":" in text and not Path(text).exists()
 
 
-def _run_policy(args: argparse.Namespace) -> PolicyUnderTest:
-    """Return the policy of a run, evaluated with the image size it was trained on."""
-    from lifelong.evaluation.restore import restore
+class RunPolicy(PolicyUnderTest):
+    """The policy of a run, evaluated with the image size it was trained on."""
 
-    run = restore(Path(args.policy), after=args.after, device=args.device)
-    digest = hashlib.sha256(run.checkpoint.read_bytes()).hexdigest()[:16]
-    settings = run.eval
+    def __init__(self, args: argparse.Namespace):
+        from lifelong.evaluation.restore import restore
 
-    def protocol(p: "EvalProtocol") -> "EvalProtocol":
-        if args.protocol == "libero":  # a run may have other values
-            p = replace(p, horizon=settings.horizon, settle_steps=settings.settle_steps)
-        return replace(p, camera_size=run.policy.spec.image_size, original=False)
+        self.args = args
+        self.run = restore(Path(args.policy), after=args.after, device=args.device)
+        digest = hashlib.sha256(self.run.checkpoint.read_bytes()).hexdigest()[:16]
+        self.identity = {"run": str(self.run.path), "after": self.run.learned, "weights": digest}
+        self.out = self.run.path / "eval" / f"after_{self.run.learned:02d}"
+        self.tasks = self.run.tasks
+        self.selection = tuple(self.run.eval.init_states("curve"))
 
-    return PolicyUnderTest(
-        identity={"run": str(run.path), "after": run.learned, "weights": digest},
-        out=run.path / "eval" / f"after_{run.learned:02d}",
-        tasks=run.tasks,
-        selection=tuple(settings.init_states("curve")),
-        protocol=protocol,
-        env=lambda task, count, p: _run_env(run, task, count, p, args),
-        actor=lambda task, states, p: _run_actor(run, task, states, args.seed),
-    )
+    def protocol(self, base: "EvalProtocol") -> "EvalProtocol":
+        settings = self.run.eval
+        if self.args.protocol == "libero":  # a run may have other values
+            base = replace(base, horizon=settings.horizon, settle_steps=settings.settle_steps)
+        return replace(base, camera_size=self.run.policy.spec.image_size, original=False)
 
+    def env(self, task: "Task", count: int, protocol: "EvalProtocol") -> "VectorEnv":
+        from libero_env.envs.batch import BatchEnv
+        from lifelong.data.settings import CAMERAS
 
-def _run_env(
-    run: "LoadedRun", task: "Task", count: int, protocol: "EvalProtocol", args: argparse.Namespace
-) -> "VectorEnv":
-    from libero_env.envs.batch import BatchEnv
-    from lifelong.data.settings import CAMERAS
-
-    return BatchEnv(
-        task,
-        count,
-        num_threads=args.threads,
-        cameras=tuple(CAMERAS[view] for view in run.policy.spec.views),
-        camera_size=protocol.camera_size,
-        horizon=protocol.steps(task) + protocol.settle_steps,
-        assets=args.assets,
-    )
-
-
-@contextmanager
-def _run_actor(run: "LoadedRun", task: "Task", states: Sequence[int], seed: int) -> "Iterator[Actor]":
-    from lifelong.evaluation.actors import PolicyActor
-    from lifelong.seeding import generator
-
-    draws = [generator(seed, ROLLOUT, task.index, state) for state in states]
-    with run.acting(task) as policy:
-        yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws)
-
-
-def _user_policy(args: argparse.Namespace) -> PolicyUnderTest:
-    """Return a user-defined policy; see `lifelong.evaluation.actors.CallableActor` for its interface."""
-    from libero_env.envs.batch import BatchEnv
-    from lifelong.evaluation.actors import CallableActor
-    from lifelong.evaluation.protocols import SELECTION
-
-    policy = load_callable(args.policy)
-    cameras = tuple(getattr(policy, "cameras", ("agentview", "robot0_eye_in_hand")))
-    views = tuple(f"{c.removeprefix('robot0_')}_rgb" for c in cameras)
-    observations = tuple(getattr(policy, "observations", ("rgb", "proprioception", "ee_quat")))
-
-    def protocol(p: "EvalProtocol") -> "EvalProtocol":
-        size = (args.size, args.size) if args.size else tuple(getattr(policy, "camera_size", p.camera_size))
-        return replace(
-            p, camera_size=size, original=p.original if args.names is None else args.names == "original"
-        )
-
-    def env(task: "Task", count: int, p: "EvalProtocol") -> "VectorEnv":
         return BatchEnv(
             task,
             count,
-            num_threads=args.threads,
-            cameras=cameras,
-            camera_size=p.camera_size,
-            horizon=p.steps(task) + p.settle_steps,
-            observations=observations,
-            assets=args.assets,
+            num_threads=self.args.threads,
+            cameras=tuple(CAMERAS[view] for view in self.run.policy.spec.views),
+            camera_size=protocol.camera_size,
+            horizon=protocol.steps(task) + protocol.settle_steps,
+            assets=self.args.assets,
         )
 
     @contextmanager
-    def actor(task: "Task", states: Sequence[int], p: "EvalProtocol") -> "Iterator[Actor]":
-        yield CallableActor(policy, task.language, views, p.original)
+    def actor(self, task: "Task", states: Sequence[int], protocol: "EvalProtocol") -> "Iterator[Actor]":
+        from lifelong.evaluation.actors import PolicyActor
+        from lifelong.seeding import generator
 
-    name = args.policy.replace(":", ".")
-    return PolicyUnderTest({"policy": args.policy}, Path("eval") / name, (), SELECTION, protocol, env, actor)
+        run = self.run
+        draws = [generator(self.args.seed, ROLLOUT, task.index, state) for state in states]
+        with run.acting(task) as policy:
+            yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws)
+
+
+class UserPolicy(PolicyUnderTest):
+    """A user-defined policy; see `lifelong.evaluation.actors.CallableActor` for its interface."""
+
+    def __init__(self, args: argparse.Namespace):
+        from lifelong.evaluation.protocols import SELECTION
+
+        self.args, self.policy = args, load_callable(args.policy)
+        self.cameras = tuple(getattr(self.policy, "cameras", ("agentview", "robot0_eye_in_hand")))
+        self.identity = {"policy": args.policy}
+        self.out = Path("eval") / args.policy.replace(":", ".")
+        self.selection = SELECTION
+
+    def protocol(self, base: "EvalProtocol") -> "EvalProtocol":
+        args, size = self.args, tuple(getattr(self.policy, "camera_size", base.camera_size))
+        if args.size:
+            size = (args.size, args.size)
+        original = base.original if args.names is None else args.names == "original"
+        return replace(base, camera_size=size, original=original)
+
+    def env(self, task: "Task", count: int, protocol: "EvalProtocol") -> "VectorEnv":
+        from libero_env.envs.batch import BatchEnv
+
+        default = ("rgb", "proprioception", "ee_quat")
+        return BatchEnv(
+            task,
+            count,
+            num_threads=self.args.threads,
+            cameras=self.cameras,
+            camera_size=protocol.camera_size,
+            horizon=protocol.steps(task) + protocol.settle_steps,
+            observations=tuple(getattr(self.policy, "observations", default)),
+            assets=self.args.assets,
+        )
+
+    @contextmanager
+    def actor(self, task: "Task", states: Sequence[int], protocol: "EvalProtocol") -> "Iterator[Actor]":
+        from lifelong.evaluation.actors import CallableActor
+
+        views = tuple(f"{camera.removeprefix('robot0_')}_rgb" for camera in self.cameras)
+        yield CallableActor(self.policy, task.language, views, protocol.original)
 
 
 def load_callable(text: str) -> Any:
