@@ -1,6 +1,7 @@
 """Classes of objects by category, as the original registers them, with the models of `libero_env`."""
 
 import re
+from collections.abc import Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -198,10 +199,7 @@ class BuiltinObject(BaseObject):
         self.rotation_axis = physics.rotation_axis
         if self.rotation and self.rotation_axis in self.rotation and len(self.rotation) == 1:
             self.rotation = self.rotation[self.rotation_axis]
-        articulation = {
-            f"default_{state}_ranges": list(physics.articulation.get(state, ())) for state in STATES
-        }
-        self.object_properties = {"articulation": articulation, "vis_site_names": {}}
+        self.object_properties = _properties(physics.articulation)
 
     def _own_file(self, obj_name: str, joints: Any) -> None:
         folder = Path(chosen_assets().value) / self.family
@@ -209,13 +207,17 @@ class BuiltinObject(BaseObject):
         if stem.suffix != ".xml":
             stem = folder / (stem if self.in_folders else "") / f"{stem.name}.xml"
         self.file, self.joint_specs, self._fixed = str(stem), joints, joints is None
-        empty: dict[str, list[float]] = {f"default_{state}_ranges": [] for state in STATES}
-        self.object_properties = {"articulation": empty, "vis_site_names": {}}
+        self.object_properties = _properties({})
 
     @cached_property
     def model(self) -> ObjectModel:
         """Model in the pack in use."""
         return select_pack().build(self.category_name)
+
+
+def _properties(articulation: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    ranges = {f"default_{state}_ranges": list(articulation.get(state, ())) for state in STATES}
+    return {"articulation": ranges, "vis_site_names": {}}
 
 
 def _parameters(category: str) -> ObjectModel | Physics:

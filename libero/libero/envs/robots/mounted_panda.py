@@ -1,6 +1,6 @@
 """The arm on its pedestal: table, kitchen and study."""
 
-from libero.libero.envs.robots.panda import Panda, behind_a_table
+from libero.libero.envs.robots.panda import COMMON_OFFSETS, Panda, behind_a_table
 
 
 class MountedPanda(Panda):
@@ -8,9 +8,7 @@ class MountedPanda(Panda):
 
     default_mount = "RethinkMount"
     base_xpos_offset = {
-        "bins": (-0.5, -0.1, 0.0),
-        "empty": (-0.6, 0.0, 0.0),
-        "table": behind_a_table(-0.16, 0.0),
+        **COMMON_OFFSETS,
         "kitchen_table": behind_a_table(-0.16, 0.0),
         "study_table": behind_a_table(-0.25, 0.0),
     }

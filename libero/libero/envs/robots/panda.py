@@ -14,6 +14,7 @@ class Panda:
     Attributes:
         default_mount: Name of the mount; None for the ground.
         base_xpos_offset: Workspace -> position of the base, (3,) m; for a table a function of its length.
+        horizontal_radius: Radius that is kept free around the arm, m.
     """
 
     default_mount: ClassVar[str | None] = None
@@ -26,6 +27,8 @@ class Panda:
     joints: ClassVar[tuple[str, ...]] = ARM_JOINTS
     gripper_joints: ClassVar[tuple[str, ...]] = FINGER_JOINTS
     base_xpos_offset: ClassVar[dict[str, Any]] = {}
+    dof: ClassVar[int] = len(ARM_JOINTS)
+    horizontal_radius: ClassVar[float] = 0.5
 
     def __init__(self, idn: int = 0):
         self.idn, self.name = idn, f"Panda{idn}"
@@ -36,21 +39,18 @@ class Panda:
         return np.array(REST_QPOS)
 
     @property
-    def dof(self) -> int:
-        """Number of joints."""
-        return len(ARM_JOINTS)
-
-    @property
     def top_offset(self) -> np.ndarray:
         """Highest point over the base, (3,) m."""
         return np.array([0.0, 0.0, 1.0])
-
-    @property
-    def horizontal_radius(self) -> float:
-        """Radius that is kept free around the arm, m."""
-        return 0.5
 
 
 def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, float, float]]:
     """Return the position of the base behind a table as a function of the length of the table."""
     return lambda table_length: (x - table_length / 2, 0.0, height)
+
+
+COMMON_OFFSETS = {
+    "bins": (-0.5, -0.1, 0.0),
+    "empty": (-0.6, 0.0, 0.0),
+    "table": behind_a_table(-0.16, 0.0),
+}
