@@ -24,9 +24,7 @@ def main(args: argparse.Namespace) -> int:
     roots = args.paths or [datasets_folder()]
     files = [f for root in roots for f in ([root] if root.is_file() else sorted(root.rglob("*.hdf5")))]
     if not files:
-        raise DemoError(
-            f"no demonstrations in {', '.join(map(str, roots))}; `libero demos download` fetches some"
-        )
+        raise DemoError(f"no demonstrations in {', '.join(map(str, roots))}; get some: libero demos download")
     bad = 0
     for file in tqdm(files, unit="file", disable=None):
         try:

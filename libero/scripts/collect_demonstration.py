@@ -31,12 +31,9 @@ def collect(args: argparse.Namespace) -> int:
         LiberoError: The robot or controller does not exist, or the number of demonstrations is below 1.
     """
     robots = [args.robots] if isinstance(args.robots, str) else args.robots
-    for flag, found, known in (
-        ("--robots", robots, ["Panda"]),
-        ("--controller", args.controller, "OSC_POSE"),
-    ):
-        if found != known:
-            raise LiberoError(f"{flag} {found}: demonstrations are recorded with {known} only")
+    for flag, got, known in (("--robots", robots, ["Panda"]), ("--controller", args.controller, "OSC_POSE")):
+        if got != known:
+            raise LiberoError(f"{flag} {got}: demonstrations are recorded with {known} only")
     if args.num_demonstration < 1:
         raise LiberoError(f"--num-demonstration {args.num_demonstration}: expected at least 1")
     task = read_task(args.bddl_file)

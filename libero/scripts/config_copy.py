@@ -21,11 +21,8 @@ def main(args: argparse.Namespace) -> None:
         LiberoError: The folder exists.
     """
     if args.target.exists() and not args.overwrite:
-        raise LiberoError(
-            f"{args.target} exists; choose another folder, or replace its files with --overwrite"
-        )
+        raise LiberoError(f"{args.target} exists; choose another folder, or pass --overwrite")
     with as_file(files("libero") / "configs") as source:
-        shutil.copytree(
-            source, args.target, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__", "*.py")
-        )
+        ignored = shutil.ignore_patterns("__pycache__", "*.py")
+        shutil.copytree(source, args.target, dirs_exist_ok=True, ignore=ignored)
     print(f"{args.target}: {len(list(args.target.rglob('*.yaml')))} files")

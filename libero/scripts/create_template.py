@@ -27,9 +27,7 @@ KINDS = {
 @script(
     option("--template", "-t", choices=tuple(KINDS), help="kind of template"),
     option("--name", "-n", help="name of the class, such as MyKitchenScene"),
-    option(
-        "--out", "-o", type=Path, default=Path(), help="folder of the files (default: the current folder)"
-    ),
+    option("--out", "-o", type=Path, default=Path(), help="folder (default: the current folder)"),
     option("--overwrite", action="store_true", help="replace files that exist"),
     prog="libero.create_template",
 )
@@ -44,18 +42,14 @@ def main(args: argparse.Namespace) -> None:
         raise LiberoError(f"{kind!r} is not a template; valid: {', '.join(KINDS)}")
     name = args.name or ask("Name of the class, such as MyKitchenScene", "--name")
     if not re.fullmatch(r"[A-Z]\w*", name, re.ASCII):
-        raise LiberoError(
-            f"{name!r} is not a valid class name; use letters and digits, and begin with a capital"
-        )
+        raise LiberoError(f"{name!r} is not a valid class name; begin with a capital, use letters and digits")
     stem = category_of(name) if kind == "object" else scene_key(name)
     texts = {}
     for file in KINDS[kind]:
         text = (files("libero.scripts") / "templates" / f"{file}.txt").read_text(encoding="utf-8")
         texts[args.out / f"{stem}{Path(file).suffix}"] = Template(text).substitute(Name=name, name=stem)
     if (existing := [path for path in texts if path.exists()]) and not args.overwrite:
-        raise LiberoError(
-            f"{existing[0]} exists; choose another name or folder, or replace it with --overwrite"
-        )
+        raise LiberoError(f"{existing[0]} exists; choose another name or folder, or pass --overwrite")
     args.out.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         path.write_text(text, encoding="utf-8")

@@ -15,9 +15,7 @@ from libero.scripts.command import option, script
 @script(
     option("--download-dir", type=Path, help="folder (default: that of get_libero_path('datasets'))"),
     option("--datasets", choices=("all", *DATASET_LINKS), default="all", help="data set (default: all)"),
-    option(
-        "--use-huggingface", action="store_true", help="download verified files from the Hub, not archives"
-    ),
+    option("--use-huggingface", action="store_true", help="download verified files of the Hub, not archives"),
 )
 def main(args: argparse.Namespace) -> int:
     """Download, then print which files exist; return 1 where a requested file is missing."""

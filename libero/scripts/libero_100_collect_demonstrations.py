@@ -9,10 +9,7 @@ from libero.scripts.command import option, script
 from libero_env.errors import LiberoError
 
 
-@script(
-    *OPTIONS,
-    option("--task-id", type=int, required=True, help="0 to 99; the last ten are those of libero_10"),
-)
+@script(*OPTIONS, option("--task-id", type=int, required=True, help="0 to 99; 90 to 99 are libero_10"))
 def main(args: argparse.Namespace) -> int:
     """Record the demonstrations, see `collect_demonstration.collect`.
 

@@ -24,9 +24,7 @@ def main(args: argparse.Namespace) -> int:
     if args.check:
         return compare(args.check)
     roots = args.paths or [datasets_folder()]
-    files = [
-        f for r in roots for f in ([r] if r.is_file() else sorted(p for p in r.rglob("*") if p.is_file()))
-    ]
+    files = [f for root in roots for f in (root, *sorted(root.rglob("*"))) if f.is_file()]
     if not files:
         raise LiberoError(f"no files in {', '.join(map(str, roots))}")
     for file in tqdm(files, unit="file", disable=None):

@@ -41,10 +41,10 @@ def cameras(
         UnknownNameError: The segmentation does not exist.
     """
     names = [names] if isinstance(names, str) else list(names)
-    per_camera = isinstance(segmentations, Sequence) and any(
+    nested = isinstance(segmentations, list | tuple) and any(
         isinstance(s, list | tuple) for s in segmentations
     )
-    kinds = list(segmentations) if per_camera else [segmentations] * len(names)  # type: ignore[call-overload]
+    kinds = list(segmentations) if nested else [segmentations] * len(names)  # type: ignore[call-overload]
     columns = [_each(heights, len(names)), _each(widths, len(names)), _each(depths, len(names)), kinds]
     if any(len(column) != len(names) for column in columns):
         raise LiberoError(

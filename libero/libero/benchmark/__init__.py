@@ -109,11 +109,8 @@ class Benchmark:
         if self.name in suite_names():
             self.tasks = [_entry(task) for task in get_suite(self.name).order(self.task_order_index)]
         else:
-            order = (
-                load_data("task_orders.yaml")[self.task_order_index]
-                if len(tasks) == 10
-                else range(len(tasks))
-            )
+            orders = load_data("task_orders.yaml")
+            order = orders[self.task_order_index] if len(tasks) == 10 else range(len(tasks))
             self.tasks = [tasks[i] for i in order]
         self.n_tasks = len(self.tasks)
 

@@ -2,6 +2,4 @@
 
 from libero_env.tasks import get_suite, suite_names
 
-libero_task_map: dict[str, list[str]] = {
-    name: [task.name for task in get_suite(name).tasks] for name in suite_names()
-}
+libero_task_map = {name: [task.name for task in get_suite(name).tasks] for name in suite_names()}

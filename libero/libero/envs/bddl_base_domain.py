@@ -103,9 +103,8 @@ class BDDLBaseDomain:
         **kwargs: Any,
     ):
         if unknown := [key for key in kwargs if key not in WITHOUT_EFFECT]:
-            raise UnknownNameError(
-                "argument", unknown[0], [*signature(BDDLBaseDomain).parameters, *WITHOUT_EFFECT]
-            )
+            valid = [*signature(BDDLBaseDomain).parameters, *WITHOUT_EFFECT]
+            raise UnknownNameError("argument", unknown[0], valid)
         if control_freq != CONTROL_FREQ:
             raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
@@ -119,9 +118,8 @@ class BDDLBaseDomain:
         self.window = Window(render_camera) if has_renderer else None
         self.initialization_noise = initialization_noise
         self.placement_initializer = placement_initializer
-        self.camera_list = cameras(
-            camera_names, camera_heights, camera_widths, camera_depths, camera_segmentations
-        )
+        sizes = camera_heights, camera_widths
+        self.camera_list = cameras(camera_names, *sizes, camera_depths, camera_segmentations)
         self.camera_names = [camera.name for camera in self.camera_list]
         self.rng = np.random.default_rng()
         self.timestep, self.cur_time, self.done = 0, 0.0, False
@@ -184,9 +182,8 @@ class BDDLBaseDomain:
         self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
         self.model = TaskModel(scene, self.sim.model._model)
         drawn = self.camera_list if self.use_camera_obs else ()
-        self.observer = Observer(
-            self.sim, list(scene.objects) if self.use_object_obs else [], drawn, self.model.segments
-        )
+        observed = list(scene.objects) if self.use_object_obs else []
+        self.observer = Observer(self.sim, observed, drawn, self.model.segments)
         self._add_placement_initializer()
 
     # Episodes -----------------------------------------------------------------------------------------------
@@ -237,9 +234,8 @@ class BDDLBaseDomain:
             )
         self.simulations.fixtures[0] = self.simulations.read_fixtures()
         fixtures = state[short:].reshape(1, -1, 7) if state.size == whole else None
-        self.simulations.reset(
-            [0], state[None, 1 : 1 + nq], state[None, 1 + nq : short], float(state[0]), fixtures
-        )
+        qpos, qvel = state[None, 1 : 1 + nq], state[None, 1 + nq : short]
+        self.simulations.reset([0], qpos, qvel, float(state[0]), fixtures)
 
     def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
         """Act for 50 ms; return observation, reward, success, and a dictionary with `success`.

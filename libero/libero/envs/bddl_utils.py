@@ -126,7 +126,6 @@ def task_file(name: str | os.PathLike) -> str:
     if path.exists() or (path.name != str(name) and not into_checkout):
         return str(name)
     suites = [path.parent.name] if into_checkout else list(suite_tasks())
-    found = [
-        file for suite in suites if (file := Path(get_libero_path("bddl_files"), suite, path.name)).exists()
-    ]
+    files = [Path(get_libero_path("bddl_files"), suite, path.name) for suite in suites]
+    found = [file for file in files if file.exists()]
     return str(found[0]) if len(found) == 1 else str(name)

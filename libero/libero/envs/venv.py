@@ -4,6 +4,7 @@ Observations are object arrays of dictionaries; rewards and successes are stacke
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,7 @@ class BaseVectorEnv:
         self.env_num = len(env_fns)
         self.wait_num = wait_num or self.env_num
         if not 1 <= self.wait_num <= self.env_num:
-            raise LiberoError(
-                f"wait_num={wait_num}: expected 1 to {self.env_num}, the number of environments"
-            )
+            raise LiberoError(f"wait_num={wait_num}: expected 1 to {self.env_num} environments")
         if timeout is not None and timeout <= 0:
             raise LiberoError(f"timeout={timeout}: expected a positive number of seconds")
         self.timeout = timeout
@@ -119,9 +118,7 @@ class BaseVectorEnv:
         """Return whether the goal of each environment holds."""
         return self._call("check_success", self._ids(id))
 
-    def get_segmentation_of_interest(
-        self, segmentation_images: Sequence[np.ndarray], id: Ids = None
-    ) -> list[np.ndarray]:
+    def get_segmentation_of_interest(self, segmentation_images: Any, id: Ids = None) -> list[np.ndarray]:
         """Call `get_segmentation_of_interest` of each environment with its picture."""
         return self._call("get_segmentation_of_interest", self._ids(id), segmentation_images)
 
@@ -140,9 +137,7 @@ class BaseVectorEnv:
             for worker in self.workers:
                 worker.close()
 
-    def _call(
-        self, method: str, ids: Sequence[int], arguments: Sequence[Any] | None = None, **kwargs: Any
-    ) -> list[Any]:
+    def _call(self, method: str, ids: Sequence[int], arguments: Any = None, **kwargs: Any) -> list[Any]:
         """Call a method of these environments at once, each with its own argument."""
         if arguments is not None and len(arguments) != len(ids):
             raise LiberoError(f"{method}: {len(arguments)} values for {len(ids)} environments")
@@ -167,9 +162,7 @@ class BaseVectorEnv:
             raise LiberoError("this vector of environments is closed; make a new one")
         ids = list(range(self.env_num)) if id is None else [int(i) for i in np.atleast_1d(id)]
         if busy := [i for i in ids if i in self.waiting_id]:
-            raise LiberoError(
-                f"environments {busy} are still at their last step; call step until they are ready"
-            )
+            raise LiberoError(f"environments {busy} are still at their last step; call step to wait for them")
         return ids
 
 
@@ -197,9 +190,8 @@ class SubprocVectorEnv(BaseVectorEnv):
         call_timeout: float | None = None,
         **kwargs: Any,
     ):
-        super().__init__(
-            env_fns, lambda env_fn: SubprocEnvWorker(env_fn, share_memory, call_timeout), **kwargs
-        )
+        worker_fn = partial(SubprocEnvWorker, share_memory=share_memory, timeout=call_timeout)
+        super().__init__(env_fns, worker_fn, **kwargs)
 
 
 def _objects(items: Sequence[Any]) -> np.ndarray:

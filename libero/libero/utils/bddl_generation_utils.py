@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from libero._adapters.lookup import lookup
 from libero.libero.envs.bddl_utils import as_expression
 from libero.libero.utils.object_utils import get_affordance_regions
@@ -135,9 +137,7 @@ def get_xy_region(
         region_half_len: Half size, m: one number, or one along x and one along y.
         yaw_rotation: Range (low, high) of the rotation about the vertical, rad.
     """
-    centres: Any = (
-        [region_centroid_xy] if isinstance(region_centroid_xy[0], int | float) else region_centroid_xy
-    )
+    centres: Any = np.reshape(region_centroid_xy, (-1, 2)).tolist()
     half = (region_half_len,) * 2 if isinstance(region_half_len, int | float) else tuple(region_half_len)
     ranges = tuple((x - half[0], y - half[1], x + half[0], y + half[1]) for x, y in centres)
     low, high = map(float, yaw_rotation)
@@ -172,15 +172,10 @@ def get_goal_state(goal_states: Sequence[Any]) -> Expression:
     return parts[0] if len(parts) == 1 and not isinstance(parts[0], Atom) else And(parts)
 
 
-def get_affordance_region_kwargs_list_from_fixture_info(
-    fixture_info: Mapping[str, int],
-) -> list[dict[str, str]]:
+def get_affordance_region_kwargs_list_from_fixture_info(fixture_info: Mapping[str, int]) -> list[dict]:
     """Return arguments of `get_object_affordance_region` for all regions of objects, from category -> number."""
-    objects = {
-        category: names
-        for category, names in get_object_dict(fixture_info).items()
-        if category not in WORKSPACE_CATEGORIES.values()
-    }
+    workspaces = {*WORKSPACE_CATEGORIES, *WORKSPACE_CATEGORIES.values()}
+    objects = get_object_dict({c: n for c, n in fixture_info.items() if c not in workspaces})
     regions = get_affordance_regions(objects)
     return [
         {"region_name": region, "target_name": name}
@@ -190,9 +185,7 @@ def get_affordance_region_kwargs_list_from_fixture_info(
     ]
 
 
-def get_xy_region_kwargs_list_from_regions_info(
-    regions_info: Mapping[str, Mapping[str, Any]],
-) -> list[dict[str, Any]]:
+def get_xy_region_kwargs_list_from_regions_info(regions_info: Mapping[str, Mapping]) -> list[dict]:
     """Return arguments of `get_xy_region`, from those that `InitialSceneTemplates.get_region_dict` returns."""
     return [{"region_name": name, **facts} for name, facts in regions_info.items()]
 

@@ -131,9 +131,7 @@ class InitialSceneTemplates:
             LiberoError: The region exists already.
         """
         if region_name in self.regions:
-            raise LiberoError(
-                f"{type(self).__name__}: region {region_name} is defined twice; rename one of them"
-            )
+            raise LiberoError(f"{type(self).__name__}: region {region_name} is defined twice; rename one")
         facts = {
             "target_name": target_name,
             "region_centroid_xy": region_centroid_xy,

@@ -98,9 +98,7 @@ def get_task_info(scene_name: str | None = None) -> Any:
     return lookup(TASK_INFO, "scene with tasks", scene_key(scene_name))
 
 
-def generate_bddl_from_task_info(
-    folder: str | os.PathLike | Any = "", output_dir: str | os.PathLike = ""
-) -> Any:
+def generate_bddl_from_task_info(folder: Any = "", output_dir: str | os.PathLike = "") -> Any:
     """Write the task files of all registered tasks, or of one.
 
     Args:

@@ -5,7 +5,6 @@ from typing import Any, ClassVar
 
 import mujoco
 
-from libero.libero.envs.arenas.style import STYLE_KINDS
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.pack import select_pack
 
@@ -63,10 +62,10 @@ class WorkspaceArena(Arena):
         **kwargs: Any,
     ):
         spec = mujoco.MjSpec()
-        given = dict(zip((*STYLE_KINDS, "scene"), (floor_style, wall_style, scene), strict=True))
+        styles = {"floor": floor_style, "wall": wall_style, "scene": scene}
         self.workspace = load_workspace(self.category)
         select_pack().add_arena(
-            spec, self.workspace, {key: name for key, name in given.items() if name is not None}
+            spec, self.workspace, {k: name for k, name in styles.items() if name is not None}
         )
         super().__init__(spec)
 

@@ -1,11 +1,6 @@
 """What opens, closes and turns."""
 
-from libero.libero.envs.base_object import (
-    BuiltinObject,
-    declare,
-    get_object_fn,
-    register_visual_change_object,
-)
+from libero.libero.envs.base_object import BuiltinObject, declare, register_visual_change_object
 
 
 class ArticulatedObject(BuiltinObject):
@@ -19,5 +14,6 @@ NAMES = (
     "BasinFaucet Faucet FlatStove Microwave ShortCabinet ShortFridge SlideCabinet WhiteCabinet Window "
     "WoodenCabinet"
 )
-globals().update(declare(ArticulatedObject, NAMES))
-register_visual_change_object(get_object_fn("flat_stove"))
+CLASSES = declare(ArticulatedObject, NAMES)
+globals().update(CLASSES)
+register_visual_change_object(CLASSES["FlatStove"])

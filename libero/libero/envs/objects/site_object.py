@@ -39,7 +39,7 @@ class SiteObject:
         return contains(self._box(this_position, this_mat), np.asarray(other_position))
 
     def under(
-        self, this_position: Any, this_mat: Any, other_position: Any, other_height: float = 0.10
+        self, this_position: Any, this_mat: Any, other_position: Any, other_height: float = 0.1
     ) -> bool:
         """Return whether a point is above the box, by less than `other_height`, m."""
         return is_over(self._box(this_position, this_mat), np.asarray(other_position), other_height)

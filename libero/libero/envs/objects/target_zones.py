@@ -38,6 +38,5 @@ class TargetZone(BuiltinObject):
     def on_top(self, this_position: Any, other_position: Any, other_height: float = 0.02) -> bool:
         """Return whether a point is above the zone, by less than `other_height`, m."""
         delta = np.asarray(other_position) - np.asarray(this_position)
-        return bool(
-            (np.abs(delta[:2]) < self.size[:2]).all() and self.size[2] - 0.005 < delta[2] < other_height
-        )
+        inside = (np.abs(delta[:2]) < self.size[:2]).all()
+        return bool(inside and self.size[2] - 0.005 < delta[2] < other_height)

@@ -49,8 +49,4 @@ def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, fl
     return lambda table_length: (x - table_length / 2, 0.0, height)
 
 
-COMMON_OFFSETS = {
-    "bins": (-0.5, -0.1, 0.0),
-    "empty": (-0.6, 0.0, 0.0),
-    "table": behind_a_table(-0.16, 0.0),
-}
+COMMON_OFFSETS = {"bins": (-0.5, -0.1, 0.0), "empty": (-0.6, 0.0, 0.0), "table": behind_a_table(-0.16, 0.0)}
