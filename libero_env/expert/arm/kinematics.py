@@ -1,4 +1,4 @@
-"""Inverse kinematics of the arm, and the limit that keeps its elbow bent."""
+"""Inverse kinematics of the arm, and the limit on actions that keeps its elbow bent."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,8 @@ _JOINT_MARGIN = 0.2  # [rad] from the limits of the joints, which the controller
 _ELBOW_RANGE = -2.85, -0.9  # [rad] of joint 4: short of folded, short of straight (-0.47), where it locks
 _ROLL_JOINTS, _MAX_ROLL = [0, 2, 4], 1.0  # joints that roll the arm; [rad] of roll that is free of cost
 
-_STRAIGHT_ELBOW, _LIMITED_BEND = -0.467, 0.6  # [rad] of joint 4, and from there, where motion is limited
+_STRAIGHT_ELBOW = -0.467  # [rad] of joint 4
+_LIMITED_BEND = 0.6  # [rad] from straight, below which the elbow's extension is limited
 _LINK_FACTOR = 0.0892  # [m] a b / (2 (a + b)) for links of lengths a and b
 _RESERVE = 0.012  # [m] of the remaining reach that is not used
 
@@ -46,7 +47,11 @@ def joint_angles(view: StateView) -> np.ndarray:
 
 
 class ArmKinematics:
-    """Inverse kinematics that prefers the rest posture, as the controller does."""
+    """Inverse kinematics that prefers the rest posture, as the controller does.
+
+    Args:
+        model: Model of a scene with the robot.
+    """
 
     def __init__(self, model: mujoco.MjModel):
         self._model, self._data = model, mujoco.MjData(model)
@@ -62,7 +67,7 @@ class ArmKinematics:
         """Solve for poses of the grip site one after the other, each from the solution before.
 
         Args:
-            start: Joint angles to start from, (7,), [rad].
+            start: Joint angles at the start, (7,), [rad].
             poses: Poses of the grip site.
 
         Returns:
@@ -75,7 +80,15 @@ class ArmKinematics:
         return angles, largest
 
     def solve(self, start: np.ndarray, pose: Pose) -> tuple[np.ndarray, float]:
-        """Return joint angles (7,) near a pose, and the error beyond the tolerance: [m] and tenths of [rad]."""
+        """Solve for one pose of the grip site.
+
+        Args:
+            start: Joint angles at the start, (7,), [rad].
+            pose: Pose of the grip site.
+
+        Returns:
+            Joint angles (7,), [rad], and the error beyond the tolerances, [m]; 0.1 rad of orientation count as 1 cm.
+        """
         model, data, angles = self._model, self._data, start.copy()
         jacobian, rest = np.zeros((6, model.nv)), np.array(REST_QPOS)
         for _ in range(_MAX_STEPS):

@@ -15,11 +15,10 @@ from libero_env.expert.skills.pick_place import (
     FINGER_CLEARANCE,
     OBSTACLE_RADIUS,
     STANDING,
-    STILL,
     PickPlace,
     has_moved,
 )
-from libero_env.expert.skills.skill import Skill
+from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -56,8 +55,7 @@ class DropIntoContainer(Skill):
         self._clear_height = 0.0  # [m] above the grasp, at which the fingertips are clear of the object
         self._hold_pose = Pose(np.zeros(3), np.eye(3))  # to keep while the fingers move
         self._grasp_offset = np.zeros(3)  # of the object from the grip site when it was grasped
-        self._resisted_steps, self._backing_off = 0, False  # something resisted the way down; going up again
-        self._back_offs = 0
+        self._back_off = BackOff()
 
     @classmethod
     def find_container(cls, view: StateView, shapes: Shapes, atom: Atom) -> str | None:
@@ -88,7 +86,7 @@ class DropIntoContainer(Skill):
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
-        self._resisted_steps, self._backing_off = 0, False
+        self._back_off.stop()
 
     def _start(self, phase: str, view: StateView) -> np.ndarray:
         self._enter(phase)
@@ -116,35 +114,21 @@ class DropIntoContainer(Skill):
         if away < ARRIVED and abs(goal[2] - pos[2]) < ARRIVED and turn < ARRIVED_TURN:
             self._hold_pose = grasp
             return self._start("close", view)
-        lift = style.funnel_slope * (away - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
-        lift = float(np.clip(lift, 0.0, self._clear_height + style.hover))
+        full_lift = self._clear_height + style.hover
+        lift = funnel_lift(style.funnel_slope, away - 0.008, turn - ARRIVED_TURN, full_lift)
+        self._back_off.update(
+            standing=pos[2] > goal[2] + lift + STANDING and self._is_still() and self._steps > 5,
+            clear=away < 0.006 and pos[2] > goal[2] + self._clear_height - GRIPPER.tip_below + 0.01,
+        )
+        if self._back_off.count > MAX_BACK_OFFS:
+            self.failure_reason = f"something is in the way of grasping {self._object} from above"
         target = goal.copy()
-        target[2] += self._back_off(away, goal[2], pos[2], lift)
+        target[2] += full_lift if self._back_off.active else lift
         if away > 0.05:
             obstacles = self._obstacle_height(view, goal)
             target[2] = max(target[2], obstacles + FINGER_CLEARANCE + GRIPPER.tip_below)
         lateral_scale = lateral_ramp(pos[2], target[2], 0.02, 0.04)
         return self._toward(view, target, grasp.mat, OPEN, lateral_scale)
-
-    def _back_off(self, away: float, goal_height: float, height: float, lift: float) -> float:
-        """Return the lift, or a full one while a finger that stands on something goes up and to the middle.
-
-        Args:
-            away: Horizontal distance to the grasp, [m].
-            goal_height: Height of the grip site at the grasp, [m].
-            height: Height of the grip site, [m].
-            lift: Height above the grasp that is intended, [m].
-        """
-        standing = height > goal_height + lift + STANDING and np.linalg.norm(self._velocity) < STILL
-        self._resisted_steps = self._resisted_steps + 1 if standing and self._steps > 5 else 0
-        if self._resisted_steps >= 3 and not self._backing_off:
-            self._backing_off, self._back_offs = True, self._back_offs + 1
-            if self._back_offs > MAX_BACK_OFFS:
-                self.failure_reason = f"something is in the way of grasping {self._object} from above"
-        clear = height > goal_height + self._clear_height - GRIPPER.tip_below + 0.01
-        if away < 0.006 and clear:
-            self._backing_off = False
-        return self._clear_height + self.style.hover if self._backing_off else lift
 
     def _close(self, view: StateView) -> np.ndarray:
         pose = self._hold_pose

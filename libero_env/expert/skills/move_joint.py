@@ -10,7 +10,7 @@ from libero_env.expert.grasping.handle_candidates import HandleGrasp
 from libero_env.expert.grasping.handle_grasps import grasp_handle, grasp_knob
 from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
 from libero_env.expert.planning.goal_plan import OPPOSITES, JointState
-from libero_env.expert.skills.skill import Skill
+from libero_env.expert.skills.skill import Skill, funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -188,8 +188,8 @@ class MoveJoint(Skill):
             return self._start("close" if self._grasp.gripping else "move", view)
         if self._still_steps > 8:
             return self._let_go(view)
-        lift = self.style.funnel_slope * (lateral_error - 0.006) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
-        target = goal.pos + np.clip(lift, 0.0, APPROACH) * back
+        lift = funnel_lift(self.style.funnel_slope, lateral_error - 0.006, turn - ARRIVED_TURN, APPROACH)
+        target = goal.pos + lift * back
         lateral_scale = 1.0
         if np.linalg.norm((target - pos)[:2]) > 0.08:
             surface = view.scene.workspace.surface_height

@@ -11,7 +11,7 @@ from libero_env.expert.grasping.grasps import collision_depth
 from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
-from libero_env.expert.skills.skill import Skill, gripper_opening
+from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift, gripper_opening
 from libero_env.expert.skills.transport import Move, Transport
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
@@ -23,7 +23,7 @@ MAX_RETRIES = 6
 MAX_REPLANS = 3  # of the place of what is in the hand
 # wide, so that the fingers close in motion: a clone that creeps up to a threshold never passes it
 ARRIVED, ARRIVED_TURN = 0.012, 0.12  # [m], [rad]
-STANDING, STILL = 0.008, 0.04  # [m] too high, and slower than [m/s]: a finger stands on something
+STANDING = 0.008  # [m] by which a hand that does not move is too high: a finger stands on something
 FINGER_CLEARANCE = 0.03  # [m] of the fingertips over what they pass
 OBSTACLE_RADIUS = 0.08  # [m] around the hand
 LEVEL = 0.45  # vertical part of an approach, below which it counts as level
@@ -60,8 +60,8 @@ class PickPlace(Skill):
         self._transport: Transport | None = None
         self._replans = 0
         self._opens_partially = False  # others are where the fingers would open to
-        self._resisted_steps, self._backing_off = 0, False  # something resisted the way in; going back out
-        self._stuck_steps, self._back_offs = 0, 0
+        self._back_off = BackOff()
+        self._stuck_steps = 0
         self._previous_turn = 0.0  # [rad] between hand and grasp one step ago
         self._rise_xy: np.ndarray | None = None  # where the hand rises before it moves sideways, (2,)
         self._previous_pose: Pose | None = None  # of the object one step ago
@@ -112,8 +112,7 @@ class PickPlace(Skill):
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
-        self._resisted_steps, self._backing_off = 0, False
-        self._stuck_steps, self._back_offs = 0, 0
+        self._back_off, self._stuck_steps = BackOff(), 0
 
     def _retry(self, placed: bool = False) -> None:
         """Begin again with another plan; `placed`: the object was released at its place."""
@@ -139,12 +138,16 @@ class PickPlace(Skill):
         still = np.linalg.norm(self._velocity) < 0.008 and abs(turn - self._previous_turn) < 0.01
         self._stuck_steps = self._stuck_steps + 1 if still and self._steps > 12 else 0
         self._previous_turn = turn
-        if self._stuck_steps > 14 or self._back_offs > 2:
+        if self._stuck_steps > 14 or self._back_off.count > 2:
             self._retry()
             return self._toward(view, pos + 0.08 * back, view.eef_mat, OPEN)
-        lift = style.funnel_slope * (lateral_error - 0.008) + 0.3 * max(turn - ARRIVED_TURN, 0.0)
-        lift = float(np.clip(lift, 0.0, self._clear_distance + style.hover))
-        lift = self._back_off(lateral_error, -float(error @ back), lift)
+        height, full_lift = -float(error @ back), self._clear_distance + style.hover
+        lift = funnel_lift(style.funnel_slope, lateral_error - 0.008, turn - ARRIVED_TURN, full_lift)
+        self._back_off.update(
+            standing=height > lift + STANDING and self._is_still() and self._steps > 5,
+            clear=lateral_error < 0.006 and height > self._clear_distance - GRIPPER.tip_below + 0.01,
+        )
+        lift = full_lift if self._back_off.active else lift
         target, passing = self._approach_target(view, goal, back, lift, lateral_error)
         lateral_scale = 1.0
         if passing or back[2] > 0.9:
@@ -176,22 +179,6 @@ class PickPlace(Skill):
         if level:
             return np.array([*target[:2], max(target[2], height)]), True
         return target + max(height - target[2], 0.0) / back[2] * back, True
-
-    def _back_off(self, lateral_error: float, height: float, lift: float) -> float:
-        """Return the lift, or a full one while a finger that stands on something goes back and to the middle.
-
-        Args:
-            lateral_error: Distance from the line of the approach, [m].
-            height: Distance from the grasp, back along the approach, [m].
-            lift: Distance that is intended, [m].
-        """
-        standing = height > lift + STANDING and np.linalg.norm(self._velocity) < STILL
-        self._resisted_steps = self._resisted_steps + 1 if standing and self._steps > 5 else 0
-        if self._resisted_steps >= 3 and not self._backing_off:
-            self._backing_off, self._back_offs = True, self._back_offs + 1
-        if lateral_error < 0.006 and height > self._clear_distance - GRIPPER.tip_below + 0.01:
-            self._backing_off = False
-        return self._clear_distance + self.style.hover if self._backing_off else lift
 
     def _close(self, view: StateView) -> np.ndarray:
         pose = self._hold_pose

@@ -11,6 +11,7 @@ from libero_env.expert.variation import MotionStyle
 from libero_env.sim.state import StateView
 from libero_env.timing import CONTROL_HZ
 
+_STILL_HAND = 0.04  # [m/s] below which the hand hardly moves
 _RESTING_FINGERS = 4e-4  # [m] of finger motion in one step, below which the fingers are at rest
 
 
@@ -85,6 +86,10 @@ class Skill(ABC):
         """Return the action that lifts the open hand."""
         return np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, OPEN])
 
+    def _is_still(self) -> bool:
+        """Return whether the hand hardly moves."""
+        return bool(np.linalg.norm(self._velocity) < _STILL_HAND)
+
     def _fingers_rest(self, view: StateView, max_steps: int = 15) -> bool:
         """Return whether closing fingers have come to rest, or have had the given number of steps."""
         opening = gripper_opening(view)
@@ -122,6 +127,47 @@ class Skill(ABC):
             speed=speed_scale * self.style.speed,
             lateral_scale=lateral_scale,
         )
+
+
+class BackOff:
+    """Detection of a finger that stands on something; the hand then goes back until it is clear.
+
+    Attributes:
+        active: Whether the hand goes back.
+        count: Number of times that the hand went back.
+    """
+
+    def __init__(self) -> None:
+        self.active, self.count, self._standing_steps = False, 0, 0
+
+    def update(self, *, standing: bool, clear: bool) -> None:
+        """Go back after three steps of standing, until the hand is clear.
+
+        Args:
+            standing: Whether the hand is further away than intended, and hardly moves.
+            clear: Whether the fingers are clear of the object and the hand is over its target.
+        """
+        self._standing_steps = self._standing_steps + 1 if standing else 0
+        if self._standing_steps >= 3 and not self.active:
+            self.active, self.count = True, self.count + 1
+        if clear:
+            self.active = False
+
+    def stop(self) -> None:
+        """Stop going back; the count stays."""
+        self.active, self._standing_steps = False, 0
+
+
+def funnel_lift(slope: float, distance: float, angle: float, largest: float) -> float:
+    """Return how far a hand stays back from its target, so that it approaches within a funnel, [m].
+
+    Args:
+        slope: Slope of the funnel.
+        distance: Lateral distance from the target beyond the tolerance, [m].
+        angle: Angle from the target orientation beyond the tolerance, [rad].
+        largest: Height of the funnel, [m].
+    """
+    return float(np.clip(slope * distance + 0.3 * max(angle, 0.0), 0.0, largest))
 
 
 def gripper_opening(view: StateView) -> float:

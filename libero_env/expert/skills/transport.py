@@ -10,6 +10,7 @@ from libero_env.expert.clearance import hand_extent_below, obstacle_height
 from libero_env.expert.planning.pick_plan import PickPlan
 from libero_env.expert.planning.reachability import ENTRY_DISTANCE
 from libero_env.expert.shapes import Shapes, pose_of
+from libero_env.expert.skills.skill import funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -144,19 +145,15 @@ class Transport:
         pos, style, drops = view.eef_pos, self.style, self.plan.drop_height > MIN_DROP
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
         self._blocked_steps = self._blocked_steps + 1 if slow and away < 0.04 else 0
-        if (
-            away < (0.025 if drops else 0.014)
-            and turn < 0.2
-            and pos[2] < goal[2] + (0.02 if drops else 0.006)
-        ):
+        aligned = away < (0.025 if drops else 0.014) and turn < 0.2
+        if aligned and pos[2] < goal[2] + (0.02 if drops else 0.006):
             return "arrived"
         if self._blocked_steps > 6:
             return "blocked" if pos[2] - goal[2] > BLOCKED_DISTANCE else "arrived"
         walls = obstacle_height(self._obstacles(view), goal, goal, 0.05, self._surface_height(view))
         over_walls = walls + below + style.carry_clearance
         target = goal.copy()
-        funnel = style.funnel_slope * (away - (0.03 if drops else 0.012)) + 0.3 * max(turn - 0.12, 0.0)
-        target[2] += np.clip(funnel, 0.0, 0.04)
+        target[2] += funnel_lift(style.funnel_slope, away - (0.03 if drops else 0.012), turn - 0.12, 0.04)
         deep = over_walls - style.carry_clearance - goal[2] > MIN_WALL and not drops
         if self._stays_above(away, turn, deep, slow):
             over_path = self._path_height(view, goal) + below + 0.7 * style.carry_clearance
