@@ -1,6 +1,6 @@
 """The scripted expert that makes demonstrations: a goal becomes skills, skills become actions.
 
-The names below are loaded when they are first used.
+Its names are loaded when they are first used.
 """
 
 import lazy_loader

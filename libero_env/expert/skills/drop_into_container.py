@@ -9,6 +9,7 @@ from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.grasping.grasps import GraspError
 from libero_env.expert.grasping.top_grasps import TopGrasp, choose_top_grasp
 from libero_env.expert.shapes import Shapes, pose_of
+from libero_env.expert.skills.approach import BackOff, funnel_lift
 from libero_env.expert.skills.pick_place import (
     ARRIVED,
     ARRIVED_TURN,
@@ -18,7 +19,7 @@ from libero_env.expert.skills.pick_place import (
     PickPlace,
     has_moved,
 )
-from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift
+from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -81,9 +82,6 @@ class DropIntoContainer(Skill):
         """Return `PickPlace`, which searches more grasps, after a failure."""
         return PickPlace(self.atom, style=self.style, shapes=self.shapes) if self.failure_reason else None
 
-    def _next_action(self, view: StateView) -> np.ndarray:
-        return self._run_phase(view)
-
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
         self._back_off.stop()
@@ -132,7 +130,7 @@ class DropIntoContainer(Skill):
 
     def _close(self, view: StateView) -> np.ndarray:
         pose = self._hold_pose
-        if not self._fingers_rest(view):
+        if not self._fingers_stopped(view):
             return self._toward(view, pose.pos, pose.mat, CLOSE)
         if self._opening < 0.004:
             self._retry()

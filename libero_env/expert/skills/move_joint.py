@@ -10,7 +10,8 @@ from libero_env.expert.grasping.handle_candidates import HandleGrasp
 from libero_env.expert.grasping.handle_grasps import grasp_handle, grasp_knob
 from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
 from libero_env.expert.planning.goal_plan import OPPOSITES, JointState
-from libero_env.expert.skills.skill import Skill, funnel_lift
+from libero_env.expert.skills.approach import funnel_lift
+from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -199,7 +200,7 @@ class MoveJoint(Skill):
         return self._toward(view, target, goal.mat, OPEN if self._grasp.gripping else CLOSE, lateral_scale)
 
     def _close(self, view: StateView) -> np.ndarray:
-        if self._fingers_rest(view, max_steps=16):
+        if self._fingers_stopped(view, max_steps=16):
             if self._opening < 0.004:
                 return self._let_go(view)
             self._previous_value = self._part.value(view)

@@ -11,7 +11,8 @@ from libero_env.expert.grasping.grasps import collision_depth
 from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
-from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift, gripper_opening
+from libero_env.expert.skills.approach import BackOff, funnel_lift
+from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.skills.transport import Move, Transport
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
@@ -182,7 +183,7 @@ class PickPlace(Skill):
 
     def _close(self, view: StateView) -> np.ndarray:
         pose = self._hold_pose
-        if self._fingers_rest(view):
+        if self._fingers_stopped(view):
             if self._opening < 0.002:
                 self._retry()
                 return self._toward(view, view.eef_pos + [0, 0, 0.05], pose.mat, OPEN)

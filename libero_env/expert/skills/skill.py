@@ -12,7 +12,7 @@ from libero_env.sim.state import StateView
 from libero_env.timing import CONTROL_HZ
 
 _STILL_HAND = 0.04  # [m/s] below which the hand hardly moves
-_RESTING_FINGERS = 4e-4  # [m] of finger motion in one step, below which the fingers are at rest
+_STOPPED_FINGERS = 4e-4  # [m] of finger motion in one step, below which the fingers have stopped
 
 
 class Skill(ABC):
@@ -61,9 +61,9 @@ class Skill(ABC):
         """Return the skill that takes over from one that failed; None where there is none, or no failure."""
         return None
 
-    @abstractmethod
     def _next_action(self, view: StateView) -> np.ndarray:
         """Return the next action; velocity and steps are up to date."""
+        return self._run_phase(view)
 
     def _enter(self, phase: str) -> None:
         """Begin a phase."""
@@ -90,12 +90,12 @@ class Skill(ABC):
         """Return whether the hand hardly moves."""
         return bool(np.linalg.norm(self._velocity) < _STILL_HAND)
 
-    def _fingers_rest(self, view: StateView, max_steps: int = 15) -> bool:
-        """Return whether closing fingers have come to rest, or have had the given number of steps."""
+    def _fingers_stopped(self, view: StateView, max_steps: int = 15) -> bool:
+        """Return whether closing fingers have stopped, or have had the given number of steps."""
         opening = gripper_opening(view)
-        resting = abs(opening - self._opening) < _RESTING_FINGERS
+        stopped = abs(opening - self._opening) < _STOPPED_FINGERS
         self._opening = opening
-        return self._steps > 4 + self.style.pause and resting or self._steps > max_steps
+        return self._steps > 4 + self.style.pause and stopped or self._steps > max_steps
 
     def _toward(
         self,
@@ -127,47 +127,6 @@ class Skill(ABC):
             speed=speed_scale * self.style.speed,
             lateral_scale=lateral_scale,
         )
-
-
-class BackOff:
-    """Detection of a finger that stands on something; the hand then goes back until it is clear.
-
-    Attributes:
-        active: Whether the hand goes back.
-        count: Number of times that the hand went back.
-    """
-
-    def __init__(self) -> None:
-        self.active, self.count, self._standing_steps = False, 0, 0
-
-    def update(self, *, standing: bool, clear: bool) -> None:
-        """Go back after three steps of standing, until the hand is clear.
-
-        Args:
-            standing: Whether the hand is further away than intended, and hardly moves.
-            clear: Whether the fingers are clear of the object and the hand is over its target.
-        """
-        self._standing_steps = self._standing_steps + 1 if standing else 0
-        if self._standing_steps >= 3 and not self.active:
-            self.active, self.count = True, self.count + 1
-        if clear:
-            self.active = False
-
-    def stop(self) -> None:
-        """Stop going back; the count stays."""
-        self.active, self._standing_steps = False, 0
-
-
-def funnel_lift(slope: float, distance: float, angle: float, largest: float) -> float:
-    """Return how far a hand stays back from its target, so that it approaches within a funnel, [m].
-
-    Args:
-        slope: Slope of the funnel.
-        distance: Lateral distance from the target beyond the tolerance, [m].
-        angle: Angle from the target orientation beyond the tolerance, [rad].
-        largest: Height of the funnel, [m].
-    """
-    return float(np.clip(slope * distance + 0.3 * max(angle, 0.0), 0.0, largest))
 
 
 def gripper_opening(view: StateView) -> float:

@@ -10,7 +10,7 @@ from libero_env.expert.clearance import hand_extent_below, obstacle_height
 from libero_env.expert.planning.pick_plan import PickPlan
 from libero_env.expert.planning.reachability import ENTRY_DISTANCE
 from libero_env.expert.shapes import Shapes, pose_of
-from libero_env.expert.skills.skill import funnel_lift
+from libero_env.expert.skills.approach import funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate
