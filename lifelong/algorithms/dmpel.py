@@ -12,7 +12,7 @@ from torch.nn import functional
 from torch.utils.hooks import RemovableHandle
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.windows import TaskWindows
+from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.nn.adapters import freeze_statistics, initial_pair
 from lifelong.nn.experts import Router, expert_output, expert_shape, routed_layers
@@ -267,18 +267,18 @@ class DMPEL(Algorithm):
     # --- making and keeping
 
     @torch.no_grad()
-    def _contexts(self, dataset: Any) -> tuple[Tensor, Tensor]:
-        """The query of every demonstration (D, Q), and which of them each window belongs to (W,).
+    def _contexts(self, dataset: WindowDataset) -> tuple[Tensor, Tensor]:
+        """Return the query of every demonstration, (D, Q), and to which of them each window belongs, (W,).
 
-        Read from `last`, the last frame of each window's demonstration, through datasets that are made of others
-        (`datasets`, or `chosen` windows of a `dataset`). Without it every window is a demonstration.
+        A dataset that reads a file knows the last frame of each window's demonstration (`last`). Without it every
+        window counts as a demonstration.
         """
-        if hasattr(dataset, "datasets"):
+        if isinstance(dataset, JoinedWindows):
             parts = [self._contexts(part) for part in dataset.datasets]
             offsets = torch.tensor([0] + [len(queries) for queries, _ in parts]).cumsum(0).tolist()
             moved = [of_window + offset for (_, of_window), offset in zip(parts, offsets, strict=False)]
             return torch.cat([queries for queries, _ in parts]), torch.cat(moved)
-        if hasattr(dataset, "chosen"):
+        if isinstance(dataset, WindowSubset):
             queries, of_window = self._contexts(dataset.dataset)
             return queries, of_window[dataset.chosen.to(of_window.device)]
         ends, of_window = getattr(dataset, "last", torch.arange(len(dataset))).unique(return_inverse=True)
