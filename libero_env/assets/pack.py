@@ -62,17 +62,17 @@ class BuiltinPack:
         return BUILTIN
 
     def build(self, category: str) -> ObjectModel:
-        """See `Pack`."""
+        """Return a new model of a category; see `Pack`."""
         return get_object(category)
 
     def categories(self) -> tuple[str, ...]:
-        """See `Pack`."""
+        """Return all categories; see `Pack`."""
         return object_names()
 
     def add_arena(
         self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
     ) -> None:
-        """See `Pack`."""
+        """Add the arena of a workspace; see `Pack`."""
         add_arena(spec, workspace, scene_properties)
 
 

@@ -87,8 +87,10 @@ def _occupied(scene: str) -> list[tuple[float, float]]:
     """Return the places that are occupied in a scene of the benchmark, (x, y) [m]."""
     if scene not in scene_names():
         return []
-    regions = [facts for target in load_scene(scene).get("regions", {}).values() for facts in _values(target)]
-    return [tuple(facts["at"]) for facts in regions if facts and isinstance(facts.get("at"), list)]
+    regions = [
+        region for target in load_scene(scene).get("regions", {}).values() for region in _values(target)
+    ]
+    return [tuple(region["at"]) for region in regions if region and isinstance(region.get("at"), list)]
 
 
 def _values(regions: object) -> list[dict]:

@@ -152,9 +152,11 @@ class _Reader:
         self.file = file
 
     def fail(self, line: int, what: str, expected: str) -> NoReturn:
+        """Raise the error of a line in this file."""
         fail(self.file, line, what, expected)
 
     def problem(self, text: str) -> Problem:
+        """Return the problem of a text."""
         root = parse_tree(text, self.file)
         if root.head != "define" or len(root.items) < 2:
             self.fail(root.line, "not a problem", "(define (problem NAME) ...)")
@@ -173,6 +175,7 @@ class _Reader:
         return self.assemble(self.word(title.items[1]), root.line, sections)
 
     def assemble(self, name: str, line: int, sections: dict[str, List]) -> Problem:
+        """Return the problem of the sections of a file."""
         for needed in (":language", ":fixtures", ":objects", ":init", ":goal"):
             if needed not in sections:
                 self.fail(
@@ -202,6 +205,7 @@ class _Reader:
         )
 
     def word(self, node: Word | List) -> str:
+        """Return the text of a word, in which brackets are an error."""
         if isinstance(node, List):
             self.fail(node.line, f"a list {show(node)}", "a word")
         return node.text
@@ -231,6 +235,7 @@ class _Reader:
         return found
 
     def regions(self, nodes: tuple[Word | List, ...]) -> tuple[Region, ...]:
+        """Return the regions of the section `:regions`."""
         found: dict[str, Region] = {}
         for node in nodes:
             region = self.region(node)
@@ -240,6 +245,7 @@ class _Reader:
         return tuple(found.values())
 
     def region(self, node: Word | List) -> Region:
+        """Return the region of one entry of `:regions`."""
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not a region: {show(node)}", "(NAME (:target NAME) ...)")
         found: dict[str, Any] = {}
@@ -267,22 +273,26 @@ class _Reader:
         return Region(name=self.word(node.items[0]), **found)
 
     def numbers(self, node: Word | List, count: int, head: str) -> tuple[float, ...]:
+        """Return the `count` numbers of a list."""
         if not isinstance(node, List) or len(node.items) != count:
             self.fail(node.line, f"{show(node)} in {head}", f"a list of {count} numbers")
         return tuple(self.number(item) for item in node.items)
 
     def number(self, node: Word | List) -> float:
+        """Return the value of a word that is a number."""
         try:
             return number(self.word(node))
         except ValueError:
             self.fail(node.line, f"{show(node)} is not a number", "a finite number such as 0.25 or -pi/4")
 
     def scene_property(self, node: Word | List) -> tuple[str, str]:
+        """Return kind and style of an entry of `:scene_properties`."""
         if not isinstance(node, List) or not node.head.startswith(":"):
             self.fail(node.line, f"not a scene property: {show(node)}", "(:floor STYLE) or (:wall STYLE)")
         return node.head[1:], " ".join(map(self.word, node.items[1:]))
 
     def atom(self, node: Word | List, known: set[str]) -> Atom:
+        """Return the atom of a list, whose arguments must be in `known`."""
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not an atom: {show(node)}", "(PREDICATE NAME ...)")
         predicate, *args = map(self.word, node.items)
@@ -295,6 +305,7 @@ class _Reader:
         return Atom(predicate.capitalize(), tuple(args))
 
     def expression(self, node: Word | List, known: set[str]) -> Expression:
+        """Return the expression of a list, whose names must be in `known`."""
         parts = node.items[1:] if isinstance(node, List) else ()
         head = node.head if isinstance(node, List) else ""
         if head in ("and", "or"):

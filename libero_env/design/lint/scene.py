@@ -98,9 +98,7 @@ def _check_site(report: Report, scene: Scene, name: str) -> None:
     remedy = (
         report.suggest(region.name, own) if own else "use the name of the object itself; it has no places"
     )
-    report.error(
-        report.lines.of(name), "no-site", f"{region.target} has no place called {region.name!r}", remedy
-    )
+    report.error(report.lines.of(name), "no-site", f"{region.target} has no place {region.name!r}", remedy)
 
 
 def _atoms(report: Report, scene: Scene) -> Iterator[tuple[Atom, int]]:

@@ -129,7 +129,7 @@ def _window_frame(palette: Palette) -> Mesh:
 
 
 def _sash(palette: Palette, x0: float, x1: float, y: float) -> Mesh:
-    """Frame of one pane with its crossbar, metres; `y` is that of its middle."""
+    """Return the frame of one pane with its crossbar, centred at `y`, [m]."""
     rail, stile, near, far = palette["sash"], palette["upright"], y - 0.0060, y + 0.0060
     right = 0.014 if y < 0 else 0.010  # the handle stands on the broader stile
     return merge(
