@@ -15,17 +15,11 @@ from libero.libero.utils.mu_utils import scene_key
 from libero.scripts.command import option, script
 from libero_env.errors import LiberoError
 
-# Kind of template -> files that it consists of.
-KINDS = {
-    "problem_class": ("problem_class.py",),
-    "scene": ("scene.py",),
-    "object": ("object.py", "object.xml"),
-    "arena": ("arena.py",),
-}
+KINDS = ("problem_class", "scene", "object", "arena")
 
 
 @script(
-    option("--template", "-t", choices=tuple(KINDS), help="kind of template"),
+    option("--template", "-t", choices=KINDS, help="kind of template"),
     option("--name", "-n", help="name of the class, such as MyKitchenScene"),
     option("--out", "-o", type=Path, default=Path(), help="folder (default: the current folder)"),
     option("--overwrite", action="store_true", help="replace files that exist"),
@@ -45,9 +39,9 @@ def main(args: argparse.Namespace) -> None:
         raise LiberoError(f"{name!r} is not a valid class name; begin with a capital, use letters and digits")
     stem = category_of(name) if kind == "object" else scene_key(name)
     texts = {}
-    for file in KINDS[kind]:
-        text = (files("libero.scripts") / "templates" / f"{file}.txt").read_text(encoding="utf-8")
-        texts[args.out / f"{stem}{Path(file).suffix}"] = Template(text).substitute(Name=name, name=stem)
+    for ending in ("py", "xml") if kind == "object" else ("py",):
+        text = (files("libero.scripts") / "templates" / f"{kind}.{ending}.txt").read_text(encoding="utf-8")
+        texts[args.out / f"{stem}.{ending}"] = Template(text).substitute(Name=name, name=stem)
     if (existing := [path for path in texts if path.exists()]) and not args.overwrite:
         raise LiberoError(f"{existing[0]} exists; choose another name or folder, or pass --overwrite")
     args.out.mkdir(parents=True, exist_ok=True)

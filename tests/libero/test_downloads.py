@@ -229,7 +229,7 @@ def test_small_pieces(server, tmp_path):
     assert not download_utils.url_is_alive("http://127.0.0.1:9/")
     path = download_utils.download_url(f"{server.url}/notes.txt", tmp_path, is_zipfile=False)
     assert path.read_bytes() == b"hello"
-    with pytest.raises(DownloadError, match="not an intact archive"):
+    with pytest.raises(DownloadError, match="archive is damaged"):
         download_utils.download_url(f"{server.url}/notes.txt", tmp_path)
     with download_utils.DownloadProgressBar(unit="B", disable=False) as bar:
         urllib.request.urlretrieve(

@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,13 +28,7 @@ class Camera:
     segmentations: tuple[str, ...] = ()
 
 
-def cameras(
-    names: str | Sequence[str],
-    heights: int | Sequence[int],
-    widths: int | Sequence[int],
-    depths: bool | Sequence[bool],
-    segmentations: object,
-) -> tuple[Camera, ...]:
+def cameras(names: Any, heights: Any, widths: Any, depths: Any, segmentations: Any) -> tuple[Camera, ...]:
     """Return the cameras of robosuite's arguments, where one value stands for all cameras.
 
     Raises:
@@ -41,14 +36,13 @@ def cameras(
         UnknownNameError: The segmentation does not exist.
     """
     names = [names] if isinstance(names, str) else list(names)
-    nested = isinstance(segmentations, list | tuple) and any(
-        isinstance(s, list | tuple) for s in segmentations
-    )
-    kinds = list(segmentations) if nested else [segmentations] * len(names)  # type: ignore[call-overload]
+    sequence = (list, tuple)
+    nested = isinstance(segmentations, sequence) and any(isinstance(s, sequence) for s in segmentations)
+    kinds = list(segmentations) if nested else [segmentations] * len(names)
     columns = [_each(heights, len(names)), _each(widths, len(names)), _each(depths, len(names)), kinds]
     if any(len(column) != len(names) for column in columns):
         raise LiberoError(
-            f"camera_heights, _widths, _depths, _segmentations: expected one value, or {len(names)} as camera_names"
+            f"expected one value or {len(names)} in camera_heights, _widths, _depths, _segmentations"
         )
     return tuple(
         Camera(name, h, w, bool(depth), _kinds(kind))

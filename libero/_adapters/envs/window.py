@@ -38,10 +38,8 @@ class Window:
     def _opened(self, model: mujoco.MjModel, data: mujoco.MjData) -> Any:
         self._tried = True
         if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-            warnings.warn(
-                "has_renderer=True: there is no screen, so nothing is shown; use camera observations or sim.render",
-                stacklevel=4,
-            )
+            message = "has_renderer=True: there is no screen; use camera observations or sim.render"
+            warnings.warn(message, stacklevel=4)
             return None
         from mujoco import viewer  # it loads a GL library
 

@@ -174,10 +174,9 @@ class BDDLBaseDomain:
         for name, site in self.object_sites_dict.items():
             fixed = site.parent_name not in scene.objects
             self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name, is_fixture=fixed)
+        states = self.object_states_dict.values()
         self.tracking_object_states_changes = [
-            state
-            for state in self.object_states_dict.values()
-            if getattr(state, "has_turnon_affordance", False)
+            s for s in states if getattr(s, "has_turnon_affordance", False)
         ]
         self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
         self.model = TaskModel(scene, self.sim.model._model)

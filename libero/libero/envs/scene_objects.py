@@ -82,17 +82,17 @@ class TaskModel:
                 of_class[kind] += ids[kind]
         self.geom_ids_to_instances = _inverse(self.instances_to_ids)
         self.geom_ids_to_classes = _inverse(self.classes_to_ids)
-        self.segments = {
-            "instance": _numbers(self.instances_to_ids, model.ngeom),
-            "class": _numbers(self.classes_to_ids, model.ngeom),
-        }
+        instances, kinds = (
+            _numbers(ids, model.ngeom) for ids in (self.instances_to_ids, self.classes_to_ids)
+        )
+        self.segments = {"instance": instances, "class": kinds}
 
 
 def _robot_bodies(model: mujoco.MjModel) -> dict[str, list[int]]:
     """Return the bodies of each part of the robot that has geoms."""
     names = [model.body(b).name for b in range(model.nbody)]
     parts = {
-        part: [b for b in range(model.nbody) if names[b].startswith(prefix)]
+        part: [b for b, name in enumerate(names) if name.startswith(prefix)]
         for part, prefix in _ROBOT_PARTS.items()
     }
     return {part: bodies for part, bodies in parts.items() if np.isin(model.geom_bodyid, bodies).any()}

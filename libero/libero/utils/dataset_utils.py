@@ -9,9 +9,7 @@ from libero_env.demos.read import demo_names, open_demo_file
 from libero_env.errors import DemoError
 
 
-def get_dataset_info(
-    dataset_path: str | Path, filter_key: str | None = None, verbose: bool = True
-) -> dict[str, Any]:
+def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, verbose: bool = True) -> dict:
     """Return number and lengths of demonstrations, range of actions, observation keys and attributes of a file.
 
     Args:

@@ -24,6 +24,8 @@ DATASET_LINKS = {
     "libero_spatial": "https://utexas.box.com/shared/static/04k94hyizn4huhbv5sz4ev9p2h1p6s7f.zip",
     "libero_100": "https://utexas.box.com/shared/static/cv73j8zschq8auh9npzt876fdc1akvmk.zip",
 }
+Folder = str | os.PathLike
+
 _SUITES = ("libero_object", "libero_goal", "libero_spatial", "libero_10", "libero_90")
 
 
@@ -47,7 +49,7 @@ def url_is_alive(url: str) -> bool:
 
 
 def download_url(
-    url: str, download_dir: str | os.PathLike, check_overwrite: bool = True, is_zipfile: bool = True
+    url: str, download_dir: Folder, check_overwrite: bool = True, is_zipfile: bool = True
 ) -> Path:
     """Download a file into a folder, and return the file, or the folder of an unpacked archive.
 
@@ -73,15 +75,13 @@ def download_url(
             archive.extractall(folder)
     except zipfile.BadZipFile as error:
         file.unlink()
-        raise DownloadError(
-            f"{url}: the download is not an intact archive and was removed ({error}); try again"
-        ) from error
+        raise DownloadError(f"{url}: the archive is damaged and was removed ({error}); try again") from error
     file.unlink()
     return folder
 
 
 def download_from_huggingface(
-    dataset_name: str, download_dir: str | os.PathLike, check_overwrite: bool = True
+    dataset_name: str, download_dir: Folder, check_overwrite: bool = True
 ) -> list[Path]:
     """Download the files of a suite one by one, verify their checksums, and return them.
 
@@ -99,7 +99,7 @@ def download_from_huggingface(
 
 def libero_dataset_download(
     datasets: str = "all",
-    download_dir: str | os.PathLike | None = None,
+    download_dir: Folder | None = None,
     check_overwrite: bool = True,
     use_huggingface: bool = False,
 ) -> None:
@@ -130,7 +130,7 @@ def libero_dataset_download(
             download_url(DATASET_LINKS[name], folder, check_overwrite)
 
 
-def check_libero_dataset(download_dir: str | os.PathLike | None = None) -> bool:
+def check_libero_dataset(download_dir: Folder | None = None) -> bool:
     """Print how many files of each suite exist, and return whether all do.
 
     Args:

@@ -22,6 +22,7 @@ from libero_env.tasks.builder import build_problem, load_scene
 MU_DICT: dict[str, Any] = {}  # name -> class
 SCENE_DICT: dict[str, list[type["InitialSceneTemplates"]]] = {"kitchen": [], "living_room": [], "study": []}
 
+Counts = Mapping[str, int]
 Template = TypeVar("Template", bound=type["InitialSceneTemplates"])
 
 
@@ -87,9 +88,7 @@ class InitialSceneTemplates:
         UnknownNameError: The workspace or a category does not exist.
     """
 
-    def __init__(
-        self, workspace_name: str, fixture_num_info: Mapping[str, int], object_num_info: Mapping[str, int]
-    ):
+    def __init__(self, workspace_name: str, fixture_num_info: Counts, object_num_info: Counts):
         if workspace_name not in WORKSPACE_CATEGORIES:
             raise UnknownNameError("workspace", workspace_name, WORKSPACE_CATEGORIES)
         self.workspace_name = workspace_name
@@ -99,9 +98,8 @@ class InitialSceneTemplates:
         self.object_num_info = dict(object_num_info)
         self.fixture_object_dict = get_object_dict(self.fixture_num_info)
         self.movable_object_dict = get_object_dict(self.object_num_info)
-        self.affordance_region_kwargs_list = get_affordance_region_kwargs_list_from_fixture_info(
-            {**self.fixture_num_info, **self.object_num_info}
-        )
+        counts = {**self.fixture_num_info, **self.object_num_info}
+        self.affordance_region_kwargs_list = get_affordance_region_kwargs_list_from_fixture_info(counts)
         self.regions: dict[str, dict[str, Any]] = {}
         self.xy_region_kwargs_list: list[dict[str, Any]] = []
         self.define_regions()
@@ -183,7 +181,7 @@ class BenchmarkScene(InitialSceneTemplates):
         return [(atom.predicate, *atom.args) for atom in self.problem.init]
 
 
-def _benchmark_scenes(scene_type: str, number: int) -> dict[str, type[BenchmarkScene]]:
+def _scenes(scene_type: str, number: int) -> dict[str, type[BenchmarkScene]]:
     """Register `KitchenScene1` and so on, and return them by name."""
     found = {}
     for i in range(1, number + 1):
@@ -193,8 +191,4 @@ def _benchmark_scenes(scene_type: str, number: int) -> dict[str, type[BenchmarkS
     return found
 
 
-BENCHMARK_SCENES = {
-    **_benchmark_scenes("kitchen", 10),
-    **_benchmark_scenes("living_room", 6),
-    **_benchmark_scenes("study", 4),
-}
+BENCHMARK_SCENES = _scenes("kitchen", 10) | _scenes("living_room", 6) | _scenes("study", 4)

@@ -1,7 +1,6 @@
 """A stopwatch."""
 
 import time
-from types import TracebackType
 
 
 class Timer:
@@ -13,9 +12,7 @@ class Timer:
         self.start = time.perf_counter()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.value = time.perf_counter() - self.start
 
     def get_elapsed_time(self) -> float | None:

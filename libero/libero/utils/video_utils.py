@@ -3,12 +3,13 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
 from libero_env.demos.video import write_video
 from libero_env.errors import LiberoError
+
+Obs = Mapping[str, np.ndarray]
 
 _TINT = np.array([0, 255, 0])  # RGB, mixed into the pictures after success
 _TINT_WEIGHT = 0.2
@@ -37,9 +38,7 @@ class VideoWriter:
     def __enter__(self) -> "VideoWriter":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.save()
 
     def reset(self) -> None:
@@ -51,9 +50,7 @@ class VideoWriter:
         if self.save_video:
             self.image_buffer.setdefault(idx, []).append(np.asarray(img, np.uint8)[::-1])
 
-    def append_obs(
-        self, obs: Mapping[str, np.ndarray], done: bool, idx: int = 0, camera_name: str = "agentview_image"
-    ) -> None:
+    def append_obs(self, obs: Obs, done: bool, idx: int = 0, camera_name: str = "agentview_image") -> None:
         """Add the picture of an observation; after success the last picture, tinted green."""
         if not done:
             self.last_images[idx] = np.asarray(obs[camera_name])
@@ -64,7 +61,7 @@ class VideoWriter:
 
     def append_vector_obs(
         self,
-        obs: Sequence[Mapping[str, np.ndarray]],
+        obs: Sequence[Obs],
         dones: Sequence[bool],
         camera_name: str = "agentview_image",
     ) -> None:

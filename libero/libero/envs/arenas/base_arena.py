@@ -64,9 +64,7 @@ class WorkspaceArena(Arena):
         spec = mujoco.MjSpec()
         styles = {"floor": floor_style, "wall": wall_style, "scene": scene}
         self.workspace = load_workspace(self.category)
-        select_pack().add_arena(
-            spec, self.workspace, {k: name for k, name in styles.items() if name is not None}
-        )
+        select_pack().add_arena(spec, self.workspace, {k: v for k, v in styles.items() if v is not None})
         super().__init__(spec)
 
     @property

@@ -56,9 +56,7 @@ class MultiRegionRandomSampler:
         """Add objects to place."""
         self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
 
-    def sample(
-        self, fixtures: Mapping[str, Any] | None = None, reference: Any = None, on_top: bool = True
-    ) -> Placements:
+    def sample(self, fixtures: Any = None, reference: Any = None, on_top: bool = True) -> Placements:
         """Return placements of all objects.
 
         Args:
@@ -107,10 +105,8 @@ class MultiRegionRandomSampler:
     def _clear(item: Any, pos: np.ndarray, other: Any) -> bool:
         """Return whether the circles of the two do not overlap, or the one is above the other."""
         other_pos, _, other_item = other
-        apart = (
-            np.hypot(*(pos[:2] - np.asarray(other_pos)[:2]))
-            > item.horizontal_radius + other_item.horizontal_radius
-        )
+        distance = np.hypot(*(pos[:2] - np.asarray(other_pos)[:2]))
+        apart = distance > item.horizontal_radius + other_item.horizontal_radius
         return bool(apart or pos[2] + item.bottom_offset[-1] >= other_pos[2] + other_item.top_offset[-1])
 
     def _quat(self, item: Any) -> np.ndarray:
@@ -161,9 +157,7 @@ class SiteSequentialCompositeSampler:
         self.name = name
         self.samplers: dict[str, tuple[MultiRegionRandomSampler, dict[str, Any]]] = {}
 
-    def append_sampler(
-        self, sampler: MultiRegionRandomSampler, sample_args: Mapping[str, Any] | None = None
-    ) -> None:
+    def append_sampler(self, sampler: MultiRegionRandomSampler, sample_args: Any = None) -> None:
         """Add a sampler at the end, with arguments for its `sample`."""
         self.samplers[sampler.name] = sampler, dict(sample_args or {})
 
