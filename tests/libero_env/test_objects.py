@@ -381,7 +381,7 @@ def test_users_register_and_replace_objects(scratch_catalog):
 
 
 def test_bad_registrations_are_named(scratch_catalog):
-    with pytest.raises(LiberoError, match="no valid category"):
+    with pytest.raises(LiberoError, match="not a valid category"):
         register_object("two words", lambda: None)
     register_object("nothing", lambda: None)
     with pytest.raises(LiberoError, match="expected ObjectModel"):

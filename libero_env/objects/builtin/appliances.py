@@ -19,7 +19,7 @@ from libero_env.objects.builtin.paint import Canvas, Color
 from libero_env.objects.builtin.surfaces import brushed, edged, painted, plain
 
 BURNER = (0.15, 0.0)  # axis of the burner, root frame
-RIDGES = (0.008, 0.021, 0.034, 0.047, 0.060)  # radii of the burner's ridges, metres; it glows between them
+RIDGES = (0.008, 0.021, 0.034, 0.047, 0.060)  # [m] radii of the burner's ridges; it glows between them
 GLOW_HEIGHT, RIDGE_HEIGHT = 0.0205, 0.0255  # [m] the glowing disc lies between these heights
 
 

@@ -7,7 +7,7 @@ from libero_env.objects.builtin.joinery import Palette, block, prism, turned
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.objects.builtin.surfaces import edged, plain, wood
 
-SHELVES = (  # centre (y, z), metres, and slope of the planes that bottles lie on
+SHELVES = (  # centre (y, z) [m] and slope of the planes that bottles lie on
     ((-0.0061, 0.25118), np.radians(31.28)),
     ((-0.04273, 0.12727), np.radians(31.28)),
 )

@@ -4,7 +4,7 @@ import mujoco
 
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 
-HALF = (0.05, 0.05, 0.001)  # half extents, metres
+HALF = (0.05, 0.05, 0.001)  # [m] half extents
 COLOR = (0.85, 0.15, 0.15, 0.5)
 
 
