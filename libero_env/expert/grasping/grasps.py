@@ -10,7 +10,10 @@ from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.arm.servo import downward
 from libero_env.expert.grasping import collision_kernels, kernels
 
-WALL_COST = 0.5  # cost of a grasp at a wall, compared with one around the whole body
+# costs of a grasp: for each [rad] that the hand turns and that it is misaligned with the body, for each [m] of width,
+# of distance from the middle of the body in height and of shift in the ground plan; and for any grasp at a wall
+TURN_COST, MISALIGNMENT_COST, WIDTH_COST, HEIGHT_COST, SHIFT_COST, WALL_COST = 0.25, 0.4, 8.0, 4.0, 3.0, 0.5
+DEPTH_COST, COLLISION_COST = 20.0, 0.3  # for each [m] of a collision's depth, and for any collision
 _NUM_YAWS, _NUM_TILTED_YAWS = 18, 8  # yaws that are tried, from above and from another side
 _NUM_HEIGHTS = 4
 _SHIFTS = np.array([0.0, 0.01, -0.01, 0.02, -0.02, 0.03, -0.03, 0.045, -0.045])  # [m] along the pads
@@ -124,7 +127,7 @@ def choose_grasp(
         if best is not None and grasp.cost >= best[0]:
             break
         depth = collision_depth(obstacles, grasp.pos_world, grasp.mat)
-        cost = grasp.cost + 20.0 * depth + 0.3 * (depth > 0)
+        cost = grasp.cost + DEPTH_COST * depth + COLLISION_COST * (depth > 0)
         if best is None or cost < best[0]:
             best = cost, grasp
     assert best is not None
@@ -216,13 +219,19 @@ def _candidates(
         off_centre = abs(height - 0.5 * (bottom + top)) + 5.0 * max(0.010 - top + height, 0.0)
         for yaw in aligned + yaw_grid(yaw_now, num_yaws):
             misalignment = min((yaw_distance(yaw, other) for other in aligned), default=0.0)
-            cost = 0.25 * yaw_distance(yaw, yaw_now) + 4.0 * off_centre + 0.4 * misalignment
+            turn = yaw_distance(yaw, yaw_now)
+            cost = TURN_COST * turn + HEIGHT_COST * off_centre + MISALIGNMENT_COST * misalignment
             for x, y, width, shift in body_grasps(section, yaw):
-                yield cost + 8.0 * width + 3.0 * shift, np.array([x, y, height]), float(yaw), width
+                yield (
+                    cost + WIDTH_COST * width + SHIFT_COST * shift,
+                    np.array([x, y, height]),
+                    float(yaw),
+                    width,
+                )
         # what is below the highest point of a cell makes no difference to fingers
         column = kernels.highest_per_cell(cloud[cloud[:, 2] > height - GRIPPER.tip_below], 0.004)
         for yaw in yaw_grid(yaw_now, num_yaws):
-            cost = WALL_COST + 0.25 * yaw_distance(yaw, yaw_now)
+            cost = WALL_COST + TURN_COST * yaw_distance(yaw, yaw_now)
             for x, y, width, wall_cost in _wall_grasps(section, column, height, yaw):
                 yield cost + wall_cost, np.array([x, y, height]), float(yaw), width
 

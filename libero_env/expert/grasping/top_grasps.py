@@ -7,6 +7,13 @@ import numpy as np
 
 from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.grasping.grasps import (
+    COLLISION_COST,
+    DEPTH_COST,
+    HEIGHT_COST,
+    MISALIGNMENT_COST,
+    SHIFT_COST,
+    TURN_COST,
+    WIDTH_COST,
     aligned_yaws,
     body_grasps,
     cross_section,
@@ -64,7 +71,7 @@ def choose_top_grasp(
         if best is not None and cost >= best[0]:
             break
         depth = _collision_depth(obstacles, grasp)
-        cost += 20.0 * depth + 0.3 * (depth > 0)
+        cost += DEPTH_COST * depth + COLLISION_COST * (depth > 0)
         if best is None or cost < best[0]:
             best = cost, grasp
     if best is None:
@@ -85,7 +92,8 @@ def _candidates(cloud: np.ndarray, surface_height: float, yaw_now: float) -> Ite
             turn = yaw_distance(yaw, yaw_now)
             misalignment = min((yaw_distance(yaw, other) for other in aligned), default=0.0)
             for x, y, width, shift in body_grasps(section, yaw):
-                cost = 0.25 * turn + 8.0 * width + 4.0 * off_centre + 3.0 * shift + 0.4 * misalignment
+                cost = TURN_COST * turn + WIDTH_COST * width + HEIGHT_COST * off_centre + SHIFT_COST * shift
+                cost += MISALIGNMENT_COST * misalignment
                 yield cost, TopGrasp(np.array([x, y, height]), float(yaw), width)
 
 

@@ -32,7 +32,7 @@ _NUM_TESTED = 80  # points of an object that are tested
 
 
 class PlaceError(LiberoError):
-    """There is no room for an object where the goal wants it."""
+    """There is no room for an object where the goal requires it."""
 
 
 @dataclass(frozen=True)
