@@ -203,12 +203,12 @@ class _Run:
             rates = evaluate_success(self.cfg, self.algo, self.benchmark, tasks, summary)
             summary["L_conf_mat"][i, : i + 1] = losses
             summary["S_conf_mat"][i, : i + 1] = rates.reshape(-1, size).mean(1)
-            successes, means = np.round(rates, 2).tolist(), np.round(losses, 3).tolist()
-            print(f"[info] after task {i}: success {successes}, loss {means}")
+            shown = f"success {np.round(rates, 2).tolist()}, loss {np.round(losses, 3).tolist()}"
+            print(f"[info] after task {i}: {shown}")
             means = {"success/mean": float(rates.mean()), "loss/mean": float(losses.mean())}
             self.tracker.log({**means, "tasks": i + 1})
-        with atomic_path(Path(self.cfg.experiment_dir, "result.pt")) as temporary:
-            torch.save(_tensors(summary), temporary)
+        with atomic_path(Path(self.cfg.experiment_dir, "result.pt")) as path, open(path, "wb") as file:
+            torch.save(_tensors(summary), file)
 
     def _empty_summary(self) -> dict[str, Any]:
         """Return results of zeros, with lists for simulator states if they are kept."""

@@ -51,13 +51,9 @@ class NpEncoder(json.JSONEncoder):
 def torch_save_model(
     model: nn.Module, model_path: str | Path, cfg: Any = None, previous_masks: Any = None
 ) -> None:
-    """Write a model's weights, with its configuration and PackNet's masks as plain data.
-
-    The file is there whole or not at all.
-    """
-    path = Path(model_path)
+    """Write a model's weights, with its configuration and PackNet's masks as plain data, in one step."""
     stored = {"state_dict": dict(model.state_dict()), "cfg": plain(cfg), "previous_masks": previous_masks}
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_path(Path(model_path)) as temporary, open(temporary, "wb") as file:
         torch.save(stored, file)
 
 

@@ -49,10 +49,9 @@ def get_algo_list() -> dict[str, type["Sequential"]]:
 class AlgoMeta(type):
     """Registers every class of this metaclass under its name."""
 
-    def __new__(mcs, name: str, bases: tuple, namespace: dict[str, Any]) -> Any:
-        cls = super().__new__(mcs, name, bases, namespace)
+    def __init__(cls, name: str, bases: tuple, namespace: dict[str, Any]):
+        super().__init__(name, bases, namespace)
         register_algo(cast(Any, cls))
-        return cls
 
 
 @dataclass

@@ -33,19 +33,15 @@ def get_policy_list() -> dict[str, type["BasePolicy"]]:
 
 
 class PolicyMeta(type):
-    """Registers every subclass of BasePolicy, except those defined with `registered=False`."""
+    """Registers every class of this metaclass under its name, except the two base classes."""
 
-    def __new__(mcs, name: str, bases: tuple, namespace: dict[str, Any], registered: bool = True) -> Any:
-        cls = super().__new__(mcs, name, bases, namespace)
-        if registered:
-            register_policy(cast(Any, cls))
-        return cls
-
-    def __init__(cls, name: str, bases: tuple, namespace: dict[str, Any], registered: bool = True):
+    def __init__(cls, name: str, bases: tuple, namespace: dict[str, Any]):
         super().__init__(name, bases, namespace)
+        if name not in ("BasePolicy", "NativePolicy"):
+            register_policy(cast(Any, cls))
 
 
-class BasePolicy(nn.Module, metaclass=PolicyMeta, registered=False):
+class BasePolicy(nn.Module, metaclass=PolicyMeta):
     """Policy trained on dictionaries of windows.
 
     A subclass sets `policy_head` and implements `forward` and `get_action`; it never changes a batch. Data in training:

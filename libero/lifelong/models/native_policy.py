@@ -25,7 +25,7 @@ from lifelong.policies.history import HistoryPolicy
 from lifelong.saved_config import upgrade_policy
 
 
-class NativePolicy(BasePolicy, registered=False):
+class NativePolicy(BasePolicy):
     """Policy with a `HistoryPolicy` as `network`, whose checkpoints and this policy's weights are interchangeable.
 
     `cfg.policy.native` holds further arguments of the network, as flat keys (see `upgrade_policy`). With `norm: batch`,
