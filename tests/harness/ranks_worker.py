@@ -1,4 +1,4 @@
-"""What test_distributed.py runs in several processes: torchrun ... ranks_worker.py MODE FOLDER."""
+"""Script of test_distributed.py for several processes: torchrun ... ranks_worker.py MODE FOLDER."""
 
 import json
 import os
@@ -32,7 +32,7 @@ EVAL = EvalSettings(episodes=2, curve_episodes=2, every=4, horizon=4, settle_ste
 
 
 def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float], dict[str, torch.Tensor]]:
-    """Two tasks with an algorithm as it is configured; every step's loss, and the weights at the end.
+    """Learn two tasks with a configured algorithm; return every step's loss, and the weights at the end.
 
     Without dropout: its masks are each rank's own.
     """
@@ -57,7 +57,7 @@ def refuse(*args, **kwargs):
 
 
 def learn_all(folder: Path, ranks: Ranks) -> None:
-    """All algorithms; each rank leaves its weights, and the first the losses."""
+    """Learn with all algorithms; each rank writes its weights, and the first one the losses."""
     if not ranks.first:
         checkpoints_save, checkpoints.save, ResultLog.append = checkpoints.save, refuse, refuse
     else:
@@ -70,7 +70,7 @@ def learn_all(folder: Path, ranks: Ranks) -> None:
 
 
 def talk(folder: Path, ranks: Ranks) -> None:
-    """What processes tell each other, with nothing to learn."""
+    """Test the communication between processes, without training."""
     shared = ranks.broadcast(lambda: {"from": ranks.rank, "path": folder})
     assert shared == {"from": 0, "path": folder}
     a, b, c = (torch.nn.Parameter(torch.zeros(2, 2)) for _ in range(3))
@@ -88,7 +88,7 @@ def talk(folder: Path, ranks: Ranks) -> None:
 
 
 def die(folder: Path, ranks: Ranks) -> None:
-    """The second process is killed; the first waits for it, for ever if nobody ends it."""
+    """Kill the second process while the first waits for it."""
     if not ranks.first:
         os.kill(os.getpid(), signal.SIGKILL)
     ranks.barrier()

@@ -1,4 +1,4 @@
-"""A sequence of three tasks with a tiny policy and a fake environment; runs that are killed."""
+"""A sequence of three tasks with a tiny policy and a fake environment; simulated kills of runs."""
 
 from dataclasses import asdict
 
@@ -39,7 +39,7 @@ ALGORITHMS = {
 
 
 class FakeEnv:
-    """Succeeds after as many steps as the first action's size says; stands still afterwards."""
+    """Succeeds depending on the size of the actions; does not move afterwards."""
 
     def __init__(self, task: int, num_envs: int):
         self.num_envs, self.task, self.closed = num_envs, task, False
@@ -113,7 +113,7 @@ def sequence(context: RunContext, first: int = 0) -> TaskSequence:
 
 
 def outcome(path, log):
-    """All records without their times, and the last weights and algorithm's state."""
+    """Return all records without their times, and the last weights and algorithm's state."""
     kept = {}
     for record in log.read().records:
         values = {k: v for k, v in asdict(record).items() if k != "seconds"}
@@ -140,11 +140,11 @@ def assert_same(a, b):
 
 
 class Killed(BaseException):
-    """What a killed process leaves, without the process."""
+    """Stands for a killed process."""
 
 
 class Killer:
-    """Lets so many writes pass, then ends the process in the middle of one."""
+    """Allows N writes, then ends the process in the middle of one."""
 
     def __init__(self, monkeypatch, writes: int):
         self.left = writes

@@ -1,4 +1,4 @@
-"""kill -9, again and again: the same command always goes on, to the same bits as if nothing had happened."""
+"""Repeated kill -9: the same command always resumes, to the same bits as an uninterrupted run."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def start(algo: str, runs: Path, demos: Path) -> subprocess.Popen:
 
 
 def finish(process: subprocess.Popen, runs: Path) -> Path:
-    """Wait for a good end; the run's directory."""
+    """Wait for successful termination and return the run's directory."""
     try:
         status = process.wait(DEADLINE)
     finally:
@@ -63,7 +63,7 @@ def finish(process: subprocess.Popen, runs: Path) -> Path:
 
 
 def written(runs: Path) -> dict[Path, tuple[int, int]]:
-    """Every file with its time of change and size, those half written too."""
+    """Return every file with its modification time and size, temporary files included."""
     found = {}
     for path in runs.rglob("*"):
         try:
@@ -76,7 +76,7 @@ def written(runs: Path) -> dict[Path, tuple[int, int]]:
 
 
 def kill_somewhere(process: subprocess.Popen, runs: Path, draws: random.Random) -> bool:
-    """kill -9 during start-up, or a moment after so many changes of files; False if the process ended before."""
+    """Kill a process during start-up or after some changes of files; return False if it ended before."""
     if draws.random() < START_UP:
         time.sleep(draws.uniform(0.0, 2.0))
     else:
@@ -92,7 +92,7 @@ def kill_somewhere(process: subprocess.Popen, runs: Path, draws: random.Random) 
 
 
 def outcome(run: Path) -> dict[tuple, dict]:
-    """What was measured, without times; a record that was made twice must be the same both times."""
+    """Return the measurements without times; a record that was written twice must be the same both times."""
     found: dict[tuple, dict] = {}
     for line in (run / "results.jsonl").read_text().splitlines():
         record = json.loads(line)
@@ -136,5 +136,5 @@ def test_killed_five_times_each_run_ends_in_the_same_bits(algo, demos, tmp_path)
     assert not list(again.rglob("*.part")), "what a killed process leaves half written is cleared away"
 
 
-def test_that_is_twenty_times_at_least():
+def test_there_are_at_least_twenty_kills():
     assert KILLS * len(ALGORITHMS) >= 20

@@ -1,4 +1,4 @@
-"""From a mesh and a YAML scene to a trained and evaluated policy, with the commands that people type."""
+"""From a mesh and a YAML scene to a trained and evaluated policy, through the command line."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def home(tmp_path, monkeypatch) -> Path:
 
 
 def write_bar(path: Path) -> None:
-    """A bar of 40 x 60 x 40 with a checked picture, as an exporter that thinks in millimetres writes it."""
+    """Write a textured bar of 40 x 60 x 40, as an exporter in millimetres does."""
     mesh = trimesh.creation.box((40, 60, 40))
     squares = np.kron([[0, 1] * 4, [1, 0] * 4] * 4, np.ones((8, 8)))[..., None] * [200, 120, 40]
     Image.fromarray(squares.astype(np.uint8)).save(path.with_name("checks.png"))

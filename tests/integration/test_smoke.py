@@ -1,4 +1,4 @@
-"""The real thing: train.py from its command line to a report, and killed on the way."""
+"""train.py from its command line to a report, also when killed and resumed."""
 
 import json
 import os
@@ -99,7 +99,7 @@ def test_killed_twice_and_resumed_gives_the_same_results(home, tmp_path):
     finish(start(home, killed, *TINY))
 
     def outcome(path):
-        """Records by what they are about, without times; one made twice must be the same both times."""
+        """Return records by key, without times; a record that was written twice must be the same both times."""
         found = {}
         for record in records(path):
             if record["kind"] in ("loss", "eval", "task_end"):
@@ -115,7 +115,7 @@ def test_killed_twice_and_resumed_gives_the_same_results(home, tmp_path):
         assert torch.equal(value, last[1]["policy"][name]), name
 
 
-def test_another_configuration_in_the_same_place_is_refused(home, tmp_path):
+def test_another_configuration_in_the_same_directory_is_refused(home, tmp_path):
     finish(start(home, tmp_path, *TINY, "benchmark.tasks=1"))
     process = start(home, tmp_path, *TINY, "benchmark.tasks=1", "train.lr=0.5")
     output, _ = process.communicate(timeout=300)
@@ -123,7 +123,7 @@ def test_another_configuration_in_the_same_place_is_refused(home, tmp_path):
     assert "train.lr 0.003 -> 0.5" in output and "run_id=" in output and "Traceback" not in output
 
 
-def test_a_sweep_ends_with_a_report_that_compares(home, tmp_path):
+def test_a_sweep_ends_with_a_comparison_report(home, tmp_path):
     tiny = (*(t for t in TINY if not t.startswith("algo")), "benchmark.tasks=1")
     output = finish(start(home, tmp_path, "-m", "algo=sequential,ewc", "wandb.mode=disabled", *tiny))
     assert "2 runs compared" in output
@@ -133,7 +133,7 @@ def test_a_sweep_ends_with_a_report_that_compares(home, tmp_path):
 
 @pytest.mark.parametrize("policy", ["bc_transformer_small", "bc_rnn_small", "bc_vilt_small"])
 def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
-    """The whole line of preset=smoke, with fewer and shorter steps and episodes."""
+    """Run preset=smoke with fewer and shorter steps and episodes."""
     tiny = (*(t for t in TINY if not t.startswith("algo")), "eval.episodes=1", f"policy={policy}")
     output = finish(start(home, tmp_path, "-m", f"algo={','.join(ALGORITHMS)}", *tiny))
     assert f"{len(ALGORITHMS)} runs compared" in output
@@ -156,7 +156,7 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
         ("device=tpu", "valid: auto, cpu, cuda"),
     ],
 )
-def test_what_cannot_run_is_told_in_one_line(home, tmp_path, override, message):
+def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, message):
     process = start(home, tmp_path, "preset=smoke", override)
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 1

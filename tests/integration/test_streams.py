@@ -1,4 +1,4 @@
-"""train.py with groups, blurred boundaries and pretraining, and a run that begins with its weights."""
+"""train.py with groups, blurred boundaries and pretraining, and a run that starts from its weights."""
 
 import os
 import subprocess
@@ -28,7 +28,7 @@ TINY = (
 
 
 def train(home: Path, *overrides: str) -> tuple[int, str]:
-    """Status and output of a run in a folder."""
+    """Return the status and output of a run in a folder."""
     env = os.environ | {"LIBERO_CACHE": str(home / "cache"), "LIBERO_DEMOS": str(home / "demos")}
     command = [sys.executable, str(ROOT / "train.py"), *TINY, f"runs_dir={home / 'runs'}", *overrides]
     done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, timeout=900)

@@ -1,4 +1,4 @@
-"""Intervals over orders, runs and episodes: what they cover, and what they depend on."""
+"""Bootstrap intervals over orders, runs and episodes: their coverage and properties."""
 
 import dataclasses
 
@@ -61,7 +61,7 @@ def test_a_single_run_has_the_interval_of_its_episodes():
         assert width(found.interval(name)) == pytest.approx(width(getattr(wilson, name)), rel=0.15)
 
 
-def test_certain_episodes_still_have_width():
+def test_intervals_have_width_where_all_episodes_succeed():
     member = members(3, runs=1, spread=0.0)[0]
     perfect = dataclasses.replace(
         member.scores,
@@ -105,7 +105,7 @@ def test_differences_are_of_independent_groups():
     assert (back.low, back.high) == pytest.approx((-difference.high, -difference.low))
 
 
-def test_metrics_that_are_undefined_stay_so():
+def test_undefined_metrics_stay_undefined():
     member = members(7, runs=1, spread=0.0)[0]
     empty = Curve(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
     cut = dataclasses.replace(member.scores, curves=(*member.scores.curves[:-1], empty))
@@ -116,7 +116,7 @@ def test_metrics_that_are_undefined_stay_so():
         resample([])
 
 
-def test_of_tasks_learned_together_only_the_success_at_the_end_is_known():
+def test_of_tasks_learned_jointly_only_final_success_is_known():
     episodes = np.zeros((4, 4), int)
     episodes[-1] = 20
     matrix = np.where(episodes > 0, 0.5, np.nan)

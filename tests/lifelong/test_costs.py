@@ -1,4 +1,4 @@
-"""What algorithms cost: operations against the formulas, and nothing is changed by count_flops them."""
+"""Costs of algorithms: operations against formulas, without side effects of counting."""
 
 import copy
 from functools import partial
@@ -63,7 +63,7 @@ KINDS = [Sequential(), ER(memory=ReplayMemory(9)), AGEM(memory=ReplayMemory(9)),
 
 
 @pytest.mark.parametrize("algorithm", KINDS, ids=lambda a: type(a).__name__)
-def test_a_step_of_any_size_is_told_by_two_small_ones(algorithm: Algorithm):
+def test_costs_of_two_small_steps_determine_those_of_any(algorithm: Algorithm):
     policy, first, second = transformer(), dataset(0), dataset(1)
     algorithm.begin_task(0, first, policy)
     algorithm.end_task(0, first, policy, generator(0))
@@ -105,7 +105,7 @@ def test_count_flops_changes_neither_policy_nor_algorithm():
     assert all(torch.equal(v, before[k]) for k, v in policy.state_dict().items())
 
 
-def test_parameters_and_those_that_are_trained():
+def test_parameters_and_trained_parameters():
     policy = transformer()
     everything = sum(p.numel() for p in policy.parameters())
     for p in policy.encoders.parameters():
@@ -116,7 +116,7 @@ def test_parameters_and_those_that_are_trained():
     assert costs["parameters_trained"] == everything - frozen
 
 
-def test_an_action_of_a_recurrent_policy_costs_less_if_its_memory_is_carried():
+def test_an_action_of_a_recurrent_policy_costs_less_with_carried_memory():
     lstm = partial(TemporalLSTM, hidden=16, layers=1)
     with seeded(1):
         window, carried = (small_rnn(SPEC, temporal=lstm, memory=m) for m in ("window", "reset"))
@@ -126,7 +126,7 @@ def test_an_action_of_a_recurrent_policy_costs_less_if_its_memory_is_carried():
     assert costs[0] - costs[1] == read_anew * step
 
 
-def test_what_is_stored():
+def test_stored_bytes():
     policy, first = transformer(), dataset(0)
     assert stored_bytes(Sequential()) == 0
     ewc = EWC()
@@ -140,7 +140,7 @@ def test_what_is_stored():
     assert stored_bytes(er) == 9 * (window + 8)  # and an index each
 
 
-def test_peaks_are_of_this_process():
+def test_peak_memory_is_that_of_this_process():
     assert (
         Path("/proc/self/status").exists() is False
         or peak_costs(torch.device("cpu"))["peak_memory_bytes"] > 2**26

@@ -1,4 +1,4 @@
-"""Several processes train as one: the same losses, the same weights on all, and none goes on alone."""
+"""Data-parallel training: the losses of one process, equal weights on all ranks, and a common end."""
 
 import json
 import os
@@ -63,13 +63,13 @@ def test_all_processes_end_with_the_same_weights(algo, learned):
         assert torch.equal(value, second[name]), name
 
 
-def test_what_processes_tell_each_other(tmp_path):
+def test_communication_between_processes(tmp_path):
     done = run_worker("talk", tmp_path)
     assert done.returncode == 0, done.stderr
     assert {p.name for p in tmp_path.iterdir()} == {"talked_0", "talked_1"}
 
 
-def test_one_that_dies_ends_all(tmp_path):
+def test_a_killed_process_ends_all(tmp_path):
     done = run_worker("die", tmp_path)
     assert done.returncode != 0
     assert "another process of this run has ended" in done.stderr or "SIGKILL" in done.stderr
@@ -78,13 +78,13 @@ def test_one_that_dies_ends_all(tmp_path):
 
 @pytest.mark.parametrize("size", [1, 2, 3, 8])
 @pytest.mark.parametrize("count", [1, 7, 32])
-def test_every_row_is_somebodys_and_shares_are_even(size, count):
+def test_every_row_belongs_to_one_rank_and_shares_are_even(size, count):
     rows = [range(count)[Ranks(rank, size).local_rows(count)] for rank in range(size)]
     assert [i for part in rows for i in part] == list(range(count))
     assert max(map(len, rows)) - min(map(len, rows)) <= 1
 
 
-def test_alone_nothing_is_said():
+def test_a_single_process_communicates_with_nobody():
     value, made = torch.ones(3), []
     with process_group() as ranks:
         assert ranks == Ranks() and ranks.first
@@ -93,7 +93,7 @@ def test_alone_nothing_is_said():
         assert torch.equal(ranks.sum(value), torch.ones(3))
 
 
-def test_devices_that_cannot_be_are_named(monkeypatch):
+def test_invalid_devices_are_named(monkeypatch):
     with pytest.raises(ConfigError, match="valid: auto, cpu, cuda"):
         Ranks().device("tpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

@@ -43,7 +43,7 @@ class Countdown:
 
 
 class Forward(nn.Module):
-    """Always the same action; remembers how it was called."""
+    """Returns always the same action and records its calls."""
 
     spec = SPEC
 
@@ -78,18 +78,18 @@ def test_success_and_length_of_each_episode():
     assert policy.training, "the policy is left in the mode it was in"
 
 
-def test_it_ends_when_all_have_succeeded():
+def test_a_rollout_ends_when_all_episodes_have_succeeded():
     policy, rollouts = run([1, 2])
     assert policy.calls == 2
 
 
-def test_an_episode_draws_the_same_whatever_runs_beside_it():
+def test_an_episodes_random_draws_do_not_depend_on_other_episodes():
     alone, _ = run([5])
     beside, _ = run([2, 5, 3])
     assert [d[0] for d in alone.draws] == [d[1] for d in beside.draws]
 
 
-def test_pictures_of_the_first_episode_until_it_ends(tmp_path):
+def test_frames_of_the_first_episode_are_recorded_until_it_ends(tmp_path):
     _, rollouts = run([3, 0], record_every=1)
     assert len(rollouts.frames) == 3 and rollouts.frames[0].shape == (4, 4, 3)
     save_animation(rollouts.frames, tmp_path / "videos" / "a.webp", seconds_per_frame=0.1)
@@ -97,12 +97,12 @@ def test_pictures_of_the_first_episode_until_it_ends(tmp_path):
         assert picture.size == (4, 4)
 
 
-def test_as_many_simulations_as_initial_states():
+def test_numbers_of_simulations_and_initial_states_must_match():
     with pytest.raises(ConfigError, match="3 initial states, but the environment has 2"):
         rollout(Forward(), Countdown(2), [1, 2, 3], language=torch.zeros(2), horizon=3)
 
 
-def test_the_pool_closes_what_was_not_used_for_longest_and_all_at_the_end():
+def test_the_pool_closes_the_least_recently_used_and_all_at_the_end():
     with EnvPool(Countdown, capacity=2) as pool:
         first, second = pool.get(1), pool.get(2)
         assert pool.get(1) is first

@@ -1,4 +1,4 @@
-"""Reports of made-up runs: everything on one page, nothing fetched, unfinished and broken runs included."""
+"""Reports of synthetic runs: self-contained pages, also of unfinished and damaged runs."""
 
 import base64
 import json
@@ -54,7 +54,7 @@ def make_run(
     order: int = 0,
     **settings: object,
 ) -> Path:
-    """A run directory as an experiment leaves it, with made-up but likely numbers."""
+    """Write a run directory as an experiment does, with synthetic numbers."""
     rng = np.random.default_rng([seed, *algo.encode()])
     names = GROCERIES[:tasks] if tasks <= 10 else [f"thing {i}" for i in range(tasks)]
     names = names[order:] + names[:order]
@@ -143,7 +143,7 @@ def add_video(folder: Path, name: str = "task_01_success") -> None:
 
 
 class Page(HTMLParser):
-    """What a test asks of a page: its text, what it loads, and that every element is closed."""
+    """Parses a page: its text, the files it loads, and whether every element is closed."""
 
     VOID = ("meta", "img", "br", "link", "input", "line")
 
@@ -187,17 +187,17 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_one_page_that_loads_nothing(finished: Path):
+def test_the_page_loads_no_other_file(finished: Path):
     page = Page((finished / "report.html").read_text())
     assert page.open == []
     assert page.loads and all(v.startswith(("data:", "#")) for v in page.loads)
     assert "@import" not in (finished / "report.html").read_text()
 
 
-def test_the_page_tells_the_whole_run(finished: Path):
+def test_the_page_describes_the_whole_run(finished: Path):
     text = Page((finished / "report.html").read_text()).text
-    for said in ("er on libero_object", "FWT", "NBT", "AUC", "Just learned", "demos 5 min 10 s", "mujoco"):
-        assert said in text
+    for message in ("er on libero_object", "FWT", "NBT", "AUC", "Just learned", "demos 5 min 10 s", "mujoco"):
+        assert message in text
     assert "pick up the cream cheese and place it in the basket" in text
     assert "task 01 success" in text and "epochs: 10" in text
     assert "not finished" not in text
@@ -213,7 +213,7 @@ def test_the_heatmap_shows_the_matrix(finished: Path):
     assert f"{round(20 * rates[3, 1])} of 20 episodes" in hints[7]
 
 
-def test_pictures_for_papers_lie_beside_the_page(finished: Path):
+def test_figures_for_papers_are_written_beside_the_page(finished: Path):
     assert (finished / "heatmap.pdf").read_bytes().startswith(b"%PDF")
     with Image.open(finished / "heatmap.png") as image:
         assert min(image.size) > 800
@@ -225,7 +225,7 @@ def test_the_same_results_give_the_same_page(finished: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("done", [0, 2])
-def test_an_unfinished_run_is_reported_as_far_as_it_is(tmp_path: Path, done: int):
+def test_an_unfinished_run_is_reported(tmp_path: Path, done: int):
     folder = make_run(tmp_path / "run", tasks=3, done=done)
     with open(folder / "results.jsonl", "ab") as file:
         file.write(b'{"kind": "eval", "pha')
@@ -234,7 +234,7 @@ def test_an_unfinished_run_is_reported_as_far_as_it_is(tmp_path: Path, done: int
     assert ("None yet" in page.text) == (done == 0)
 
 
-def test_broken_lines_and_a_missing_config_are_said_on_the_page(tmp_path: Path):
+def test_invalid_lines_and_a_missing_config_are_noted_on_the_page(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
     lines = (folder / "results.jsonl").read_text().splitlines()
     (folder / "results.jsonl").write_text("\n".join([*lines[:4], "<b>oops</b>", *lines[4:]]) + "\n")
@@ -291,7 +291,7 @@ def test_means_and_intervals_of_the_comparison(compared: tuple[Path, dict]):
     assert final["low"] < final["value"] < final["high"] < 0  # made so: er keeps more
 
 
-def test_forgetting_is_told_by_task_and_by_part_of_the_goal(compared: tuple[Path, dict]):
+def test_forgetting_by_task_and_by_subgoal(compared: tuple[Path, dict]):
     page, found = compared
     er = found["groups"]["er"]
     soup = "pick_up_the_alphabet_soup_and_place_it_in_the_basket"
@@ -309,11 +309,11 @@ def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: 
     page, found = compared
     assert found["groups"]["er"]["costs"]["stored_bytes"] == 6e6  # after the last of three tasks
     for text in (Page(page.read_text()).text, Page((finished / "report.html").read_text()).text):
-        for said in ("Costs", "34.0 GFLOP", "50.0 MFLOP", "1.20 M", "6.00 MB", "0.7 s"):
-            assert said in text, said
+        for message in ("Costs", "34.0 GFLOP", "50.0 MFLOP", "1.20 M", "6.00 MB", "0.7 s"):
+            assert message in text, message
 
 
-def test_parts_of_the_goals_are_on_the_page_and_old_records_go_without(finished: Path, tmp_path: Path):
+def test_subgoals_are_on_the_page_unless_records_are_old(finished: Path, tmp_path: Path):
     text = Page((finished / "report.html").read_text()).text
     assert "Subgoals" in text and "In thing_0 basket_1_contain_region" in text
     assert "held from the start" in text
@@ -326,7 +326,7 @@ def test_parts_of_the_goals_are_on_the_page_and_old_records_go_without(finished:
     assert "Subgoals" not in text and "Costs" not in text and "FWT" in text
 
 
-def test_where_the_policy_looks_is_on_the_page(tmp_path: Path):
+def test_saliency_is_on_the_page(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
     assert "<h2>Saliency</h2>" not in write_report([folder]).read_text()
     (folder / "saliency").mkdir()
@@ -364,14 +364,16 @@ def test_long_sequences_fit(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty", "begun"])
-def test_what_is_no_run_is_named(tmp_path: Path, name: str):
+def test_paths_that_are_no_runs_are_named(tmp_path: Path, name: str):
     folder = tmp_path / name
-    said = {"nowhere": "no such run", "empty": "results.jsonl is missing", "begun": "no 'run' record"}[name]
+    message = {"nowhere": "no such run", "empty": "results.jsonl is missing", "begun": "no 'run' record"}[
+        name
+    ]
     if name != "nowhere":
         folder.mkdir()
     if name == "begun":
         (folder / "results.jsonl").write_text("")
-    with pytest.raises(LifelongError, match=f"{re.escape(str(folder))}.*{said}"):
+    with pytest.raises(LifelongError, match=f"{re.escape(str(folder))}.*{message}"):
         write_report([folder])
     with pytest.raises(LifelongError, match="no run directory given"):
         write_report([])
@@ -384,7 +386,7 @@ def test_a_folder_that_cannot_be_written_is_named(finished: Path, tmp_path: Path
         write_report([finished], tmp_path / "sub" / "report.html")
 
 
-def test_too_many_pictures_are_left_out_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_media_above_the_limit_are_omitted_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = make_run(tmp_path / "run", tasks=2)
     for name in ("a", "b"):
         add_video(folder, name)
@@ -395,7 +397,7 @@ def test_too_many_pictures_are_left_out_by_name(tmp_path: Path, monkeypatch: pyt
     assert base64.b64encode((folder / "videos" / "a.gif").read_bytes()).decode() in raw
 
 
-def test_labels_leave_out_what_all_instructions_share():
+def test_labels_omit_the_common_words_of_all_instructions():
     texts = [f"pick up the {n} and place it in the basket" for n in GROCERIES]
     assert short_labels(texts) == list(GROCERIES)
     assert short_labels(["open the door"]) == ["open the door"]
@@ -403,7 +405,7 @@ def test_labels_leave_out_what_all_instructions_share():
     assert short_labels(["open the door", "close the window"]) == ["open the door", "close the window"]
 
 
-def test_lines_of_many_methods_can_be_told_apart():
+def test_lines_of_many_methods_are_distinguishable():
     figure = forgetting_figure([Line(f"method {i}", np.full((1, 3), 0.05 * i)) for i in range(14)])
     lines = [line for line in figure.axes[0].get_lines() if not line.get_label().startswith("_")]
     looks = {(x.get_color(), x.get_marker(), x.get_linestyle(), x.get_markerfacecolor()) for x in lines}

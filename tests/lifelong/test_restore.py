@@ -1,4 +1,4 @@
-"""A run's policy is read back as it acted, and looked at."""
+"""Loading of a run's policy, and its saliency."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def make_windows(task: int, spec: PolicySpec) -> SequenceVLDataset:
 
 
 def make_run(folder: Path, *overrides: str):
-    """A run's directory with two tasks learned, as far as restoring needs it; and the policy after each."""
+    """Write the files of a run with two learned tasks that loading needs; return the policy after each."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         config = compose("config", [*TINY, *overrides])
     folder.mkdir(parents=True)
@@ -70,7 +70,7 @@ def make_run(folder: Path, *overrides: str):
     return tasks, states, batch, answers
 
 
-def test_the_weights_after_each_task_and_the_last_by_default(tmp_path):
+def test_weights_after_a_given_task_and_after_the_last_by_default(tmp_path):
     tasks, states, *_ = make_run(tmp_path / "run", "algo=sequential")
     for after, wanted in ((None, 1), (0, 0), (1, 1)):
         found = restore(tmp_path / "run", after=after)
@@ -82,7 +82,7 @@ def test_the_weights_after_each_task_and_the_last_by_default(tmp_path):
 
 
 @pytest.mark.parametrize("algo", ["er", "packnet", "single_task", "lora"])
-def test_each_task_is_acted_on_as_by_the_algorithm_itself(tmp_path, algo):
+def test_a_loaded_policy_acts_as_the_algorithm_does(tmp_path, algo):
     tasks, _, batch, answers = make_run(tmp_path / "run", f"algo={algo}")
     found = restore(tmp_path / "run")
     for task, answer in zip(tasks, answers, strict=True):
@@ -101,7 +101,7 @@ def test_instructions_are_embedded_as_in_the_run(tmp_path):
         found.embed(get_task("libero_goal/1"))
 
 
-def test_what_is_no_run_is_named(tmp_path):
+def test_paths_that_are_no_runs_are_named(tmp_path):
     with pytest.raises(LifelongError, match="no run directory"):
         restore(tmp_path)
     make_run(tmp_path / "run")
@@ -113,7 +113,7 @@ def test_what_is_no_run_is_named(tmp_path):
 
 
 @pytest.mark.sim
-def test_pictures_of_where_it_looks(tmp_path):
+def test_saliency_sheet_of_a_run(tmp_path):
     make_run(tmp_path / "run")
     settings = SaliencySettings(stride=43, sigma=20)
     path = draw_saliency(tmp_path / "run", task=1, moments=3, horizon=4, settings=settings)

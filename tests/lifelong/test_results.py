@@ -1,4 +1,4 @@
-"""What is recorded stays readable, whatever happens to the process or the disk."""
+"""Records stay readable after a killed process or a full disk."""
 
 import json
 import os
@@ -144,7 +144,7 @@ def test_reading_never_changes_the_file(log: ResultLog):
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("{not json", "not JSON"),
         ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, eval"),
@@ -157,13 +157,13 @@ def test_reading_never_changes_the_file(log: ResultLog):
         ("[1, 2]", "unknown kind"),
     ],
 )
-def test_a_broken_line_is_named_and_the_others_are_read(log: ResultLog, line: str, said: str):
+def test_an_invalid_line_is_named_and_the_others_are_read(log: ResultLog, line: str, message: str):
     lines = log.path.read_text().splitlines()
     log.path.write_text("\n".join([*lines[:3], line, *lines[3:]]) + "\n")
     results = log.read()
     assert list(results.records) == RUN
     (problem,) = results.problems
-    assert problem.startswith(f"{log.path}:4: ") and said in problem
+    assert problem.startswith(f"{log.path}:4: ") and message in problem
 
 
 def test_a_full_disk_leaves_whole_lines(log: ResultLog, monkeypatch: pytest.MonkeyPatch):
@@ -184,7 +184,7 @@ def test_a_device_that_is_full_is_an_error_with_the_path():
         ResultLog("/dev/full").append(RUN[3])
 
 
-def test_what_is_recorded_need_not_be_done_again(log: ResultLog):
+def test_recorded_evaluations_and_losses_are_found(log: ResultLog):
     results = log.read()
     assert results.evaluation("matrix", 1, 0) == results.evaluation("matrix", 1, 0, epoch=1) == RUN[11]
     assert results.evaluation("matrix", 1, 0, epoch=2) is None and results.evaluation("curve", 1, 0) is None
@@ -210,12 +210,12 @@ def test_matrix_and_curves(log: ResultLog):
     assert results.seconds_by_phase() == {"demos": 30.0, "training": 4.0, "evaluation": 10.5}
 
 
-def test_the_diagonal_can_be_eq_3_to_the_letter(log: ResultLog):
+def test_the_diagonal_can_be_that_of_eq_3_exactly(log: ResultLog):
     rates, _ = log.read().success_matrix(diagonal="curve")
     np.testing.assert_array_equal(rates, [[0.75, np.nan], [0.25, 1.0]])
 
 
-def test_the_best_of_the_curve_stands_in_for_a_diagonal_that_was_not_evaluated():
+def test_the_best_of_the_curve_replaces_a_diagonal_that_was_not_evaluated():
     records = [
         r for r in RUN if not (isinstance(r, EvalRecord) and r.phase == "matrix" and r.learned == r.task)
     ]

@@ -1,4 +1,4 @@
-"""A run's directory: one configuration, one writer at a time, nothing thrown away."""
+"""A run's directory: one configuration, one writer at a time, no results lost."""
 
 import pytest
 
@@ -9,14 +9,14 @@ from lifelong.tracking import Tracker
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
 
 
-def test_the_same_configuration_is_found_again(tmp_path):
+def test_a_directory_reopens_with_the_same_configuration(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     for _ in range(2):
         with directory.opened(CONFIG, resume=True):
             assert (directory.path / "config.yaml").exists()
 
 
-def test_what_changes_no_result_may_change(tmp_path):
+def test_keys_that_change_no_result_may_differ(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     with directory.opened(CONFIG, resume=True):
         pass
@@ -34,7 +34,7 @@ def test_another_configuration_is_refused_with_the_difference_and_the_remedy(tmp
         pass
 
 
-def test_starting_afresh_keeps_the_old_run(tmp_path):
+def test_starting_again_keeps_the_old_run(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     for lr in (0.1, 0.2, 0.3):
         with directory.opened(CONFIG | {"train": {"lr": lr}}, resume=False):

@@ -1,4 +1,4 @@
-"""Saliency is where a policy looks, and nowhere else."""
+"""Saliency maps against a policy whose input is known."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ PATCH = (slice(20, 28), slice(60, 70))  # of the second camera
 
 
 class OnePatch(Policy):
-    """Answers with the mean of one patch of one camera."""
+    """Returns the mean of one patch of one camera."""
 
     def window_losses(self, batch: Batch) -> Tensor:
         return (self.predict(batch) - batch.actions).square().mean((1, 2))
@@ -43,7 +43,7 @@ def window() -> Batch:
 
 
 @pytest.mark.parametrize("measure", ["action", "loss"])
-def test_saliency_is_high_where_the_policy_looks_and_zero_elsewhere(measure):
+def test_saliency_is_high_at_the_used_patch_and_zero_elsewhere(measure):
     policy = OnePatch(SPEC).train()
     settings = SaliencySettings(stride=8, sigma=4, blur=6)
     heat = saliency(policy, window(), settings, measure=measure)
@@ -82,7 +82,7 @@ def test_a_blurred_place_is_half_the_squared_difference_of_actions():
         assert heat[1, 0, column].item() == pytest.approx(0.5 * 7 * difference**2, rel=1e-3)
 
 
-def test_what_cannot_be_looked_at_is_refused():
+def test_invalid_batches_and_measures_are_refused():
     policy = OnePatch(SPEC)
     with pytest.raises(ConfigError, match="one window; this one has 2"):
         saliency(policy, fake_batch(SPEC, 2, generator(0)))
@@ -92,7 +92,7 @@ def test_what_cannot_be_looked_at_is_refused():
         SaliencySettings(stride=0)
 
 
-def test_pictures_keep_grey_what_does_not_matter():
+def test_overlays_are_grey_where_saliency_is_zero():
     draws = np.random.default_rng(0)
     image = draws.integers(0, 256, (8, 8, 3), np.uint8)
     heat = np.zeros((8, 8))
@@ -106,7 +106,7 @@ def test_pictures_keep_grey_what_does_not_matter():
     np.testing.assert_array_equal(sheet[2:26:3, 2:26:3], image)
 
 
-def test_a_window_is_what_the_policy_remembers():
+def test_windows_end_at_the_step():
     frames = [{"x": torch.full((1, 1, 1), float(step))} for step in range(5)]
     assert window_at(frames, 3, 2)["x"].flatten().tolist() == [2, 3]
     assert window_at(frames, 1, 4)["x"].flatten().tolist() == [0, 1]

@@ -53,7 +53,7 @@ def test_the_records_are_complete(tmp_path):
     assert all(set(r.init_states) == ({0, 1, 2} if r.phase == "matrix" else {48, 49}) for r in evals)
 
 
-def test_the_last_weights_are_kept_when_asked_for(tmp_path):
+def test_select_last_keeps_the_last_weights(tmp_path):
     p = run_context(tmp_path, "sequential")
     object.__setattr__(p.eval, "select", "last")
     sequence(p).run()

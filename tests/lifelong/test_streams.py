@@ -1,4 +1,4 @@
-"""What is learned in which order: groups, few demonstrations, blurred boundaries, what a policy begins with."""
+"""Streams: groups of tasks, fewer demonstrations, blurred boundaries, pretraining and initial weights."""
 
 import math
 import shlex
@@ -49,7 +49,7 @@ def stage_data(
 
 
 def contents(windows) -> torch.Tensor:
-    """(W, D) what is in each window."""
+    """Return the (W, D) contents of the windows."""
     return windows.batch(torch.arange(len(windows))).observation.proprio["x"][:, 0]
 
 
@@ -57,13 +57,13 @@ def rows(features: torch.Tensor) -> set[tuple[float, ...]]:
     return {tuple(row) for row in features.tolist()}
 
 
-def test_groups_are_neighbours_and_algorithms_join_groups() -> None:
+def test_groups_are_consecutive_and_algorithms_join_groups() -> None:
     assert learning_stages(Sequential(), 3) == ((0,), (1,), (2,))
     assert learning_stages(Sequential(), 6, 2) == ((0, 1), (2, 3), (4, 5))
     assert learning_stages(Multitask(), 6, 2) == ((0, 1, 2, 3, 4, 5),)
 
 
-def test_without_a_stream_a_stage_is_the_task_itself() -> None:
+def test_by_default_a_stage_is_the_task_itself() -> None:
     data = stage_data(0.0)
     assert list(data) == [0, 1, 2, 3]
     assert all(data[task] is data.datasets[task] for task in data)
@@ -71,7 +71,7 @@ def test_without_a_stream_a_stage_is_the_task_itself() -> None:
         data[4]
 
 
-def test_a_group_has_its_tasks_windows_in_the_order_asked_for_under_its_last_task() -> None:
+def test_a_group_has_the_requested_windows_in_order_with_the_id_of_its_last_task() -> None:
     data = stage_data(0.0, group_size=2)
     assert list(data) == [1, 3]
     group = data[3]
@@ -97,7 +97,7 @@ def test_with_blurred_boundaries_every_window_is_learned_once(group_size: int, r
     assert rows(torch.cat(learned)) == rows(everything)
 
 
-def test_the_blurred_share_goes_to_the_neighbours_in_even_parts() -> None:
+def test_the_blurred_share_is_divided_evenly_over_the_neighbours() -> None:
     data, sizes = stage_data(0.3), (20, 30, 25, 40)
     own = {task: rows(windows.features) for task, windows in data.datasets.items()}
     found = {
@@ -110,7 +110,7 @@ def test_the_blurred_share_goes_to_the_neighbours_in_even_parts() -> None:
         assert all(not found[task, stage] for stage in range(4) if abs(stage - task) > 1)
 
 
-def test_the_seed_alone_decides_what_is_blurred() -> None:
+def test_only_the_seed_determines_the_blurred_windows() -> None:
     def draw(seed: int) -> torch.Tensor:
         return contents(stage_data(0.3, seed=seed)[1])
 
@@ -120,7 +120,7 @@ def test_the_seed_alone_decides_what_is_blurred() -> None:
     assert torch.equal(torch.random.get_rng_state(), state)
 
 
-def test_a_memory_of_stages_is_found_again_by_what_batches_say() -> None:
+def test_a_replay_memory_of_stages_reloads_by_window_ids() -> None:
     data = stage_data(0.3, group_size=2)
     memory, draws = ER(memory=ReplayMemory(30)).memory, torch.Generator().manual_seed(0)
     for last in data:
@@ -153,18 +153,18 @@ def test_demonstrations_of_later_tasks(later, expected) -> None:
 
 
 @pytest.mark.parametrize("later", [0, -1, 1.5, 0.0, [1], [1, 0], [1, 0.5], "many"])
-def test_numbers_of_demonstrations_that_cannot_be_are_refused(later) -> None:
+def test_invalid_numbers_of_demonstrations_are_refused(later) -> None:
     with pytest.raises(ConfigError, match="stream.demos_later"):
         StreamSettings(demos_later=later).demos(50, 3)
 
 
 @pytest.mark.parametrize("change", [{"blur": 1.0}, {"blur": -0.1}, {"blur_reach": 0}])
-def test_blur_that_cannot_be_is_refused(change) -> None:
+def test_invalid_blur_is_refused(change) -> None:
     with pytest.raises(ConfigError, match=f"stream.{next(iter(change))} is .*at least"):
         StreamSettings(**change)
 
 
-def test_group_sizes_that_do_not_divide_the_sequence_name_those_that_do() -> None:
+def test_group_sizes_must_divide_the_number_of_tasks() -> None:
     assert len(BenchmarkSettings("libero_goal", group_size=5).sequence()) == 10
     with pytest.raises(ConfigError, match="groups of 1, 2, 5, 10"):
         BenchmarkSettings("libero_goal", group_size=3).sequence()
@@ -244,7 +244,7 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
     assert_same(end, state)
 
 
-def test_metrics_take_a_group_for_one_task(tmp_path) -> None:
+def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
     log = ResultLog(tmp_path / "results.jsonl")
     log.append(
         start_record(
@@ -325,7 +325,7 @@ def before(context: RunContext, path: Path) -> None:
     sequence(pretraining, first=7).run(evaluate=False)
 
 
-def test_pretraining_learns_jointly_evaluates_nothing_and_is_not_done_twice(tmp_path, monkeypatch) -> None:
+def test_pretraining_is_joint_without_evaluation_and_done_once(tmp_path, monkeypatch) -> None:
     first, second, third = (run_context(tmp_path / name, "sequential") for name in "abc")
     untrained = {k: v.clone() for k, v in first.policy.state_dict().items()}
     before(first, tmp_path / "whole")
@@ -346,7 +346,7 @@ def test_pretraining_learns_jointly_evaluates_nothing_and_is_not_done_twice(tmp_
     assert_same(dict(again.policy.state_dict()), dict(trained))
 
 
-def test_a_policy_may_begin_with_a_finished_runs_weights(tmp_path) -> None:
+def test_a_policy_may_start_from_a_finished_runs_weights(tmp_path) -> None:
     run = RunDirectory(tmp_path / "run")
     for task in (0, 1, 10):
         state = {"task": task, "policy": {"w": torch.full((2,), float(task))}, "algorithm": {}}
@@ -360,7 +360,7 @@ def test_a_policy_may_begin_with_a_finished_runs_weights(tmp_path) -> None:
     assert load_initial_weights(run.task_path(1))[0]["w"].tolist() == [1.0, 1.0]
 
 
-def test_what_holds_no_weights_is_refused(tmp_path) -> None:
+def test_paths_without_weights_are_refused(tmp_path) -> None:
     with pytest.raises(CheckpointError, match=r"no run directory, or no task is learned yet"):
         load_initial_weights(tmp_path)
     with pytest.raises(CheckpointError, match="no checkpoint at"):
@@ -371,7 +371,7 @@ def test_what_holds_no_weights_is_refused(tmp_path) -> None:
         load_initial_weights(progress)
 
 
-def test_single_task_begins_each_task_with_what_was_there_before(tmp_path) -> None:
+def test_single_task_starts_each_task_from_the_pretrained_weights(tmp_path) -> None:
     p = run_context(tmp_path, "sequential")
     p = replace(p, algorithm=SingleTask(), fit=replace(p.fit, epochs=1, steps_per_epoch=1))
     before(p, tmp_path / "first")
@@ -382,7 +382,7 @@ def test_single_task_begins_each_task_with_what_was_there_before(tmp_path) -> No
 
 
 def shown() -> list[list[str]]:
-    """The overrides of every command in docs/streams.md."""
+    """Return the overrides of every command in docs/streams.md."""
     lines = (ROOT / "docs" / "streams.md").read_text(encoding="utf-8").splitlines()
     return [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("python train.py")]
 

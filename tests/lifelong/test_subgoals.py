@@ -1,4 +1,4 @@
-"""Parts of goals: what was reached, what was forgotten, and what is no achievement."""
+"""Subgoals: rates, forgetting, and atoms that held from the start."""
 
 from itertools import pairwise
 
@@ -81,7 +81,7 @@ def test_the_last_of_equal_records_counts_and_tasks_that_are_not_done_do_not():
     assert [a.task for a in subgoals(RUN, 1).atoms] == [0, 0]
 
 
-def test_records_without_atoms_tell_nothing():
+def test_records_without_atoms_have_no_subgoals():
     lines = [to_line(r).decode() for r in RUN]
     old = []
     for line in lines:

@@ -1,4 +1,4 @@
-"""Policies evaluated on tasks: fixed starts, what is done is kept, and anybody's policy may act."""
+"""Evaluation of policies on tasks: fixed initial states, resumption, user-defined policies."""
 
 import argparse
 import json
@@ -45,7 +45,7 @@ def nothing():
 
 
 class Countdown:
-    """Simulation i succeeds after as many steps as its start's number says; its goal has two parts."""
+    """Simulation i succeeds after as many steps as the index of its initial state; its goal has two atoms."""
 
     atoms = ("(Turnon stove_1)", "(On pot_1 stove_1)")
 
@@ -102,7 +102,7 @@ def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
     return SuiteEvaluation(out=out, actor=actor, **(arguments | changes))
 
 
-def test_success_with_its_interval_in_all_and_by_task(tmp_path):
+def test_success_with_intervals_overall_and_by_task(tmp_path):
     policy = Still()
     results = evaluation(tmp_path, policy).run()
     assert [r.successes for r in results] == [(True, True, True, False)] * 2
@@ -118,7 +118,7 @@ def test_success_with_its_interval_in_all_and_by_task(tmp_path):
     assert found["init_states"] == [3, 4, 9, 20] and found["evaluated"] == {"policy": "still"}
 
 
-def test_what_is_done_is_not_done_again(tmp_path):
+def test_tasks_with_results_are_not_evaluated_again(tmp_path):
     first = evaluation(tmp_path, tasks=TASKS[:1]).run()
 
     def env(task):
@@ -138,13 +138,13 @@ def test_what_is_done_is_not_done_again(tmp_path):
     ],
     ids=lambda c: next(iter(c)),
 )
-def test_results_of_something_else_are_not_mixed_in(tmp_path, changes):
+def test_results_of_another_evaluation_are_not_mixed_in(tmp_path, changes):
     evaluation(tmp_path).run()
     with pytest.raises(ConfigError, match=r"libero_goal_00\.json.*--again"):
         evaluation(tmp_path, **changes).run()
 
 
-def test_selection_and_reporting_are_apart():
+def test_selection_and_reporting_states_are_disjoint():
     chosen, reported = (choose_init_states(which, None, range(15)) for which in ("selection", "reporting"))
     assert set(chosen).isdisjoint(reported) and set(chosen) | set(reported) == set(
         choose_init_states("all", None)
@@ -174,12 +174,12 @@ def test_names_and_conventions_of_the_original():
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [(np.zeros((3, 6)), r"\(3, 6\); expected \(3, 7\)"), (np.full((3, 7), np.nan), "not finite")],
 )
-def test_answers_that_are_no_actions_are_refused(answer, said):
+def test_invalid_actions_are_refused(answer, message):
     policy = argparse.Namespace(predict=lambda observations: answer)
-    with pytest.raises(PolicyError, match=said):
+    with pytest.raises(PolicyError, match=message):
         CallableActor(policy, "do it", ()).act({"x": np.zeros((3, 1))})
 
 
@@ -195,17 +195,17 @@ def test_a_policy_from_a_module_of_the_working_directory(module):
     before = list(sys.path)
     assert load_callable(f"{module}:make").calls == []
     assert sys.path == before
-    for text, said in (
+    for text, message in (
         ("nowhere_at_all:make", "No module"),
         (f"{module}:mend", "mend"),
         (f"{module}:nothing", "predict"),
     ):
-        with pytest.raises(LifelongError, match=said):
+        with pytest.raises(LifelongError, match=message):
             load_callable(text)
 
 
 @pytest.mark.sim
-def test_from_the_command_line_with_a_policy_of_ones_own(module, tmp_path, capsys):
+def test_a_user_defined_policy_from_the_command_line(module, tmp_path, capsys):
     command = ["eval", f"{module}:make", "--suite", "libero_object/3", "--episodes", "2", "--horizon", "3"]
     command += ["--protocol", "openpi", "--out", "found", "--threads", "1"]
     assert cli.main(command) == 0
@@ -221,12 +221,12 @@ def test_from_the_command_line_with_a_policy_of_ones_own(module, tmp_path, capsy
     assert "--again" in capsys.readouterr().err
 
 
-def test_what_cannot_be_evaluated_is_told_in_one_line(module, tmp_path, capsys):
-    for argv, said in (
+def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
+    for argv, message in (
         ([f"{module}:make"], "no tasks are given"),
         ([f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"], "Valid: libero, openpi"),
         ([str(tmp_path / "no_run")], "no run directory"),
     ):
         assert cli.main(["eval", *argv]) == 2
         err = capsys.readouterr().err
-        assert said in err and err.count("\n") == 1
+        assert message in err and err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""The training loop: exact when resumed, silent about randomness, loud about what cannot work."""
+"""The training loop: exact when resumed, without side effects on generators, with errors that name the remedy."""
 
 import copy
 import os
@@ -89,8 +89,8 @@ def test_every_window_is_seen_once_an_epoch_and_steps_can_be_fixed():
     assert sorted(torch.cat(seen[:2]).tolist()) == list(range(16))
 
 
-def test_a_callers_own_step_and_loader_take_part_in_the_same_loop():
-    """With another optimiser whose rate is its own, and batches that are read elsewhere."""
+def test_user_defined_step_and_loader_run_in_the_same_loop():
+    """Use another optimiser with its own learning rate, and batches that are read elsewhere."""
     data, policy, twin = Windows(size=16), LinearPolicy(), LinearPolicy()
     twin.load_state_dict(policy.state_dict())
     settings, sizes = FitSettings(epochs=2, batch_size=8, grad_clip=0, precision="fp32"), []
@@ -162,7 +162,7 @@ def test_an_empty_dataset_is_an_error():
     ("key", "value"),
     [("epochs", 0), ("batch_size", 0), ("precision", "fp8"), ("accumulate", 0), ("compile", "max-autotune")],
 )
-def test_settings_that_cannot_work_are_named(key, value):
+def test_invalid_settings_are_named(key, value):
     with pytest.raises(ConfigError, match=key):
         FitSettings(**{key: value})
 
@@ -192,7 +192,7 @@ def test_micro_batches_learn_as_the_whole_batch_does(algo, parts, tmp_path):
 
 
 @pytest.mark.parametrize(("parts", "expected"), [(1, [10]), (4, [2, 3, 2, 3]), (100, [1] * 10)])
-def test_no_more_windows_are_computed_at_once_than_asked_for(parts, expected):
+def test_micro_batches_have_at_most_the_requested_size(parts, expected):
     sizes = []
 
     class Spy(LinearPolicy):
@@ -205,7 +205,7 @@ def test_no_more_windows_are_computed_at_once_than_asked_for(parts, expected):
     assert sizes == expected * 2
 
 
-def test_a_policy_that_normalises_over_the_batch_refuses_to_have_it_cut():
+def test_batch_norm_forbids_dividing_the_batch():
     cut = FitSettings(epochs=1, accumulate=2)
     with pytest.raises(
         ConfigError, match=r"norm takes its statistics over the batch.*policy\.encoder\.norm=group"
@@ -227,7 +227,7 @@ def test_a_policy_that_normalises_over_the_batch_refuses_to_have_it_cut():
 
 @pytest.fixture
 def traced(monkeypatch):
-    """torch.compile without its compiler: what is traced runs as it is, one graph but for recurrent layers."""
+    """Trace with torch.compile but run eagerly; one graph except for recurrent layers."""
     real, functions = torch.compile, []
 
     def trace(function, mode=None):
@@ -272,7 +272,7 @@ def test_compiled_training_keeps_names_and_numbers(traced):
     assert [mode for _, mode in traced] == ["reduce-overhead"]
 
 
-def test_a_missing_compiler_is_told_with_the_remedy(monkeypatch):
+def test_a_missing_compiler_is_reported_with_the_remedy(monkeypatch):
     def fail(*args, **kwargs):
         raise RuntimeError("No working C++ compiler found")
 
@@ -322,7 +322,7 @@ class Pictures:
 # --- deterministic
 
 
-def test_deterministic_kernels_are_asked_for_and_the_setting_put_back(monkeypatch):
+def test_deterministic_kernels_are_enabled_and_the_setting_restored(monkeypatch):
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
     with deterministic(False):
         assert not torch.are_deterministic_algorithms_enabled()
@@ -333,14 +333,14 @@ def test_deterministic_kernels_are_asked_for_and_the_setting_put_back(monkeypatc
     assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
 
 
-def test_an_operation_that_cannot_is_told_with_the_remedy():
+def test_an_operation_without_deterministic_kernel_is_reported_with_the_remedy():
     message = "some_backward_cuda does not have a deterministic implementation, but you set it."
     with pytest.raises(TrainingError, match="some_backward_cuda.*deterministic=false"), deterministic(True):
         raise RuntimeError(message)
     assert not torch.are_deterministic_algorithms_enabled()
 
 
-def test_on_a_cpu_the_bits_are_the_same_anyway(tmp_path):
+def test_on_a_cpu_deterministic_changes_no_bits(tmp_path):
     results = []
     for on in (False, True):
         with deterministic(on):
