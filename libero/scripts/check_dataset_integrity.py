@@ -3,12 +3,10 @@
 import argparse
 from pathlib import Path
 
-from tqdm import tqdm
-
 from libero.libero.utils.download_utils import datasets_folder
 from libero.scripts.command import option, script
-from libero_env.demos.curate import examine
-from libero_env.errors import DemoError
+from libero_env.cli.demos import check_files
+from libero_env.demos.curate import find_demo_files
 
 
 @script(
@@ -21,23 +19,7 @@ def main(args: argparse.Namespace) -> int:
     Raises:
         DemoError: There are no files.
     """
-    roots = args.paths or [datasets_folder()]
-    files = [f for root in roots for f in ([root] if root.is_file() else sorted(root.rglob("*.hdf5")))]
-    if not files:
-        raise DemoError(f"no demonstrations in {', '.join(map(str, roots))}; get some: libero demos download")
-    bad = 0
-    for file in tqdm(files, unit="file", disable=None):
-        try:
-            stats = examine(file)
-            faults = [str(fault) for fault in stats.faults]
-            if len(stats.lengths) != args.num_demos:
-                faults.append(f"{len(stats.lengths)} demonstrations; expected {args.num_demos}")
-        except DemoError as error:
-            faults = [str(error)]
-        bad += bool(faults)
-        for fault in faults:
-            tqdm.write(f"FAIL  {file}: {fault}")
-        if not faults:
-            tqdm.write(f"ok    {file}: {stats}")
-    print(f"{len(files) - bad} of {len(files)} files are complete")
-    return int(bad > 0)
+    files = find_demo_files(args.paths or [datasets_folder()])
+    broken = check_files(files, args.num_demos)
+    print(f"{len(files) - broken} of {len(files)} files are complete")
+    return int(broken > 0)

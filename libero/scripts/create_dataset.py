@@ -2,20 +2,16 @@
 
 import argparse
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
-import numpy as np
-from tqdm import tqdm
 
 from libero.libero.utils.dataset_utils import get_dataset_info
 from libero.scripts.command import option, script
-from libero_env.demos.curate import read_episodes, read_header, recorded_task
-from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
-from libero_env.demos.read import LOW_DIM_KEYS, demo_number
-from libero_env.demos.replay import rerender
-from libero_env.demos.write import DemoWriter
+from libero_env.demos.curate import recorded_task
+from libero_env.demos.observe import RenderConfig
+from libero_env.demos.read import LOW_DIM_KEYS
+from libero_env.demos.replay import rerender, rerun_actions
 
 
 @script(
@@ -38,37 +34,13 @@ def main(args: argparse.Namespace) -> None:
     config = RenderConfig(cameras, (args.size, args.size), modalities)
     if args.use_actions:
         with tempfile.TemporaryDirectory() as folder:
-            rerender(acted(args.demo_file, Path(folder) / "acted.hdf5"), target, config)
+            rerender(rerun_actions(args.demo_file, Path(folder) / "rerun.hdf5"), target, config)
     else:
         rerender(args.demo_file, target, config)
     if args.no_proprio:
         drop_proprioception(target)
     print(target)
     get_dataset_info(str(target))
-
-
-def acted(file: Path, target: Path) -> Path:
-    """Write a copy of demonstrations with the states that their actions lead to from the first one.
-
-    Raises:
-        DemoError: The file is broken or does not fit the scene of its task.
-    """
-    renderer = StateRenderer(recorded_task(file), RenderConfig(()))
-    writer = DemoWriter(target, read_header(file))
-    world = renderer.env.world
-    try:
-        for name, episode in tqdm(read_episodes(file), desc="acting", unit="demo", disable=None):
-            renderer.place_fixtures(fixture_poses(episode, renderer.scene, f"{file}: {name}"))
-            renderer.env.set_state(episode.states[0])
-            states = []
-            for action in episode.actions:
-                states.append(world.physics_state(0))
-                world.step([0], action[None])
-            success = bool(world.check_goal(0)[0])
-            writer.write(demo_number(name), replace(episode, states=np.array(states), success=success))
-    finally:
-        renderer.close()
-    return writer.finish()
 
 
 def drop_proprioception(file: Path) -> None:

@@ -3,7 +3,7 @@
 import argparse
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -186,20 +186,33 @@ def run_info(args: argparse.Namespace) -> None:
 
 def run_check(args: argparse.Namespace) -> int:
     """Read every file completely; return 1 if one is broken."""
+    return int(check_files(find_demo_files(args.paths)) > 0)
+
+
+def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
+    """Read files completely and print one line about each; return the number of broken files.
+
+    Args:
+        files: Demonstration files.
+        num_demos: Number of demonstrations that each file must have; None for any.
+    """
     from libero_env.demos.curate import examine
     from libero_env.errors import DemoError
 
     broken = 0
-    for path in find_demo_files(args.paths):
+    for path in files:
         try:
             stats = examine(path)
         except DemoError as error:
             broken += 1
             print(f"FAIL  {error}")
             continue
-        for fault in stats.faults:
+        faults = list(map(str, stats.faults))
+        if num_demos not in (None, len(stats.lengths)):
+            faults.append(f"{len(stats.lengths)} demonstrations; expected {num_demos}")
+        broken += bool(faults)
+        for fault in faults:
             print(f"FAIL  {path}: {fault}")
-        broken += bool(stats.faults)
-        if not stats.faults:
+        if not faults:
             print(f"ok    {path}: {len(stats.lengths)} demonstrations, {stats}")
-    return int(broken > 0)
+    return broken

@@ -158,6 +158,36 @@ def rerender(
     return writer.finish()
 
 
+def rerun_actions(file: Path, target: Path) -> Path:
+    """Write a copy of demonstrations with the states that their actions lead to from the first recorded state.
+
+    Args:
+        file: File to read.
+        target: File to write.
+
+    Returns:
+        The new file.
+
+    Raises:
+        DemoError: The file is broken or does not fit its task's scene.
+    """
+    renderer = StateRenderer(recorded_task(file), RenderConfig(()))
+    writer, world = DemoWriter(target, read_header(file)), renderer.env.world
+    try:
+        for name, episode in tqdm(read_episodes(file), unit="demo", disable=None):
+            renderer.place_fixtures(_checked_fixtures(file, name, episode, renderer.scene))
+            renderer.env.set_state(episode.states[0])
+            states = []
+            for action in episode.actions:
+                states.append(world.physics_state(0))
+                world.step([0], action[None])
+            success = bool(world.check_goal(0)[0])
+            writer.write(demo_number(name), replace(episode, states=np.array(states), success=success))
+    finally:
+        renderer.close()
+    return writer.finish()
+
+
 def _checked_fixtures(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:
     """Return the poses of the fixtures, after a check that the states fit the scene."""
     length = 1 + scene.model.nq + scene.model.nv
