@@ -1,14 +1,25 @@
 """The hooks through which an algorithm acts on training; the defaults are plain fine-tuning.
 
-They are called in this order. `set_augmentation` comes once, before all others; the rest for every task (or every
-stage of `stages`):
+    hook                                              called
+    set_augmentation(augment)                         once, before all others
+    stages(tasks) -> stages                           once: which tasks are learned together
+    begin_task(task_index, dataset, policy)           before the first step on a task
+    phases() -> phases                                then, for the phases of the task
+    begin_phase(phase, policy)                        before the first step of each phase
+    trained(policy) -> parameters                     before the first step, and when a run resumes
+    mode_train(policy)                                before the steps of each epoch
+    mix(batch, generator) -> batch                    each step, before the loss
+    penalty(policy) -> scalar or None                 each step, after the loss
+    after_backward(policy)                            each step, before gradients are clipped
+    after_step(policy)                                each step, after the optimiser moved the weights
+    end_phase(phase, policy)                          after each phase, with the weights that are kept
+    end_task(task_index, dataset, policy, generator)  after the last phase
+    policy_for(task_index, policy) -> policy          around every rollout, as a context
+    state_dict() -> state                             when a checkpoint is written
+    load_state_dict(state, datasets)                  when a run resumes
 
-    begin_task
-      for each of phases():  begin_phase, trained
-                             per step: mix -> (policy loss) + penalty -> after_backward -> after_step
-                             end_phase          with the phase's best weights loaded
-    end_task
-    policy_for                                  around every rollout
+The hooks from `begin_task` to `end_task` are called for every task, or for every stage of `stages`, whose
+`task_index` is that of its last task.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -23,14 +34,16 @@ from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
+Augmentation = Callable[[Batch, torch.Generator], Batch]
+
 
 @dataclass(frozen=True)
 class Phase:
-    """One stretch of training on a task.
+    """Part of the training on a task.
 
     Attributes:
-        name: Stands in the records and in checkpoint file names.
-        share: Epochs of this phase as a share of the configured epochs.
+        name: Name in the records and in checkpoint file names.
+        share: Number of epochs of this phase as a share of the configured epochs.
         measures_transfer: Whether success during this phase is the learning curve of forward transfer.
     """
 
@@ -40,41 +53,79 @@ class Phase:
 
 
 class Algorithm:
-    """Sequential fine-tuning; a base for algorithms, which override the hooks they need.
+    """Sequential fine-tuning, and the base of all algorithms, which override the hooks they need.
+
+    The hooks and the order of their calls are listed at the top of this module. An algorithm that keeps the weights
+    of the last task close:
+
+    >>> import torch
+    >>> class L2(Algorithm):
+    ...     def __init__(self, *, strength: float):
+    ...         self.strength, self.anchor = strength, {}
+    ...
+    ...     def penalty(self, policy):
+    ...         terms = [
+    ...             (p - self.anchor[n]).square().sum() for n, p in policy.named_parameters() if n in self.anchor
+    ...         ]
+    ...         return self.strength * sum(terms) if terms else None
+    ...
+    ...     def end_task(self, task_index, dataset, policy, generator):
+    ...         self.anchor = {n: p.detach().clone() for n, p in policy.named_parameters()}
+    ...
+    ...     def state_dict(self):
+    ...         return {"anchor": self.anchor}
+    ...
+    ...     def load_state_dict(self, state, datasets):
+    ...         self.anchor = dict(state["anchor"])
+    >>> algorithm, policy = L2(strength=10.0), torch.nn.Linear(2, 2)
+    >>> algorithm.penalty(policy) is None  # nothing is learned yet
+    True
+    >>> algorithm.end_task(0, None, policy, torch.Generator())
+    >>> algorithm.penalty(policy).item()
+    0.0
 
     Attributes:
         augment: Augmentation of training batches, for algorithms that also apply it elsewhere; None for no
             augmentation.
     """
 
-    augment: Callable[[Batch, torch.Generator], Batch] | None = None
+    augment: Augmentation | None = None
 
-    def set_augmentation(self, augment: Callable[[Batch, torch.Generator], Batch] | None) -> None:
+    def set_augmentation(self, augment: Augmentation | None) -> None:
         """Receive the augmentation of training batches, before any other hook and also when a run is resumed."""
         self.augment = augment
 
     def stages(self, tasks: int) -> tuple[tuple[int, ...], ...]:
-        """Which tasks are learned together, stage after stage: by default one at a time.
+        """Return which tasks are learned together, stage after stage; by default one at a time.
 
-        Elsewhere (in the other hooks, in records and file names) a stage goes by its last task.
+        In the other hooks, in records and in file names, a stage has the index of its last task.
+
+        Args:
+            tasks: Number of tasks.
         """
         return tuple((task,) for task in range(tasks))
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
-        """Before the first step on a task (position `task_index` in the sequence)."""
+        """Prepare for a task, before the first step on it.
+
+        Args:
+            task_index: Position of the task in the sequence.
+            dataset: Windows of the task.
+            policy: Policy with the weights that the last task ended with.
+        """
 
     def phases(self) -> tuple[Phase, ...]:
-        """The stretches of training every task goes through, in order."""
+        """Return the phases of training that every task goes through, in order."""
         return (Phase(),)
 
     def begin_phase(self, phase: Phase, policy: Policy) -> None:
-        """Before the first step of a phase; not called again when a killed run goes on inside it."""
+        """Prepare for a phase, before its first step; not called again when a run resumes inside the phase."""
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
-        """What the optimiser moves and whose gradient is clipped, always in the same order.
+        """Return the parameters that the optimiser moves and whose gradient is clipped, always in the same order.
 
-        Asked for before the first step of a phase, and again when a killed run goes on inside it. An algorithm may
-        add parameters of its own, which it keeps in `state_dict`, and may switch off gradients of others.
+        Called before the first step of a phase, and again when a run resumes inside it. An algorithm may add its own
+        parameters, which it keeps in `state_dict`, and may switch off gradients of others.
         """
         return [p for p in policy.parameters() if p.requires_grad]
 
@@ -83,40 +134,52 @@ class Algorithm:
         policy.train()
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """The batch the loss is taken on: what came from the task's data, plus what the algorithm adds."""
+        """Return the batch that the loss is computed on: the task's windows, and what the algorithm adds.
+
+        Args:
+            batch: Windows of the present task, not augmented yet.
+            generator: CPU generator of the step.
+        """
         return batch
 
     def penalty(self, policy: Policy) -> Tensor | None:
-        """A scalar added to the loss, or None; computed in the precision of the loss."""
+        """Return a scalar to add to the loss, or None; computed in the precision of the loss."""
         return None
 
     def after_backward(self, policy: Policy) -> None:
-        """With gradients in place, before they are clipped; in the precision of the loss."""
+        """Change the gradients before they are clipped; in the precision of the loss."""
 
     def after_step(self, policy: Policy) -> None:
-        """After the optimiser moved the weights."""
+        """Change the weights after the optimiser moved them."""
 
     def end_phase(self, phase: Phase, policy: Policy) -> None:
-        """After the last step of a phase, with the weights that are kept."""
+        """Finish a phase, after its last step, with the weights that are kept."""
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
-        """After training on a task, with the final weights."""
+        """Finish a task, after its last phase.
+
+        Args:
+            task_index: Position of the task in the sequence.
+            dataset: Windows of the task.
+            policy: Policy with the task's final weights.
+            generator: CPU generator of the task's end.
+        """
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """Within the context, the policy that acts on a task; afterwards the policy is as before."""
+        """Yield the policy that acts on a task; after the context the policy is as before."""
         yield policy
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""
+        """Return everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Take up what `state_dict` gave.
+        """Restore what `state_dict` returned.
 
         Args:
-            state: From `state_dict`.
-            datasets: The windows of the tasks learned so far, by position; each is read when asked for.
+            state: State from `state_dict`.
+            datasets: Windows of the tasks learned so far, by position; each is read when it is accessed.
         """

@@ -1,4 +1,4 @@
-"""The contract every policy keeps.
+"""The contract of all policies.
 
 Shape legend: B batch, T time, V views, H W C image, A action, L language embedding.
 """
@@ -14,11 +14,39 @@ from lifelong.types import Batch, Observation, PolicySpec
 
 
 class Policy(nn.Module, ABC):
-    """A network that is trained on windows and acts step by step.
+    """Network that is trained on windows and acts step by step.
 
-    A subclass gives `window_losses`, `reset` and `_act`, and `predict` for algorithms that distil. What it computes
-    on a window in training and what it computes when the same frames come one by one must be the same. It never
-    changes a batch.
+    A subclass implements `window_losses`, `reset` and `_act`, and `predict` for algorithms that distil. What it
+    computes on a window in training and what it computes when the same frames come one by one must be the same. It
+    never changes a batch. A policy that sees the joints only:
+
+    >>> import torch
+    >>> from lifelong.data.fake import fake_batch, fake_observation
+    >>> class JointPolicy(Policy):
+    ...     def __init__(self, *, spec: PolicySpec):
+    ...         super().__init__(spec)
+    ...         self.linear = torch.nn.Linear(spec.proprio["joint_states"], spec.action_dim)
+    ...
+    ...     def predict(self, batch):
+    ...         return self.linear(batch.observation.proprio["joint_states"]).tanh()
+    ...
+    ...     def window_losses(self, batch):
+    ...         return (self.predict(batch) - batch.actions).square().mean((1, 2))
+    ...
+    ...     def reset(self, num_envs): ...
+    ...
+    ...     def _act(self, observation, generators):
+    ...         return self.linear(observation.proprio["joint_states"][:, 0]).tanh()
+    >>> spec, draws = PolicySpec(image_size=(32, 32)), torch.Generator().manual_seed(0)
+    >>> policy = JointPolicy(spec=spec)
+    >>> policy.window_losses(fake_batch(spec, 4, draws)).shape
+    torch.Size([4])
+    >>> policy.eval().reset(num_envs=2)
+    >>> policy.act(fake_observation(spec, 2, draws, steps=1)).shape
+    torch.Size([2, 7])
+
+    Args:
+        spec: What the policy observes and does.
     """
 
     def __init__(self, spec: PolicySpec) -> None:
@@ -27,47 +55,46 @@ class Policy(nn.Module, ABC):
 
     @abstractmethod
     def window_losses(self, batch: Batch) -> Tensor:
-        """Loss of each window, mean over its steps, (B,) float32."""
+        """Return the loss of each window, mean over its steps, (B,) float32."""
 
     def loss(self, batch: Batch) -> Tensor:
-        """Mean of `window_losses`, a scalar."""
+        """Return the mean of `window_losses`, a scalar."""
         return self.window_losses(batch).mean()
 
     def predict(self, batch: Batch) -> Tensor:
-        """The policy's own answer at every step of each window, (B, T, A) float32, with gradients.
+        """Return the mean action at every step of each window, (B, T, A) float32, with gradients.
 
-        The mean of its action distribution: what distillation compares, and nothing random beyond dropout. Only the
-        observations of the batch are read.
+        Distillation compares it. Nothing is random beyond dropout, and only the observations of the batch are read.
 
         Raises:
-            PolicyError: the policy does not give it.
+            PolicyError: The policy does not implement it.
         """
         raise PolicyError(
             f"{type(self).__name__} has no predict(batch), which algorithms that distil need: "
-            "give it one, or choose another algorithm"
+            "implement it, or choose another algorithm"
         )
 
     @abstractmethod
     def reset(self, num_envs: int) -> None:
-        """Forgets the past and makes ready for the first step of episodes in `num_envs` environments."""
+        """Forget the past; the next step is the first one of episodes in `num_envs` environments."""
 
     @abstractmethod
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
-        """See `act`; called without gradients, in eval mode, with a checked observation."""
+        """Return the next actions, see `act`; called without gradients, in eval mode, with a checked observation."""
 
     def act(self, observation: Observation, generators: Sequence[torch.Generator] | None = None) -> Tensor:
-        """The next action of every environment; advances the history.
+        """Return the next action of every environment and advance the history.
 
         Args:
-            observation: T = 1, one row per environment that `reset` announced.
-            generators: one CPU generator per environment for policies that act at random, so that an action
+            observation: Observation with T = 1 and one row for each environment of `reset`.
+            generators: One CPU generator per environment for policies that sample actions, so that an action
                 does not depend on which environments are stepped together. Not used otherwise.
 
         Returns:
-            (B, A) float32 in [-1, 1].
+            Actions (B, A) float32 in [-1, 1].
 
         Raises:
-            PolicyError: in training mode, before `reset`, or with an observation of the wrong shape.
+            PolicyError: The policy is in training mode or was not reset, or the observation has a wrong shape.
         """
         if self.training:
             raise PolicyError("a policy acts in eval mode only (dropout is on); call policy.eval() first")
