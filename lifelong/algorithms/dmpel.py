@@ -20,34 +20,34 @@ from lifelong.nn.tokens import standardise
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Observation
 
-_QUERY = "routing_query"  # stands among the readings of a batch; policies read those of their spec only
-_FREE = 0.002  # divergence that replay lets pass: coefficients that are off by 0.03
-_CHUNK = 8  # windows of which queries are made at a time
+_QUERY = "routing_query"  # key among the readings of a batch; policies read only those of their spec
+_FREE = 0.002  # [nat] divergence that replay tolerates: coefficients that are off by 0.03
+_CHUNK = 8  # windows per computation of queries
 
 
 class DMPEL(Algorithm):
-    """Add a few low-rank experts with each task, and let a router mix all there are (Lei et al. 2025).
+    """Add a few low-rank experts with each task, and let a router mix all experts (Lei et al. 2025).
 
     "Dynamic mixture of progressive parameter-efficient expert library for lifelong robot learning",
     arXiv:2506.05985: layers compute `W x + (alpha / rank) sum_i c_i B_i A_i x` with W frozen; the coefficients c come
-    from a router that sees the context (instruction, images, proprioception), not the task's number, and are a
+    from a router that takes the context (instruction, images, proprioception), not the task's number, and are a
     softmax over the best `top_k`; layers form groups with coefficients of their own. Only the newest experts and
-    the router learn. What the router must not forget is replayed: its inputs on earlier tasks and the coefficients
-    that it gave then, which are far smaller than demonstrations.
+    the router learn. The router is kept from forgetting by replay: of its inputs on earlier tasks and the coefficients
+    that it returned then, which are far smaller than demonstrations.
 
     Departures:
 
     * c is fixed for an episode and computed from its first frame. A policy keeps features of earlier frames while it
-      acts, which other coefficients would belie; so windows in training and single steps compute the same. A window
-      belongs to the first frame of its demonstration.
-    * The paper's router sees features of a frozen CLIP; this one the image in `pool` by `pool` pixels.
+      acts, which other coefficients would contradict; so windows in training and single steps compute the same. A
+      window belongs to the first frame of its demonstration.
+    * The paper's router takes features of a frozen CLIP; this one the image in `pool` by `pool` pixels.
     * Choice 0 is the base alone, without an expert: the task that the base was learned with needs none.
     * Replay is a penalty while a task is learned, not a stage after it: the divergence of the coefficients, over all
-      choices, from those kept, as far as it is more than hardly any. Squared errors would not move a router that is
-      sure of itself; and without the allowance the optimiser, which looks at gradients' signs rather than sizes,
-      would push new choices away from old contexts, and with these from all, before they have learned anything.
-    * Linear layers and convolutions have experts. An LSTM stays as the base left it; what goes into it and what
-      comes out passes through layers that have.
+      choices, from the stored ones, above a small tolerance. Squared errors would not move a router with saturated
+      outputs; and without the tolerance the optimiser, which follows gradients' signs rather than sizes, would push
+      new choices away from old contexts, and with these from all, before they have learned anything.
+    * Linear layers and convolutions have experts. An LSTM stays as in the base; its inputs and outputs pass through
+      layers with experts.
     """
 
     def __init__(
@@ -64,22 +64,23 @@ class DMPEL(Algorithm):
         replay_size: int = 50,
         base_tasks: int = 1,
     ):
-        """Make the algorithm.
+        """Create the algorithm.
 
         Args:
-            rank: Of an expert.
-            alpha: The experts' scale is alpha / rank.
-            experts: Added for each task.
-            top_k: So many choices share the weight; 0: all.
+            rank: Rank of an expert.
+            alpha: Numerator of the experts' scale alpha / rank.
+            experts: Number of experts added for each task.
+            top_k: Number of choices that share the weight; 0: all.
             adapted: Patterns of names of the weights whose layers get experts, e.g. `transformer.*`, `head.*`.
-            hidden: Units of the router.
-            pool: The router sees every image in so many pixels by so many.
-            replay: Weight of the earlier coefficients.
-            replay_size: Contexts kept of each task.
-            base_tasks: So many tasks train the whole policy, which is frozen afterwards; 0: it is pretrained.
+            hidden: Number of hidden units of the router.
+            pool: Side, in pixels, to which images are reduced for the router.
+            replay: Weight of the divergence from stored coefficients.
+            replay_size: Number of contexts stored of each task.
+            base_tasks: Number of tasks that train the whole policy, which is frozen afterwards; 0 for a pretrained
+                policy.
 
         Raises:
-            ConfigError: A number below the least that can work.
+            ConfigError: A number below its smallest valid value.
         """
         for name, value in {
             "rank": rank,
@@ -99,14 +100,14 @@ class DMPEL(Algorithm):
         self._router: Router | None = None
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self._episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
-        self._now: Tensor | None = None  # (B, G, N), what layers mix with
-        self._held: Tensor | None = None  # (B, G, N), of episodes that are acted out
+        self._now: Tensor | None = None  # (B, G, N), coefficients of the present forward pass
+        self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
         self._handles: list[RemovableHandle] = []
 
     # --- hooks
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
-        """Note the episodes' contexts; after the base, add experts and choices of the router."""
+        """Store the episodes' contexts; after the base, add experts and choices of the router."""
         self.task_index, layers = task_index, routed_layers(policy, self.adapted)
         queries, of_window = self._contexts(dataset)
         self._episodes = {"queries": queries.to(next(policy.parameters()).device), "of_window": of_window}
@@ -117,13 +118,13 @@ class DMPEL(Algorithm):
         draws = torch.Generator().manual_seed(self._seed)
         queries = self._episodes["queries"]
         if self._router is None:
-            self._router = self._make_router(len(_groups(layers)), queries, draws)
+            self._router = self._build_router(len(_groups(layers)), queries, draws)
         earlier = [m["queries"] for m in self._memory.values()]
         self._router.grow(self.experts, queries, torch.cat([queries[:0], *earlier]))
-        self._library[task_index] = {n: self._make_experts(layer, draws) for n, layer in layers.items()}
+        self._library[task_index] = {n: self._build_experts(layer, draws) for n, layer in layers.items()}
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
-        """The router and the task's experts; everything while the base is learned."""
+        """Return the router's and the task's experts' parameters; everything while the base is learned."""
         if self._router is None or self.task_index not in self._library:
             return super().trained(policy)
         policy.requires_grad_(False)
@@ -132,13 +133,13 @@ class DMPEL(Algorithm):
         return [*self._router.parameters(), *(p for pair in pairs for p in pair.values())]
 
     def mode_train(self, policy: Policy) -> None:
-        """Training mode, with running statistics frozen with the base."""
+        """Set training mode, with running statistics frozen with the base."""
         policy.train()
         if self._library:
             freeze_statistics(policy)
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """The batch, in which each window carries the query of its episode."""
+        """Return the batch with the query of its episode in each window."""
         if self._router is None:
             return batch
         known, device = batch.task_ids == self.task_index, batch.actions.device
@@ -151,7 +152,7 @@ class DMPEL(Algorithm):
         return replace(batch, observation=replace(batch.observation, proprio=proprio))
 
     def penalty(self, policy: Policy) -> Tensor | None:
-        """`replay * max(0, KL(c_then | c) - _FREE)`, mean over earlier tasks' contexts, a scalar; None without any."""
+        """Return `replay * max(0, KL(c_then | c) - _FREE)`, mean over earlier tasks' contexts; None without any."""
         if self._router is None or not self._memory:
             return None
         logits = self._router.logits(torch.cat([m["queries"] for m in self._memory.values()]))
@@ -160,14 +161,14 @@ class DMPEL(Algorithm):
         return self.replay * functional.relu(divergence - _FREE).mean()
 
     def end_phase(self, phase: Any, policy: Policy) -> None:
-        """Take the experts off the policy's layers."""
+        """Remove the experts from the policy's layers."""
         self._detach(policy)
 
     @torch.no_grad()
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
-        """Keep some of the task's contexts, with the coefficients that they are answered with."""
+        """Store some of the task's contexts, with the router's coefficients for them."""
         queries = self._episodes["queries"]
         chosen = torch.randperm(len(queries), generator=generator)[: self.replay_size]
         queries = queries[chosen.to(queries.device)]
@@ -182,7 +183,7 @@ class DMPEL(Algorithm):
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """The policy with routed experts, the same for every task."""
+        """Yield the policy with routed experts, the same for every task."""
         if self._router is None:
             yield policy
             return
@@ -198,22 +199,22 @@ class DMPEL(Algorithm):
     # --- routing
 
     def query(self, observation: Observation) -> Tensor:
-        """The context in the first frame of windows, (B, Q): instruction, images, proprioception."""
+        """Return the context in the first frame of windows, (B, Q): instruction, images, proprioception."""
         images = observation.images[:, 0].flatten(0, 1).movedim(-1, 1).float()  # (B V, C, H, W)
-        seen = functional.adaptive_avg_pool2d(images, self.pool) / 64 - 2  # of order one
-        seen = seen.reshape(len(observation.images), -1)
-        felt = [observation.proprio[name][:, 0] for name in sorted(observation.proprio) if name != _QUERY]
-        return torch.cat([standardise(observation.language), seen, *felt], dim=1)
+        pictures = functional.adaptive_avg_pool2d(images, self.pool) / 64 - 2  # of order one
+        pictures = pictures.reshape(len(observation.images), -1)
+        readings = [observation.proprio[name][:, 0] for name in sorted(observation.proprio) if name != _QUERY]
+        return torch.cat([standardise(observation.language), pictures, *readings], dim=1)
 
     def coefficients(self, observation: Observation) -> Tensor:
-        """How much of each choice each group of layers takes, (B, G, N)."""
+        """Return the coefficient of each choice in each group of layers, (B, G, N)."""
         assert self._router is not None
         given = observation.proprio.get(_QUERY)
         return self._router(self.query(observation) if given is None else given[:, 0])
 
     @contextmanager
     def holding(self, coefficients: Tensor) -> Iterator[None]:
-        """Within the context, these coefficients hold whatever is observed."""
+        """Use the given coefficients within the context, whatever is observed."""
         self._held = coefficients
         try:
             yield
@@ -221,16 +222,16 @@ class DMPEL(Algorithm):
             self._held = None
 
     def _attach(self, policy: Policy) -> None:
-        """Let the policy's layers mix experts, with coefficients found when it encodes an observation.
+        """Let the policy's layers mix experts, with coefficients computed when it encodes an observation.
 
-        A copy of the policy mixes them as well: functions and methods know no policy but the one they are called on.
+        A copy of the policy mixes them as well: functions and methods refer to the policy they are called on.
         """
         if "encode" in policy.__dict__:
             return
         encode = getattr(type(policy), "encode", None)
         if encode is None:
             raise ConfigError(
-                f"{type(policy).__name__} has no encode(observation), where experts are routed; use algo=lora"
+                f"{type(policy).__name__} has no encode(observation), which the router needs; use algo=lora"
             )
 
         def routed(self_: Policy, observation: Observation) -> Tensor:
@@ -252,7 +253,7 @@ class DMPEL(Algorithm):
         self._handles, self._now = [], None
 
     def _hook(self, name: str, group: int) -> Callable[[nn.Module, Any, Tensor], Tensor]:
-        """What adds to a layer's output what the experts give."""
+        """Return a hook that adds the experts' output to a layer's output."""
 
         def add(layer: nn.Module, args: Any, output: Tensor) -> Tensor:
             if self._now is None:
@@ -264,7 +265,7 @@ class DMPEL(Algorithm):
 
         return add
 
-    # --- making and keeping
+    # --- experts and state
 
     @torch.no_grad()
     def _contexts(self, dataset: WindowDataset) -> tuple[Tensor, Tensor]:
@@ -286,12 +287,12 @@ class DMPEL(Algorithm):
         found = [self.query(dataset.batch(indices).observation) for indices in starts.split(_CHUNK)]
         return torch.cat(found), of_window
 
-    def _make_router(self, groups: int, queries: Tensor, draws: torch.Generator) -> Router:
+    def _build_router(self, groups: int, queries: Tensor, draws: torch.Generator) -> Router:
         enter, _ = initial_pair(1, queries.shape[1], self.hidden, draws)
         keys, bias = torch.zeros(1, groups, self.hidden), torch.zeros(1, groups)
         return Router(enter=enter, keys=keys, bias=bias, top_k=self.top_k).to(queries.device)
 
-    def _make_experts(self, layer: nn.Module, draws: torch.Generator) -> dict[str, Tensor]:
+    def _build_experts(self, layer: nn.Module, draws: torch.Generator) -> dict[str, Tensor]:
         out, inputs = expert_shape(layer)
         rank = min(self.rank, out, inputs)
         a, b = initial_pair(out, inputs, self.experts * rank, draws)
@@ -299,12 +300,12 @@ class DMPEL(Algorithm):
         return {"a": nn.Parameter(a.to(device)), "b": nn.Parameter(b.to(device))}
 
     def sizes(self) -> dict[int, int]:
-        """Numbers that each task's experts consist of; the router's are not among them."""
+        """Return the number of parameters of each task's experts, without the router's."""
         tensors = {task: [t for p in of.values() for t in p.values()] for task, of in self._library.items()}
         return {task: sum(t.numel() for t in of_task) for task, of_task in tensors.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Experts, router, contexts kept, and those of the present task's windows."""
+        """Return experts, router, stored contexts, and those of the present task's windows."""
         library = {
             task: {name: {k: t.detach() for k, t in pair.items()} for name, pair in of_task.items()}
             for task, of_task in self._library.items()
@@ -315,7 +316,7 @@ class DMPEL(Algorithm):
         return {**place, "library": library, "router": router, **kept}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Take up what `state_dict` gave."""
+        """Restore what `state_dict` returned."""
         self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
         self._seed = int(state["seed"])
         self._memory, self._episodes = _copied(state["memory"]), dict(state["episodes"])
@@ -327,7 +328,7 @@ class DMPEL(Algorithm):
 
 
 class _Routed(Policy):
-    """A policy whose experts are routed once, at the first step of each episode."""
+    """Policy whose experts are routed once, at the first step of each episode."""
 
     def __init__(self, inner: Policy, algorithm: DMPEL) -> None:
         super().__init__(inner.spec)
@@ -336,15 +337,15 @@ class _Routed(Policy):
         self.training = inner.training
 
     def window_losses(self, batch: Batch) -> Tensor:
-        """See `Policy`; windows that carry no query are routed by their own first frame."""
+        """Call the inner policy; windows without a query are routed by their own first frame."""
         return self.inner.window_losses(batch)
 
     def predict(self, batch: Batch) -> Tensor:
-        """See `Policy`; windows that carry no query are routed by their own first frame."""
+        """Call the inner policy; windows without a query are routed by their own first frame."""
         return self.inner.predict(batch)
 
     def reset(self, num_envs: int) -> None:
-        """See `Policy`."""
+        """Reset the inner policy; the next step is routed again."""
         self._coefficients = None
         self.inner.reset(num_envs)
 
@@ -356,12 +357,12 @@ class _Routed(Policy):
 
 
 def _groups(layers: Mapping[str, nn.Module]) -> list[str]:
-    """Layers below the same attribute of the policy (`encoders`, `transformer`, `head`) form a group."""
+    """Return the groups: layers below the same attribute of the policy (`encoders`, `transformer`, `head`)."""
     return sorted({name.partition(".")[0] for name in layers})
 
 
 def _padded(coefficients: Tensor, like: Tensor) -> Tensor:
-    """Coefficients (n, G, N then) with zeros for the choices that came later."""
+    """Pad coefficients (n, G, N then) with zeros for the choices that came later."""
     return functional.pad(coefficients, (0, like.shape[-1] - coefficients.shape[-1]))
 
 

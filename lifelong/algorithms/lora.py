@@ -1,4 +1,4 @@
-"""Low-rank adapters of each task on a frozen base."""
+"""Low-rank adapters for each task on a frozen base."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,16 +19,16 @@ class LoRA(Algorithm):
 
     TAIL (Liu et al. 2024, "TAIL: Task-specific adapters for imitation learning with large pretrained models", ICLR)
     with LoRA (Hu et al. 2022): the weight of task k is `W_k = W + (alpha / rank) B_k A_k` (Hu et al., eq. 3) with W
-    frozen. Small parameters (`own`) are learned anew by every task. Nothing that an earlier task uses ever moves:
-    its outputs stay bit-identical.
+    frozen. Every task has its own copy of small parameters (`own`). Nothing that an earlier task uses changes: its
+    outputs stay bit-identical.
 
-    The sum is kept in the policy's own parameters, which therefore compute as always, whatever their kind: linear,
-    convolution, recurrent. Gradients come from the chain rule, dL/dB = s G A^T and dL/dA = s B^T G with G = dL/dW_k;
-    the optimiser moves A and B, and W_k is put together again after each step.
+    The sum is stored in the policy's own parameters, so layers of any kind compute as usual: linear, convolution,
+    recurrent. Gradients come from the chain rule, dL/dB = s G A^T and dL/dA = s B^T G with G = dL/dW_k; the optimiser
+    moves A and B, and W_k is computed again after each step.
 
     Departures: TAIL adapts large pretrained encoders and a transformer; here the base is the policy after the first
-    `base_tasks`, or as it was given with `base_tasks=0` (pretraining), and by default every matrix is adapted,
-    because a base that saw one task has no general features. There is no dropout before A.
+    `base_tasks`, or as it was pretrained with `base_tasks=0`, and by default every matrix is adapted,
+    because a base that has learned one task has no general features. There is no dropout before A.
     """
 
     def __init__(
@@ -40,16 +40,16 @@ class LoRA(Algorithm):
         own: Sequence[str] = ("*bias*", "*norm*"),
         base_tasks: int = 1,
     ):
-        """Make the algorithm.
+        """Create the algorithm.
 
         Args:
-            rank: Of the adapters; a smaller side of a weight limits it.
-            alpha: The adapters' scale is alpha / rank.
+            rank: Rank of the adapters, at most the smaller side of a weight.
+            alpha: Numerator of the adapters' scale alpha / rank.
             adapted: Patterns of names of the parameters that get adapters, of those with two or more dimensions,
                 e.g. `transformer.*`, `head.*`, `*.qkv.weight`.
             own: Patterns of names of parameters of which every task has its own copy.
-            base_tasks: So many tasks (counted together where they are learned together) train the whole policy,
-                which is frozen afterwards.
+            base_tasks: Number of tasks (stages, where tasks are learned together) that train the whole policy,
+                which is frozen afterwards; 0 for a pretrained policy.
 
         Raises:
             ConfigError: A rank below 1 or fewer than 0 tasks.
@@ -61,13 +61,13 @@ class LoRA(Algorithm):
         self.rank, self.scale = rank, alpha / rank
         self.adapted, self.own = tuple(adapted), tuple(own)
         self.task_index, self._base_left, self._base_last = -1, base_tasks, -1
-        self._seed = 0  # of the next task's A; drawn when a task ends
+        self._seed = 0  # of the next task's A, drawn when a task ends
         self._base: dict[str, Tensor] = {}  # frozen values of all that a task may change
         self._pairs: dict[int, dict[str, dict[str, Tensor]]] = {}  # task -> name -> a (r, in), b (out, r)
         self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
-        """Freeze the base when it is learned, and start the task's adapter from it."""
+        """Freeze the base once it is learned, and initialise the task's adapter."""
         self.task_index = task_index
         names = self._choose(policy) if not self._base else []
         if self._base_left:
@@ -84,10 +84,10 @@ class LoRA(Algorithm):
                 a, b = initial_pair(out, inputs, rank, draws)
                 pairs[name] = {"a": nn.Parameter(a.to(base.device)), "b": nn.Parameter(b.to(base.device))}
         _put(policy, self._base)
-        policy.zero_grad()  # the optimiser, which does it at each step, has the matrices no longer
+        policy.zero_grad()  # the optimiser, which does it at each step, no longer has the matrices
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
-        """The task's A and B and its own copies; everything while the base is learned."""
+        """Return the task's A and B and its own copies; everything while the base is learned."""
         pairs = self._pairs.get(self.task_index)
         if pairs is None:
             return super().trained(policy)
@@ -101,14 +101,14 @@ class LoRA(Algorithm):
         return chosen
 
     def mode_train(self, policy: Policy) -> None:
-        """Training mode, with running statistics frozen with the base."""
+        """Set training mode, with running statistics frozen with the base."""
         policy.train()
         if self._base:
             freeze_statistics(policy)
 
     @torch.no_grad()
     def after_backward(self, policy: Policy) -> None:
-        """Gradients of A and B from those of the weights, which are then dropped."""
+        """Compute the gradients of A and B from those of the weights, which are then dropped."""
         pairs = self._pairs.get(self.task_index, {})
         for name, p in policy.named_parameters():
             if name in pairs and p.grad is not None:
@@ -118,14 +118,14 @@ class LoRA(Algorithm):
                 p.grad = None
 
     def after_step(self, policy: Policy) -> None:
-        """Put the weights together again."""
+        """Compute the adapted weights again."""
         pairs = self._pairs.get(self.task_index, {})
         _put(policy, {name: self._sum(name, pair) for name, pair in pairs.items()})
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
-        """Keep the task's own copies; its A and B are kept already."""
+        """Store the task's own copies; its A and B are stored already."""
         self._seed = int(torch.randint(2**62, (), generator=generator))
         if task_index in self._pairs:
             params = dict(policy.named_parameters())
@@ -134,13 +134,13 @@ class LoRA(Algorithm):
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """The policy with the task's adapter; as it is for the present task and those not begun."""
+        """Yield the policy with the task's adapter; unchanged for the present task and those not begun."""
         learned = [-1] if task_index <= self._base_last else [t for t in self._kept if t >= task_index]
         if not self._base or not learned:
             yield policy
             return
         present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self._base}
-        stage = min(learned)  # goes by the last of the tasks that were learned together
+        stage = min(learned)  # index of the last task of a stage
         sums = {name: self._sum(name, pair) for name, pair in self._pairs.get(stage, {}).items()}
         _put(policy, self._base | sums | self._kept.get(stage, {}))
         try:
@@ -149,13 +149,13 @@ class LoRA(Algorithm):
             _put(policy, present)
 
     def sizes(self) -> dict[int, int]:
-        """Numbers that each task with an adapter learned, its own copies included."""
+        """Return the number of parameters learned by each task with an adapter, its own copies included."""
         small = sum(p.numel() for n, p in self._base.items() if matches(n, self.own))
         pairs = {task: [t for pair in p.values() for t in pair.values()] for task, p in self._pairs.items()}
         return {task: small + sum(t.numel() for t in tensors) for task, tensors in pairs.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """The base, and every task's A, B and own copies."""
+        """Return the base, and every task's A, B and own copies."""
         pairs = {
             task: {name: {k: t.detach() for k, t in pair.items()} for name, pair in of_task.items()}
             for task, of_task in self._pairs.items()
@@ -165,7 +165,7 @@ class LoRA(Algorithm):
         return {**place, "seed": self._seed, **state}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Take up what `state_dict` gave."""
+        """Restore what `state_dict` returned."""
         self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
         self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])
         self._base, self._kept = dict(state["base"]), dict(state["own"])
@@ -175,7 +175,7 @@ class LoRA(Algorithm):
         }
 
     def _choose(self, policy: Policy) -> list[str]:
-        """Names of all parameters that tasks may change."""
+        """Return the names of all parameters that tasks may change."""
         learned = {n: p for n, p in policy.named_parameters() if p.requires_grad}
         matrices = [n for n, p in learned.items() if p.dim() >= 2 and not matches(n, self.own)]
         found = [n for n in matrices if matches(n, self.adapted)]
@@ -184,7 +184,7 @@ class LoRA(Algorithm):
 
     @torch.no_grad()
     def _sum(self, name: str, pair: Mapping[str, Tensor]) -> Tensor:
-        """W + (alpha / rank) B A."""
+        """Return W + (alpha / rank) B A."""
         base = self._base[name]
         return base + (self.scale * (pair["b"] @ pair["a"])).view(base.shape)
 

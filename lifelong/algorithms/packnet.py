@@ -1,4 +1,4 @@
-"""PackNet: every task owns a share of the weights, which nothing later moves."""
+"""PackNet: every task owns a share of the weights, which later tasks do not change."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,8 +13,8 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.policies.base import Policy
 
 _NORMS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._InstanceNorm)
-_WEIGHTED = (nn.Linear, nn.Conv2d)  # what LIBERO's code divides
-_STILL = (nn.modules.batchnorm._BatchNorm, nn.LayerNorm)  # what it never trains
+_DIVIDED = (nn.Linear, nn.Conv2d)  # layers whose weights LIBERO's code divides
+_UNTRAINED = (nn.modules.batchnorm._BatchNorm, nn.LayerNorm)  # layers that it never trains
 
 
 class PackNet(Algorithm):
@@ -22,24 +22,24 @@ class PackNet(Algorithm):
 
     Each parameter with two or more dimensions (convolutions, linear layers, embeddings, recurrent weights) is
     divided among the tasks, tensor by tensor. All others (biases, norms, their running statistics) learn with
-    the first task and are then frozen. After each step of the optimiser, whatever is not free is put back,
-    so weight decay and momentum cannot move it; a task's outputs stay bit-identical for ever.
+    the first task and are then frozen. After each step of the optimiser, frozen values are restored, so weight
+    decay and momentum cannot change them; a task's outputs stay bit-identical.
 
-    With `masks_only` it is as in LIBERO's code, and they do not. Only weights of linear layers and convolutions
+    With `masks_only` it is as in LIBERO's code, and outputs do change. Only weights of linear layers and convolutions
     are divided. Gradients of those that are not free are zeroed, and always those of these layers' biases and of
     batch and layer norms; weight decay still shrinks them all. Everything else (recurrent weights, group norms,
     embeddings) learns with every task. With that go the results of Liu et al., table 8 (FWT / NBT / AUC of ResNet-T:
-    LONG .22 / .08 / .25, SPATIAL .55 / .07 / .63, OBJECT .60 / .17 / .60, GOAL .63 / .06 / .75). Two things differ
-    yet: there, gradients are clipped before they are zeroed, and retraining keeps the epoch with the best success.
+    LONG .22 / .08 / .25, SPATIAL .55 / .07 / .63, OBJECT .60 / .17 / .60, GOAL .63 / .06 / .75). Two differences
+    remain: there, gradients are clipped before they are zeroed, and retraining keeps the epoch with the best success.
     """
 
     def __init__(self, *, prune_perc: float = 0.75, post_prune_share: float = 1.0, masks_only: bool = False):
-        """Make the algorithm.
+        """Create the algorithm.
 
         Args:
-            prune_perc: Share of the free weights given back after a task; the task keeps the rest.
-            post_prune_share: Epochs of retraining after pruning, as a share of the epochs of training.
-            masks_only: Whether only gradients are masked, as in LIBERO's code, instead of weights being put back.
+            prune_perc: Share of the free weights that a task frees again when it ends; it keeps the rest.
+            post_prune_share: Number of epochs of retraining after pruning, as a share of the epochs of training.
+            masks_only: Whether to mask gradients only, as in LIBERO's code, instead of restoring frozen weights.
 
         Raises:
             ConfigError: A share outside its range.
@@ -52,29 +52,29 @@ class PackNet(Algorithm):
         self.task_index = 0
         self._pruned = False
         self._owner: dict[str, Tensor] = {}  # name -> uint8: 0 free, k + 1 owned by task k
-        self._fixed: dict[str, Tensor] = {}  # name -> value that `after_step` puts back
-        self._movable: dict[str, Tensor] = {}  # name -> bool mask of what the optimiser may move
+        self._fixed: dict[str, Tensor] = {}  # name -> value that `after_step` restores
+        self._movable: dict[str, Tensor] = {}  # name -> bool mask of the weights that may change
 
     def phases(self) -> tuple[Phase, ...]:
-        """Training on all free weights, then retraining of those the task keeps."""
+        """Return training of all free weights, then retraining of those the task keeps."""
         return (Phase("train"), Phase("retrain", self.post_prune_share, measures_transfer=False))
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
-        """Open the free weights to the new task."""
+        """Give the free weights to the new task."""
         self.task_index = task_index
         self._pruned = False
-        divided = _layers(policy, _WEIGHTED, "weight") if self.masks_only else None
+        divided = _layers(policy, _DIVIDED, "weight") if self.masks_only else None
         for name, p in policy.named_parameters():
             chosen = p.dim() >= 2 if divided is None else name in divided
             if p.requires_grad and chosen and name not in self._owner:
                 self._owner[name] = torch.zeros(p.shape, dtype=torch.uint8, device=p.device)
 
     def begin_phase(self, phase: Phase, policy: Policy) -> None:
-        """Note which weights may move, and the values of the others."""
-        self._hold(policy)
+        """Store which weights may change, and the values of the others."""
+        self._freeze(policy)
 
     def mode_train(self, policy: Policy) -> None:
-        """Training mode, with running statistics frozen after the first task (`compat`: from the start)."""
+        """Set training mode, with running statistics frozen after the first task (`masks_only`: from the start)."""
         policy.train()
         if self.task_index > 0 or self.masks_only:
             for module in policy.modules():
@@ -82,8 +82,8 @@ class PackNet(Algorithm):
                     module.eval()
 
     def after_backward(self, policy: Policy) -> None:
-        """No gradient on frozen weights, so that they do not count in the gradient's norm."""
-        self._ready(policy)
+        """Zero the gradients of frozen weights, so that they do not count in the gradient's norm."""
+        self._freeze_once(policy)
         for name, p in policy.named_parameters():
             if p.grad is None:
                 continue
@@ -94,10 +94,10 @@ class PackNet(Algorithm):
 
     @torch.no_grad()
     def after_step(self, policy: Policy) -> None:
-        """Put everything back that the task may not move."""
+        """Restore everything that the task may not change."""
         if self.masks_only:
             return
-        self._ready(policy)
+        self._freeze_once(policy)
         for name, tensor in _tensors(policy).items():
             if name in self._movable:
                 torch.where(self._movable[name], tensor, self._fixed[name], out=tensor)
@@ -106,7 +106,7 @@ class PackNet(Algorithm):
 
     @torch.no_grad()
     def end_phase(self, phase: Phase, policy: Policy) -> None:
-        """After the first phase: the largest free weights become the task's, the others zero."""
+        """After the first phase, give the largest free weights to the task and set the others to zero."""
         if self._pruned:
             return
         for name, p in policy.named_parameters():
@@ -116,7 +116,7 @@ class PackNet(Algorithm):
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """The policy with only the weights of the tasks up to `task_index`, as it was when that one ended."""
+        """Yield the policy with only the weights of the tasks up to `task_index`, as it was when that task ended."""
         if task_index > self.task_index or (task_index == self.task_index and not self._pruned):
             yield policy
             return
@@ -135,21 +135,15 @@ class PackNet(Algorithm):
                         p.copy_(whole[name])
 
     def state_dict(self) -> dict[str, Any]:
-        """Owners of all weights, and where in the task it stands."""
+        """Return the owners of all weights, and the position in the task."""
         return {"task_index": self.task_index, "pruned": self._pruned, "owner": dict(self._owner)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Take up what `state_dict` gave."""
+        """Restore what `state_dict` returned."""
         self.task_index = int(state["task_index"])
         self._pruned = bool(state["pruned"])
         self._owner = dict(state["owner"])
         self._fixed, self._movable = {}, {}
-
-    def owned_share(self) -> list[float]:
-        """Share of the divisible weights each task owns, in the order of the tasks."""
-        size = sum(o.numel() for o in self._owner.values())
-        tasks = range(1, self.task_index + 2)
-        return [sum(int((o == k).sum()) for o in self._owner.values()) / size for k in tasks]
 
     def _prune(self, weight: Tensor, owner: Tensor) -> None:
         free = (owner == 0).flatten().nonzero()[:, 0]
@@ -162,11 +156,11 @@ class PackNet(Algorithm):
         owner.copy_(flat.view_as(owner))
         weight.masked_fill_(owner == 0, 0)
 
-    def _hold(self, policy: Policy) -> None:
-        """The frozen values are those the policy has now: nothing frozen has moved since the phase began."""
+    def _freeze(self, policy: Policy) -> None:
+        """Store the frozen values, which are those of the policy now: none has changed since the phase began."""
         self._fixed, self._movable = {}, {}
         target = self.task_index + 1 if self._pruned else 0
-        still = _layers(policy, _WEIGHTED, "bias") | _layers(policy, _STILL, "weight", "bias")
+        untrained = _layers(policy, _DIVIDED, "bias") | _layers(policy, _UNTRAINED, "weight", "bias")
         for name, tensor in _tensors(policy).items():
             if name in self._owner:
                 if self._owner[name].shape != tensor.shape:
@@ -176,20 +170,20 @@ class PackNet(Algorithm):
                     )
                 self._movable[name] = self._owner[name] == target
                 self._fixed[name] = tensor.detach().clone()
-            elif name in still if self.masks_only else self.task_index > 0:
+            elif name in untrained if self.masks_only else self.task_index > 0:
                 self._fixed[name] = tensor.detach().clone()
 
-    def _ready(self, policy: Policy) -> None:
+    def _freeze_once(self, policy: Policy) -> None:
         if not self._fixed:
-            self._hold(policy)
+            self._freeze(policy)
 
 
 def _tensors(policy: Policy) -> dict[str, Tensor]:
-    """Parameters and buffers by name."""
+    """Return parameters and buffers by name."""
     return dict(policy.named_parameters()) | dict(policy.named_buffers())
 
 
 def _layers(policy: Policy, kinds: tuple[type[nn.Module], ...], *params: str) -> set[str]:
-    """Names of these parameters of all layers of some kinds."""
+    """Return the names of the given parameters of all layers of some kinds."""
     names = [name for name, module in policy.named_modules() if isinstance(module, kinds)]
     return {f"{name}.{param}" for name in names for param in params}

@@ -1,9 +1,10 @@
-"""A policy of its own for each task: no transfer, no forgetting."""
+"""A separate policy for each task: no transfer, no forgetting."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
@@ -12,11 +13,11 @@ from lifelong.policies.base import Policy
 
 
 class SingleTask(Algorithm):
-    """Train every task from the weights the run began with, and act on it with what that gave.
+    """Train every task from the run's initial weights, and act on it with the weights learned for it.
 
-    The reference of what a task yields by itself: zero-shot success on the diagonal is that of an untrained
-    policy, and columns of the success matrix are constant. All tasks' weights are kept, one policy for each,
-    in memory and in every checkpoint.
+    The reference for what a task yields by itself: zero-shot success on the diagonal is that of an untrained
+    policy, and columns of the success matrix are constant. The weights of all tasks are kept in memory and in every
+    checkpoint.
     """
 
     def __init__(self) -> None:
@@ -24,18 +25,20 @@ class SingleTask(Algorithm):
         self._learned: dict[int, dict[str, Tensor]] = {}  # position -> weights and buffers
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
-        """Put the first weights back; at the first task, note them."""
+        """Restore the initial weights; at the first task, store them."""
         if self._initial is None:
             self._initial = _copy(policy)
         policy.load_state_dict(self._initial)
 
-    def end_task(self, task_index: int, dataset: TaskWindows, policy: Policy, generator: Any) -> None:
-        """Keep the task's weights."""
+    def end_task(
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Store the task's weights."""
         self._learned[task_index] = _copy(policy)
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """The policy with the task's own weights, or as it is while the task is not learned."""
+        """Yield the policy with the task's own weights, or unchanged while the task is not learned."""
         if task_index not in self._learned:
             yield policy
             return
@@ -47,11 +50,11 @@ class SingleTask(Algorithm):
             policy.load_state_dict(present)
 
     def state_dict(self) -> dict[str, Any]:
-        """The first weights and those of every task learned."""
+        """Return the initial weights and those of every learned task."""
         return {"initial": self._initial, "learned": dict(self._learned)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Take up what `state_dict` gave."""
+        """Restore what `state_dict` returned."""
         self._initial = state["initial"]
         self._learned = dict(state["learned"])
 

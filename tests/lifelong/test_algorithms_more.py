@@ -258,7 +258,7 @@ def test_derpp_keeps_what_the_policy_answered_when_each_task_ended():
         then = torch.stack(
             [answers[t][w] for t, w in zip(batch.task_ids.tolist(), batch.window_ids, strict=True)]
         )
-        torch.testing.assert_close(algorithm.recall(batch), then)
+        torch.testing.assert_close(algorithm.stored_outputs(batch), then)
     assert sum(len(z) for z in algorithm.state_dict()["outputs"].values()) == len(algorithm.memory)
 
 
@@ -288,8 +288,8 @@ def test_lwf_holds_the_answers_to_old_instructions_on_new_windows():
     for task in (0, 1):
         learn(algorithm, policy, task)
     assert algorithm.mix(batch, draws) is batch
-    assert algorithm._asked.observation.language.abs().max() == 0  # those of the fake tasks
-    assert torch.equal(algorithm._asked.observation.proprio["x"], batch.observation.proprio["x"])
+    assert algorithm._distilled.observation.language.abs().max() == 0  # those of the fake tasks
+    assert torch.equal(algorithm._distilled.observation.proprio["x"], batch.observation.proprio["x"])
     assert algorithm.penalty(policy).item() == 0
     with torch.no_grad():
         policy.linear.bias += torch.tensor([0.5, 0.0])
@@ -306,9 +306,9 @@ def test_lwf_teacher_stands_still_while_the_policy_learns():
     policy, algorithm = Deep(), LwF()
     learn(algorithm, policy, 0)
     with torch.no_grad():
-        before = algorithm._teach(policy).predict(everything(0))
+        before = algorithm._build_teacher(policy).predict(everything(0))
     fit(policy, Windows(1), algorithm, settings=SETTINGS, seed=(1, 0))
-    teacher = algorithm._teach(policy)
+    teacher = algorithm._build_teacher(policy)
     assert not teacher.training and not any(p.requires_grad for p in teacher.parameters())
     assert all(p.requires_grad for p in policy.parameters())
     assert torch.equal(teacher.predict(everything(0)), before)

@@ -33,7 +33,7 @@ def torchrun(processes: int, *arguments: str, cwd: Path = ROOT) -> subprocess.Co
 
 
 def run_worker(mode: str, folder: Path) -> subprocess.CompletedProcess:
-    return torchrun(2, str(ROOT / "tests" / "lifelong" / "ranks_worker.py"), mode, str(folder))
+    return torchrun(2, str(ROOT / "tests" / "harness" / "ranks_worker.py"), mode, str(folder))
 
 
 @pytest.fixture(scope="module")
