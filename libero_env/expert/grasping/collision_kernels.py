@@ -51,7 +51,7 @@ def open_hand_collision_depth(
         u = abs(x * mat[0, 0] + y * mat[1, 0] + z * mat[2, 0])
         if v < finger_half:
             thickness = min(max(tip_thickness + taper * (up + tip_below), tip_thickness), max_thickness)
-            deepest = max(deepest, half_opening + thickness + 0.002 - u)
+            deepest = max(deepest, half_opening + thickness + _HAND_MARGIN - u)
         if up > palm_above:
             deepest = max(deepest, palm_half_length - u)
     return deepest

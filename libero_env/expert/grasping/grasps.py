@@ -10,9 +10,12 @@ from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.arm.servo import downward
 from libero_env.expert.grasping import collision_kernels, kernels
 
-# costs of a grasp: for each [rad] that the hand turns and that it is misaligned with the body, for each [m] of width,
-# of distance from the middle of the body in height and of shift in the ground plan; and for any grasp at a wall
-TURN_COST, MISALIGNMENT_COST, WIDTH_COST, HEIGHT_COST, SHIFT_COST, WALL_COST = 0.25, 0.4, 8.0, 4.0, 3.0, 0.5
+TURN_COST = 0.25  # for each [rad] that the hand rotates
+MISALIGNMENT_COST = 0.4  # for each [rad] between the fingers and the sides of the body
+WIDTH_COST = 8.0  # for each [m] of width
+HEIGHT_COST = 4.0  # for each [m] of height from the middle of the body
+SHIFT_COST = 3.0  # for each [m] from the middle of the body in the ground plan
+WALL_COST = 0.5  # for a grasp at a wall
 DEPTH_COST, COLLISION_COST = 20.0, 0.3  # for each [m] of a collision's depth, and for any collision
 _NUM_YAWS, _NUM_TILTED_YAWS = 18, 8  # yaws that are tried, from above and from another side
 _NUM_HEIGHTS = 4

@@ -121,21 +121,14 @@ def wall_grasps(
         if len(strip) < 2:
             continue
         beside = np.flatnonzero(np.abs(column_v - middle) < finger_half + 0.003)
-        start = 0
-        for end in range(1, len(strip) + 1):
-            if end < len(strip) and u[strip[end]] - u[strip[end - 1]] <= _WALL_GAP:
-                continue
+        for start, end in _split_walls(u, strip):
             wall = strip[start:end]
-            start = end
             first, last = u[wall[0]], u[wall[-1]]
             width = last - first
             if width > max_thickness or len(wall) < 2:
                 continue
             low, high = first - _WALL_MARGIN, last + _WALL_MARGIN
-            overlap = -np.inf
-            for k in beside:
-                if low < column_u[k] < high:
-                    overlap = max(overlap, column[k, 2] - height)
+            overlap = _wall_top(column, column_u, beside, low, high) - height
             if overlap < min_overlap:
                 continue
             slope = -1.0
@@ -155,6 +148,27 @@ def wall_grasps(
                 found[count] = x, y, width, cost + 3.0 * abs(offset) + slope
                 count += 1
     return found[:count]
+
+
+@njit(cache=True, nogil=True)
+def _split_walls(u: np.ndarray, strip: np.ndarray) -> list[tuple[int, int]]:
+    """Return (start, end) of the parts of a sorted strip that are separated by gaps."""
+    parts, start = [], 0
+    for end in range(1, len(strip) + 1):
+        if end == len(strip) or u[strip[end]] - u[strip[end - 1]] > _WALL_GAP:
+            parts.append((start, end))
+            start = end
+    return parts
+
+
+@njit(cache=True, nogil=True)
+def _wall_top(column: np.ndarray, u: np.ndarray, beside: np.ndarray, low: float, high: float) -> float:
+    """Return the height of the highest point of a column with u in (low, high), [m]."""
+    top = -np.inf
+    for k in beside:
+        if low < u[k] < high:
+            top = max(top, column[k, 2])
+    return top
 
 
 @njit(cache=True, nogil=True)
