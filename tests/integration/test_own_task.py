@@ -64,7 +64,7 @@ def write_bar(path: Path) -> None:
 def test_from_a_mesh_to_a_report(home, capsys):
     write_bar(home / "bar.obj")
     assert main(["objects", "add", "bar.obj", "--name", "checked_bar", "--size", "0.06"]) == 0
-    assert "hold      4.0 cm wide" in capsys.readouterr().out
+    assert "grasp     4.0 cm wide" in capsys.readouterr().out
 
     (home / "scene.yaml").write_text(yaml.safe_dump(SCENE))
     goals = {
