@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from libero._adapters.lifelong.config import ALGOS, BENCHMARKS, POLICIES
+from libero._adapters.lifelong.config import group_options
 
 
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
@@ -14,10 +14,10 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
         prog="lifelong.eval", description="Success of a stored policy on a task."
     )
     parser.add_argument("--experiment_dir", default="experiments", help="folder of the runs")
-    parser.add_argument("--benchmark", required=True, help=f"{', '.join(BENCHMARKS)}, or a registered one")
+    parser.add_argument("--benchmark", required=True, help="name of the benchmark, such as libero_object")
     parser.add_argument("--task_id", type=int, required=True, help="position of the task in the benchmark")
-    parser.add_argument("--algo", required=True, choices=ALGOS)
-    parser.add_argument("--policy", required=True, choices=POLICIES)
+    parser.add_argument("--algo", required=True, choices=group_options("lifelong"))
+    parser.add_argument("--policy", required=True, choices=group_options("policy"))
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--ep", type=int, help="epoch of a multitask run's checkpoint; default: the last")
     parser.add_argument(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from libero._adapters.lifelong.config import ALGOS, POLICIES
+from libero._adapters.lifelong.config import load_config
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.video_utils import VideoWriter
 from libero.lifelong.algos import PackNet, Sequential, get_algo_class
@@ -62,12 +62,13 @@ def checkpoint_path(args: argparse.Namespace) -> Path:
     Raises:
         CheckpointError: There is no such run or file.
     """
-    name = f"{POLICIES[args.policy]}_seed{args.seed}"
-    found = sorted(p for p in Path(args.experiment_dir).glob(f"*/{ALGOS[args.algo]}/{name}") if p.is_dir())
+    cfg = load_config(f"lifelong={args.algo}", f"policy={args.policy}")
+    name = f"{cfg.lifelong.algo}/{cfg.policy.policy_type}_seed{args.seed}"
+    found = sorted(p for p in Path(args.experiment_dir).glob(f"*/{name}") if p.is_dir())
     roots = [p for p in found if p.parts[-3].lower() == args.benchmark.lower()]
     if not roots:
         raise CheckpointError(
-            f"no run {args.benchmark}/{ALGOS[args.algo]}/{name} in {args.experiment_dir}; there is "
+            f"no run {args.benchmark}/{name} in {args.experiment_dir}; there is "
             f"{', '.join(map(str, found)) or 'none of this name'}"
         )
     folder = roots[0] / f"run_{args.run:03d}" if args.run else latest_run(roots[0])
@@ -86,7 +87,7 @@ def _load_algorithm(
     args: argparse.Namespace, cfg: Any, benchmark: Any, weights: Any, masks: Any
 ) -> Sequential:
     """Return the algorithm with the stored policy, ready to act on the task."""
-    algo = get_algo_class(ALGOS[args.algo])(benchmark.n_tasks, cfg)
+    algo = get_algo_class(cfg.lifelong.algo)(benchmark.n_tasks, cfg)
     algo.policy.load_state_dict(weights)
     if isinstance(algo, PackNet):
         algo.load_masks(masks, args.task_id if args.load_task is None else args.load_task)

@@ -1,4 +1,4 @@
-"""The original's batches, nested dictionaries of tensors, with the methods of `lifelong.types.Batch`."""
+"""The original's batches, nested dictionaries of tensors, as the batches of `lifelong`."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -22,17 +22,13 @@ class DictBatch:
         """Return the batch on another device."""
         return DictBatch(map_tensors(self.data, lambda x: x.to(device, non_blocking=True)))
 
-    def rows(self, rows: slice) -> "DictBatch":
-        """Return a slice of the windows."""
-        return DictBatch(map_tensors(self.data, lambda x: x[rows]))
-
     def join(self, other: "DictBatch") -> "DictBatch":
         """Return this batch followed by another, with the entries that both have."""
         return DictBatch(_join(self.data, other.data))
 
 
 class DictWindows:
-    """Any dataset of dictionaries as the windows of a task; see `lifelong.algorithms.base.WindowDataset`.
+    """Any dataset of dictionaries as the windows of a task; see `lifelong.data.windows.TaskWindows`.
 
     Args:
         dataset: Dataset whose items are nested dictionaries of tensors.

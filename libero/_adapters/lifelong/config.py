@@ -103,15 +103,16 @@ def notes(cfg: Any) -> list[str]:
 
 
 def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
-    """Return the entry of a name, ignoring case.
+    """Return the entry of a name, ignoring case; raise an UnknownNameError, with the valid names, if there is none."""
+    entries = {key.lower(): value for key, value in table.items()}
+    if str(name).lower() not in entries:
+        raise UnknownNameError(kind, name, sorted(table))
+    return entries[str(name).lower()]
 
-    Raises:
-        UnknownNameError: There is no such name; the message lists the valid ones.
-    """
-    for key, value in table.items():
-        if key.lower() == str(name).lower():
-            return value
-    raise UnknownNameError(kind, name, sorted(table))
+
+def group_options(group: str) -> list[str]:
+    """Return the names of the files of a configuration group, which are its options."""
+    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
 def _wrap(value: Any) -> Any:
@@ -129,22 +130,3 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         return
     for key, part in node.items():
         yield from _leaves(part, f"{path}.{key}" if path else str(key))
-
-
-BENCHMARKS = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90", "libero_100")
-
-ALGOS = {
-    "base": "Sequential",
-    "single_task": "SingleTask",
-    "multitask": "Multitask",
-    "er": "ER",
-    "agem": "AGEM",
-    "ewc": "EWC",
-    "packnet": "PackNet",
-}
-
-POLICIES = {
-    "bc_rnn_policy": "BCRNNPolicy",
-    "bc_transformer_policy": "BCTransformerPolicy",
-    "bc_vilt_policy": "BCViLTPolicy",
-}
