@@ -160,7 +160,7 @@ def test_dataset_tool_of_the_original():
     env.close()
 
 
-def test_film_of_an_episode(tmp_path):
+def test_video_of_an_episode(tmp_path):
     from libero.libero.utils.video_utils import VideoWriter
 
     rng = np.random.default_rng(0)

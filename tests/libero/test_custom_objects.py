@@ -1,4 +1,4 @@
-"""Objects of one's own with meshes: registered as the walkthrough does, used in scenes, task files, environments."""
+"""User-defined objects with meshes, registered as in the walkthrough, in scenes, task files and environments."""
 
 import os
 import re
@@ -12,16 +12,15 @@ import pytest
 
 from libero._adapters.envs.mjcf_models import model_of
 from libero.libero.envs import OffScreenRenderEnv
-from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject, register_object
+from libero.libero.envs.base_object import MujocoXMLObject, register_object
 from libero.libero.envs.objects import ArticulatedObject, get_object_fn
-from libero.libero.utils import mu_utils, task_generation_utils
 from libero.libero.utils.mu_utils import InitialSceneTemplates, register_mu
 from libero.libero.utils.object_utils import get_affordance_regions
 from libero.libero.utils.task_generation_utils import generate_bddl_from_task_info, register_task_info
 from libero_env.errors import LiberoError
-from libero_env.objects import catalog, get_object
+from libero_env.objects import get_object
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.usefixtures("registries")]
 
 # As the walkthrough prints it: one body, one mesh, no groups, no sites.
 PLAIN = """
@@ -78,22 +77,6 @@ def assets(tmp_path, monkeypatch):
         write_box(folder / f"{name}.obj", half, offset=0.01)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture(autouse=True)
-def registries(monkeypatch):
-    """What a test registers is gone after it."""
-    for holder, name in (
-        (mu_utils, "MU_DICT"),
-        (task_generation_utils, "TASK_INFO"),
-        (catalog, "_registered"),
-    ):
-        monkeypatch.setattr(holder, name, dict(getattr(holder, name)))
-    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
-    kept = dict(OBJECTS_DICT)
-    yield
-    OBJECTS_DICT.clear()
-    OBJECTS_DICT.update(kept)
 
 
 class CustomObjects(MujocoXMLObject):
@@ -205,7 +188,7 @@ def test_the_walkthrough_from_class_to_environment(assets):
     before = obs["libero_mug_1_pos"]
     for _ in range(5):
         obs, _, done, _ = env.step([0.0] * 7)
-    assert np.allclose(obs["libero_mug_1_pos"], before, atol=0.005), "it stands still on the table"
+    assert np.allclose(obs["libero_mug_1_pos"], before, atol=0.005), "it is at rest on the table"
     assert not done
     model = env.sim.model
     seen = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body_name2id("libero_mug_1_main")]
@@ -219,7 +202,7 @@ def test_rotation_may_be_a_range_or_one_for_each_axis(assets):
     assert get_object("libero_mug_yellow").rotation == {"z": (0.0, 0.0)}
 
 
-def test_what_a_plain_file_leaves_out_is_measured(assets):
+def test_offsets_missing_in_a_plain_file_are_measured(assets):
     register_mugs()
     model = get_object("libero_mug")
     assert np.allclose([model.bottom_offset[2], model.top_offset[2]], [-0.02, 0.04], atol=1e-6)
@@ -230,7 +213,7 @@ def test_what_a_plain_file_leaves_out_is_measured(assets):
     )
 
 
-def test_files_that_cannot_be_used(tmp_path):
+def test_invalid_files_are_reported(tmp_path):
     class Thing(MujocoXMLObject):
         def __init__(self, file, name="thing"):
             super().__init__(file, name=name)
@@ -250,7 +233,7 @@ def test_files_that_cannot_be_used(tmp_path):
     assert Thing(tmp_path / "thing.xml").file == MujocoXMLObject(custom_path=tmp_path / "thing.xml").file
 
 
-def test_articulated_objects_of_ones_own(tmp_path):
+def test_user_defined_articulated_objects(tmp_path):
     """A fixture with a drawer that a task opens: the family's base class, with a file that is named by its path."""
     (tmp_path / "tool_box.xml").write_text(DRAWER)
 
@@ -327,7 +310,7 @@ def test_subclasses_of_robosuites_own_class(assets):
     assert second == "0.030 ['x', 'y', 'z'] 0.0005"
 
 
-def test_meshes_count_once(assets):
+def test_meshes_are_counted_once(assets):
     """Reading a file again gives the same model; a changed file gives the changed one."""
     register_mugs()
     first = get_object("libero_mug").horizontal_radius

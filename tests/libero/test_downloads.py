@@ -1,4 +1,4 @@
-"""Downloads against a server on this machine: one that breaks off, one that lies, one that knows no ranges."""
+"""Downloads from a local server that closes connections, sends wrong bytes, or does not support ranges."""
 
 import hashlib
 import io
@@ -86,7 +86,7 @@ def server(monkeypatch):
         thread.join()
 
 
-def test_a_broken_connection_is_taken_up_again(server, tmp_path):
+def test_an_interrupted_connection_is_resumed(server, tmp_path):
     server.files["/big.bin"], server.breaks = CONTENT, 2
     path = fetch(f"{server.url}/big.bin", tmp_path / "big.bin", pause=0.0)
     assert path.read_bytes() == CONTENT
@@ -95,7 +95,7 @@ def test_a_broken_connection_is_taken_up_again(server, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_later_run_goes_on(server, tmp_path):
+def test_a_later_run_resumes(server, tmp_path):
     server.files["/big.bin"] = CONTENT
     (tmp_path / "big.bin.partial").write_bytes(CONTENT[:1000])
     fetch(f"{server.url}/big.bin", tmp_path / "big.bin", size=len(CONTENT))
@@ -103,19 +103,19 @@ def test_a_later_run_goes_on(server, tmp_path):
     assert server.requests == [("big.bin", "bytes=1000-")]
 
 
-def test_a_server_without_ranges_begins_again(server, tmp_path):
+def test_a_server_without_ranges_starts_from_the_beginning(server, tmp_path):
     server.files["/big.bin"], server.ranges = CONTENT, False
     (tmp_path / "big.bin.partial").write_bytes(b"x" * 1000)
     assert fetch(f"{server.url}/big.bin", tmp_path / "big.bin").read_bytes() == CONTENT
 
 
-def test_what_is_longer_than_the_file_is_thrown_away(server, tmp_path):
+def test_a_partial_file_that_is_too_long_is_discarded(server, tmp_path):
     server.files["/big.bin"] = CONTENT
     (tmp_path / "big.bin.partial").write_bytes(CONTENT + b"more")
     assert fetch(f"{server.url}/big.bin", tmp_path / "big.bin", pause=0.0).read_bytes() == CONTENT
 
 
-def test_tries_are_bounded_and_nothing_is_lost(server, tmp_path):
+def test_attempts_are_bounded_and_partial_files_are_kept(server, tmp_path):
     server.files["/big.bin"], server.breaks = CONTENT, 10**6
     with pytest.raises(
         DownloadError, match=r"the connection was closed early; tried 5 times.*are kept: run it again"
@@ -130,7 +130,7 @@ def test_tries_are_bounded_and_nothing_is_lost(server, tmp_path):
         fetch("file:///etc/hosts", tmp_path / "hosts")
 
 
-def test_demonstrations_arrive_verified(server, tmp_path, capsys):
+def test_demonstrations_are_verified(server, tmp_path, capsys):
     server.offer(FILE, CONTENT)
     server.breaks = 1
     assert main(["demos", "download", "libero_object/0", "--dest", str(tmp_path)]) == 0
@@ -148,7 +148,7 @@ def test_a_wrong_checksum_is_refused(server, tmp_path, capsys):
     assert list((tmp_path / "libero_object").iterdir()) == []
 
 
-def test_other_files_are_not_replaced_unasked(server, tmp_path):
+def test_different_files_are_not_replaced_by_default(server, tmp_path):
     server.offer(FILE, CONTENT)
     (tmp_path / FILE).parent.mkdir()
     (tmp_path / FILE).write_bytes(b"recorded here")
@@ -184,7 +184,7 @@ def test_every_task_has_a_file():
     assert all(file.endswith("_demo.hdf5") for file in remote_files(["libero_spatial"]))
 
 
-def test_the_facade_fetches_from_the_hub(server, tmp_path, capsys):
+def test_the_facade_downloads_from_the_hub(server, tmp_path, capsys):
     for file in remote_files(["libero_goal"]):
         server.offer(file, file.encode())
     download_utils.libero_dataset_download("libero_goal", tmp_path, use_huggingface=True)
@@ -207,7 +207,7 @@ def _archive(suites):
     return buffer.getvalue()
 
 
-def test_the_facade_fetches_archives(server, tmp_path, monkeypatch, capsys):
+def test_the_facade_downloads_archives(server, tmp_path, monkeypatch, capsys):
     links = {name: f"{server.url}/{name}.zip" for name in download_utils.DATASET_LINKS}
     monkeypatch.setattr(download_utils, "DATASET_LINKS", links)
     for name in links:
@@ -222,7 +222,7 @@ def test_the_facade_fetches_archives(server, tmp_path, monkeypatch, capsys):
     assert "libero_100: complete" in capsys.readouterr().out
 
 
-def test_small_pieces(server, tmp_path):
+def test_download_functions(server, tmp_path):
     server.files["/notes.txt"] = b"hello"
     assert download_utils.url_is_alive(f"{server.url}/notes.txt")
     assert not download_utils.url_is_alive(f"{server.url}/nothing.txt")

@@ -1,4 +1,4 @@
-"""The environments: what is observed and when, states, fixtures, success, cameras."""
+"""Environments: observations, states, fixtures, success and cameras."""
 
 import json
 
@@ -80,7 +80,7 @@ def test_horizon(make_env):
     env.step(REST)
 
 
-def test_a_seed_decides_the_placement_and_the_global_generator_nothing(make_env):
+def test_only_the_seed_determines_the_placement(make_env):
     states = []
     for noise in range(2):
         np.random.seed(noise)  # noqa: NPY002 - that it does not matter
@@ -93,7 +93,7 @@ def test_a_seed_decides_the_placement_and_the_global_generator_nothing(make_env)
     assert (env.get_sim_state() != states[0]).any()
 
 
-def test_states_come_back(make_env, suite):
+def test_states_are_restored(make_env, suite):
     env = make_env(**BLIND)
     row = suite.get_task_init_states(0)[1]
     env.set_init_state(row)
@@ -110,7 +110,7 @@ def test_states_come_back(make_env, suite):
         env.set_init_state(state[:-1])
 
 
-def test_fixtures_move_where_a_client_writes_them():
+def test_clients_can_move_fixtures():
     env = ControlEnv(bddl_file_name=_stove_task(), **BLIND)
     env.reset()
     model, fixture = env.sim.model, env.env.fixtures_dict["flat_stove_1"]
@@ -206,7 +206,7 @@ def test_absolute_actions_and_other_controllers(make_env):
     env.step(np.zeros(7))
 
 
-def test_a_problem_class_may_move_a_camera(suite):
+def test_a_problem_class_can_move_a_camera(suite):
     from libero.libero.envs.bddl_base_domain import TASK_MAPPING, register_problem
 
     original = TASK_MAPPING["libero_floor_manipulation"]
@@ -228,7 +228,7 @@ def test_a_problem_class_may_move_a_camera(suite):
         TASK_MAPPING["libero_floor_manipulation"] = original
 
 
-def test_observations_are_those_of_the_recordings(shared, make_env):
+def test_observations_match_the_recordings(shared, make_env):
     with np.load(shared / "parity" / "libero_object-00-random.npz", allow_pickle=False) as stored:
         keys, states, actions, seen = (stored[k] for k in ("obs_keys", "states", "actions", "obs"))
     env = make_env(**BLIND)

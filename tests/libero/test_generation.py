@@ -1,4 +1,4 @@
-"""Scenes and tasks as classes, and the task files that follow from them."""
+"""Scenes and tasks as classes, and the task files written from them."""
 
 import numpy as np
 import pytest
@@ -18,21 +18,11 @@ from libero_env.errors import BDDLError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, get_suite
 from libero_env.tasks.problem import And, Atom, Or, differences
 
-pytestmark = pytest.mark.unit
-
-
-@pytest.fixture(autouse=True)
-def registries(monkeypatch):
-    """What a test registers is gone after it."""
-    get_scene_class("kitchen_scene1")
-    monkeypatch.setattr(mu_utils, "MU_DICT", dict(mu_utils.MU_DICT))
-    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
-    monkeypatch.setattr(task_generation_utils, "TASK_INFO", {})
-    monkeypatch.setattr(object_utils, "EXCEPTION_DICT", {})
+pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("registries")]
 
 
 @pytest.fixture
-def demo_scene():
+def demo_scene(registries):
     """As the procedural creation walkthrough defines a scene."""
 
     @register_mu(scene_type="kitchen")
@@ -108,7 +98,7 @@ def test_scenes_are_found_by_name_and_type(demo_scene):
         get_scene_dict("garage")
 
 
-def test_what_a_scene_offers(demo_scene):
+def test_properties_of_a_scene(demo_scene):
     scene = demo_scene()
     assert scene.movable_objects == ["akita_black_bowl_1", "plate_1"]
     assert scene.fixture_object_dict == {
@@ -258,15 +248,15 @@ def test_the_originals_files_from_the_templates(shared):
         assert differences(bddl.parse(task_generation_utils.bddl_text(info)), original) == [], path.name
 
 
-def test_pieces(tmp_path, capsys):
-    things = pieces.get_object_dict({"main_table": 1, "flat_stove": 1, "plate": 2})
-    assert things == {
+def test_functions_of_bddl_generation_utils(tmp_path, capsys):
+    names = pieces.get_object_dict({"main_table": 1, "flat_stove": 1, "plate": 2})
+    assert names == {
         "table": ["main_table"],
         "flat_stove": ["flat_stove_1"],
         "plate": ["plate_1", "plate_2"],
     }
-    assert pieces.get_fixtures(things)["plate_2"] == pieces.get_objects(things)["plate_1"] == "plate"
-    assert isinstance(things, pieces.ObjectDict)
+    assert pieces.get_fixtures(names)["plate_2"] == pieces.get_objects(names)["plate_1"] == "plate"
+    assert isinstance(names, pieces.ObjectDict)
     assert [pieces.object_naming_mapping(n) for n in ("main_table", "plate_2", "floor")] == [
         "table",
         "plate",
@@ -336,7 +326,7 @@ def test_generators_know_their_workspaces():
         get_suite_generator_func("roof")
 
 
-def test_places_of_things(capsys):
+def test_regions_of_objects(capsys):
     from libero.libero.envs.objects import get_object_dict
 
     regions = object_utils.get_affordance_regions(get_object_dict())

@@ -1,4 +1,4 @@
-"""Every public name of the original's environment half is there and can be called."""
+"""Every public name of the original's environment half exists and works."""
 
 import importlib
 
@@ -165,7 +165,7 @@ def test_benchmarks(name):
     assert suite.get_task_emb(number - 1) == number - 1
 
 
-def test_states_answer(env):
+def test_object_states(env):
     for state in env.env.object_states_dict.values():
         assert state.get_geom_state()["pos"].shape == (3,)
         assert state.get_geom_state()["quat"].shape == (4,)
@@ -296,7 +296,7 @@ def test_samplers():
         regions.OpenCloseSampler("door", "ajar")
 
 
-def test_small_helpers(tmp_path):
+def test_small_functions(tmp_path):
     from libero.libero.envs.arenas import KitchenTableArena
     from libero.libero.envs.arenas.style import get_texture_filename
     from libero.libero.envs.robots import MountedPanda, OnTheGroundPanda
@@ -313,7 +313,7 @@ def test_small_helpers(tmp_path):
     assert (reconstruct_image_output(process_image_input(np.arange(3))) == np.arange(3)).all()
 
 
-def test_sim_answers_by_name(env):
+def test_sim_by_name(env):
     sim = env.sim
     assert sim.model.body_id2name(sim.model.body_name2id("plate_1_main")) == "plate_1_main"
     assert sim.model.joint_names[0] == "robot0_joint1"

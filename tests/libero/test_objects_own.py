@@ -1,4 +1,4 @@
-"""Objects that a client registers, the original's way."""
+"""User-defined objects, registered as in the original."""
 
 import pytest
 

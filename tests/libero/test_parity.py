@@ -1,4 +1,4 @@
-"""Recordings of the original stack, driven through the facade by the client that drove the original."""
+"""Recordings of the original, repeated through the facade by the client that made them."""
 
 import importlib.util
 

@@ -1,4 +1,4 @@
-"""Paths: importing writes nothing and asks nothing; files are laid out when somebody wants them."""
+"""Paths: importing neither writes nor prompts; files are written when their path is requested."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from libero_env.tasks import bddl
 pytestmark = pytest.mark.unit
 
 
-def test_importing_writes_nothing_and_asks_nothing(tmp_path):
+def test_importing_neither_writes_nor_prompts(tmp_path):
     code = (
         "import libero.libero, libero.libero.benchmark, libero.libero.envs, libero.libero.utils.video_utils"
     )
@@ -93,7 +93,7 @@ def test_benchmarks():
         benchmark.LIBERO_90(1)
 
 
-def test_a_benchmark_of_ones_own():
+def test_a_user_defined_benchmark():
     names = libero_task_map["libero_spatial"][:3]
     benchmark.task_maps["mine"] = {name: benchmark.task_maps["libero_spatial"][name] for name in names}
 

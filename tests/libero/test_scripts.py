@@ -1,4 +1,4 @@
-"""The original's command line scripts: each does what it says, and says what is wrong."""
+"""The original's command line scripts: results and error messages."""
 
 import importlib
 import runpy
@@ -12,8 +12,6 @@ import pytest
 from PIL import Image
 
 from libero.libero.envs import ControlEnv
-from libero.libero.envs.base_object import OBJECTS_DICT
-from libero.libero.utils import mu_utils, task_generation_utils
 from libero.scripts import (
     check_dataset_integrity,
     check_task_suites,
@@ -32,7 +30,6 @@ from libero.scripts import (
 from libero_env.demos.read import read_demos
 from libero_env.demos.write import DemoWriter, Episode, make_header
 from libero_env.envs.batch import BatchEnv
-from libero_env.objects import catalog
 from libero_env.tasks import bddl, get_task
 from libero_env.teleop import screens as teleop_screens
 from libero_env.teleop.devices import QUIT
@@ -86,7 +83,7 @@ def test_files_run_their_modules(path, capsys, monkeypatch):
 
 
 @pytest.mark.unit
-def test_a_script_in_a_process_of_its_own(tmp_path):
+def test_a_script_as_a_process(tmp_path):
     command = [sys.executable, str(ROOT / "benchmark_scripts" / "shasum_files.py"), str(tmp_path / "nothing")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
@@ -172,28 +169,9 @@ def test_create_libero_task_example(tmp_path, capsys):
     ]
 
 
-@pytest.fixture
-def registries(monkeypatch):
-    """What a template registers is gone after the test."""
-    from libero.libero.envs import TASK_MAPPING
-
-    kept = [(OBJECTS_DICT, dict(OBJECTS_DICT)), (TASK_MAPPING, dict(TASK_MAPPING))]
-    for holder, name in (
-        (mu_utils, "MU_DICT"),
-        (task_generation_utils, "TASK_INFO"),
-        (catalog, "_registered"),
-    ):
-        monkeypatch.setattr(holder, name, dict(getattr(holder, name)))
-    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
-    yield
-    for registry, before in kept:
-        registry.clear()
-        registry.update(before)
-
-
 @pytest.mark.sim
 @pytest.mark.usefixtures("registries")
-def test_templates_work_as_they_are(tmp_path, capsys, monkeypatch):
+def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
     for kind, name in (
         ("problem_class", "MyProblem"),
         ("scene", "MyKitchenScene2"),
@@ -232,7 +210,7 @@ def test_templates_work_as_they_are(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.unit
-def test_templates_ask(tmp_path, monkeypatch, capsys):
+def test_missing_options_of_templates_are_asked_for(tmp_path, monkeypatch, capsys):
     answers = iter(["object", "my box", "object", "MyBox"])
     monkeypatch.setattr("builtins.input", lambda question: next(answers))
     assert create_template.main(["--out", str(tmp_path)]) == 2
@@ -327,7 +305,7 @@ def test_shasum_files(tmp_path, capsys):
 
 
 class Leaver:
-    """A user who goes at once."""
+    """A user who quits at once."""
 
     def __init__(self, keyboard):
         self.keyboard = keyboard
@@ -366,7 +344,7 @@ def test_collecting_scripts(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.unit
-def test_films(tmp_path, recwarn):
+def test_videos(tmp_path, recwarn):
     """Success tints the last picture green; odd sizes, which MP4 has no room for, become a GIF."""
     from libero.libero.utils.video_utils import VideoWriter
 
@@ -383,7 +361,7 @@ def test_films(tmp_path, recwarn):
 
 
 @pytest.mark.unit
-def test_small_helpers():
+def test_small_functions():
     from libero.libero.utils.time_utils import Timer
     from libero.libero.utils.utils import postprocess_model_xml, process_image_input, update_env_kwargs
 
@@ -398,6 +376,6 @@ def test_small_helpers():
         '<mujoco><asset><mesh file="/elsewhere/robosuite/models/assets/robots/panda/meshes/link0.stl"/></asset>'
         '<worldbody><camera name="agentview" pos="0 0 0"/></worldbody></mujoco>'
     )
-    mended = postprocess_model_xml(xml, {"agentview": {"pos": (1, 2, 3)}})
-    assert 'pos="1 2 3"' in mended
-    assert Path(mended.partition('file="')[2].partition('"')[0]).parent.parent.is_dir()
+    processed = postprocess_model_xml(xml, {"agentview": {"pos": (1, 2, 3)}})
+    assert 'pos="1 2 3"' in processed
+    assert Path(processed.partition('file="')[2].partition('"')[0]).parent.parent.is_dir()

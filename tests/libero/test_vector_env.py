@@ -1,4 +1,4 @@
-"""Vectors of environments, in this process and in others."""
+"""Vector environments in this process and in others."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.sim
 
 
 class Slow:
-    """An environment that takes its time, breaks and dies on request."""
+    """An environment that is slow, raises and exits on request."""
 
     def __init__(self, wait=0.0):
         self.wait, self.count = wait, 0
@@ -36,7 +36,7 @@ class Slow:
         pass
 
 
-def test_subprocesses_do_what_one_process_does(suite):
+def test_subprocesses_give_the_results_of_one_process(suite):
     args = {"bddl_file_name": suite.get_task_bddl_file_path(0), "use_camera_obs": False}
     rows = suite.get_task_init_states(0)[:2]
     results = []
@@ -64,7 +64,7 @@ def test_subprocesses_do_what_one_process_does(suite):
         assert (one == many).all()
 
 
-def test_errors_and_deaths_are_named_and_the_others_go_on():
+def test_failures_are_reported_and_other_workers_continue():
     env = SubprocVectorEnv([Slow, Slow], call_timeout=30.0)
     env.reset()
     with pytest.raises(WorkerError, match="no such action"):
@@ -76,7 +76,7 @@ def test_errors_and_deaths_are_named_and_the_others_go_on():
     env.close()
 
 
-def test_a_hanging_worker_is_given_up():
+def test_a_worker_that_does_not_answer_is_killed():
     env = SubprocVectorEnv([lambda: Slow(60.0)], call_timeout=15.0)
     env.reset()
     env.workers[0]._timeout = 0.3
@@ -86,7 +86,7 @@ def test_a_hanging_worker_is_given_up():
     assert not env.workers[0].process.is_alive()
 
 
-def test_waiting_for_some():
+def test_step_returns_the_environments_that_are_ready():
     env = SubprocVectorEnv([lambda: Slow(0.0), lambda: Slow(2.0)], wait_num=1)
     env.reset()
     obs, _, _, info = env.step([1, 1])
@@ -97,7 +97,7 @@ def test_waiting_for_some():
     env.close()
 
 
-def test_shared_arrays_and_factories_travel():
+def test_shared_arrays_and_factories_can_be_pickled():
     import pickle
 
     array = ShArray(np.float32, (2, 3))

@@ -1,4 +1,4 @@
-"""What scripts take for granted: a task file by its name, a window where there is a screen."""
+"""Task files by their name, and the window of `has_renderer`."""
 
 import mujoco.viewer
 import pytest
@@ -52,7 +52,7 @@ def test_a_window_shows_what_render_draws(make_env, monkeypatch):
     (viewer,) = opened
     assert viewer.synced == 2
     assert viewer.cam.fixedcamid == env.sim.model.camera_name2id("agentview")
-    viewer.running = False  # closed by hand: it stays closed, and the script goes on
+    viewer.running = False  # closed by hand: it stays closed, and the script continues
     env.env.render()
     assert (len(opened), viewer.synced) == (1, 2)
     env.close()
@@ -60,17 +60,17 @@ def test_a_window_shows_what_render_draws(make_env, monkeypatch):
 
 
 @pytest.mark.sim
-def test_without_a_screen_one_warning_says_so(make_env, monkeypatch):
+def test_without_a_screen_there_is_one_warning(make_env, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     env = make_env(has_renderer=True, **BLIND)
     obs = env.reset()
-    with pytest.warns(UserWarning, match="no screen") as told:
+    with pytest.warns(UserWarning, match="no screen") as caught:
         env.env.render()
         env.env.render()
-    assert len(told) == 1
-    assert told[0].filename == __file__
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
     assert env.get_observation().keys() == obs.keys()
     env.env.render()
 
