@@ -19,7 +19,7 @@ def register(subparsers: Subparsers) -> None:
     listing.add_argument("--all", action="store_true", help="also list those of the benchmark")
     listing.set_defaults(run=run_list)
     for name, run, text in (
-        ("show", run_show, "print the properties of an object: size, mass, places, grasp"),
+        ("show", run_show, "print the properties of an object: size, mass, regions, grasp"),
         ("remove", run_remove, "remove user-defined objects"),
     ):
         command = commands.add_parser(name, help=text)
@@ -51,7 +51,9 @@ def _register_add(commands: Subparsers) -> None:
         help="convex pieces, the convex hull, or boxes (default: decompose; without CoACD boxes)",
     )
     option("--faces", type=int, default=3000, help="largest number of triangles for display (default: 3000)")
-    option("--container", action="store_true", help="objects can be put In it: adds the place contain_region")
+    option(
+        "--container", action="store_true", help="objects can be put In it: adds the region contain_region"
+    )
     option("--replace", action="store_true", help="replace a user-defined object of this name")
     option(
         "--out",
@@ -112,17 +114,21 @@ def run_list(args: argparse.Namespace) -> None:
 
 
 def run_show(args: argparse.Namespace) -> None:
-    """Print the properties and places of objects."""
+    """Print the properties and regions of objects."""
     from libero_env.objects import folder, get_object
-    from libero_env.tasks.authoring import places_of
+    from libero_env.tasks.authoring import model_regions
 
     for name in args.names:
-        item, place = get_object(name), folder.find(name)
-        print(f"{name}: {place or 'builtin'}")
+        item, directory = get_object(name), folder.find(name)
+        print(f"{name}: {directory or 'builtin'}")
         height = item.top_offset[2] - item.bottom_offset[2]
-        lines = describe(folder.read_properties(place)) if place else [f"  height    {100 * height:.1f} cm"]
+        lines = (
+            describe(folder.read_properties(directory))
+            if directory
+            else [f"  height    {100 * height:.1f} cm"]
+        )
         print("\n".join([*lines, f"  radius    {100 * item.horizontal_radius:.1f} cm"]))
-        print(f"  places    {', '.join(places_of(name)) or 'none'}")
+        print(f"  regions   {', '.join(model_regions(name)) or 'none'}")
 
 
 def run_preview(args: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ from math import hypot
 import yaml
 
 from libero_env.errors import LiberoError
-from libero_env.tasks.authoring import EMPTY, make_task, places_of
+from libero_env.tasks.authoring import EMPTY, make_task, model_regions
 from libero_env.tasks.builder import load_scene, scene_names
 from libero_env.tasks.task import Task
 
@@ -57,7 +57,7 @@ def _default_goal(names: Mapping[str, str]) -> list[str]:
     if len(names) < 2:
         raise LiberoError("a goal is required: --goal 'On red_coffee_mug_1 plate_1'; or give two objects")
     first, *_, last = names
-    inside = _INSIDE in places_of(names[last])
+    inside = _INSIDE in model_regions(names[last])
     return [f"In {first} {last}_{_INSIDE}" if inside else f"On {first} {last}"]
 
 

@@ -29,8 +29,8 @@ def names() -> tuple[str, ...]:
 
 def find(name: str) -> Path | None:
     """Return the folder of a user-defined object; None where it does not exist."""
-    place = objects_dir() / name
-    return place if name.isidentifier() and (place / PROPERTIES).is_file() else None
+    directory = objects_dir() / name
+    return directory if name.isidentifier() and (directory / PROPERTIES).is_file() else None
 
 
 def folder_of(name: str) -> Path:
@@ -39,10 +39,10 @@ def folder_of(name: str) -> Path:
     Raises:
         UnknownNameError: The object does not exist; the message lists the existing ones.
     """
-    place = find(name)
-    if place is None:
+    directory = find(name)
+    if directory is None:
         raise UnknownNameError(f"user-defined object in {objects_dir()}", name, names())
-    return place
+    return directory
 
 
 def remove(name: str) -> Path:
@@ -51,18 +51,18 @@ def remove(name: str) -> Path:
     Raises:
         UnknownNameError: The object does not exist; the message lists the existing ones.
     """
-    place = folder_of(name)
-    shutil.rmtree(place)
-    return place
+    directory = folder_of(name)
+    shutil.rmtree(directory)
+    return directory
 
 
-def read_properties(place: Path) -> dict[str, Any]:
+def read_properties(directory: Path) -> dict[str, Any]:
     """Return the content of `object.yaml`.
 
     Raises:
         LiberoError: The file is not valid YAML, or a required key is missing.
     """
-    path = place / PROPERTIES
+    path = directory / PROPERTIES
     try:
         properties = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
@@ -73,17 +73,19 @@ def read_properties(place: Path) -> dict[str, Any]:
     return properties
 
 
-def load(place: Path, category: str) -> ObjectModel:
+def load(directory: Path, category: str) -> ObjectModel:
     """Return a new model of the object in a folder at each call.
 
     Raises:
         LiberoError: A file is missing or broken.
     """
-    properties = read_properties(place)
-    spec = read_spec(place / MODEL)
+    properties = read_properties(directory)
+    spec = read_spec(directory / MODEL)
     bodies = [body.name for body in spec.worldbody.bodies]
     if bodies != [ROOT_BODY]:
-        raise LiberoError(f"{place / MODEL}: expected one body {ROOT_BODY!r} in the world, found {bodies}")
+        raise LiberoError(
+            f"{directory / MODEL}: expected one body {ROOT_BODY!r} in the world, found {bodies}"
+        )
     optional: dict[str, Any] = {key: properties[key] for key in _OPTIONAL if key in properties}
     bottom, top = (tuple(map(float, properties[key])) for key in ("bottom_offset", "top_offset"))
     return ObjectModel(
@@ -92,7 +94,7 @@ def load(place: Path, category: str) -> ObjectModel:
         bottom_offset=(bottom[0], bottom[1], bottom[2]),
         top_offset=(top[0], top[1], top[2]),
         horizontal_radius=float(properties["horizontal_radius"]),
-        digest=digest(place),
+        digest=digest(directory),
         **optional,
     )
 
@@ -121,16 +123,16 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     return spec
 
 
-def digest(place: Path) -> str:
+def digest(directory: Path) -> str:
     """Return a digest of the files that a scene is built from, 16 hexadecimal digits."""
     hashed = hashlib.sha256()
-    for path in sorted(place.iterdir()):
+    for path in sorted(directory.iterdir()):
         if path.is_file() and path.name not in (PREVIEW, PROPERTIES):
             hashed.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return hashed.hexdigest()[:16]
 
 
-def write_properties(place: Path, properties: Mapping[str, Any]) -> None:
+def write_properties(directory: Path, properties: Mapping[str, Any]) -> None:
     """Write `object.yaml`."""
     text = yaml.safe_dump(dict(properties), sort_keys=False, allow_unicode=True, width=110)
-    (place / PROPERTIES).write_text(text, encoding="utf-8")
+    (directory / PROPERTIES).write_text(text, encoding="utf-8")

@@ -22,7 +22,7 @@ The keys are those of `libero_env.tasks.builder`, and the following short forms:
                that the scene gives
     goal       one atom, several, or an expression; an atom is `On a b`, `(On a b)` or, in Python, `("On", "a", "b")`
 
-Places of objects and fixtures, such as `basket_1_contain_region`, need no declaration.
+Regions that are sites of a model, such as `basket_1_contain_region`, need no declaration.
 """
 
 import re
@@ -78,7 +78,7 @@ def make_task(name: str | None = None, **definition: Any) -> Task:
         The task; its suite is `file`.
 
     Raises:
-        LiberoError: A key, scene, object or place does not exist, or an object has no place; the message lists the
+        LiberoError: A key, scene, object or region does not exist, or an object has no place; the message lists the
             valid names.
 
     Example:
@@ -116,16 +116,16 @@ def read_definition(path: Path) -> dict[str, Any]:
     return definition
 
 
-def places_of(category: str) -> tuple[str, ...]:
-    """Return the places on an object or fixture that atoms can refer to, such as `contain_region`, sorted.
+def model_regions(category: str) -> tuple[str, ...]:
+    """Return the regions that are sites of an object's or fixture's model, such as `contain_region`, sorted.
 
     Raises:
         UnknownNameError: No object has this name.
     """
-    return _places(select_pack().build(category))
+    return _site_regions(select_pack().build(category))
 
 
-def _places(item: ObjectModel) -> tuple[str, ...]:
+def _site_regions(item: ObjectModel) -> tuple[str, ...]:
     names = {site.name for site in item.spec.sites}
     return tuple(
         sorted(name for name in names if name and name != "default_site" and not name.endswith("_site"))
@@ -340,10 +340,10 @@ def _merge_regions(*sources: Mapping[str, Any] | None) -> dict[str, dict[str, An
 def _undeclared(
     atoms: Iterable[str], declared: Mapping[str, Definition], entities: Mapping[str, str], where: str
 ) -> dict[str, dict[str, Any]]:
-    """Return the places on models that atoms refer to and no region declares.
+    """Return the regions of models that atoms refer to and that are not declared.
 
     Raises:
-        UnknownNameError: A place does not exist; the message lists the valid ones.
+        UnknownNameError: The region does not exist; the message lists the valid ones.
     """
     known = {*entities, *(f"{target}_{name}" for target, names in declared.items() for name in names)}
     found: dict[str, dict[str, Any]] = {}
@@ -354,7 +354,7 @@ def _undeclared(
             if name in known or target is None or entities[target] in WORKSPACES:
                 continue
             site = name.removeprefix(f"{target}_")
-            if site not in (places := places_of(entities[target])):
-                raise UnknownNameError(f"place of {target} ({where}: {atom})", site, places or ("none",))
+            if site not in (valid := model_regions(entities[target])):
+                raise UnknownNameError(f"region of {target} ({where}: {atom})", site, valid or ("none",))
             found.setdefault(target, {})[site] = {}
     return found

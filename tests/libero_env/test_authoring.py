@@ -27,7 +27,7 @@ from libero_env.tasks import (
     suite_names,
     write_task,
 )
-from libero_env.tasks.authoring import EMPTY, places_of
+from libero_env.tasks.authoring import EMPTY, model_regions
 from libero_env.tasks.builder import load_data
 from libero_env.tasks.problem import Atom, Not, Or, differences
 from lifelong.cli.main import main
@@ -211,8 +211,10 @@ def test_errors_name_the_file(tmp_path):
 
 
 def test_places_are_the_sites_that_goals_can_name():
-    assert places_of("basket") == ("contain_region",)
-    assert {"top_region", "middle_region", "bottom_region", "top_side"} <= set(places_of("wooden_cabinet"))
+    assert model_regions("basket") == ("contain_region",)
+    assert {"top_region", "middle_region", "bottom_region", "top_side"} <= set(
+        model_regions("wooden_cabinet")
+    )
 
 
 def test_the_tasks_of_files_form_a_suite(tmp_path):

@@ -57,7 +57,7 @@ FAULTS = [
      "region-ranges", "error", "workspace only"),
     ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "region-ranges", "warning", "X0 < X1"),
     ("(-0.060000000000000005 0.12000000000000001 -0.04 0.14)", "(0.04 -0.03 0.060000000000000005 -0.01)",
-     "duplicate-region", "warning", "same place as main_table_plate_region"),
+     "duplicate-region", "warning", "same region as main_table_plate_region"),
     ("    akita_black_bowl_1\n    wooden_cabinet_1_top_region", "    akita_bowl_1", "unknown-name", "warning",
      "did you mean akita_black_bowl_1"),
     ("LIBERO_Tabletop", "LIBERO_Kitchen_Tabletop", "problem-name", "warning", "kitchen_table"),

@@ -25,7 +25,7 @@ from libero_env.init_states.store import scene_digest
 from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
-from libero_env.tasks.authoring import places_of
+from libero_env.tasks.authoring import model_regions
 from lifelong.cli.main import main
 
 pytestmark = pytest.mark.sim
@@ -235,7 +235,7 @@ def test_an_open_mesh_weighs_as_much_as_its_hull(tmp_path):
     assert any("not watertight" in note for note in added.notes)
     assert added.properties["mass"] == pytest.approx(1.2e-4 * DENSITY, rel=1e-3)
     assert added.properties["grasp"]["width"] == pytest.approx(0.04, abs=0.003)
-    assert places_of("open") == ("contain_region",)
+    assert model_regions("open") == ("contain_region",)
 
 
 def test_an_mjcf_file_keeps_its_parts_and_gets_what_scenes_need(tmp_path):
@@ -253,7 +253,7 @@ def test_an_mjcf_file_keeps_its_parts_and_gets_what_scenes_need(tmp_path):
     assert model.body("main").pos.tolist() == [0, 0, 0]
     solid = (model.geom_contype | model.geom_conaffinity) > 0
     assert solid.sum() == 2 and (model.geom_group[solid] == 0).all() and (model.geom_group[~solid] == 1).all()
-    assert places_of("chest") == ("lid_region",)
+    assert model_regions("chest") == ("lid_region",)
     (tmp_path / "meshes" / "box.stl").unlink()  # the object has its own copy
     get_object("chest").spec.compile()
 

@@ -275,7 +275,7 @@ def _check_regions(report: Report, problem: Problem) -> None:
         key = (region.target, region.ranges, region.yaw)
         if region.ranges and address in used and (first := seen.setdefault(key, address)) != address:
             report.warning(
-                line, "duplicate-region", f"{address} is the same place as {first}", "use one of the two"
+                line, "duplicate-region", f"{address} is the same region as {first}", "use one of the two"
             )
 
 

@@ -55,7 +55,7 @@ def furthest_reach(workspace: Workspace) -> float:
 
 
 def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
-    """Build the scene, check its places, then some of its initial states."""
+    """Build the scene, check its regions, then some of its initial states."""
     try:
         scene = build_scene(task.problem, pack)
     except (LiberoError, ValueError) as error:
@@ -96,9 +96,9 @@ def _check_site(report: Report, scene: Scene, name: str) -> None:
     sites = [scene.model.site(s).name for s in range(scene.model.nsite)]
     own = [site.removeprefix(prefix) for site in sites if site.startswith(prefix)]
     remedy = (
-        report.suggest(region.name, own) if own else "use the name of the object itself; it has no places"
+        report.suggest(region.name, own) if own else "use the name of the object itself; it has no regions"
     )
-    report.error(report.lines.of(name), "no-site", f"{region.target} has no place {region.name!r}", remedy)
+    report.error(report.lines.of(name), "no-site", f"{region.target} has no region {region.name!r}", remedy)
 
 
 def _atoms(report: Report, scene: Scene) -> Iterator[tuple[Atom, int]]:
@@ -258,7 +258,7 @@ def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
 
 
 def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
-    """Check that objects and places of the goal are within the arm's length, in any orientation of the hand."""
+    """Check that objects and regions of the goal are within the arm's length, in any orientation of the hand."""
     shoulder = np.array(scene.workspace.robot_base_pos) + (0.0, 0.0, _SHOULDER)
     for atom, line in zip(atoms_of(scene.problem.goal), report.lines.goal, strict=True):
         for name in atom.args:

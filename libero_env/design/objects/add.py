@@ -44,7 +44,7 @@ class Options:
         up: Axis of the file that points up, `z` or `y`; None is the convention of the format.
         collision: `decompose`, `hull` or `boxes`; see `libero_env.design.objects.collision`.
         faces: Approximate largest number of triangles of the visual mesh.
-        container: Whether to add the place `contain_region`, the inside of the object's bounds, for goals such as
+        container: Whether to add the region `contain_region`, the inside of the object's bounds, for goals such as
             `In x box_1_contain_region`.
     """
 
@@ -119,11 +119,13 @@ def add_object(
     """
     path = Path(path)
     name = check_name(name or _name_of(path), reject_existing=not replace)
-    place = (Path(out) if out else objects_dir()) / name
-    if place.exists() and not replace:
-        raise LiberoError(f"{place} exists already; choose another name (--name), or replace it (--replace)")
-    place.parent.mkdir(parents=True, exist_ok=True)
-    return _make(path, name, place, Options(**options))
+    directory = (Path(out) if out else objects_dir()) / name
+    if directory.exists() and not replace:
+        raise LiberoError(
+            f"{directory} exists already; choose another name (--name), or replace it (--replace)"
+        )
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    return _make(path, name, directory, Options(**options))
 
 
 def register_object_file(path: str | Path, name: str | None = None, **options: Any) -> str:
@@ -149,11 +151,11 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
     if not name.isidentifier():
         raise LiberoError(f"{name!r} is not a valid category; use letters, digits and underscores")
     content = repr((_FORMAT, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), name))
-    place = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
-    if not (place / folder.PROPERTIES).is_file():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        _make(path, name, place, chosen)
-    catalog.register_object(name, lambda: folder.load(place, name))
+    directory = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
+    if not (directory / folder.PROPERTIES).is_file():
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        _make(path, name, directory, chosen)
+    catalog.register_object(name, lambda: folder.load(directory, name))
     return name
 
 
@@ -186,12 +188,12 @@ def _name_of(path: Path) -> str:
     return words if not words[:1].isdigit() else f"object_{words}"
 
 
-def _make(path: Path, name: str, place: Path, options: Options) -> Added:
-    """Convert a file in a temporary folder, test the object, and move the complete folder to `place`."""
+def _make(path: Path, name: str, directory: Path, options: Options) -> Added:
+    """Convert a file in a temporary folder, test the object, and move the complete folder to `directory`."""
     if not path.is_file():
         raise LiberoError(f"{path}: no such file")
     notes: list[str] = []
-    scratch = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=place.parent))
+    scratch = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=directory.parent))
     try:
         if path.suffix.lower() in (".xml", ".mjcf"):
             if options.mesh_options:
@@ -204,16 +206,16 @@ def _make(path: Path, name: str, place: Path, options: Options) -> Added:
         model = ObjectModel(name, folder.read_spec(scratch / folder.MODEL))
         properties |= try_object(model, notes.append, scratch / folder.PREVIEW)
         folder.write_properties(scratch, {"name": name, "source": path.name, **properties})
-        if place.exists():
-            shutil.rmtree(place)
+        if directory.exists():
+            shutil.rmtree(directory)
         scratch.chmod(0o755)  # temporary folders are closed to other users
-        scratch.replace(place)
+        scratch.replace(directory)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return Added(name, place, folder.read_properties(place), tuple(notes))
+    return Added(name, directory, folder.read_properties(directory), tuple(notes))
 
 
-def _from_mesh(path: Path, name: str, place: Path, options: Options, notes: list[str]) -> dict[str, Any]:
+def _from_mesh(path: Path, name: str, directory: Path, options: Options, notes: list[str]) -> dict[str, Any]:
     """Write the files of an object that is made from a mesh; return its properties."""
     surfaces = read_mesh(path, size=options.size, up=options.up, notify=notes.append)
     low, high = bounds(surfaces)
@@ -237,7 +239,7 @@ def _from_mesh(path: Path, name: str, place: Path, options: Options, notes: list
     mass, kilograms = _compute_mass(vertices, faces, closed, options, notes)
     inside = tuple(INSIDE * float(value) / 2 for value in high - low) if options.container else None
     body = Body(name, kilograms, mass.centre, mass.inertia, pieces, inside)
-    store_mesh(place, body, surfaces, options.faces, notes.append)
+    store_mesh(directory, body, surfaces, options.faces, notes.append)
     return {
         "mass": round(kilograms, 5),
         "watertight": closed,

@@ -81,7 +81,7 @@ def bounds(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def merge_vertices(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """Return all surfaces as one mesh, (n, 3) and (f, 3); vertices at the same place are merged, also at seams."""
+    """Return all surfaces as one mesh, (n, 3) and (f, 3); vertices at the same position are merged, also at seams."""
     starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     points = np.concatenate([s.vertices for s in surfaces])
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)])

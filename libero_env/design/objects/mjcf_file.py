@@ -20,7 +20,7 @@ INSIDE = 0.8  # size of `contain_region`, as a share of the bounds
 _HIDDEN = 3  # first geom group that viewers hide by default
 
 
-def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
+def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
     """Write the MJCF file of an object, with its meshes and textures; return its mass and collision geometry.
 
     The object is the one body of the file's world or, as in the original's files, the body `object` within it.
@@ -29,8 +29,8 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: N
     Args:
         path: MJCF file to read.
         name: Category.
-        place: Folder to write to.
-        container: Whether to add a place `contain_region` if the object has none.
+        directory: Folder to write to.
+        container: Whether to add a region `contain_region` if the object has none.
         notify: Function that receives a message about omitted elements.
 
     Returns:
@@ -42,7 +42,7 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: N
     spec = _read(path, name)
     root = _root(spec, path, notify)
     _sort_geoms(spec)
-    _gather_files(spec, name, place)
+    _gather_files(spec, name, directory)
     low, high = bounds_of(_compiled(spec, path))
     if container and all(site.name != "contain_region" for site in spec.sites):
         root.add_site(
@@ -57,8 +57,8 @@ def store_mjcf(path: Path, name: str, place: Path, *, container: bool, notify: N
     kilograms = float(model.body_subtreemass[model.body(ROOT_BODY).id])
     if kilograms < 1e-6:
         raise LiberoError(f"{path}: it has no mass; give its collision geoms a mass or density")
-    text = spec.to_xml().replace(f"{place.absolute()}/", "")
-    (place / MODEL).write_text(text, encoding="utf-8")
+    text = spec.to_xml().replace(f"{directory.absolute()}/", "")
+    (directory / MODEL).write_text(text, encoding="utf-8")
     solid = int(((model.geom_contype | model.geom_conaffinity) > 0).sum())
     return {"mass": round(kilograms, 5), "collision": {"method": "mjcf", "pieces": solid}}
 
@@ -165,7 +165,7 @@ def _rename(spec: mujoco.MjSpec, name: str) -> None:
         asset.name = f"{name}_{asset.name}"
 
 
-def _gather_files(spec: mujoco.MjSpec, name: str, place: Path) -> None:
+def _gather_files(spec: mujoco.MjSpec, name: str, directory: Path) -> None:
     """Copy the meshes and textures in use into the folder."""
     for kind, elements in (("mesh", spec.meshes), ("texture", spec.textures)):
         for element in elements:
@@ -174,7 +174,7 @@ def _gather_files(spec: mujoco.MjSpec, name: str, place: Path) -> None:
             source = Path(element.file)
             if not source.is_file():
                 raise LiberoError(f"{kind} {source} is missing; put it there, or fix the path in the file")
-            target = place / f"{element.name.removeprefix(f'{name}_') or kind}_{source.name}"
+            target = directory / f"{element.name.removeprefix(f'{name}_') or kind}_{source.name}"
             shutil.copyfile(source, target)
             element.file = str(target.absolute())
 

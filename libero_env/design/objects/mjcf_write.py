@@ -39,11 +39,11 @@ class Body:
     inside: tuple[float, ...] | None = None
 
 
-def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int, notify: Notify) -> None:
+def store_mesh(directory: Path, body: Body, surfaces: Sequence[Surface], faces: int, notify: Notify) -> None:
     """Write the files of an object.
 
     Args:
-        place: Folder to write to.
+        directory: Folder to write to.
         body: Physical properties.
         surfaces: Visual geometry.
         faces: Approximate largest number of triangles of all surfaces together.
@@ -58,21 +58,21 @@ def store_mesh(place: Path, body: Body, surfaces: Sequence[Surface], faces: int,
         "inertial",
         {"pos": _text(body.centre), "mass": _text([body.mass]), "fullinertia": _text(body.inertia)},
     )
-    _add_collision(place, body, assets, main)
+    _add_collision(directory, body, assets, main)
     total = sum(len(surface.faces) for surface in surfaces)
     if total > faces:
         notify(f"its {total} triangles are simplified to about {faces} for display; --faces keeps more")
     for number, surface in enumerate(surfaces):
         share = max(faces * len(surface.faces) // total, 50)
-        _add_visual(place, f"{body.name}_visual{number}", surface, share, assets, main, number)
+        _add_visual(directory, f"{body.name}_visual{number}", surface, share, assets, main, number)
     if body.inside is not None:
         inside = {"type": "box", "size": _text(body.inside), "rgba": "0 0 0 0", "group": "3"}
         ET.SubElement(main, "site", {"name": "contain_region", **inside})
     ET.indent(root)
-    (place / MODEL).write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+    (directory / MODEL).write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 
 
-def _add_collision(place: Path, body: Body, assets: ET.Element, main: ET.Element) -> None:
+def _add_collision(directory: Path, body: Body, assets: ET.Element, main: ET.Element) -> None:
     contact = {
         "group": "0",
         "condim": "3",
@@ -93,10 +93,16 @@ def _add_collision(place: Path, body: Body, assets: ET.Element, main: ET.Element
 
 
 def _add_visual(
-    place: Path, name: str, surface: Surface, faces: int, assets: ET.Element, main: ET.Element, number: int
+    directory: Path,
+    name: str,
+    surface: Surface,
+    faces: int,
+    assets: ET.Element,
+    main: ET.Element,
+    number: int,
 ) -> None:
     vertices, triangles, texcoords, corners = _simplified(surface, faces)
-    _write_obj(place / f"{name}.obj", vertices, triangles, texcoords, corners)
+    _write_obj(directory / f"{name}.obj", vertices, triangles, texcoords, corners)
     material = {
         "name": f"{name}_material",
         "rgba": _text(surface.rgba),
@@ -106,7 +112,7 @@ def _add_visual(
     if surface.image is not None:
         texture = surface.image.copy()
         texture.thumbnail((_MAX_TEXTURE, _MAX_TEXTURE))
-        texture.save(place / f"{name}.png")
+        texture.save(directory / f"{name}.png")
         ET.SubElement(assets, "texture", {"name": f"{name}_texture", "type": "2d", "file": f"{name}.png"})
         material["texture"] = f"{name}_texture"
     ET.SubElement(assets, "material", material)

@@ -45,7 +45,7 @@ class CollisionShape:
 
 @dataclass(frozen=True)
 class Site:
-    """Named place on an object.
+    """Named region on an object.
 
     Attributes:
         name: Name that task files use, such as `contain_region`.
@@ -92,7 +92,7 @@ class Part:
         com: Centre of mass in the frame of the body, (3,) [m].
         inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about `com`, [kg m^2]; empty for a body without mass.
         boxes: Collision shapes.
-        sites: Named places.
+        sites: Named regions.
         parent: Name of the parent body; "" for the root.
         pos: Origin in the frame of the parent, (3,) [m].
         quat: Orientation in the frame of the parent, (4,) wxyz.
