@@ -1,7 +1,5 @@
 """A run: build everything from the configuration, learn the task sequence, write the results."""
 
-import hashlib
-import json
 import sys
 import time
 from collections.abc import Mapping
@@ -22,10 +20,10 @@ from lifelong.data.demonstrations import DemoDatasets, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.pretraining import load_initial_weights, pretraining_context
+from lifelong.pretraining import load_initial_weights, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
 from lifelong.results.records import PhaseRecord, RunEndRecord, start_record, utc_now
-from lifelong.results.run_directory import RunDirectory, result_relevant
+from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
@@ -129,9 +127,9 @@ def _build_contexts(
     )
     if not first:
         return context, None
-    relevant = result_relevant(_pretraining_config(OmegaConf.to_container(config, resolve=True)))
-    digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
-    directory = RunDirectory(Path(settings.runs_dir) / "pretrain" / str(pretrain.suite) / digest)
+    plain = OmegaConf.to_container(config, resolve=True)
+    folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite)
+    directory = pretraining_directory(folder, _pretraining_config(plain))
     return context, pretraining_context(
         context, tasks=first, languages=languages[: len(first)], settings=pretrain, directory=directory
     )

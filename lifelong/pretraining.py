@@ -1,8 +1,13 @@
 """What a policy knows before the first task: the weights of another run, or a suite learned jointly."""
 
+import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import yaml
 from torch import Tensor
 
 from libero_env.tasks import Task
@@ -11,7 +16,8 @@ from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
 from lifelong.errors import CheckpointError
 from lifelong.results.log import ResultLog
-from lifelong.results.run_directory import RunDirectory
+from lifelong.results.run_directory import RunDirectory, result_relevant
+from lifelong.saved_config import upgrade_config
 from lifelong.settings import PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
@@ -88,3 +94,21 @@ def pretraining_context(
         directory=directory,
         tracker=Tracker(),
     )
+
+
+def pretraining_directory(folder: Path, config: Mapping[str, Any]) -> RunDirectory:
+    """Return the directory of a pretraining.
+
+    Args:
+        folder: Folder of all pretrainings on the suite.
+        config: The part of the run's configuration that affects the pretraining.
+
+    Returns:
+        The directory of an equal pretraining, also by an earlier version, or else that of a new one.
+    """
+    relevant = result_relevant(config)
+    digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
+    for file in sorted(folder.glob("*/config.yaml")):
+        if result_relevant(upgrade_config(yaml.safe_load(file.read_text(encoding="utf-8")))) == relevant:
+            return RunDirectory(file.parent)
+    return RunDirectory(folder / digest)

@@ -8,16 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from libero_env.storage import atomic_write_text
 from libero_env.tasks import get_suite
 from lifelong import checkpoints
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
 from lifelong.context import RunContext
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import CheckpointError, ConfigError
-from lifelong.pretraining import load_initial_weights, pretraining_context
+from lifelong.pretraining import load_initial_weights, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
@@ -30,6 +32,7 @@ from lifelong.results.records import (
     utc_now,
 )
 from lifelong.results.run_directory import RunDirectory
+from lifelong.saved_config import upgrade_config
 from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
 from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
@@ -344,6 +347,25 @@ def test_pretraining_is_joint_without_evaluation_and_done_once(tmp_path, monkeyp
     again = run_context(tmp_path / "d", "sequential")
     before(again, tmp_path / "whole")
     assert_same(dict(again.policy.state_dict()), dict(trained))
+
+
+def test_an_equal_pretraining_of_an_earlier_version_is_reused(tmp_path) -> None:
+    flat = {
+        "_target_": "lifelong.policies.bc_rnn.BCRNN",
+        "image_embed": 64,
+        "text_embed": 32,
+        "image_width": 16,
+        "rnn_hidden": 256,
+        "head": "deterministic",
+        "head_hidden": 256,
+    }
+    earlier = {"pretrain": {"suite": "libero_90"}, "policy": flat, "seed": 1}
+    atomic_write_text(tmp_path / "0123456789ab" / "config.yaml", yaml.safe_dump(earlier))
+    now = upgrade_config(earlier)
+    assert now["policy"]["temporal"]["hidden"] == 256, "the keys are those of today"
+    assert pretraining_directory(tmp_path, now).path == tmp_path / "0123456789ab"
+    other = pretraining_directory(tmp_path, now | {"seed": 2}).path
+    assert other.parent == tmp_path and other.name != "0123456789ab"
 
 
 def test_a_policy_may_start_from_a_finished_runs_weights(tmp_path) -> None:
