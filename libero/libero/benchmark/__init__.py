@@ -80,14 +80,8 @@ def _task_maps() -> dict[str, dict[str, Task]]:
 
 
 def _entry(task: Any) -> Task:
-    return Task(
-        name=task.name,
-        language=task.language,
-        problem="Libero",
-        problem_folder=task.suite,
-        bddl_file=f"{task.name}.bddl",
-        init_states_file=f"{task.name}.pruned_init",
-    )
+    files = f"{task.name}.bddl", f"{task.name}.pruned_init"
+    return Task(task.name, task.language, "Libero", task.suite, *files)
 
 
 class Benchmark:

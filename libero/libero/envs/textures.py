@@ -5,7 +5,6 @@ from pathlib import Path
 
 from libero_env.errors import UnknownNameError
 
-TYPES = ("floor", "wall", "table", "sky")
 _FILES = """
 brown_ceramic_tile.png canvas_sky_blue.png capriccio_sky.png ceramic.png cream-plaster.png dapper_gray_floor.png
 dark_blue_wall.png dark_floor_texture.png dark_gray_plaster.png dark_green_plaster_wall.png gray_ceramic_tile.png
@@ -17,12 +16,7 @@ stucco_wall.png table_light_wood.png tile_grigia_caldera_porcelain_floor.png whi
 yellow_linen_wall_texture.png
 """
 TEXTURE_MAPPING = {Path(name).stem: name for name in _FILES.split()}
-_WORDS = {
-    "floor": ("floor", "tile", "ceramic"),
-    "wall": ("wall", "plaster", "ceramic"),
-    "table": ("table",),
-    "sky": ("sky",),
-}
+_WORDS = {"floor": "floor tile ceramic", "wall": "wall plaster ceramic", "table": "table", "sky": "sky"}
 
 
 def get_texture_file_list(type: str, texture_path: str | os.PathLike) -> list[tuple[str, str]]:
@@ -31,7 +25,7 @@ def get_texture_file_list(type: str, texture_path: str | os.PathLike) -> list[tu
     Raises:
         UnknownNameError: The kind does not exist.
     """
-    if type not in TYPES:
-        raise UnknownNameError("kind of texture", type, TYPES)
-    names = [name for name in TEXTURE_MAPPING if any(word in name for word in _WORDS[type])]
+    if type not in _WORDS:
+        raise UnknownNameError("kind of texture", type, _WORDS)
+    names = [name for name in TEXTURE_MAPPING if any(word in name for word in _WORDS[type].split())]
     return [(name, os.path.join(texture_path, TEXTURE_MAPPING[name])) for name in names]

@@ -1,9 +1,20 @@
-"""Rooms by class."""
+"""Arenas by class."""
+
+from typing import Any
 
 from libero.libero.envs.arenas.base_arena import Arena, WorkspaceArena
-from libero.libero.envs.arenas.coffee_table_arena import CoffeeTableArena
-from libero.libero.envs.arenas.empty_arena import EmptyArena
-from libero.libero.envs.arenas.kitchen_arena import KitchenTableArena
-from libero.libero.envs.arenas.living_room_arena import LivingRoomTableArena
-from libero.libero.envs.arenas.study_arena import StudyTableArena
-from libero.libero.envs.arenas.table_arena import TableArena
+
+
+def _arena(name: str, category: str) -> Any:
+    """Return the class of the arena of a workspace."""
+    return type(
+        name, (WorkspaceArena,), {"__module__": __name__, "__doc__": f"`{category}`", "category": category}
+    )
+
+
+CoffeeTableArena = _arena("CoffeeTableArena", "coffee_table")
+EmptyArena = _arena("EmptyArena", "floor")
+KitchenTableArena = _arena("KitchenTableArena", "kitchen_table")
+LivingRoomTableArena = _arena("LivingRoomTableArena", "living_room_table")
+StudyTableArena = _arena("StudyTableArena", "study_table")
+TableArena = _arena("TableArena", "table")

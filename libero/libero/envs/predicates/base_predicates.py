@@ -64,36 +64,6 @@ class FalsePredicateFn(MultiarayAtomic):
         return False
 
 
-class InContactPredicateFn(_Native, BinaryAtomic):
-    """The two touch."""
-
-    predicate = "Incontact"
-
-
-class In(_Native, BinaryAtomic):
-    """The first is in the second, a region."""
-
-    predicate = "In"
-
-
-class On(_Native, BinaryAtomic):
-    """The first is on the second."""
-
-    predicate = "On"
-
-
-class Up(_Native, UnaryAtomic):
-    """The object is at least a metre above the floor."""
-
-    predicate = "Up"
-
-
-class Stack(_Native, BinaryAtomic):
-    """The first is on the second and inside it."""
-
-    predicate = "Stack"
-
-
 class PrintJointState(_Native, UnaryAtomic):
     """Always true; prints the joint positions."""
 
@@ -105,25 +75,20 @@ class PrintJointState(_Native, UnaryAtomic):
         return super().__call__(*args)
 
 
-class Open(_StateMethod):
-    """Any joint is in the open range."""
-
-    method = "is_open"
-
-
-class Close(_StateMethod):
-    """All joints are in the closed range."""
-
-    method = "is_close"
+def _predicate(name: str, bases: tuple[type, ...], doc: str, **attributes: str) -> Any:
+    """Return a class of predicates."""
+    return type(name, bases, {"__module__": __name__, "__doc__": doc, **attributes})
 
 
-class TurnOn(_StateMethod):
-    """Any joint is in the range of on."""
-
-    method = "turn_on"
-
-
-class TurnOff(_StateMethod):
-    """All joints are in the range of off."""
-
-    method = "turn_off"
+_TWO = (_Native, BinaryAtomic)
+InContactPredicateFn = _predicate("InContactPredicateFn", _TWO, "The two touch.", predicate="Incontact")
+In = _predicate("In", _TWO, "The first is in the second, a region.", predicate="In")
+On = _predicate("On", _TWO, "The first is on the second.", predicate="On")
+Stack = _predicate("Stack", _TWO, "The first is on the second and inside it.", predicate="Stack")
+Up = _predicate(
+    "Up", (_Native, UnaryAtomic), "The object is at least a metre above the floor.", predicate="Up"
+)
+Open = _predicate("Open", (_StateMethod,), "Any joint is in the open range.", method="is_open")
+Close = _predicate("Close", (_StateMethod,), "All joints are in the closed range.", method="is_close")
+TurnOn = _predicate("TurnOn", (_StateMethod,), "Any joint is in the range of on.", method="turn_on")
+TurnOff = _predicate("TurnOff", (_StateMethod,), "All joints are in the range of off.", method="turn_off")

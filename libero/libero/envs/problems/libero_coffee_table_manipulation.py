@@ -1,8 +1,3 @@
-"""A coffee table."""
+"""Path of the original; see `libero.libero.envs.problems`."""
 
-from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, register_problem
-
-
-@register_problem
-class Libero_Coffee_Table_Manipulation(BDDLBaseDomain):
-    """A coffee table; the scene follows from the task file."""
+from libero.libero.envs.problems import Libero_Coffee_Table_Manipulation  # noqa: F401

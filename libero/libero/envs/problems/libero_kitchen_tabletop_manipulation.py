@@ -1,8 +1,3 @@
-"""A kitchen table."""
+"""Path of the original; see `libero.libero.envs.problems`."""
 
-from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, register_problem
-
-
-@register_problem
-class Libero_Kitchen_Tabletop_Manipulation(BDDLBaseDomain):
-    """A kitchen table; the scene follows from the task file."""
+from libero.libero.envs.problems import Libero_Kitchen_Tabletop_Manipulation  # noqa: F401
