@@ -60,10 +60,7 @@ def run_experts(
         One attempt for each expert, in order.
     """
     noise = noise or [None] * len(experts)
-    world = env.world
-    states: list[list[np.ndarray]] = [[] for _ in experts]
-    executed: list[list[np.ndarray]] = [[] for _ in experts]
-    intended: list[list[np.ndarray]] = [[] for _ in experts]
+    world, recordings = env.world, [_Recording() for _ in experts]
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
         running = map(int, np.flatnonzero(env.running[: len(experts)]))
@@ -72,28 +69,38 @@ def run_experts(
             break
         actions = np.zeros((env.num_envs, 7))
         for i in live:
-            action = experts[i].act(world.views[i])
-            own_noise = noise[i]
+            action, own_noise = experts[i].act(world.views[i]), noise[i]
             actions[i] = action if own_noise is None else own_noise.apply(action, experts[i].noise_scale)
-            states[i].append(world.physics_state(i))
-            executed[i].append(actions[i].copy())
-            intended[i].append(action)
+            recordings[i].states.append(world.physics_state(i))
+            recordings[i].actions.append(actions[i].copy())
+            recordings[i].expert_actions.append(action)
         success = env.step(actions)[-1]["success"][: len(experts)]
-    for i, rows in enumerate(states):
-        rows.append(world.physics_state(i))
+    for i, recording in enumerate(recordings):
+        recording.states.append(world.physics_state(i))
+    fixtures = world.simulations.fixtures
     return [
-        Attempt(
-            success=bool(success[i]),
-            states=np.array(states[i]),
-            actions=np.array(executed[i]),
-            expert_actions=np.array(intended[i]),
-            retries=expert.retries,
-            reason="" if success[i] else _failure(expert, len(executed[i])),
-            fixtures=world.simulations.fixtures[i].copy(),
-        )
+        recordings[i].attempt(expert, bool(success[i]), fixtures[i].copy())
         for i, expert in enumerate(experts)
     ]
 
 
-def _failure(expert: Expert, steps: int) -> str:
-    return expert.failure_reason or f"in phase {expert.phase} after {steps} steps, {expert.retries} retries"
+@dataclass
+class _Recording:
+    """What an attempt consists of so far."""
+
+    states: list[np.ndarray] = field(default_factory=list)
+    actions: list[np.ndarray] = field(default_factory=list)
+    expert_actions: list[np.ndarray] = field(default_factory=list)
+
+    def attempt(self, expert: Expert, success: bool, fixtures: np.ndarray) -> Attempt:
+        """Return the attempt at its end."""
+        reason = f"in phase {expert.phase} after {len(self.actions)} steps, {expert.retries} retries"
+        return Attempt(
+            success=success,
+            states=np.array(self.states),
+            actions=np.array(self.actions),
+            expert_actions=np.array(self.expert_actions),
+            retries=expert.retries,
+            reason="" if success else expert.failure_reason or reason,
+            fixtures=fixtures,
+        )
