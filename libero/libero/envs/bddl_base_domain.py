@@ -175,9 +175,7 @@ class BDDLBaseDomain:
             fixed = site.parent_name not in scene.objects
             self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name, is_fixture=fixed)
         states = self.object_states_dict.values()
-        self.tracking_object_states_changes = [
-            s for s in states if getattr(s, "has_turnon_affordance", False)
-        ]
+        self.tracking_object_states_changes = [s for s in states if getattr(s, "has_turnon_affordance", 0)]
         self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
         self.model = TaskModel(scene, self.sim.model._model)
         drawn = self.camera_list if self.use_camera_obs else ()

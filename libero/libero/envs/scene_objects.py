@@ -82,10 +82,8 @@ class TaskModel:
                 of_class[kind] += ids[kind]
         self.geom_ids_to_instances = _inverse(self.instances_to_ids)
         self.geom_ids_to_classes = _inverse(self.classes_to_ids)
-        instances, kinds = (
-            _numbers(ids, model.ngeom) for ids in (self.instances_to_ids, self.classes_to_ids)
-        )
-        self.segments = {"instance": instances, "class": kinds}
+        ids_of = {"instance": self.instances_to_ids, "class": self.classes_to_ids}
+        self.segments = {kind: _numbers(ids, model.ngeom) for kind, ids in ids_of.items()}
 
 
 def _robot_bodies(model: mujoco.MjModel) -> dict[str, list[int]]:

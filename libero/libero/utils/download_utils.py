@@ -24,7 +24,7 @@ DATASET_LINKS = {
     "libero_spatial": "https://utexas.box.com/shared/static/04k94hyizn4huhbv5sz4ev9p2h1p6s7f.zip",
     "libero_100": "https://utexas.box.com/shared/static/cv73j8zschq8auh9npzt876fdc1akvmk.zip",
 }
-Folder = str | os.PathLike
+Dir = str | os.PathLike
 
 _SUITES = ("libero_object", "libero_goal", "libero_spatial", "libero_10", "libero_90")
 
@@ -48,16 +48,14 @@ def url_is_alive(url: str) -> bool:
         return False
 
 
-def download_url(
-    url: str, download_dir: Folder, check_overwrite: bool = True, is_zipfile: bool = True
-) -> Path:
+def download_url(url: str, download_dir: Dir, check_overwrite: bool = True, is_zipfile: bool = True) -> Path:
     """Download a file into a folder, and return the file, or the folder of an unpacked archive.
 
     An interrupted download is resumed.
 
     Args:
         url: Address; its last part is the name of the file.
-        download_dir: Folder.
+        download_dir: Dir.
         check_overwrite: Whether a file that exists is kept.
         is_zipfile: Whether the file is an archive to unpack and remove.
 
@@ -81,13 +79,13 @@ def download_url(
 
 
 def download_from_huggingface(
-    dataset_name: str, download_dir: Folder, check_overwrite: bool = True
+    dataset_name: str, download_dir: Dir, check_overwrite: bool = True
 ) -> list[Path]:
     """Download the files of a suite one by one, verify their checksums, and return them.
 
     Args:
         dataset_name: Suite, such as `libero_object`; `libero_100` is `libero_90` and `libero_10`.
-        download_dir: Folder of the folders of the suites.
+        download_dir: Dir of the folders of the suites.
         check_overwrite: Whether different files of the same names are kept.
 
     Raises:
@@ -99,7 +97,7 @@ def download_from_huggingface(
 
 def libero_dataset_download(
     datasets: str = "all",
-    download_dir: Folder | None = None,
+    download_dir: Dir | None = None,
     check_overwrite: bool = True,
     use_huggingface: bool = False,
 ) -> None:
@@ -107,7 +105,7 @@ def libero_dataset_download(
 
     Args:
         datasets: `all`, or a name in `DATASET_LINKS`.
-        download_dir: Folder of the folders of the suites; by default `get_libero_path("datasets")`.
+        download_dir: Dir of the folders of the suites; by default `get_libero_path("datasets")`.
         check_overwrite: Whether files that exist are kept.
         use_huggingface: Whether verified files of the Hub are downloaded instead of archives.
 
@@ -130,11 +128,11 @@ def libero_dataset_download(
             download_url(DATASET_LINKS[name], folder, check_overwrite)
 
 
-def check_libero_dataset(download_dir: Folder | None = None) -> bool:
+def check_libero_dataset(download_dir: Dir | None = None) -> bool:
     """Print how many files of each suite exist, and return whether all do.
 
     Args:
-        download_dir: Folder of the folders of the suites; by default `get_libero_path("datasets")`.
+        download_dir: Dir of the folders of the suites; by default `get_libero_path("datasets")`.
     """
     folder = Path(download_dir) if download_dir is not None else datasets_folder()
     absent = {name: _missing(folder, name) for name in _SUITES}

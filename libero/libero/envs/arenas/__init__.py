@@ -7,9 +7,7 @@ from libero.libero.envs.arenas.base_arena import Arena, WorkspaceArena
 
 def _arena(name: str, category: str) -> Any:
     """Return the class of the arena of a workspace."""
-    return type(
-        name, (WorkspaceArena,), {"__module__": __name__, "__doc__": f"`{category}`", "category": category}
-    )
+    return type(name, (WorkspaceArena,), {"__module__": __name__, "category": category})
 
 
 CoffeeTableArena = _arena("CoffeeTableArena", "coffee_table")

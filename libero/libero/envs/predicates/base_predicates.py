@@ -85,9 +85,7 @@ InContactPredicateFn = _predicate("InContactPredicateFn", _TWO, "The two touch."
 In = _predicate("In", _TWO, "The first is in the second, a region.", predicate="In")
 On = _predicate("On", _TWO, "The first is on the second.", predicate="On")
 Stack = _predicate("Stack", _TWO, "The first is on the second and inside it.", predicate="Stack")
-Up = _predicate(
-    "Up", (_Native, UnaryAtomic), "The object is at least a metre above the floor.", predicate="Up"
-)
+Up = _predicate("Up", (_Native, UnaryAtomic), "It is at least a metre above the floor.", predicate="Up")
 Open = _predicate("Open", (_StateMethod,), "Any joint is in the open range.", method="is_open")
 Close = _predicate("Close", (_StateMethod,), "All joints are in the closed range.", method="is_close")
 TurnOn = _predicate("TurnOn", (_StateMethod,), "Any joint is in the range of on.", method="turn_on")
