@@ -147,6 +147,14 @@ def test_the_same_seed_gives_the_same_weights(files, succeed):
     assert same == [True, False]
 
 
+def test_an_infinite_loss_names_the_keys_of_this_configuration(files, succeed):
+    succeed(0.0)
+    algo, data, _ = learner(files, "base")
+    algo.observe = lambda batch: float("nan")
+    with pytest.raises(LiberoError, match=r"train\.optimizer\.kwargs\.lr"):
+        algo.learn_one_task(data[0], 0, Tasks(), {})
+
+
 def test_windows_are_read_ahead_by_workers(files, succeed):
     """Worker processes read the same batches, and every window is observed once in an epoch."""
     succeed(*[0.0, 1.0] * 3)

@@ -23,6 +23,7 @@ from libero.lifelong.utils import (
     torch_save_model,
 )
 from lifelong import algorithms
+from lifelong.errors import TrainingError
 from lifelong.seeding import generator
 from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
@@ -264,7 +265,12 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
 
         def step(batch: Any, draws: torch.Generator, _: float) -> tuple[Tensor, Tensor]:
             self.draws = draws
-            return torch.tensor(self.observe(batch.data)), torch.tensor(0.0)
+            loss = self.observe(batch.data)
+            if not np.isfinite(loss):
+                raise TrainingError(
+                    f"the loss is {loss}: lower train.optimizer.kwargs.lr or lifelong.e_lambda"
+                )
+            return torch.tensor(loss), torch.tensor(0.0)
 
         self.policy.eval()
         evaluate(0, mean_loss(self, dataset, train.batch_size, train.num_workers))
