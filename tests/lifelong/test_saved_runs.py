@@ -19,9 +19,11 @@ import yaml
 from omegaconf import OmegaConf
 
 from lifelong import checkpoints
+from lifelong.build import build
 from lifelong.data.fake import fake_observation
 from lifelong.evaluation.restore import restore
 from lifelong.report.page import write_report
+from lifelong.report.runs import group_runs, load_run
 from lifelong.results.run_directory import result_relevant
 from lifelong.saved_config import upgrade_config
 from lifelong.types import Observation
@@ -98,6 +100,72 @@ def test_a_configuration_of_today_is_not_changed(name):
 
 
 @pytest.mark.unit
+@pytest.mark.parametrize(
+    ("saved", "upgraded"),
+    [
+        (
+            {
+                "_target_": "lifelong.algorithms.er.ER",
+                "budget": 7,
+                "ratio": 2.0,
+                "per_task": 5,
+                "compat": None,
+            },
+            {
+                "_target_": "lifelong.algorithms.er.ER",
+                "ratio": 2.0,
+                "memory": {"_target_": "lifelong.data.memory.ReplayMemory", "budget": 7},
+            },
+        ),
+        (
+            {"_target_": "lifelong.algorithms.agem.AGEM", "budget": 7, "per_task": 5, "compat": "libero"},
+            {
+                "_target_": "lifelong.algorithms.agem.AGEM",
+                "memory": {"_target_": "lifelong.data.memory.FirstWindows", "budget": 5},
+                "augment_reference": True,
+            },
+        ),
+        (
+            {"_target_": "lifelong.algorithms.ewc.EWC", "strength": 3.0, "fisher": "batch", "compat": None},
+            {
+                "_target_": "lifelong.algorithms.ewc.EWC",
+                "strength": 3.0,
+                "estimator": {
+                    "_target_": "lifelong.algorithms.importance.BatchFisher",
+                    "windows": 512,
+                    "batch_size": 32,
+                    "augment": False,
+                },
+            },
+        ),
+        (
+            {"_target_": "lifelong.algorithms.ewc.EWC", "fisher": "per_sample", "compat": "libero"},
+            {
+                "_target_": "lifelong.algorithms.ewc.EWC",
+                "estimator": {
+                    "_target_": "lifelong.algorithms.importance.SampleFisher",
+                    "windows": 0,
+                    "augment": True,
+                },
+            },
+        ),
+        (
+            {"_target_": "lifelong.algorithms.packnet.PackNet", "compat": "libero"},
+            {"_target_": "lifelong.algorithms.packnet.PackNet", "masks_only": True},
+        ),
+        (
+            {"_target_": "lifelong.algorithms.si.SI", "strength": 0.1},
+            {"_target_": "lifelong.algorithms.si.SI", "strength": 0.1},
+        ),
+    ],
+)
+def test_an_algorithm_is_upgraded_and_can_be_built(saved, upgraded):
+    found = upgrade_config({"algo": saved, "compat": saved.get("compat")})
+    assert found == {"algo": upgraded}
+    build(OmegaConf.create(upgraded))
+
+
+@pytest.mark.unit
 @every_run
 def test_a_restored_policy_acts_as_it_did(name):
     run = restore(RUNS / name, device="cpu")
@@ -118,6 +186,25 @@ def test_saved_runs_are_reported_together(tmp_path):
     page = write_report([RUNS / name for name in COMMANDS], tmp_path / "report.html")
     text = page.read_text()
     assert all(name in text for name in COMMANDS)
+
+
+@pytest.mark.unit
+def test_seeds_of_earlier_versions_are_grouped_with_those_of_today(tmp_path):
+    """And runs whose components differ are not."""
+    runs = [RUNS / "er"]
+    for name, overrides in {"same": (), "other": ("compat=none",)}.items():
+        shutil.copytree(RUNS / "er", tmp_path / name)
+        config = composed(
+            *SHORT, *COMMANDS["er"], "policy.stochastic=true", "eval.selection=reporting", *overrides
+        )
+        plain = OmegaConf.to_container(config, resolve=True) | {"seed": 2}
+        (tmp_path / name / "config.yaml").write_text(yaml.safe_dump(plain))
+        runs.append(tmp_path / name)
+    groups = group_runs([load_run(run) for run in runs])
+    assert [(group.label, len(group.runs)) for group in groups] == [
+        ("er (memory FirstWindows)", 2),
+        ("er (memory ReplayMemory)", 1),
+    ]
 
 
 @pytest.mark.slow
