@@ -1,4 +1,4 @@
-"""Settings that belong to no single part: of the run, the task sequence, and the data."""
+"""Settings of the run, the task sequence and pretraining."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ __all__ = ["CAMERAS", "BenchmarkSettings", "DataSettings", "PretrainSettings", "
 
 @dataclass(frozen=True)
 class RunSettings:
-    """The keys at the top of the configuration; see configs/config.yaml."""
+    """Keys at the top of the configuration; see configs/config.yaml."""
 
     seed: int
     device: str
@@ -29,16 +29,18 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """Which tasks, in which order.
+    """The task sequence.
 
     Attributes:
         suite: Name of a suite.
-        order: One of its published sequences.
-        tasks: The first so many of the sequence, or a list of names or indices, in the order to be learned.
-        horizon: Control steps in which a quick policy solves any of them, for `eval.horizon` to refer to.
-        group_size: So many tasks, next to each other in the sequence, are learned together as one step of it. They
-            are evaluated one by one; metrics take a group for one task, whose success is the mean over its tasks.
-        files: Task files of your own, .yaml or .bddl, which are then the suite; `suite` is what it is called.
+        order: Index of one of the suite's published sequences.
+        tasks: Number of tasks from the start of the sequence, or a list of names or indices in learning order.
+            None: all.
+        horizon: Number of control steps in which a fast policy solves any of the tasks; `eval.horizon` may refer
+            to it.
+        group_size: Number of neighbouring tasks of the sequence that are learned together as one step of it. They
+            are evaluated one by one; metrics treat a group as one task, whose success is the mean over its tasks.
+        files: User-defined task files, .yaml or .bddl, which form the suite; `suite` is then its name.
     """
 
     suite: str
@@ -49,11 +51,11 @@ class BenchmarkSettings:
     files: Sequence[str] | None = None
 
     def sequence(self) -> tuple[Task, ...]:
-        """The tasks in learning order.
+        """Return the tasks in learning order.
 
         Raises:
-            UnknownNameError: No such suite, order or task.
-            ConfigError: They cannot be learned in groups of that size.
+            UnknownNameError: The suite, the order or a task does not exist.
+            ConfigError: The number of tasks is not a multiple of the group size, or the files do not make a suite.
         """
         tasks = self._chosen()
         valid = [n for n in range(1, len(tasks) + 1) if len(tasks) % n == 0]
@@ -69,11 +71,11 @@ class BenchmarkSettings:
             return get_suite(self.suite)
         if not self.files or isinstance(self.files, str):
             raise ConfigError(
-                f"benchmark.files is {self.files!r}; name task files of yours: '[a.yaml,b.bddl]'"
+                f"benchmark.files is {self.files!r}; give a list of task files: '[a.yaml,b.bddl]'"
             )
         if self.suite in suite_names():
             raise ConfigError(
-                f"benchmark.files are given, and {self.suite} has its own tasks; say benchmark=own"
+                f"benchmark.files are given, and {self.suite} has its own tasks; use benchmark=own"
             )
         return read_suite(self.files, self.suite)
 
@@ -95,13 +97,13 @@ class BenchmarkSettings:
 
 @dataclass(frozen=True)
 class PretrainSettings:
-    """What a policy learns before the sequence, as one joint task.
+    """Tasks that a policy learns jointly before the sequence.
 
     Attributes:
-        suite: Name of a suite. None: nothing.
-        tasks: As of `BenchmarkSettings`.
-        demos: Demonstrations of each. None: `data.demos`.
-        epochs: None: `train.epochs`.
+        suite: Name of a suite. None: no pretraining.
+        tasks: Number of tasks from the start of the suite, or a list of names or indices. None: all.
+        demos: Number of demonstrations of each task. None: `data.demos`.
+        epochs: Number of epochs. None: `train.epochs`.
     """
 
     suite: str | None = None
@@ -116,9 +118,9 @@ class PretrainSettings:
                 raise ConfigError(f"pretrain.{name} is {value}; it must be at least 1, or null")
 
     def sequence(self) -> tuple[Task, ...]:
-        """The tasks; none where nothing is learned before.
+        """Return the tasks; none without pretraining.
 
         Raises:
-            UnknownNameError: No such suite or task.
+            UnknownNameError: The suite or a task does not exist.
         """
         return () if self.suite is None else BenchmarkSettings(self.suite, tasks=self.tasks).sequence()

@@ -134,6 +134,28 @@ class FlatReadout(nn.Module):
         return functional.gelu(self.norm(self.read(self.reduce(h).flatten(1))))
 
 
+def make_readout(
+    kind: str, channels: int, size: tuple[int, int], keypoints: int, temperature: float
+) -> nn.Module:
+    """Build the readout of a feature map, (N, C, H, W) -> (N, 2 K).
+
+    Args:
+        kind: `keypoints` (`SpatialSoftmax`) or `flat` (`FlatReadout`).
+        channels: C.
+        size: H, W of the feature map.
+        keypoints: K.
+        temperature: Temperature of the keypoints' softmax.
+
+    Raises:
+        PolicyError: Another kind.
+    """
+    if kind == "keypoints":
+        return SpatialSoftmax(channels=channels, size=size, keypoints=keypoints, temperature=temperature)
+    if kind == "flat":
+        return FlatReadout(channels=channels, size=size, features=2 * keypoints)
+    raise PolicyError(f"unknown readout {kind!r}. Valid: flat, keypoints")
+
+
 class ResNetFiLMEncoder(nn.Module):
     """Image encoder of ResNet-T: ResNet-18's first stages, FiLM after every block, keypoints, one linear map.
 
@@ -191,14 +213,7 @@ class ResNetFiLMEncoder(nn.Module):
                 channels = out
         size = self._map_size(image_size)
         keypoints = keypoints or latent_dim // 2
-        if readout == "keypoints":
-            self.readout: nn.Module = SpatialSoftmax(
-                channels=channels, size=size, keypoints=keypoints, temperature=temperature
-            )
-        elif readout == "flat":
-            self.readout = FlatReadout(channels=channels, size=size, features=2 * keypoints)
-        else:
-            raise PolicyError(f"unknown readout {readout!r}. Valid: flat, keypoints")
+        self.readout = make_readout(readout, channels, size, keypoints, temperature)
         self.project = nn.Linear(2 * keypoints, latent_dim)
         self.to(memory_format=torch.channels_last)
 

@@ -249,7 +249,7 @@ def test_the_settings_of_a_run_take_files(tmp_path):
     ):
         with pytest.raises(ConfigError, match="name task files"):
             bad.sequence()
-    with pytest.raises(ConfigError, match="say benchmark=own"):
+    with pytest.raises(ConfigError, match="use benchmark=own"):
         BenchmarkSettings("libero_goal", files=files).sequence()
     with pytest.raises(UnknownNameError):
         BenchmarkSettings("own", files=files, tasks=["w"]).sequence()
