@@ -14,6 +14,7 @@ from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import RunRecord
 from lifelong.results.results import Results
+from lifelong.saved_config import upgrade_config
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
 # sections of the config
@@ -129,7 +130,11 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
     record = run.record
     basic = {n: getattr(record, n) for n in _BASICS}
     flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
-    ignored = ("seed", "_target_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
+    flat = {
+        k.removesuffix("._target_"): str(v).rpartition(".")[2] if k.endswith("._target_") else v
+        for k, v in flat.items()  # a component goes by the name of its class
+    }
+    ignored = ("seed", "_partial_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
     flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(ignored)}
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
         flat["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
@@ -152,4 +157,4 @@ def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:
         config = yaml.safe_load(text)
     except yaml.YAMLError as error:
         return {}, text, [f"{path.name} is not valid YAML ({' '.join(str(error).split())})."]
-    return (config if isinstance(config, dict) else {}), text, []
+    return (upgrade_config(config) if isinstance(config, dict) else {}), text, []
