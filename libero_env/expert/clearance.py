@@ -6,7 +6,7 @@ from numba import njit
 from libero_env.expert.arm.gripper import GRIPPER
 
 _CELL, _COARSE_CELL = 0.006, 0.012  # [m] voxels for objects, and for the hand
-_WALL_HEIGHT = 0.01  # [m] between the lowest points of what stands on a surface; more is an overhang
+_WALL_HEIGHT = 0.01  # [m] above a limit, up to which the lowest point of a column is a wall and no overhang
 _HALF_SIZE = np.array([0.75, 0.9, 0.5])  # [m] of the space that is covered
 
 
