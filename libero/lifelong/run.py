@@ -23,7 +23,7 @@ from libero._adapters.lifelong.config import Config, notes, plain
 from libero.libero import get_libero_path
 from libero.libero.benchmark import get_benchmark
 from libero.lifelong.algos import Multitask, Sequential, get_algo_class
-from libero.lifelong.datasets import GroupedTaskDataset, SequenceDataset, SequenceVLDataset, get_dataset
+from libero.lifelong.datasets import GroupedTaskDataset, SequenceVLDataset, get_dataset
 from libero.lifelong.metric import evaluate_loss, evaluate_success, native_task
 from libero.lifelong.utils import (
     NpEncoder,
@@ -105,7 +105,7 @@ def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
             f"data.task_group_size={size} does not divide the {count} tasks of {cfg.benchmark_name}"
         )
     cfg.demonstrations = [str(demonstrations(cfg, benchmark, i)) for i in range(count)]
-    read = [task_dataset(cfg, path) for path in cfg.demonstrations]
+    read = [get_dataset(path, cfg.data.obs.modality, seq_len=cfg.data.seq_len) for path in cfg.demonstrations]
     parts, shape_meta = [windows for windows, _ in read], read[0][1]
     embs = get_task_embs(cfg, [task.language for task in benchmark.tasks])
     benchmark.set_task_embs(embs)
@@ -124,11 +124,6 @@ def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
     task = native_task(benchmark.get_task(i), cfg.bddl_folder)
     print(f"[info] no {path}: demonstrations of the scripted expert are used", flush=True)
     return ensure_demos([task], DEMOS, camera_size=size)[0]
-
-
-def task_dataset(cfg: Any, path: str | Path) -> tuple[SequenceDataset, dict[str, Any]]:
-    """Return the windows of a file without an instruction, and their shapes."""
-    return get_dataset(path, cfg.data.obs.modality, seq_len=cfg.data.seq_len)
 
 
 def load_pretrained(algo: Sequential, path: str, device: str) -> None:

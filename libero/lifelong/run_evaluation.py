@@ -11,9 +11,9 @@ from libero._adapters.lifelong.config import load_config
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.video_utils import VideoWriter
 from libero.lifelong.algos import PackNet, Sequential, get_algo_class
-from libero.lifelong.datasets import SequenceVLDataset
+from libero.lifelong.datasets import SequenceVLDataset, get_dataset
 from libero.lifelong.metric import evaluate_loss, rollouts
-from libero.lifelong.run import fill_in, task_dataset
+from libero.lifelong.run import fill_in
 from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
 from lifelong.errors import CheckpointError
 from lifelong.results.metrics import wilson_interval
@@ -102,7 +102,8 @@ def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
     path = next((p for p in known if p.name == Path(name).name and p.exists()), None)
     if path is None:
         return float("nan")
-    dataset = SequenceVLDataset(task_dataset(cfg, path)[0], benchmark.get_task_emb(task_id))
+    windows, _ = get_dataset(path, cfg.data.obs.modality, seq_len=cfg.data.seq_len)
+    dataset = SequenceVLDataset(windows, benchmark.get_task_emb(task_id))
     return float(evaluate_loss(cfg, algo, benchmark, [dataset])[0])
 
 

@@ -1,7 +1,7 @@
 """The original's configuration, composed by Hydra from `libero/configs`."""
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,12 +53,6 @@ class Config(dict):
     def __delattr__(self, name: str) -> None:
         del self[name]
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Config":
-        return Config({key: copy.deepcopy(value, memo) for key, value in self.items()})
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Config, (dict(self),)
-
 
 def load_config(*overrides: str) -> Config:
     """Compose the configuration from defaults and overrides such as `lifelong=er`, `seed=100`."""
@@ -94,12 +88,14 @@ def assign(node: Any, key: str, value: Any) -> None:
 
 def notes(cfg: Any) -> list[str]:
     """Return one line for each key that was changed but has no effect."""
-    now, default = dict(_leaves(plain(cfg))), dict(_leaves(plain(load_config())))
-    return [
-        f"{key}={now[key]} has no effect: {why}"
-        for key, why in NO_EFFECT.items()
-        if key in now and now[key] != default.get(key)
-    ]
+    current, defaults = OmegaConf.create(plain(cfg)), OmegaConf.create(plain(load_config()))
+    lines = []
+    for key, why in NO_EFFECT.items():
+        default = OmegaConf.select(defaults, key)
+        value = OmegaConf.select(current, key, default=default)
+        if value != default:
+            lines.append(f"{key}={value} has no effect: {why}")
+    return lines
 
 
 def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
@@ -121,12 +117,3 @@ def _wrap(value: Any) -> Any:
     if type(value) in (list, tuple):
         return type(value)(_wrap(part) for part in value)
     return value
-
-
-def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every leaf with its dotted path; lists are leaves."""
-    if not isinstance(node, Mapping):
-        yield path, node
-        return
-    for key, part in node.items():
-        yield from _leaves(part, f"{path}.{key}" if path else str(key))
