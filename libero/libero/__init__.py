@@ -56,11 +56,7 @@ def get_path_dict() -> dict[str, str]:
 
 
 def get_libero_path(query_key: str) -> str:
-    """Return one of the paths, and warn if it does not exist.
-
-    Raises:
-        UnknownNameError: The key does not exist.
-    """
+    """Return one of the paths, and warn if it does not exist; raise an UnknownNameError if the key does not exist."""
     from libero._adapters.envs.files import ensure
 
     if query_key not in _KEYS:

@@ -15,11 +15,7 @@ from libero_env.errors import LiberoError
     prog="libero.config_copy",
 )
 def main(args: argparse.Namespace) -> None:
-    """Copy the files and print the folder.
-
-    Raises:
-        LiberoError: The folder exists.
-    """
+    """Copy the files and print the folder; raise a LiberoError if the folder exists."""
     if args.target.exists() and not args.overwrite:
         raise LiberoError(f"{args.target} exists; choose another folder, or pass --overwrite")
     with as_file(files("libero") / "configs") as source:

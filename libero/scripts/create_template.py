@@ -51,11 +51,7 @@ def main(args: argparse.Namespace) -> None:
 
 
 def ask(question: str, option: str) -> str:
-    """Return what the user types.
-
-    Raises:
-        LiberoError: There is no terminal.
-    """
+    """Return what the user types; raise a LiberoError if there is no terminal."""
     if not sys.stdin.isatty():
         raise LiberoError(f"{option} is missing, and there is no terminal to ask for it")
     return input(f"{question}: ").strip()

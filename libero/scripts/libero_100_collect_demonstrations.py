@@ -11,11 +11,7 @@ from libero_env.errors import LiberoError
 
 @script(*OPTIONS, option("--task-id", type=int, required=True, help="0 to 99; 90 to 99 are libero_10"))
 def main(args: argparse.Namespace) -> int:
-    """Record the demonstrations, see `collect_demonstration.collect`.
-
-    Raises:
-        LiberoError: The task does not exist.
-    """
+    """Record the demonstrations, see `collect_demonstration.collect`; raise a LiberoError if there is no such task."""
     suite = get_benchmark("libero_100")()
     if args.task_id not in range(suite.n_tasks):
         raise LiberoError(f"--task-id {args.task_id}: LIBERO-100 has 0 to {suite.n_tasks - 1}")

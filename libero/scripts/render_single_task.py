@@ -26,11 +26,7 @@ from libero_env.errors import LiberoError
     option("--out", type=Path, default=Path("benchmark_tasks"), help="folder (default: benchmark_tasks)"),
 )
 def main(args: argparse.Namespace) -> None:
-    """Write the picture and print its path.
-
-    Raises:
-        LiberoError: No task is named, or the index does not exist.
-    """
+    """Write the picture and print its path; raise a LiberoError if no task is named, or the index does not exist."""
     file, states = task_and_states(args)
     env = OffScreenRenderEnv(bddl_file_name=file, camera_heights=args.size, camera_widths=args.size)
     env.seed(args.seed)

@@ -56,11 +56,7 @@ def get_benchmark_dict(help: bool = False) -> dict[str, type["Benchmark"]]:
 
 
 def get_benchmark(benchmark_name: str) -> type["Benchmark"]:
-    """Return the class of this name; case does not matter.
-
-    Raises:
-        UnknownNameError: The benchmark does not exist.
-    """
+    """Return the class of this name, ignoring case; raise an UnknownNameError if there is none."""
     return lookup(BENCHMARK_MAPPING, "benchmark", benchmark_name)
 
 
@@ -129,11 +125,7 @@ class Benchmark:
         return str(Path(get_libero_path("bddl_files"), self.tasks[i].problem_folder, self.tasks[i].bddl_file))
 
     def get_task_demonstration(self, i: int) -> str:
-        """Return the path of the demonstrations of a task below the datasets folder.
-
-        Raises:
-            UnknownNameError: The task does not exist.
-        """
+        """Return the path of the demonstrations of a task; raise an UnknownNameError if there is no such task."""
         if i not in range(self.n_tasks):
             raise UnknownNameError(f"task index of {self.name}", i, range(self.n_tasks))
         return f"{self.tasks[i].problem_folder}/{self.tasks[i].name}_demo.hdf5"

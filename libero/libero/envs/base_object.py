@@ -45,11 +45,7 @@ def register_visual_change_object(target_class: type) -> type:
 
 
 def get_object_fn(category_name: str) -> type:
-    """Return the class of a category; case does not matter.
-
-    Raises:
-        UnknownNameError: The category does not exist.
-    """
+    """Return the class of a category, ignoring case; raise an UnknownNameError if there is none."""
     return lookup(OBJECTS_DICT, "object category", category_name)
 
 

@@ -190,11 +190,7 @@ class BDDLBaseDomain:
         self.rng = np.random.default_rng(seed)
 
     def reset(self) -> "OrderedDict[str, np.ndarray]":
-        """Sample an initial state and observe it.
-
-        Raises:
-            PlacementError: The objects do not fit.
-        """
+        """Sample an initial state and observe it; raise a PlacementError if the objects do not fit."""
         start = self._sample()
         qpos = start.qpos.copy()
         if self.initialization_noise is None:
@@ -313,11 +309,7 @@ class BDDLBaseDomain:
         return object_name in self.fixtures_dict
 
     def get_object(self, object_name: str) -> Any:
-        """Return the object, fixture or region of this name.
-
-        Raises:
-            UnknownNameError: The name does not exist.
-        """
+        """Return the object, fixture or region of this name; raise an UnknownNameError if there is none."""
         known = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
         return lookup(known, "object, fixture or region", object_name)
 

@@ -15,11 +15,7 @@ _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 
 
 def read_problem(problem_filename: str) -> Problem:
-    """Read a task file, see `task_file`; it is cached as long as it does not change.
-
-    Raises:
-        BDDLError: The file is not a task file.
-    """
+    """Read a task file, see `task_file`, or take it from the cache; raise a BDDLError if it is not a task file."""
     path = task_file(problem_filename)
     stamp = Path(path).stat()
     return _read(path, stamp.st_mtime_ns, stamp.st_size)

@@ -20,11 +20,7 @@ _WORDS = {"floor": "floor tile ceramic", "wall": "wall plaster ceramic", "table"
 
 
 def get_texture_file_list(type: str, texture_path: str | os.PathLike) -> list[tuple[str, str]]:
-    """Return name and path of the textures of a kind: `floor`, `wall`, `table` or `sky`.
-
-    Raises:
-        UnknownNameError: The kind does not exist.
-    """
+    """Return name and path of the textures of a kind; raise an UnknownNameError if there is no such kind."""
     if type not in _WORDS:
         raise UnknownNameError("kind of texture", type, _WORDS)
     names = [name for name in TEXTURE_MAPPING if any(word in name for word in _WORDS[type].split())]

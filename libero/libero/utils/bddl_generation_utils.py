@@ -231,11 +231,7 @@ SUITE_GENERATORS: dict[str, Callable[..., str]] = {
 
 
 def get_suite_generator_func(workspace_name: str) -> Callable[..., str]:
-    """Return the function that writes task files for a workspace; its arguments are those of `_facts`.
-
-    Raises:
-        UnknownNameError: The workspace does not exist.
-    """
+    """Return the function that writes task files for a workspace; raise an UnknownNameError if there is none."""
     return lookup(SUITE_GENERATORS, "workspace", workspace_name)
 
 

@@ -52,20 +52,12 @@ def register_mu(scene_type: str) -> Callable[[Template], Template]:
 
 
 def get_scene_dict(scene_type: str | None = None) -> Any:
-    """Return the classes by scene type, or the classes of one type.
-
-    Raises:
-        UnknownNameError: The scene type does not exist.
-    """
+    """Return the classes by scene type, or the classes of one type; raise an UnknownNameError if there is none."""
     return SCENE_DICT if scene_type is None else lookup(SCENE_DICT, "scene type", scene_type)
 
 
 def get_scene_class(scene_name: str) -> Callable[[], "InitialSceneTemplates"]:
-    """Return a scene by the name of its class in any spelling.
-
-    Raises:
-        UnknownNameError: The scene does not exist.
-    """
+    """Return a scene by the name of its class in any spelling; raise an UnknownNameError if there is none."""
     return lookup(MU_DICT, "scene", scene_key(scene_name))
 
 

@@ -88,11 +88,7 @@ def register_task_info(
 
 
 def get_task_info(scene_name: str | None = None) -> Any:
-    """Return the tasks by scene, or the tasks of one scene.
-
-    Raises:
-        UnknownNameError: No task is defined on the scene.
-    """
+    """Return the tasks by scene, or those of one scene; raise an UnknownNameError if it has none."""
     if scene_name is None:
         return TASK_INFO
     return lookup(TASK_INFO, "scene with tasks", scene_key(scene_name))

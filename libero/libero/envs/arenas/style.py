@@ -8,9 +8,5 @@ STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
 
 
 def get_texture_filename(type: str, style: str) -> str:
-    """Return the texture file of a style in the `textures` folder of the original.
-
-    Raises:
-        UnknownNameError: The kind or style does not exist.
-    """
+    """Return the texture file of a style in the original; raise an UnknownNameError if there is none."""
     return lookup(lookup(STYLE_MAPPING, "kind of style", type), f"{type} style", style)

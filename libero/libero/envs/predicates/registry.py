@@ -44,11 +44,7 @@ def get_predicate_fn_dict() -> dict[str, Callable[..., bool]]:
 
 
 def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
-    """Return a predicate by its name; case does not matter.
-
-    Raises:
-        UnknownNameError: The predicate does not exist.
-    """
+    """Return a predicate by its name, ignoring case; raise an UnknownNameError if there is none."""
     return lookup(VALIDATE_PREDICATE_FN_DICT, "predicate", predicate_fn_name)
 
 

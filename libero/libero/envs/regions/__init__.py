@@ -31,11 +31,7 @@ REGION_SAMPLERS: dict[str, dict[str, type]] = {
 
 
 def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
-    """Return the sampler of a workspace in a problem.
-
-    Raises:
-        UnknownNameError: The problem or workspace does not exist.
-    """
+    """Return the sampler of a workspace in a problem; raise an UnknownNameError if there is none."""
     samplers = lookup(REGION_SAMPLERS, "problem", problem_name)
     return lookup(samplers, f"region sampler of {problem_name}", region_sampler_name)
 

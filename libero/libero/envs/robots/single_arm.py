@@ -17,10 +17,10 @@ CONTROLLERS = tuple(name.upper() for name in KINDS)
 
 
 def controller_of(configs: Any) -> dict[str, Any]:
-    """Return the configuration of the controller, from a configuration, a list of one, a name, or None (default).
+    """Return the configuration of the controller; raise an UnknownNameError if it does not exist.
 
-    Raises:
-        UnknownNameError: The controller does not exist.
+    Args:
+        configs: Configuration, list of one configuration, name of the controller, or None for the default.
     """
     if isinstance(configs, Sequence) and not isinstance(configs, str):
         configs = configs[0] if configs else None
