@@ -6,7 +6,7 @@ from lifelong.algorithms import Algorithm
 from lifelong.seeding import generator
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
-from tests.harness import sequences as walk
+from tests.harness import sequences
 from tests.harness.fakes import LinearPolicy, Windows
 
 SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precision="fp32")
@@ -42,11 +42,11 @@ def killed_again_and_again(path, algo, monkeypatch):
         starts += 1
         assert starts < 100
         with monkeypatch.context() as patch:
-            p = walk.run_context(path, algo)
-            killer = walk.Killer(patch, writes)
+            p = sequences.run_context(path, algo)
+            killer = sequences.Killer(patch, writes)
             patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
             try:
-                walk.sequence(p).run()
+                sequences.sequence(p).run()
                 return starts, p
-            except walk.Killed:
+            except sequences.Killed:
                 writes = 2 + starts % 3

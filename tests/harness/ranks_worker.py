@@ -18,7 +18,7 @@ from lifelong.results.records import LossRecord
 from lifelong.seeding import seeded
 from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
-from tests.harness import sequences as walk
+from tests.harness import sequences
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.policies import small_transformer
 
@@ -36,18 +36,18 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
 
     Without dropout: its masks are each rank's own.
     """
-    walk.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}").algo)
+    sequences.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}").algo)
     with seeded(7):
-        policy = small_transformer(walk.SPEC, dropout=0.0)
+        policy = small_transformer(sequences.SPEC, dropout=0.0)
     context = replace(
-        walk.run_context(folder / algo, algo, TASKS),
+        sequences.run_context(folder / algo, algo, TASKS),
         policy=policy,
         augment=RandomShift(1),
         fit=replace(FIT, **changes),
         eval=EVAL,
         ranks=ranks,
     )
-    walk.sequence(context).run()
+    sequences.sequence(context).run()
     losses = [record.loss for record in context.directory.log.read().of(LossRecord)]
     return losses, {name: value.clone() for name, value in policy.state_dict().items()}
 

@@ -18,7 +18,7 @@ from lifelong.streams import StageWindows
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Observation
-from tests.harness import sequences as walk
+from tests.harness import sequences
 from tests.harness.algorithms import killed_again_and_again, learn, outputs
 from tests.harness.fakes import DeepPolicy, Windows
 from tests.harness.policies import small_rnn, small_transformer, small_vilt
@@ -30,12 +30,12 @@ SMALL = FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32")
 
 def make_policy(kind: str = "bc_transformer", head: str = "gmm"):
     with seeded(3):
-        return POLICIES[kind](walk.SPEC, head)
+        return POLICIES[kind](sequences.SPEC, head)
 
 
 def learn_small(algorithm, policy, task: int, settings=SMALL) -> None:
     """A task of the fake demonstrations from its beginning to its end."""
-    dataset = walk.dataset(task)
+    dataset = sequences.dataset(task)
     algorithm.begin_task(task, dataset, policy)
     for number, phase in enumerate(algorithm.phases()):
         algorithm.begin_phase(phase, policy)
@@ -47,32 +47,32 @@ def learn_small(algorithm, policy, task: int, settings=SMALL) -> None:
 def answers(algorithm, policy, task: int) -> torch.Tensor:
     """What the policy of a task would do on its windows."""
     with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
-        return acting.eval().predict(walk.dataset(task).batch(torch.arange(20)))
+        return acting.eval().predict(sequences.dataset(task).batch(torch.arange(20)))
 
 
 def loss_on(algorithm, policy, task: int) -> float:
     with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
-        return acting.eval().loss(walk.dataset(task).batch(torch.arange(20))).item()
+        return acting.eval().loss(sequences.dataset(task).batch(torch.arange(20))).item()
 
 
 # --- both
 
 
 @pytest.fixture
-def walks(monkeypatch):
-    monkeypatch.setattr(walk, "ALGORITHMS", ALL)
-    return walk
+def harness(monkeypatch):
+    monkeypatch.setattr(sequences, "ALGORITHMS", ALL)
+    return sequences
 
 
 @pytest.mark.parametrize("algo", ALL)
-def test_killed_and_resumed_equals_uninterrupted(walks, tmp_path, algo, monkeypatch):
-    walks.sequence(p := walks.run_context(tmp_path / "whole", algo)).run()
-    records, state = walks.outcome(tmp_path / "whole", p.directory.log)
+def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkeypatch):
+    harness.sequence(p := harness.run_context(tmp_path / "whole", algo)).run()
+    records, state = harness.outcome(tmp_path / "whole", p.directory.log)
     starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
     assert starts > 2
-    again, end = walks.outcome(tmp_path / "killed", p.directory.log)
+    again, end = harness.outcome(tmp_path / "killed", p.directory.log)
     assert again == records
-    walks.assert_same(end, state)
+    harness.assert_same(end, state)
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
@@ -86,27 +86,27 @@ def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
     state = checkpoints.load(tmp_path / "s")
     other_policy, other = make_policy(), make()
     other_policy.load_state_dict(state["policy"])
-    other.load_state_dict(state["algorithm"], {t: walk.dataset(t) for t in (0, 1)})
+    other.load_state_dict(state["algorithm"], {t: sequences.dataset(t) for t in (0, 1)})
     learn_small(other, other_policy, 2)
-    walk.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
-    walk.assert_same(other.state_dict(), algorithm.state_dict())
+    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
+    sequences.assert_same(other.state_dict(), algorithm.state_dict())
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
 def test_the_base_is_learned_as_by_fine_tuning(make):
     plain, policy, algorithm = make_policy(), make_policy(), make()
-    fit(plain, walk.dataset(0), walk.Sequential(), settings=SMALL, seed=(0, 0))
+    fit(plain, sequences.dataset(0), sequences.Sequential(), settings=SMALL, seed=(0, 0))
     learn_small(algorithm, policy, 0)
-    walk.assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
+    sequences.assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_the_weights_kept_are_those_of_the_best_epoch(walks, tmp_path, make, monkeypatch):
+def test_the_weights_kept_are_those_of_the_best_epoch(harness, tmp_path, make, monkeypatch):
     """Success falls to nothing after the second task's first epoch: its adapter must be the first epoch's."""
     kept = {}
-    monkeypatch.setitem(walk.ALGORITHMS, "this", make)
-    p = walks.run_context(tmp_path, "this")
-    sequence = walks.sequence(p)
+    monkeypatch.setitem(sequences.ALGORITHMS, "this", make)
+    p = harness.run_context(tmp_path, "this")
+    sequence = harness.sequence(p)
     evaluate = sequence._evaluate
 
     def staged(phase, learned, task, epoch):
@@ -133,7 +133,7 @@ def test_later_tasks_are_learned_on_a_frozen_base(make, kind):
     learn_small(algorithm, policy, 1, dataclasses.replace(SMALL, epochs=10))
     assert loss_on(algorithm, policy, 1) < before - 0.02
     with algorithm.policy_for(0, policy):
-        walk.assert_same(dict(policy.state_dict()), dict(base))
+        sequences.assert_same(dict(policy.state_dict()), dict(base))
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
@@ -151,7 +151,7 @@ def test_patterns_that_fit_nothing_are_named(make):
     algorithm = make()
     algorithm.adapted, policy = ("wings.*",), make_policy()
     with pytest.raises(ConfigError, match=r"wings.*which has encoders"):
-        algorithm.begin_task(0, walk.dataset(0), policy)
+        algorithm.begin_task(0, sequences.dataset(0), policy)
 
 
 # --- LoRA
@@ -253,7 +253,7 @@ def test_lora_adapts_a_given_base_from_the_first_task_on():
     policy, algorithm = make_policy(), LoRA(rank=2, base_tasks=0)
     given = copy.deepcopy(policy.state_dict())
     learn_small(algorithm, policy, 0)
-    walk.assert_same(algorithm.state_dict()["base"]["head.means.weight"], given["head.means.weight"])
+    sequences.assert_same(algorithm.state_dict()["base"]["head.means.weight"], given["head.means.weight"])
     kept = answers(algorithm, policy, 0)
     learn_small(algorithm, policy, 1)
     assert torch.equal(answers(algorithm, policy, 0), kept)
@@ -267,7 +267,7 @@ def test_lora_tasks_learned_together_share_an_adapter():
         with algorithm.policy_for(first, policy):
             one = copy.deepcopy(policy.state_dict())
         with algorithm.policy_for(last, policy):
-            walk.assert_same(dict(policy.state_dict()), dict(one))
+            sequences.assert_same(dict(policy.state_dict()), dict(one))
 
 
 @pytest.mark.parametrize("change", [{"rank": 0}, {"base_tasks": -1}])
@@ -280,7 +280,7 @@ def test_lora_settings_that_cannot_work_are_named(change):
 
 
 def everything(task: int):
-    return walk.dataset(task).batch(torch.arange(20))
+    return sequences.dataset(task).batch(torch.arange(20))
 
 
 @pytest.mark.parametrize(
@@ -342,7 +342,7 @@ def test_dmpel_a_new_expert_begins_as_nothing_and_old_ones_never_move():
     learn_small(algorithm, policy, 0)
     base, kept = copy.deepcopy(policy.state_dict()), {}
     begun = copy.deepcopy(algorithm)
-    begun.begin_task(1, walk.dataset(1), policy)
+    begun.begin_task(1, sequences.dataset(1), policy)
     with begun.policy_for(1, policy) as acting, torch.no_grad():
         begun_answers = acting.eval().predict(everything(1))
     assert torch.equal(begun_answers, policy.predict(everything(1)))
@@ -350,10 +350,10 @@ def test_dmpel_a_new_expert_begins_as_nothing_and_old_ones_never_move():
         learn_small(algorithm, policy, task)
         library = algorithm.state_dict()["library"]
         for old, experts in kept.items():
-            walk.assert_same(library[old], experts)
+            sequences.assert_same(library[old], experts)
         kept[task] = copy.deepcopy(library[task])
         assert all(pair["b"].any() for pair in library[task].values())
-    walk.assert_same(dict(policy.state_dict()), dict(base))
+    sequences.assert_same(dict(policy.state_dict()), dict(base))
 
 
 def test_dmpel_replay_keeps_the_coefficients_of_earlier_tasks():
@@ -374,8 +374,8 @@ def test_dmpel_sees_the_first_frame_of_a_demonstration():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
     for task in (0, 1):
         learn_small(algorithm, policy, task)
-    algorithm.begin_task(2, walk.dataset(2), policy)
-    later = walk.dataset(3).batch(torch.tensor([4]))  # of a task whose demonstrations are not known
+    algorithm.begin_task(2, sequences.dataset(2), policy)
+    later = sequences.dataset(3).batch(torch.tensor([4]))  # of a task whose demonstrations are not known
     mixed = algorithm.mix(everything(2).join(later), generator(0))
     queries = mixed.observation.proprio["routing_query"][:, 0]
     first = algorithm.query(everything(2).observation)
@@ -385,7 +385,7 @@ def test_dmpel_sees_the_first_frame_of_a_demonstration():
 
 
 def test_dmpel_finds_demonstrations_in_datasets_made_of_others():
-    algorithm, parts = DMPEL(pool=2), [walk.dataset(t) for t in (0, 1)]
+    algorithm, parts = DMPEL(pool=2), [sequences.dataset(t) for t in (0, 1)]
     some = WindowSubset(parts[1], torch.tensor([3, 12, 15]))
     queries, of_window = algorithm._contexts(StageWindows([parts[0], some], 1))
     expected = [0] * 10 + [1] * 10 + [2, 3, 3]
@@ -414,7 +414,7 @@ def test_dmpel_acts_as_it_was_trained(kind, head):
     policy.stochastic = False
     for task in (0, 1, 2):
         learn_small(algorithm, policy, task)
-    batch = walk.dataset(2).batch(torch.tensor([0, 10]))
+    batch = sequences.dataset(2).batch(torch.tensor([0, 10]))
     steps = policy.memory_steps
     with algorithm.policy_for(2, policy) as acting, torch.no_grad():
         acting.eval()
@@ -429,7 +429,7 @@ def test_dmpel_acts_as_it_was_trained(kind, head):
             if head == "gmm":
                 torch.testing.assert_close(action, whole[:, step], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(action, whole[:, steps - 1], rtol=1e-4, atol=1e-5)
-        alone = acting.predict(walk.dataset(2).batch(torch.tensor([10])))
+        alone = acting.predict(sequences.dataset(2).batch(torch.tensor([10])))
         torch.testing.assert_close(acting.predict(batch)[1:], alone, rtol=1e-4, atol=1e-5)
 
 

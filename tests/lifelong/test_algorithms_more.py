@@ -15,7 +15,7 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
-from tests.harness import sequences as walk
+from tests.harness import sequences
 from tests.harness.algorithms import SETTINGS, killed_again_and_again, learn
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
@@ -69,7 +69,7 @@ def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
     learn(other, other_policy, 2)
     for name, value in policy.state_dict().items():
         assert torch.equal(value, other_policy.state_dict()[name]), name
-    walk.assert_same(other.state_dict(), algorithm.state_dict())
+    sequences.assert_same(other.state_dict(), algorithm.state_dict())
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
@@ -77,28 +77,28 @@ def test_the_first_task_is_learned_as_by_fine_tuning(make):
     torch.manual_seed(0)
     plain, policy, algorithm = Deep(), Deep(), make()
     policy.load_state_dict(plain.state_dict())
-    fit(plain, Windows(0), walk.Sequential(), settings=SETTINGS, seed=(0, 0))
+    fit(plain, Windows(0), sequences.Sequential(), settings=SETTINGS, seed=(0, 0))
     learn(algorithm, policy, 0)
     for name, value in plain.state_dict().items():
         assert torch.equal(value, policy.state_dict()[name]), name
 
 
 @pytest.fixture
-def walks(monkeypatch):
-    """The walk of test_sequence.py with these algorithms."""
-    monkeypatch.setattr(walk, "ALGORITHMS", ALL)
-    return walk
+def harness(monkeypatch):
+    """Return the harness of task sequences with these algorithms."""
+    monkeypatch.setattr(sequences, "ALGORITHMS", ALL)
+    return sequences
 
 
 @pytest.mark.parametrize("algo", ALL)
-def test_killed_and_resumed_equals_uninterrupted(walks, tmp_path, algo, monkeypatch):
-    walks.sequence(p := walks.run_context(tmp_path / "whole", algo)).run()
-    records, state = walks.outcome(tmp_path / "whole", p.directory.log)
+def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkeypatch):
+    harness.sequence(p := harness.run_context(tmp_path / "whole", algo)).run()
+    records, state = harness.outcome(tmp_path / "whole", p.directory.log)
     starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
     assert starts > 2
-    again, end = walks.outcome(tmp_path / "killed", p.directory.log)
+    again, end = harness.outcome(tmp_path / "killed", p.directory.log)
     assert again == records
-    walks.assert_same(end, state)
+    harness.assert_same(end, state)
 
 
 def test_what_an_algorithm_computes_has_the_precision_of_the_loss():
@@ -146,20 +146,20 @@ def test_single_task_begins_every_task_with_the_same_weights_and_acts_with_its_o
 # --- Multitask
 
 
-def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(walks, tmp_path):
-    walks.sequence(p := walks.run_context(tmp_path, "multitask")).run()
-    results, last = p.directory.log.read(), walks.TASKS - 1
+def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(harness, tmp_path):
+    harness.sequence(p := harness.run_context(tmp_path, "multitask")).run()
+    results, last = p.directory.log.read(), harness.TASKS - 1
     assert [r.task for r in results.of(TaskEndRecord)] == [last]
     cells = [(r.phase, r.learned, r.task) for r in results.of(EvalRecord)]
-    assert cells == [("matrix", last, task) for task in range(walks.TASKS)]
+    assert cells == [("matrix", last, task) for task in range(harness.TASKS)]
     assert [(r.task, r.epoch) for r in results.of(LossRecord)] == [(last, 1), (last, 2)]
     assert not RunDirectory(tmp_path).best_path.exists()
 
 
-def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(walks, tmp_path):
-    p = walks.run_context(tmp_path, "multitask")
+def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(harness, tmp_path):
+    p = harness.run_context(tmp_path, "multitask")
     object.__setattr__(p, "fit", FitSettings(epochs=2, steps_per_epoch=3, precision="fp32"))
-    sequence = walks.sequence(p)
+    sequence = harness.sequence(p)
     assert [s.steps_per_epoch for s in sequence._phases((0, 1, 2))] == [9]
     assert [s.steps_per_epoch for s in sequence._phases((1,))] == [3]
 

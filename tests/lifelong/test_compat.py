@@ -14,7 +14,7 @@ from lifelong.launch import check_choices
 from lifelong.seeding import generator
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
-from tests.harness import sequences as walk
+from tests.harness import sequences
 from tests.harness.algorithms import by_hand, killed_again_and_again, learn, outputs
 from tests.harness.configs import CONFIGS, FILES, composed
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
@@ -169,8 +169,8 @@ def test_another_choice_is_refused():
 
 
 def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
-    context = dataclasses.replace(walk.run_context(tmp_path, "ewc"), augment=mirrored)
-    walk.sequence(context)
+    context = dataclasses.replace(sequences.run_context(tmp_path, "ewc"), augment=mirrored)
+    sequences.sequence(context)
     assert context.algorithm.augment is mirrored
 
 
@@ -187,23 +187,23 @@ def test_a_state_taken_up_between_tasks_changes_nothing(overrides, tmp_path):
     other_policy.load_state_dict(state["policy"])
     other.load_state_dict(state["algorithm"], {0: Windows(0)})
     learn(other, other_policy, 1)
-    walk.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
+    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
 
 
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
     """EWC's estimate needs the augmentation even where a process was killed just before it."""
-    run_context = walk.run_context
-    monkeypatch.setitem(walk.ALGORITHMS, "ewc", lambda: made("ewc", "libero"))
+    run_context = sequences.run_context
+    monkeypatch.setitem(sequences.ALGORITHMS, "ewc", lambda: made("ewc", "libero"))
     monkeypatch.setattr(
-        walk, "run_context", lambda *a: dataclasses.replace(run_context(*a), augment=mirrored)
+        sequences, "run_context", lambda *a: dataclasses.replace(run_context(*a), augment=mirrored)
     )
-    walk.sequence(p := walk.run_context(tmp_path / "whole", "ewc")).run()
-    records, state = walk.outcome(tmp_path / "whole", p.directory.log)
+    sequences.sequence(p := sequences.run_context(tmp_path / "whole", "ewc")).run()
+    records, state = sequences.outcome(tmp_path / "whole", p.directory.log)
     starts, p = killed_again_and_again(tmp_path / "killed", "ewc", monkeypatch)
     assert starts > 2
-    again, end = walk.outcome(tmp_path / "killed", p.directory.log)
+    again, end = sequences.outcome(tmp_path / "killed", p.directory.log)
     assert again == records
-    walk.assert_same(end, state)
+    sequences.assert_same(end, state)
 
 
 # --- the switch
