@@ -17,11 +17,8 @@ from libero_env.errors import DemoError
 from lifelong.data import SequenceVLDataset as Windows
 from lifelong.types import PolicySpec
 
-_DEFAULT_KEYS = {
-    "rgb": ["agentview_rgb", "eye_in_hand_rgb"],
-    "depth": [],
-    "low_dim": ["gripper_states", "joint_states"],
-}
+_VIEWS, _LOW_DIM = ["agentview_rgb", "eye_in_hand_rgb"], ["gripper_states", "joint_states"]
+_DEFAULT_KEYS: dict[str, list[str]] = {"rgb": _VIEWS, "depth": [], "low_dim": _LOW_DIM}
 
 
 class SequenceDataset(Dataset):
@@ -83,10 +80,8 @@ class TruncatedSequenceDataset(Subset):
     """First `buffer_size` windows of a dataset, or all if it has fewer."""
 
     def __init__(self, sequence_dataset: Any, buffer_size: int):
-        self.sequence_dataset, self.buffer_size = (
-            sequence_dataset,
-            min(int(buffer_size), len(sequence_dataset)),
-        )
+        self.sequence_dataset = sequence_dataset
+        self.buffer_size = min(int(buffer_size), len(sequence_dataset))
         super().__init__(sequence_dataset, range(self.buffer_size))
 
 

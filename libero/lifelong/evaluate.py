@@ -10,9 +10,8 @@ from libero._adapters.lifelong.config import group_options
 
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the arguments, by default those of the command line."""
-    parser = argparse.ArgumentParser(
-        prog="lifelong.eval", description="Success of a stored policy on a task."
-    )
+    text = "Success of a stored policy on a task."
+    parser = argparse.ArgumentParser(prog="lifelong.eval", description=text)
     parser.add_argument("--experiment_dir", default="experiments", help="folder of the runs")
     parser.add_argument("--benchmark", required=True, help="name of the benchmark, such as libero_object")
     parser.add_argument("--task_id", type=int, required=True, help="position of the task in the benchmark")
@@ -20,9 +19,7 @@ def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--policy", required=True, choices=group_options("policy"))
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--ep", type=int, help="epoch of a multitask run's checkpoint; default: the last")
-    parser.add_argument(
-        "--load_task", type=int, help="task after which the checkpoint was written; default: task_id"
-    )
+    parser.add_argument("--load_task", type=int, help="last task before the checkpoint; default: task_id")
     parser.add_argument("--run", type=int, help="number of the run; default: the newest")
     parser.add_argument("--device_id", type=int, default=0, help="number of the GPU, if there is one")
     parser.add_argument("--n_eval", type=int, help="number of episodes; default: as in the run")

@@ -215,9 +215,8 @@ class _PolicyActor:
         self.algo.reset()
 
     def act(self, obs: Obs) -> np.ndarray:
-        stacked = {
-            key: obs[key][:, ::-1] if key in self.views else _proprio(obs, key) for key in _keys(self.cfg)
-        }
+        keys, views = _keys(self.cfg), self.views
+        stacked = {key: obs[key][:, ::-1] if key in views else _proprio(obs, key) for key in keys}
         actions = self.algo.policy.get_action(_policy_input(stacked, self.task_emb, self.cfg))
         return np.asarray(actions, np.float64).reshape(len(next(iter(stacked.values()))), -1)
 
@@ -241,9 +240,8 @@ class _EvalEnv(BatchEnv):
         if self.rows is not None and options is not None:
             rows = self.rows[np.asarray(options["init_state"]) % len(self.rows)]
             qpos, qvel, fixtures = split_row(self.world.scene.model, rows)
-            self.world.simulations.reset(
-                range(self.num_envs), qpos, qvel, fixtures=fixtures if fixtures.size else None
-            )
+            poses = fixtures if fixtures.size else None
+            self.world.simulations.reset(range(self.num_envs), qpos, qvel, fixtures=poses)
         return obs, info
 
     def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:

@@ -208,9 +208,8 @@ class _Run:
     def _empty_summary(self) -> dict[str, Any]:
         """Return results of zeros, with lists for simulator states if they are kept."""
         count, cfg = len(self.datasets), self.cfg
-        summary: dict[str, Any] = {
-            name: np.zeros((count, count)[: 2 if "mat" in name else 1]) for name in RESULTS
-        }
+        shape = (count, count)
+        summary: dict[str, Any] = {name: np.zeros(shape[: 2 if "mat" in name else 1]) for name in RESULTS}
         if cfg.eval.save_sim_states:
             tasks, points = range(self.benchmark.n_tasks), -(-cfg.train.n_epochs // cfg.eval.eval_every) + 1
             keys = [f"k{k}_p{p}" for k in tasks for p in range(k + 1)]

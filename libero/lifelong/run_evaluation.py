@@ -83,9 +83,7 @@ def checkpoint_path(args: argparse.Namespace) -> Path:
     return path
 
 
-def _load_algorithm(
-    args: argparse.Namespace, cfg: Any, benchmark: Any, weights: Any, masks: Any
-) -> Sequential:
+def _load_algorithm(args: Any, cfg: Any, benchmark: Any, weights: Any, masks: Any) -> Sequential:
     """Return the algorithm with the stored policy, ready to act on the task."""
     algo = get_algo_class(cfg.lifelong.algo)(benchmark.n_tasks, cfg)
     algo.policy.load_state_dict(weights)
@@ -107,9 +105,7 @@ def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
     return float(evaluate_loss(cfg, algo, benchmark, [dataset])[0])
 
 
-def _report(
-    path: Path, args: argparse.Namespace, task: Any, loss: float, successes: list[bool]
-) -> dict[str, Any]:
+def _report(path: Path, args: Any, task: Any, loss: float, successes: list[bool]) -> dict[str, Any]:
     """Print and write the results."""
     count, total = sum(successes), len(successes)
     low, high = wilson_interval(count, total)
@@ -123,8 +119,6 @@ def _report(
     }
     stats = path.with_name(f"{path.stem}_on{args.task_id}.stats")
     torch.save(results, stats)
-    print(
-        f"{task.name}: success {count}/{total} = {count / total:.0%} "
-        f"(95 %: {low:.0%} to {high:.0%}), loss {loss:.3f}; {stats}"
-    )
+    rate = f"{count}/{total} = {count / total:.0%} (95 %: {low:.0%} to {high:.0%})"
+    print(f"{task.name}: success {rate}, loss {loss:.3f}; {stats}")
     return results

@@ -48,18 +48,14 @@ class NpEncoder(json.JSONEncoder):
         return super().default(o)
 
 
-def torch_save_model(
-    model: nn.Module, model_path: str | Path, cfg: Any = None, previous_masks: Any = None
-) -> None:
+def torch_save_model(model: nn.Module, model_path: Any, cfg: Any = None, previous_masks: Any = None) -> None:
     """Write a model's weights, with its configuration and PackNet's masks as plain data, in one step."""
     stored = {"state_dict": dict(model.state_dict()), "cfg": plain(cfg), "previous_masks": previous_masks}
     with atomic_path(Path(model_path)) as temporary, open(temporary, "wb") as file:
         torch.save(stored, file)
 
 
-def torch_load_model(
-    model_path: str | Path, map_location: Any = None
-) -> tuple[dict[str, Tensor], Config | None, Any]:
+def torch_load_model(model_path: Any, map_location: Any = None) -> tuple[dict[str, Tensor], Any, Any]:
     """Read a file of `torch_save_model`: weights, configuration, masks. Nothing in the file is executed.
 
     Raises:

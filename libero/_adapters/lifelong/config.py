@@ -9,8 +9,6 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from libero_env.errors import UnknownNameError
-
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 # key without effect -> what to do instead; most had none in the original either
@@ -96,14 +94,6 @@ def notes(cfg: Any) -> list[str]:
         if value != default:
             lines.append(f"{key}={value} has no effect: {why}")
     return lines
-
-
-def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
-    """Return the entry of a name, ignoring case; raise an UnknownNameError, with the valid names, if there is none."""
-    entries = {key.lower(): value for key, value in table.items()}
-    if str(name).lower() not in entries:
-        raise UnknownNameError(kind, name, sorted(table))
-    return entries[str(name).lower()]
 
 
 def group_options(group: str) -> list[str]:

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from libero._adapters.lifelong.batches import DictBatch, DictWindows, map_tensors
-from libero._adapters.lifelong.config import lookup, plain
+from libero._adapters.lifelong.config import plain
+from libero._adapters.lookup import lookup
 from libero.lifelong.metric import mean_loss, success_rates
 from libero.lifelong.models import get_policy_class
 from libero.lifelong.utils import (
@@ -267,9 +268,8 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
             self.draws = draws
             loss = self.observe(batch.data)
             if not np.isfinite(loss):
-                raise TrainingError(
-                    f"the loss is {loss}: lower train.optimizer.kwargs.lr or lifelong.e_lambda"
-                )
+                hint = "lower train.optimizer.kwargs.lr or lifelong.e_lambda"
+                raise TrainingError(f"the loss is {loss}: {hint}")
             return torch.tensor(loss), torch.tensor(0.0)
 
         self.policy.eval()

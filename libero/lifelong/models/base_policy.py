@@ -11,7 +11,8 @@ import numpy as np
 from torch import Tensor, nn
 
 from libero._adapters.lifelong.batches import DictBatch, map_tensors
-from libero._adapters.lifelong.config import lookup, plain
+from libero._adapters.lifelong.config import plain
+from libero._adapters.lookup import lookup
 from libero.lifelong.models.modules.data_augmentation import AUGMENTATIONS, DataAugGroup
 
 REGISTERED_POLICIES: dict[str, type["BasePolicy"]] = {}

@@ -12,8 +12,9 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.config import lookup, plain
+from libero._adapters.lifelong.config import plain
 from libero._adapters.lifelong.observations import policy_spec, to_native
+from libero._adapters.lookup import lookup
 from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS, mlp
 from libero.lifelong.models.modules.rgb_modules import configure_resnet, resnet_arguments
@@ -42,11 +43,8 @@ class NativePolicy(BasePolicy):
         policy = cfg.policy
         self.max_seq_len = int(policy.get("transformer_max_seq_len") or cfg.data.seq_len)
         self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
-        arguments = {
-            **self._arguments(policy),
-            **_head_arguments(policy),
-            **plain(policy.get("native") or {}),
-        }
+        arguments = {**self._arguments(policy), **_head_arguments(policy)}
+        arguments |= plain(policy.get("native") or {})
         node = upgrade_policy({"_target_": f"{self.kind.__module__}.{self.kind.__name__}", **arguments})
         self.network: Any = build(OmegaConf.create(node), spec=self.spec)
         self._configure(policy)
@@ -65,10 +63,8 @@ class NativePolicy(BasePolicy):
             for encoder in self.network.encoders.values():
                 configure_resnet(encoder, policy.image_encoder.network_kwargs)
         if hasattr(self.network, "transformer"):
-            kwargs, codes = (
-                policy.temporal_position_encoding.network_kwargs,
-                self.network.transformer.positions,
-            )
+            kwargs = policy.temporal_position_encoding.network_kwargs
+            codes = self.network.transformer.positions
             scale = kwargs.get("factor_ratio")
             new = sinusoidal_positions(codes.shape[0], codes.shape[1], kwargs.inv_freq_factor)
             codes.copy_(new * (1.0 if scale is None else scale))

@@ -80,17 +80,10 @@ class ResnetEncoder(nn.Module):
     ):
         super().__init__()
         self.language_dim, self.output_size = language_dim, output_size
-        kwargs: dict[str, Any] = {
-            "remove_layer_num": remove_layer_num,
-            "no_stride": no_stride,
-            "freeze": freeze,
-        }
-        kwargs |= {"pretrained": pretrained, "language_fusion": language_fusion}
-        sizes = {
-            "image_size": tuple(input_shape)[1:],
-            "language_dim": language_dim,
-            "latent_dim": output_size,
-        }
+        kwargs: dict[str, Any] = {"remove_layer_num": remove_layer_num, "no_stride": no_stride}
+        kwargs |= {"freeze": freeze, "pretrained": pretrained, "language_fusion": language_fusion}
+        sizes: dict[str, Any] = {"image_size": tuple(input_shape)[1:]}
+        sizes |= {"language_dim": language_dim, "latent_dim": output_size}
         self.encoder = vision.ResNetFiLMEncoder(**{**sizes, **resnet_arguments(kwargs), **more})
         configure_resnet(self.encoder, kwargs)
 
