@@ -17,7 +17,7 @@ def option(*flags: str, **settings: Any) -> Option:
 
 
 def script(*options: Option, prog: str = "") -> Callable[[Callable[[argparse.Namespace], int | None]], Any]:
-    """Decorator: turn a function of parsed arguments into the `main(argv)` of a script.
+    """Turn a function of parsed arguments into the `main(argv)` of a script.
 
     It returns the exit status: that of the function (None for 0), or 2 for an error, which is printed in one line.
 

@@ -6,14 +6,14 @@ from libero_env.cli.doctor import Finding, check_package
 
 
 def examine() -> list[Finding]:
-    """PyTorch with its device and threads, and the packages that training needs."""
+    """Return findings about PyTorch, its device and threads, and the packages that training needs."""
     extras = [check_package("hydra-core"), check_package("safetensors")]
     hint = "pip install transformers: only for instructions whose embeddings are not shipped"
     return [check_torch(), *extras, check_package("transformers", hint, essential=False)]
 
 
 def check_torch() -> Finding:
-    """The device that training would use."""
+    """Return a finding about the device that training would use."""
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed", False, "make setup")
     try:

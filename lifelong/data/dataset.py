@@ -143,7 +143,7 @@ class SequenceVLDataset:
         return cls(images, proprio, actions, last_frames(lengths), language, task_id, spec.seq_len)
 
     def __len__(self) -> int:
-        """Number of windows, W."""
+        """Return the number of windows, W."""
         return len(self.actions)
 
     @property

@@ -33,7 +33,7 @@ class ReplayMemory:
         self._indices: dict[int, Tensor] = {}  # task id -> (n,) window indices
 
     def __len__(self) -> int:
-        """Number of windows in the memory; never more than the budget."""
+        """Return the number of windows in the memory; never more than the budget."""
         return sum(len(indices) for indices in self._indices.values())
 
     @property

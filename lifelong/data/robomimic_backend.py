@@ -80,7 +80,7 @@ class RobomimicWindows:
         return ("expert_actions" if expert else "actions"), int(shifted)
 
     def __len__(self) -> int:
-        """Number of windows, W."""
+        """Return the number of windows, W."""
         return len(self._steps)
 
     @property
