@@ -63,12 +63,15 @@ _POLICIES = {
         "temporal": ("TemporalTransformer", _TRANSFORMER),
     },
 }
+_ER, _AGEM = "lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM"
+_EWC, _PACKNET = "lifelong.algorithms.ewc.EWC", "lifelong.algorithms.packnet.PackNet"
+_REPLAY = {_ER, _AGEM}
 
 
 def upgrade_config(config: Mapping[str, Any]) -> Node:
     """Return the resolved configuration of a saved run with the keys of today.
 
-    A configuration of today comes back unchanged, so that callers need not know who wrote it.
+    A configuration of today comes back unchanged, so that callers need not know its version.
 
     Args:
         config: A run's config.yaml, or the part of it that a pretraining keeps, as plain data; it is not modified.
@@ -108,17 +111,20 @@ def upgrade_algorithm(node: Mapping[str, Any]) -> Node:
     Args:
         node: The `algo` node; nodes of other algorithms and of today come back unchanged.
     """
-    upgraded, target = dict(node), node.get("_target_", "")
+    target = node.get("_target_")
+    if target not in _REPLAY | {_EWC, _PACKNET} or {"memory", "estimator", "masks_only"} & set(node):
+        return dict(node)
+    upgraded = dict(node)
     libero = upgraded.pop("compat", None) == "libero"
-    if target in ("lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM") and "memory" not in node:
+    if target in _REPLAY:
         budget, per_task = upgraded.pop("budget", 10_000), upgraded.pop("per_task", 1000)
         kind, windows = ("FirstWindows", per_task) if libero else ("ReplayMemory", budget)
         upgraded["memory"] = {"_target_": f"lifelong.data.memory.{kind}", "budget": windows}
-        if target.endswith("AGEM"):
-            upgraded["augment_reference"] = libero
-    elif target == "lifelong.algorithms.ewc.EWC" and "estimator" not in node:
+    if target == _AGEM:
+        upgraded["augment_reference"] = libero
+    if target == _EWC:
         upgraded["estimator"] = _estimator(upgraded, libero)
-    elif target == "lifelong.algorithms.packnet.PackNet" and "masks_only" not in node:
+    if target == _PACKNET:
         upgraded["masks_only"] = libero
     return upgraded
 

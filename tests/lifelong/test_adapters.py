@@ -76,7 +76,7 @@ def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkey
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
     policy, algorithm = make_policy(), make()
     for task in (0, 1):
         learn_small(algorithm, policy, task)
@@ -147,7 +147,7 @@ def test_adapters_grow_by_the_same_number_with_each_task(make):
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_patterns_that_fit_nothing_are_named(make):
+def test_patterns_without_a_match_are_named(make):
     algorithm = make()
     algorithm.adapted, policy = ("wings.*",), make_policy()
     with pytest.raises(ConfigError, match=r"wings.*which has encoders"):
@@ -271,7 +271,7 @@ def test_lora_tasks_learned_together_share_an_adapter():
 
 
 @pytest.mark.parametrize("change", [{"rank": 0}, {"base_tasks": -1}])
-def test_lora_settings_that_cannot_work_are_named(change):
+def test_invalid_lora_settings_are_named(change):
     with pytest.raises(ConfigError, match="at least 1"):
         LoRA(**change)
 
@@ -320,7 +320,7 @@ def test_dmpel_coefficients_are_shares_of_the_best_choices():
     assert torch.equal(c.argmax(-1), router.logits(query).argmax(-1))
 
 
-def test_dmpel_new_choices_begin_level_on_new_contexts_and_leave_earlier_ones_alone():
+def test_dmpel_new_choices_start_equal_on_new_contexts_and_low_on_earlier_ones():
     """Contexts of a task differ little, those of two tasks in a few entries."""
     draws = generator(1)
     sizes = {"enter": (32, 50), "keys": (3, 2, 32), "bias": (3, 2)}
@@ -337,7 +337,7 @@ def test_dmpel_new_choices_begin_level_on_new_contexts_and_leave_earlier_ones_al
     torch.testing.assert_close(router.keys[3], router.keys[4])
 
 
-def test_dmpel_a_new_expert_begins_as_nothing_and_old_ones_never_move():
+def test_dmpel_new_experts_start_at_zero_and_old_ones_never_change():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
     learn_small(algorithm, policy, 0)
     base, kept = copy.deepcopy(policy.state_dict()), {}
@@ -370,7 +370,7 @@ def test_dmpel_replay_keeps_the_coefficients_of_earlier_tasks():
     assert drift[10.0] < 0.05 < 0.1 < drift[0.0], drift
 
 
-def test_dmpel_sees_the_first_frame_of_a_demonstration():
+def test_dmpel_routes_by_the_first_frame_of_a_demonstration():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
     for task in (0, 1):
         learn_small(algorithm, policy, task)
@@ -384,7 +384,7 @@ def test_dmpel_sees_the_first_frame_of_a_demonstration():
     assert not torch.equal(first[0], first[10])
 
 
-def test_dmpel_finds_demonstrations_in_datasets_made_of_others():
+def test_dmpel_finds_demonstrations_in_composed_datasets():
     algorithm, parts = DMPEL(pool=2), [sequences.dataset(t) for t in (0, 1)]
     some = WindowSubset(parts[1], torch.tensor([3, 12, 15]))
     queries, of_window = algorithm._contexts(StageWindows([parts[0], some], 1))
@@ -481,7 +481,7 @@ def test_dmpel_needs_no_task_number():
     assert torch.equal(predicted[0], predicted[1]) and torch.equal(predicted[0], predicted[2])
 
 
-def test_dmpel_names_policies_that_it_cannot_route():
+def test_policies_that_dmpel_cannot_route_are_named():
     policy, algorithm = DeepPolicy(), DMPEL()
     algorithm._router = Router(
         enter=torch.zeros(1, 1), keys=torch.zeros(1, 1, 1), bias=torch.zeros(1, 1), top_k=0
@@ -491,6 +491,6 @@ def test_dmpel_names_policies_that_it_cannot_route():
 
 
 @pytest.mark.parametrize("name", ["rank", "experts", "pool", "replay_size"])
-def test_dmpel_settings_that_cannot_work_are_named(name):
+def test_invalid_dmpel_settings_are_named(name):
     with pytest.raises(ConfigError, match=f"algo.{name} is 0"):
         DMPEL(**{name: 0})

@@ -17,7 +17,7 @@ from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 # --- ER
 
 
-def test_er_is_never_over_budget_and_replays_earlier_tasks_only():
+def test_er_keeps_its_budget_and_replays_earlier_tasks_only():
     policy, algorithm, draws = LinearPolicy(), ER(memory=ReplayMemory(25)), generator(0)
     for task in range(4):
         batch = Windows(task).batch(torch.arange(8))
@@ -59,7 +59,7 @@ def test_fisher_of_one_batch_is_the_squared_mean_gradient():
     torch.testing.assert_close(fisher["linear.weight"], by_hand(policy, data).mean(0).square())
 
 
-def test_fisher_per_sample_ignores_dropout_and_leaves_no_trace():
+def test_fisher_per_sample_ignores_dropout_and_changes_no_state():
     policy, data = DeepPolicy(), Windows()
     policy.train()
     before = copy.deepcopy(policy.state_dict())
@@ -69,7 +69,7 @@ def test_fisher_per_sample_ignores_dropout_and_leaves_no_trace():
     assert all(torch.equal(v, before[n]) for n, v in policy.state_dict().items())
 
 
-def test_ewc_old_importance_fades_by_gamma():
+def test_ewc_old_importance_decays_by_gamma():
     policy, algorithm = LinearPolicy(), EWC(gamma=0.5, estimator=SampleFisher(windows=0))
     data = Windows(size=6)
     algorithm.end_task(0, data, policy, generator(0))
@@ -116,7 +116,7 @@ def test_packnet_owns_a_quarter_of_what_is_free_and_covers_all_weights():
     assert set(algorithm.state_dict()["owner"]) == {n for n, p in policy.named_parameters() if p.dim() > 1}
 
 
-def test_packnet_moves_norms_and_biases_with_the_first_task_only():
+def test_packnet_trains_norms_and_biases_with_the_first_task_only():
     policy, algorithm = DeepPolicy(), PackNet()
     fresh = copy.deepcopy(policy.state_dict())
     learn(algorithm, policy, 0)
@@ -143,7 +143,7 @@ def test_packnet_policy_for_leaves_the_policy_as_it_was():
 
 
 @pytest.mark.parametrize("make", [Sequential, lambda: ER(memory=ReplayMemory(25)), EWC, PackNet])
-def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
     torch.manual_seed(1)
     policy, algorithm = DeepPolicy(), make()
     learn(algorithm, policy, 0)

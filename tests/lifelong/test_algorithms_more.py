@@ -54,7 +54,7 @@ def everything(task: int, size: int = 20):
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_a_state_taken_up_between_tasks_changes_nothing(make, tmp_path):
+def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
     torch.manual_seed(1)
     policy, algorithm = Deep(), make()
     for task in (0, 1):
@@ -245,7 +245,7 @@ def test_agem_steps_do_not_raise_the_loss_on_the_reference_to_first_order():
 # --- DER++
 
 
-def test_derpp_keeps_what_the_policy_answered_when_each_task_ended():
+def test_derpp_stores_the_outputs_at_the_end_of_each_task():
     torch.manual_seed(0)
     policy, algorithm = Deep(), DERpp(budget=25)
     answers = {}
@@ -262,7 +262,7 @@ def test_derpp_keeps_what_the_policy_answered_when_each_task_ended():
     assert sum(len(z) for z in algorithm.state_dict()["outputs"].values()) == len(algorithm.memory)
 
 
-def test_derpp_asks_for_nothing_as_long_as_the_answers_are_the_same():
+def test_derpp_has_no_penalty_while_the_outputs_are_the_same():
     policy, algorithm, draws = Linear(), DERpp(budget=25, alpha=2.0), generator(0)
     batch = everything(1, 8)
     assert algorithm.mix(batch, draws) is batch and algorithm.penalty(policy) is None
@@ -280,7 +280,7 @@ def test_derpp_asks_for_nothing_as_long_as_the_answers_are_the_same():
 # --- LwF
 
 
-def test_lwf_holds_the_answers_to_old_instructions_on_new_windows():
+def test_lwf_keeps_the_outputs_for_old_instructions_on_new_windows():
     policy, algorithm, draws = Linear(), LwF(strength=3.0), generator(0)
     batch = everything(1)
     batch.observation.language.fill_(7.0)
@@ -301,7 +301,7 @@ def test_lwf_holds_the_answers_to_old_instructions_on_new_windows():
     assert policy.linear.bias.grad.tolist() == pytest.approx([3.0, 0.0])
 
 
-def test_lwf_teacher_stands_still_while_the_policy_learns():
+def test_lwf_teacher_is_constant_while_the_policy_learns():
     torch.manual_seed(0)
     policy, algorithm = Deep(), LwF()
     learn(algorithm, policy, 0)
@@ -317,7 +317,7 @@ def test_lwf_teacher_stands_still_while_the_policy_learns():
 # --- SI
 
 
-def test_si_collects_the_descent_of_the_loss_along_the_path():
+def test_si_accumulates_the_descent_of_the_loss_along_the_path():
     """Under small plain steps the sum of omega is what the loss fell by (Zenke et al., eq. 1 to 3)."""
     policy, algorithm, batch = Linear(), SI(damping=0.5), everything(0)
     algorithm.begin_task(0, Windows(0), policy)
@@ -341,7 +341,7 @@ def test_si_collects_the_descent_of_the_loss_along_the_path():
     torch.testing.assert_close(algorithm.anchor.importance["linear.weight"], expected, rtol=1e-3, atol=1e-6)
 
 
-def test_si_omega_leaves_the_pull_of_the_penalty_out():
+def test_si_omega_excludes_the_gradient_of_the_penalty():
     torch.manual_seed(0)
     policy, algorithm = Linear(), SI(strength=5.0)
     learn(algorithm, policy, 0)

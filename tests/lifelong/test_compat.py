@@ -48,7 +48,7 @@ def test_memory_is_the_first_windows_of_each_task_in_file_order(name):
     assert not any(torch.equal(i.sort().values, torch.arange(len(i))) for i in kept["ours"].values())
 
 
-def test_memory_may_be_longer_than_a_task_and_is_taken_up_again():
+def test_memory_may_be_longer_than_a_task_and_is_restored():
     algorithm = made("er", "libero", "algo.memory.budget=30")
     algorithm.end_task(0, Windows(0, size=20), LinearPolicy(), generator(0))
     algorithm.end_task(1, Windows(1, size=40), LinearPolicy(), generator(0))
@@ -175,7 +175,7 @@ def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
 
 
 @pytest.mark.parametrize("overrides", [("er", "libero", "algo.memory.budget=5"), ("packnet", "libero")])
-def test_a_state_taken_up_between_tasks_changes_nothing(overrides, tmp_path):
+def test_a_state_restored_between_tasks_changes_nothing(overrides, tmp_path):
     torch.manual_seed(1)
     policy, algorithm = DeepPolicy(), made(*overrides)
     learn(algorithm, policy, 0)
@@ -211,14 +211,14 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", sorted(f.stem for f in FILES if str(f.parent) == "algo"))
 @pytest.mark.parametrize("preset", ["paper", "laptop"])
-def test_one_flag_sets_every_choice(name, preset):
+def test_compat_libero_sets_every_choice(name, preset):
     config = composed(f"algo={name}", f"preset={preset}", "compat=libero")
     assert config.eval.selection == "reporting" and config.eval.select == "best" and config.policy.stochastic
     assert (config.algo != composed(f"algo={name}", f"preset={preset}").algo) == (name in WITH_COMPAT)
     build(config.algo)
 
 
-def test_without_it_choices_are_ours():
+def test_compat_none_sets_none_of_them():
     for name in WITH_COMPAT:
         config = composed(f"algo={name}")
         assert config.eval.selection == "apart" and not config.policy.stochastic

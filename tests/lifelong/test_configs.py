@@ -152,7 +152,7 @@ def test_known_choices_and_other_overrides_pass():
         ({"episodes": 0}, "at least 1"),
     ],
 )
-def test_evaluation_that_cannot_work_is_named(change, message):
+def test_invalid_evaluation_settings_are_named(change, message):
     with pytest.raises(ConfigError, match=message):
         EvalSettings(**change)
 

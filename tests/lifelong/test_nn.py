@@ -104,14 +104,14 @@ def test_encoder_frames_of_a_window_share_its_language(norm: str) -> None:
     assert not torch.allclose(encoder(images, language.flip(0)), together)
 
 
-def test_encoder_refuses_what_cannot_work() -> None:
+def test_encoder_refuses_invalid_sizes_and_norms() -> None:
     with pytest.raises(PolicyError, match="too small to localise"):
         small_encoder(stage_blocks=(1, 1, 1, 1), stem_pool=True)
     with pytest.raises(PolicyError, match="Valid: batch, group, none"):
         small_encoder(norm="layer")
 
 
-def test_mask_lets_a_step_see_itself_and_the_past() -> None:
+def test_mask_lets_a_step_attend_to_itself_and_the_past() -> None:
     expected = np.kron(np.tril(np.ones((3, 3))), np.ones((2, 2))).astype(bool)
     np.testing.assert_array_equal(block_causal_mask(3, 2).numpy(), expected)
 
@@ -197,7 +197,7 @@ def test_standardised_language_has_unit_variance() -> None:
 
 
 @pytest.mark.parametrize("augmentation", [RandomShift(3), ColorJitter(keep=0.0), Compose([RandomShift(2)])])
-def test_augmentation_is_the_same_for_all_frames_of_a_window_and_spares_its_input(augmentation) -> None:
+def test_augmentation_is_the_same_for_all_frames_of_a_window_and_leaves_its_input(augmentation) -> None:
     batch = fake_batch(SPEC, 8, generator())
     batch.observation.images.copy_(batch.observation.images[:, :1].clone())  # all frames alike
     before = batch.observation.images.clone()

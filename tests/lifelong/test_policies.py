@@ -139,7 +139,7 @@ def test_bfloat16_gives_nearly_the_same_loss() -> None:
     torch.testing.assert_close(low, policy.window_losses(batch), rtol=0.05, atol=0.2)
 
 
-def test_it_learns_a_batch_by_heart() -> None:
+def test_a_batch_can_be_overfitted() -> None:
     policy, batch = make_policy(dropout=0.0), fake_batch(SPEC, 4, generator())
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
     first = policy.loss(batch).item()

@@ -1,4 +1,4 @@
-"""Every policy with every head acts as it is trained; chunks are planned, carried out and forgotten."""
+"""Every policy with every head acts as it is trained; chunks are planned, executed and forgotten."""
 
 from functools import partial
 from pathlib import Path
@@ -211,7 +211,7 @@ def test_in_eval_mode_the_loss_of_a_window_is_its_own(kind: str, head: str) -> N
 
 @every_policy
 @every_head
-def test_predict_answers_every_step_with_gradients_and_nothing_random(kind: str, head: str) -> None:
+def test_predict_is_deterministic_and_has_gradients_at_every_step(kind: str, head: str) -> None:
     policy, batch = make_policy(kind, head=head, stochastic=True).eval(), fake_batch(SPEC, 3, generator())
     answer = policy.predict(batch)
     assert (answer.shape, answer.dtype) == (batch.actions.shape, torch.float32)
@@ -223,7 +223,7 @@ def test_predict_answers_every_step_with_gradients_and_nothing_random(kind: str,
 
 
 @every_policy
-def test_acting_without_chance_carries_out_what_is_predicted(kind: str) -> None:
+def test_acting_without_sampling_executes_the_predicted_actions(kind: str) -> None:
     policy, batch = make_policy(kind, head="flow", execute=1).eval(), fake_batch(SPEC, 2, generator())
     actions = act_through(policy, steps(batch.observation, slice(policy.memory_steps)))
     expected = policy.predict(batch)[:, : policy.memory_steps].clamp(-1, 1)
@@ -232,7 +232,7 @@ def test_acting_without_chance_carries_out_what_is_predicted(kind: str) -> None:
 
 @every_policy
 @every_head
-def test_it_learns_a_batch_by_heart(kind: str, head: str) -> None:
+def test_a_batch_can_be_overfitted(kind: str, head: str) -> None:
     policy, batch = make_policy(kind, head=head, dropout=0.0), fake_batch(SPEC, 2, generator())
     before = policy.eval().loss(batch).item()
     optimizer = torch.optim.AdamW(policy.train().parameters(), lr=3e-3)
@@ -267,7 +267,7 @@ def test_language_and_every_input_matter(kind: str) -> None:
 
 
 @every_policy
-def test_no_step_sees_what_comes_after_it(kind: str) -> None:
+def test_no_step_depends_on_later_ones(kind: str) -> None:
     policy, batch = make_policy(kind, head="gmm").eval(), fake_batch(SPEC, 2, generator())
     shorter = policy.distribution(steps(batch.observation, slice(2)))["means"]
     whole = policy.distribution(batch.observation)["means"][:, :2]
@@ -316,7 +316,7 @@ class TestFlow:
                 expected = (v[:n] - (chunk - e[:n])).square().mean()
                 torch.testing.assert_close(losses[0, step], expected)
 
-    def test_what_lies_beyond_the_window_changes_nothing(self) -> None:
+    def test_slots_beyond_the_window_have_no_effect(self) -> None:
         head = FlowHead(in_dim=2, action_dim=1, chunk=2, execute=1, hidden=8).eval()
         x, latent, slots = torch.zeros(2, 1), torch.ones(2), torch.tensor([1.0, 0.0])
         other = torch.tensor([[0.0], [5.0]])
@@ -343,7 +343,7 @@ class TestFlow:
         assert (plan.prod(1) > 0).float().mean() > 0.85
         assert 0.3 < (plan[:, 0] > 0).float().mean() < 0.7
 
-    def test_a_plan_is_carried_out_before_the_next_is_made(self) -> None:
+    def test_a_plan_is_executed_before_the_next_is_made(self) -> None:
         policy = make_policy("transformer", head="flow", stochastic=True).eval()
         observation = fake_batch(SPEC, 2, generator(), steps=5).observation
         actions = act_through(policy, observation, [1, 2])
@@ -361,7 +361,7 @@ class TestFlow:
             ({"steps": 0}, "steps >= 1"),
         ],
     )
-    def test_sizes_that_cannot_work_are_refused(self, changes: dict, message: str) -> None:
+    def test_invalid_sizes_are_refused(self, changes: dict, message: str) -> None:
         with pytest.raises(PolicyError, match=message):
             make_policy("transformer", head="flow", **changes)
 
@@ -381,7 +381,7 @@ def test_wrong_use_is_refused() -> None:
             policy.act(frame(batch.observation, 0))
 
 
-def test_a_policy_without_predict_says_so() -> None:
+def test_a_policy_without_predict_is_named() -> None:
     class Silent(Policy):
         def window_losses(self, batch):
             return batch.actions.mean((1, 2))

@@ -157,6 +157,7 @@ def test_a_configuration_of_today_is_not_changed(name):
             {"_target_": "lifelong.algorithms.si.SI", "strength": 0.1},
             {"_target_": "lifelong.algorithms.si.SI", "strength": 0.1},
         ),
+        ({"_target_": "builtins.dict", "compat": "mine"}, {"_target_": "builtins.dict", "compat": "mine"}),
     ],
 )
 def test_an_algorithm_is_upgraded_and_can_be_built(saved, upgraded):
