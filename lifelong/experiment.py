@@ -13,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
-from lifelong.build import build
 from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, find_demos
@@ -27,7 +26,7 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
-from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings
+from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings, build
 from lifelong.streams import StreamSettings
 from lifelong.training.distributed import Ranks
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory

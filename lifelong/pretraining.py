@@ -17,7 +17,7 @@ from lifelong.context import RunContext
 from lifelong.errors import CheckpointError
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import RunDirectory, result_relevant
-from lifelong.saved_config import upgrade_config
+from lifelong.results.saved_config import upgrade_config
 from lifelong.settings import PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker

@@ -2,6 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
@@ -9,7 +13,17 @@ from libero_env.tasks.files import OWN, read_suite
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.errors import ConfigError
 
-__all__ = ["CAMERAS", "BenchmarkSettings", "DataSettings", "PretrainSettings", "RunSettings"]
+__all__ = ["CAMERAS", "BenchmarkSettings", "DataSettings", "PretrainSettings", "RunSettings", "build"]
+
+
+def build(node: DictConfig, **arguments: Any) -> Any:
+    """Build the object that a node of the configuration describes, with plain lists and dictionaries inside.
+
+    Args:
+        node: Node with `_target_`, the dotted path of a class or function.
+        arguments: Further keyword arguments of the target.
+    """
+    return instantiate(node, _convert_="all", _partial_=True)(**arguments)
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,9 @@ from hydra import compose, initialize_config_dir
 from loader_speed import write_noise
 
 from lifelong.algorithms import Sequential
-from lifelong.build import build
 from lifelong.data import DemoSource, open_windows
 from lifelong.seeding import generator
+from lifelong.settings import build
 from lifelong.training.distributed import Ranks
 from lifelong.training.precision import keep_freed_memory
 from lifelong.training.settings import FitSettings

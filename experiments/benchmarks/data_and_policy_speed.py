@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 
-from lifelong.build import build
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.nn import ColorJitter, RandomShift
+from lifelong.settings import build
 from lifelong.types import PolicySpec
 
 PAPER = PolicySpec(language_dim=768)

@@ -24,10 +24,10 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from lifelong.algorithms import Sequential
-from lifelong.build import build
 from lifelong.data import fake_batch
 from lifelong.policies import Policy
 from lifelong.seeding import generator
+from lifelong.settings import build
 from lifelong.training.costs import step_costs
 from lifelong.training.distributed import Ranks
 from lifelong.training.precision import keep_freed_memory

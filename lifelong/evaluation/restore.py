@@ -13,15 +13,14 @@ from omegaconf import OmegaConf
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm
-from lifelong.build import build
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, LifelongError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
-from lifelong.saved_config import upgrade_config
-from lifelong.settings import BenchmarkSettings
+from lifelong.results.saved_config import upgrade_config
+from lifelong.settings import BenchmarkSettings, build
 from lifelong.streams import learning_stages
 from lifelong.training.distributed import Ranks
 

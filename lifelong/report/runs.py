@@ -14,7 +14,7 @@ from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import RunRecord
 from lifelong.results.results import Results
-from lifelong.saved_config import upgrade_config
+from lifelong.results.saved_config import upgrade_config
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
 # sections of the config

@@ -19,7 +19,7 @@ from libero_env.storage import PART_SUFFIX, atomic_write_text
 from lifelong import checkpoints
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.log import ResultLog
-from lifelong.saved_config import upgrade_config
+from lifelong.results.saved_config import upgrade_config
 
 # Keys that may differ between the start of a run and its resumption, because they change no result.
 VOLATILE = (

@@ -10,12 +10,12 @@ from pathlib import Path
 import torch
 
 from lifelong import checkpoints
-from lifelong.build import build
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.nn.augmentation import RandomShift
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 from lifelong.seeding import seeded
+from lifelong.settings import build
 from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences

@@ -9,9 +9,9 @@ import torch
 from libero_env.errors import UnknownNameError
 from lifelong import checkpoints
 from lifelong.algorithms.importance import BatchFisher
-from lifelong.build import build
 from lifelong.launch import check_choices
 from lifelong.seeding import generator
+from lifelong.settings import build
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences

@@ -8,7 +8,6 @@ import torch
 from hydra import compose, initialize_config_dir
 from torch import nn
 
-from lifelong.build import build
 from lifelong.data import fake_batch
 from lifelong.errors import PolicyError
 from lifelong.nn import (
@@ -22,6 +21,7 @@ from lifelong.nn import (
     TemporalTransformer,
 )
 from lifelong.policies import BCRNN, BCTransformer, BCViLT, Policy
+from lifelong.settings import build
 from lifelong.types import Batch, Observation, PolicySpec
 
 pytestmark = pytest.mark.unit

@@ -12,7 +12,6 @@ from PIL import Image
 
 from libero_env.tasks import get_task
 from lifelong import checkpoints
-from lifelong.build import build
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.data.fake import fake_observation
 from lifelong.errors import ConfigError, LifelongError
@@ -20,6 +19,7 @@ from lifelong.evaluation.restore import restore
 from lifelong.evaluation.saliency import SaliencySettings
 from lifelong.evaluation.saliency_sheet import draw_saliency
 from lifelong.seeding import generator, seeded
+from lifelong.settings import build
 from lifelong.types import PolicySpec
 
 pytestmark = pytest.mark.unit

@@ -19,13 +19,13 @@ import yaml
 from omegaconf import OmegaConf
 
 from lifelong import checkpoints
-from lifelong.build import build
 from lifelong.data.fake import fake_observation
 from lifelong.evaluation.restore import restore
 from lifelong.report.page import write_report
 from lifelong.report.runs import group_runs, load_run
 from lifelong.results.run_directory import result_relevant
-from lifelong.saved_config import upgrade_config
+from lifelong.results.saved_config import upgrade_config
+from lifelong.settings import build
 from lifelong.types import Observation
 from tests.harness.configs import composed
 

@@ -19,11 +19,11 @@ from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS, mlp
 from libero.lifelong.models.modules.rgb_modules import configure_resnet, resnet_arguments
 from libero.lifelong.models.policy_head import HEADS, GMMHead, check_activation, wrap_head
-from lifelong.build import build
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import sinusoidal_positions
 from lifelong.policies.history import HistoryPolicy
-from lifelong.saved_config import upgrade_policy
+from lifelong.results.saved_config import upgrade_policy
+from lifelong.settings import build
 
 
 class NativePolicy(BasePolicy):
