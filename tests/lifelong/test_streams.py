@@ -11,7 +11,6 @@ import torch
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from lifelong.results.saved_config import upgrade_config
 
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import get_suite
@@ -33,6 +32,7 @@ from lifelong.results.records import (
     utc_now,
 )
 from lifelong.results.run_directory import RunDirectory
+from lifelong.results.saved_config import upgrade_config
 from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
 from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
