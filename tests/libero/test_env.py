@@ -49,6 +49,19 @@ def test_nothing_is_drawn_without_camera_observations(make_env, monkeypatch):
     assert "agentview_image" not in env.step(REST)[0]
 
 
+def test_arguments_are_accepted_by_position(suite):
+    first = (["Panda"], "OSC_POSITION", "default", None, False)
+    window = (False, True, "birdview", False, True, -1)
+    env = ControlEnv(
+        suite.get_task_bddl_file_path(0), *first, *window, 20, 7, True, False, "agentview", 32, 48, True
+    )
+    (camera,) = env.env.camera_list
+    assert (camera.name, camera.height, camera.width, camera.depth) == ("agentview", 32, 48, True)
+    assert (env.env.render_camera, env.env.horizon, env.env.ignore_done) == ("birdview", 7, True)
+    assert (env.env.action_dim, env.env.use_camera_obs) == (4, False)
+    env.close()
+
+
 def test_step_returns_the_old_four_tuple(make_env):
     env = make_env(**BLIND)
     env.reset()

@@ -1,19 +1,19 @@
 """Environments of a task file with robosuite's observations and the four-tuple of old Gym."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from libero._adapters.envs.sim import MjSim
 from libero._adapters.lookup import lookup
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs import problems  # noqa: F401 - registers the problem classes
 from libero.libero.envs.bddl_base_domain import TASK_MAPPING, BDDLBaseDomain
-from libero.libero.envs.robots.single_arm import SingleArm
 from libero_env.errors import PlacementError
 
 _RESETS = 5
+_NOT_FORWARDED = ("self", "bddl_file_name", "controller", "kwargs")
 DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
 
 
@@ -24,7 +24,7 @@ class ControlEnv:
         bddl_file_name: Task file; for the tasks of the benchmark its name without a folder is enough.
         controller: Name of the controller, such as `OSC_POSE`, or its configuration.
         camera_names, camera_heights, camera_widths: One value, or one for each camera.
-        kwargs: Further arguments of `BDDLBaseDomain`, such as `use_camera_obs`, `horizon` and `has_renderer`.
+        kwargs: Further arguments; they and the other parameters are those of `BDDLBaseDomain`.
 
     Raises:
         BDDLError: The file is not a task file.
@@ -39,45 +39,40 @@ class ControlEnv:
         gripper_types: Any = "default",
         initialization_noise: Any = None,
         use_camera_obs: bool = True,
-        *,
+        has_renderer: bool = False,
+        has_offscreen_renderer: bool = True,
+        render_camera: str = "frontview",
+        render_collision_mesh: bool = False,
+        render_visual_mesh: bool = True,
+        render_gpu_device_id: int = -1,
+        control_freq: float = 20,
+        horizon: int = 1000,
+        ignore_done: bool = False,
+        hard_reset: bool = True,
         camera_names: str | Sequence[str] = DEFAULT_CAMERAS,
         camera_heights: int | Sequence[int] = 128,
         camera_widths: int | Sequence[int] = 128,
+        camera_depths: bool | Sequence[bool] = False,
+        camera_segmentations: Any = None,
+        renderer: str = "mujoco",
+        renderer_config: Any = None,
         **kwargs: Any,
     ):
+        given = {key: value for key, value in locals().items() if key not in _NOT_FORWARDED}
         info = BDDLUtils.get_problem_info(bddl_file_name)
         self.problem_name, self.domain_name = info["problem_name"], info["domain_name"]
         self.language_instruction = info["language_instruction"]
         self.env: BDDLBaseDomain = lookup(TASK_MAPPING, "problem", self.problem_name)(
             bddl_file_name,
-            robots=robots,
             controller_configs={"type": controller} if isinstance(controller, str) else controller,
-            initialization_noise=initialization_noise,
-            use_camera_obs=use_camera_obs,
-            camera_names=camera_names,
-            camera_heights=camera_heights,
-            camera_widths=camera_widths,
+            **given,
             **kwargs,
         )
 
-    @property
-    def obj_of_interest(self) -> list[str]:
-        """Names of the objects of interest."""
-        return self.env.obj_of_interest
-
-    @property
-    def robots(self) -> list[SingleArm]:
-        """The arm, in a list."""
-        return self.env.robots
-
-    @property
-    def sim(self) -> MjSim:
-        """The simulation."""
-        return self.env.sim
-
-    @property
-    def _visualizations(self) -> set[str]:
-        return self.env._visualizations
+    obj_of_interest = property(attrgetter("env.obj_of_interest"), doc="Names of the objects of interest.")
+    robots = property(attrgetter("env.robots"), doc="The arm, in a list.")
+    sim = property(attrgetter("env.sim"), doc="The simulation.")
+    _visualizations = property(attrgetter("env._visualizations"))
 
     def step(self, action: Any) -> tuple[Mapping[str, np.ndarray], float, bool, dict[str, Any]]:
         """Act for 50 ms, see `BDDLBaseDomain.step`."""
