@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from multiprocessing import connection
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,7 @@ class WorkerError(LiberoError, RuntimeError):
 class CloudpickleWrapper(utils.CloudpickleWrapper):
     """Factory that can be sent to another process, also a lambda."""
 
-    @property
-    def data(self) -> Callable[[], Any]:
-        """The factory."""
-        return self.fn
+    data = property(attrgetter("fn"), doc="The factory.")
 
 
 class ShArray:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from functools import cached_property
+from operator import attrgetter
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -75,31 +76,18 @@ class BaseObject:
         """Model that scenes attach."""
         raise NotImplementedError
 
-    @property
-    def naming_prefix(self) -> str:
-        """Prefix of the names of its elements."""
-        return f"{self.name}_"
-
-    @property
-    def root_body(self) -> str:
-        """Name of its root body."""
-        return f"{self.name}_main"
-
-    @property
-    def bodies(self) -> list[str]:
-        """Names of its bodies."""
-        return self._names(self.model.spec.bodies[1:])
+    naming_prefix = property(lambda self: f"{self.name}_", doc="Prefix of the names of its elements.")
+    root_body = property(lambda self: f"{self.name}_main", doc="Name of its root body.")
+    bodies = property(lambda self: self._names(self.model.spec.bodies[1:]), doc="Names of its bodies.")
+    sites = property(lambda self: self._names(self.model.spec.sites), doc="Names of its sites.")
+    horizontal_radius = property(attrgetter("model.horizontal_radius"), doc="Radius to keep free, m.")
+    init_quat = property(lambda self: self.model.rest_quat(), doc="Orientation at rest, wxyz (4,).")
 
     @property
     def joints(self) -> list[str]:
         """Names of its joints; the free joint, if any, is the first."""
         own = [name for name in self._names(self.model.spec.joints) if name != f"{self.name}_joint0"]
         return own if self._fixed else [f"{self.name}_joint0", *own]
-
-    @property
-    def sites(self) -> list[str]:
-        """Names of its sites."""
-        return self._names(self.model.spec.sites)
 
     @property
     def important_sites(self) -> dict[str, str]:
@@ -125,16 +113,6 @@ class BaseObject:
     def top_offset(self) -> np.ndarray:
         """Highest point relative to the root body, (3,) m."""
         return np.array(self.model.top_offset)
-
-    @property
-    def horizontal_radius(self) -> float:
-        """Radius that placement keeps free, m."""
-        return self.model.horizontal_radius
-
-    @property
-    def init_quat(self) -> np.ndarray:
-        """Orientation at rest, wxyz (4,)."""
-        return self.model.rest_quat()
 
     def get_xml(self) -> str:
         """Return the object as MJCF."""

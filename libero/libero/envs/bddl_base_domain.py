@@ -4,6 +4,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from inspect import signature
+from operator import attrgetter
 from typing import Any
 
 import mujoco
@@ -313,24 +314,10 @@ class BDDLBaseDomain:
         known = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
         return lookup(known, "object, fixture or region", object_name)
 
-    @property
-    def language_instruction(self) -> str:
-        """Instruction in the task file."""
-        return self.problem.language
-
-    @property
-    def action_spec(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest action."""
-        return self.robots[0].action_limits
-
-    @property
-    def action_dim(self) -> int:
-        """Length of an action."""
-        return self.robots[0].action_dim
-
-    @property
-    def _visualizations(self) -> set[str]:
-        return {"env", "robots", "grippers"}
+    language_instruction = property(attrgetter("problem.language"), doc="Instruction in the task file.")
+    action_spec = property(lambda self: self.robots[0].action_limits, doc="Lowest and highest action.")
+    action_dim = property(lambda self: self.robots[0].action_dim, doc="Length of an action.")
+    _visualizations = property(lambda self: {"env", "robots", "grippers"})
 
     def get_xml(self) -> str:
         """Return the scene as MJCF without textures, with the present poses of the fixtures."""

@@ -130,10 +130,7 @@ class InitialSceneTemplates:
         }
         return {region_name: facts}
 
-    @property
-    def movable_objects(self) -> list[str]:
-        """Names of the objects."""
-        return list(self.movable_object_dict.names)
+    movable_objects = property(lambda self: list(self.movable_object_dict.names), doc="Names of the objects.")
 
     @property
     def fixtures(self) -> list[str]:

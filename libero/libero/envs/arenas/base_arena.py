@@ -1,6 +1,7 @@
 """A scene before it is compiled, with the interface of robosuite's arenas."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import mujoco
@@ -19,10 +20,7 @@ class Arena:
     def __init__(self, spec: mujoco.MjSpec):
         self.spec = spec
 
-    @property
-    def worldbody(self) -> Any:
-        """The world body."""
-        return self.spec.worldbody
+    worldbody = property(attrgetter("spec.worldbody"), doc="The world body.")
 
     def set_camera(
         self,
@@ -67,7 +65,4 @@ class WorkspaceArena(Arena):
         select_pack().add_arena(spec, self.workspace, {k: v for k, v in styles.items() if v is not None})
         super().__init__(spec)
 
-    @property
-    def table_offset(self) -> tuple[float, ...]:
-        """Origin of the regions, (3,) m."""
-        return self.workspace.offset
+    table_offset = property(attrgetter("workspace.offset"), doc="Origin of the regions, (3,) m.")

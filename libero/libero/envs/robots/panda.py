@@ -33,15 +33,8 @@ class Panda:
     def __init__(self, idn: int = 0):
         self.idn, self.name = idn, f"Panda{idn}"
 
-    @property
-    def init_qpos(self) -> np.ndarray:
-        """Rest pose, (7,) rad."""
-        return np.array(REST_QPOS)
-
-    @property
-    def top_offset(self) -> np.ndarray:
-        """Highest point over the base, (3,) m."""
-        return np.array([0.0, 0.0, 1.0])
+    init_qpos = property(lambda self: np.array(REST_QPOS), doc="Rest pose, (7,) rad.")
+    top_offset = property(lambda self: np.array([0.0, 0.0, 1.0]), doc="Highest point over the base, (3,) m.")
 
 
 def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, float, float]]:

@@ -1,6 +1,7 @@
 """The arm of an environment, under robosuite's names: `env.robots[0].controller`, `.gripper`, ..."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,10 @@ class Controller:
         delta = bool(config.get("control_delta", config.get("use_delta", True)))
         env.simulations.controller_state = ControllerState(1, get_controller(self.name.lower(), delta))
 
-    @property
-    def _state(self) -> ControllerState:
-        return self._env.simulations.controller_state
+    _state = property(attrgetter("_env.simulations.controller_state"))
+    ee_pos = property(attrgetter("_env.view.eef_pos"), doc="Position of the grip site, (3,) m.")
+    ee_ori_mat = property(attrgetter("_env.view.eef_mat"), doc="Orientation of the grip site, (3, 3).")
+    joint_pos = property(lambda self: self._env.sim.data.qpos[:7].copy(), doc="Joint positions, (7,) rad.")
 
     @property
     def use_delta(self) -> bool:
@@ -60,21 +62,6 @@ class Controller:
     def control_dim(self) -> int:
         """Length of an action without the gripper."""
         return self._state.controller.action_dim - 1
-
-    @property
-    def ee_pos(self) -> np.ndarray:
-        """Position of the grip site, (3,) m."""
-        return self._env.view.eef_pos
-
-    @property
-    def ee_ori_mat(self) -> np.ndarray:
-        """Orientation of the grip site, (3, 3)."""
-        return self._env.view.eef_mat
-
-    @property
-    def joint_pos(self) -> np.ndarray:
-        """Joint positions, (7,) rad."""
-        return self._env.sim.data.qpos[:7].copy()
 
     @property
     def goal_pos(self) -> np.ndarray:
@@ -134,36 +121,18 @@ class SingleArm:
         self._ref_gripper_joint_pos_indexes = self._ref_gripper_joint_vel_indexes = [7, 8]
         self.eef_site_id = env.sim.model.site_name2id(self.robot_model.grip_site)
 
-    @property
-    def action_dim(self) -> int:
-        """Length of an action."""
-        return self.controller.control_dim + 1
+    action_dim = property(lambda self: self.controller.control_dim + 1, doc="Length of an action.")
+    _joint_positions = property(lambda self: self.sim.data.qpos[:7].copy())
+    _joint_velocities = property(lambda self: self.sim.data.qvel[:7].copy())
+    _hand_pos = property(lambda self: self.sim.data.get_body_xpos(self.robot_model.eef_name).copy())
+    _hand_orn = property(lambda self: self.sim.data.get_body_xmat(self.robot_model.eef_name).copy())
+    _hand_quat = property(lambda self: np.roll(self.sim.data.get_body_xquat(self.robot_model.eef_name), -1))
 
     @property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest action."""
         controller = self._env.simulations.controller_state.controller
         return controller.low.copy(), controller.high.copy()
-
-    @property
-    def _joint_positions(self) -> np.ndarray:
-        return self.sim.data.qpos[:7].copy()
-
-    @property
-    def _joint_velocities(self) -> np.ndarray:
-        return self.sim.data.qvel[:7].copy()
-
-    @property
-    def _hand_pos(self) -> np.ndarray:
-        return self.sim.data.get_body_xpos(self.robot_model.eef_name).copy()
-
-    @property
-    def _hand_orn(self) -> np.ndarray:
-        return self.sim.data.get_body_xmat(self.robot_model.eef_name).copy()
-
-    @property
-    def _hand_quat(self) -> np.ndarray:
-        return np.roll(self.sim.data.get_body_xquat(self.robot_model.eef_name), -1)
 
     @property
     def base_pos(self) -> np.ndarray:
