@@ -63,6 +63,7 @@ class BaseObject:
         category_name: Category, such as `milk`.
         rotation: Range (low, high) about `rotation_axis`, rad; or axis -> (low, high); or None.
         object_properties: `articulation` (`default_open_ranges`, ...) and `vis_site_names`.
+        bottom_offset, top_offset: Lowest and highest point relative to the root body, (3,) m.
     """
 
     name: str
@@ -79,6 +80,8 @@ class BaseObject:
     naming_prefix = property(lambda self: f"{self.name}_", doc="Prefix of the names of its elements.")
     root_body = property(lambda self: f"{self.name}_main", doc="Name of its root body.")
     bodies = property(lambda self: self._names(self.model.spec.bodies[1:]), doc="Names of its bodies.")
+    bottom_offset = property(lambda self: np.array(self.model.bottom_offset))
+    top_offset = property(lambda self: np.array(self.model.top_offset))
     sites = property(lambda self: self._names(self.model.spec.sites), doc="Names of its sites.")
     horizontal_radius = property(attrgetter("model.horizontal_radius"), doc="Radius to keep free, m.")
     init_quat = property(lambda self: self.model.rest_quat(), doc="Orientation at rest, wxyz (4,).")
@@ -103,16 +106,6 @@ class BaseObject:
     def visual_geoms(self) -> list[str]:
         """Names of its visual geoms."""
         return self._names(g for g in self.model.spec.geoms if g.group == 1)
-
-    @property
-    def bottom_offset(self) -> np.ndarray:
-        """Lowest point relative to the root body, (3,) m."""
-        return np.array(self.model.bottom_offset)
-
-    @property
-    def top_offset(self) -> np.ndarray:
-        """Highest point relative to the root body, (3,) m."""
-        return np.array(self.model.top_offset)
 
     def get_xml(self) -> str:
         """Return the object as MJCF."""

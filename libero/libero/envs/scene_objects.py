@@ -30,15 +30,11 @@ def scene_fixtures(scene: Scene) -> dict[str, Any]:
 
 def _instance(name: str, model: ObjectModel) -> BaseObject:
     found = OBJECTS_DICT.get(model.category)
-    if found is None:
-        return _anonymous(model)(name=name, model=model)
+    if found is None:  # a category that is registered only with `libero_env`
+        found = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
+        return found(name=name, model=model)
     ours = issubclass(found, BuiltinObject) and model.category in BUILDERS
     return found(name=name, model=model) if ours else found(name=name)
-
-
-def _anonymous(model: ObjectModel) -> type[BuiltinObject]:
-    """Return a class for a category that is registered only with `libero_env`."""
-    return type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
 
 
 def scene_sites(scene: Scene) -> dict[str, SiteObject]:
@@ -72,7 +68,8 @@ class TaskModel:
     def __init__(self, scene: Scene, model: mujoco.MjModel):
         self.mujoco_model = model
         bodies, robot = {name: scene.bodies[name] for name in scene.entities}, _robot_bodies(model)
-        classes = {name: _class_name(item.category) for name, item in scene.entities.items()}
+        categories = {name: item.category for name, item in scene.entities.items()}
+        classes = {name: getattr(OBJECTS_DICT.get(c), "__name__", c) for name, c in categories.items()}
         classes |= {name: name.removesuffix("0") for name in robot}
         self.instances_to_ids = {name: _ids(model, own) for name, own in (bodies | robot).items()}
         self.classes_to_ids: dict[str, dict[str, list[int]]] = {}
@@ -100,10 +97,6 @@ def _ids(model: mujoco.MjModel, bodies: Sequence[int] | np.ndarray) -> dict[str,
     """Return the geoms and sites of bodies."""
     owners = {"geom": model.geom_bodyid, "site": model.site_bodyid}
     return {kind: np.flatnonzero(np.isin(owner, bodies)).tolist() for kind, owner in owners.items()}
-
-
-def _class_name(category: str) -> str:
-    return OBJECTS_DICT[category].__name__ if category in OBJECTS_DICT else category
 
 
 def _inverse(ids: dict[str, dict[str, list[int]]]) -> dict[int, str]:

@@ -18,11 +18,8 @@ from libero_env.assets.arena import load_workspace
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import And, Atom, Expression, Problem, Region
 
-# Name of a workspace -> its category.
-WORKSPACE_CATEGORIES = {
-    "main_table": "table",
-    **{name: name for name in ("kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")},
-}
+_OWN_NAMES = ("kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
+WORKSPACE_CATEGORIES = {"main_table": "table", **{name: name for name in _OWN_NAMES}}  # name -> category
 
 Pair = Sequence[float]
 
@@ -34,26 +31,25 @@ class Language(str):
         return super().__new__(cls, " ".join(instruction.split()))
 
 
+def get_fixtures(object_dict: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return name -> category, from category -> names."""
+    return {name: category for category, names in object_dict.items() for name in names}
+
+
+get_objects = get_fixtures
+
+
 class ObjectDict(dict[str, list[str]]):
     """Category -> names of its instances, in the order in which a task file declares them."""
 
-    @property
-    def names(self) -> dict[str, str]:
-        """Name -> category."""
-        return {name: category for category, names in self.items() for name in names}
+    names = property(get_fixtures, doc="Name -> category.")
 
 
 class RegionWrapper:
-    """Regions by address, each once.
-
-    Args:
-        regions: First regions.
-    """
+    """Regions by address, each once."""
 
     def __init__(self, regions: Iterable[Region] = ()):
-        self.regions: dict[str, Region] = {}
-        for region in regions:
-            self.add(region)
+        self.regions = {region.address: region for region in regions}
 
     def add(self, region: Region) -> None:
         """Add a region, or replace the one of its address."""
@@ -77,16 +73,12 @@ class PDDLDefinition:
         self.problem_name, self.domain = problem_name, domain
 
     def __call__(self, facts: Callable[..., Mapping[str, Any]]) -> Callable[..., str]:
-        """Return a function that writes task files.
-
-        It raises a `BDDLError` where a condition uses a name that is not declared.
-        """
+        """Return a function that writes task files; it raises a BDDLError for a name that is not declared."""
 
         @functools.wraps(facts)
         def write(*args: Any, **kwargs: Any) -> str:
             problem = Problem(name=self.problem_name, domain=self.domain, **facts(*args, **kwargs))
-            text = bddl.write(problem)
-            bddl.parse(text, f"task {problem.language!r}")
+            bddl.parse(text := bddl.write(problem), f"task {problem.language!r}")
             return text
 
         return write
@@ -106,14 +98,6 @@ def get_object_dict(object_num_info: Mapping[str, int]) -> ObjectDict:
         else:
             found.setdefault(category, []).extend(f"{category}_{i}" for i in range(1, count + 1))
     return found
-
-
-def get_fixtures(object_dict: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return name -> category, from category -> names."""
-    return ObjectDict({category: list(names) for category, names in object_dict.items()}).names
-
-
-get_objects = get_fixtures
 
 
 def get_objects_of_interest(objects_of_interest: Iterable[str]) -> tuple[str, ...]:
@@ -154,10 +138,9 @@ def region_module(
     affordance_region_kwargs_list: Iterable[Mapping[str, Any]],
 ) -> tuple[Region, ...]:
     """Return all regions, from arguments of `get_xy_region` and of `get_object_affordance_region`."""
-    wrapper = RegionWrapper(get_xy_region(**kwargs) for kwargs in xy_region_kwargs_list)
-    for kwargs in affordance_region_kwargs_list:
-        wrapper.add(get_object_affordance_region(**kwargs))
-    return tuple(wrapper.regions.values())
+    regions = [get_xy_region(**kwargs) for kwargs in xy_region_kwargs_list]
+    regions += [get_object_affordance_region(**kwargs) for kwargs in affordance_region_kwargs_list]
+    return tuple(RegionWrapper(regions).regions.values())
 
 
 def get_init_state(init_states: Iterable[Sequence[str]]) -> tuple[Atom, ...]:
@@ -248,15 +231,9 @@ def get_result(result: str | Sequence[str]) -> str:
 def save_to_file(
     result: str, scene_name: str, language: str, folder: str | Path = "", file_name: str = ""
 ) -> str:
-    """Write a task file and return its path.
+    """Write a task file to `<folder>/<file_name>.bddl` and return its path.
 
-    Args:
-        result: Text of the task file.
-        scene_name: Name of the scene.
-        language: Instruction of the task.
-        folder: Folder of the file.
-        file_name: Name of the file without its ending; by default as the benchmark names its files, such as
-            `KITCHEN_SCENE1_open_the_bottom_drawer_of_the_cabinet`.
+    By default it is named as the benchmark names its files: `KITCHEN_SCENE1_open_the_bottom_drawer_of_the_cabinet`.
     """
     words = re.sub(r"[^\w-]+", "_", language.strip().lower()).strip("_")
     path = Path(folder) / f"{file_name or f'{scene_name.upper()}_{words}'}.bddl"

@@ -49,18 +49,10 @@ def url_is_alive(url: str) -> bool:
 
 
 def download_url(url: str, download_dir: Dir, check_overwrite: bool = True, is_zipfile: bool = True) -> Path:
-    """Download a file into a folder, and return the file, or the folder of an unpacked archive.
+    """Download a file into a folder, see `libero_env.assets.http.fetch`, and return it.
 
-    An interrupted download is resumed.
-
-    Args:
-        url: Address; its last part is the name of the file.
-        download_dir: Dir.
-        check_overwrite: Whether a file that exists is kept.
-        is_zipfile: Whether the file is an archive to unpack and remove.
-
-    Raises:
-        DownloadError: The file did not arrive, or is not an archive.
+    With `is_zipfile` the archive is unpacked and removed, and the folder is returned; a DownloadError states that it
+    is not an archive. With `check_overwrite` a file that exists is kept.
     """
     folder = Path(download_dir)
     file = folder / url.rpartition("/")[2]
@@ -81,16 +73,9 @@ def download_url(url: str, download_dir: Dir, check_overwrite: bool = True, is_z
 def download_from_huggingface(
     dataset_name: str, download_dir: Dir, check_overwrite: bool = True
 ) -> list[Path]:
-    """Download the files of a suite one by one, verify their checksums, and return them.
+    """Download and verify the files of a suite, see `libero_env.demos.download.download_demos`, and return them.
 
-    Args:
-        dataset_name: Suite, such as `libero_object`; `libero_100` is `libero_90` and `libero_10`.
-        download_dir: Dir of the folders of the suites.
-        check_overwrite: Whether different files of the same names are kept.
-
-    Raises:
-        DownloadError: The files did not arrive, or different files exist.
-        UnknownNameError: The suite does not exist.
+    With `check_overwrite`, different files of the same names are kept, and a DownloadError names one.
     """
     return download_demos([dataset_name], Path(download_dir), overwrite=not check_overwrite)
 
@@ -105,7 +90,7 @@ def libero_dataset_download(
 
     Args:
         datasets: `all`, or a name in `DATASET_LINKS`.
-        download_dir: Dir of the folders of the suites; by default `get_libero_path("datasets")`.
+        download_dir: Folder with one folder for each suite; by default `get_libero_path("datasets")`.
         check_overwrite: Whether files that exist are kept.
         use_huggingface: Whether verified files of the Hub are downloaded instead of archives.
 
@@ -129,11 +114,7 @@ def libero_dataset_download(
 
 
 def check_libero_dataset(download_dir: Dir | None = None) -> bool:
-    """Print how many files of each suite exist, and return whether all do.
-
-    Args:
-        download_dir: Dir of the folders of the suites; by default `get_libero_path("datasets")`.
-    """
+    """Print how many files of each suite exist, and return whether all do; see `libero_dataset_download`."""
     folder = Path(download_dir) if download_dir is not None else datasets_folder()
     absent = {name: _missing(folder, name) for name in _SUITES}
     for name, files in absent.items():

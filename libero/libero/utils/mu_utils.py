@@ -115,11 +115,7 @@ class InitialSceneTemplates:
         region_half_len: float | Sequence[float] = 0.02,
         yaw_rotation: Sequence[float] = (0.0, 0.0),
     ) -> dict[str, dict[str, Any]]:
-        """Return a rectangle for `regions.update`; arguments as in `bddl_generation_utils.get_xy_region`.
-
-        Raises:
-            LiberoError: The region exists already.
-        """
+        """Return a rectangle for `regions.update`, see `bddl_generation_utils.get_xy_region`; each name once."""
         if region_name in self.regions:
             raise LiberoError(f"{type(self).__name__}: region {region_name} is defined twice; rename one")
         facts = {

@@ -18,17 +18,9 @@ def update_exception_dict(exceptions: Mapping[str, Sequence[str]]) -> dict[str, 
 
 
 def get_affordance_regions(objects: Iterable[str], verbose: bool = False) -> dict[str, list[str]]:
-    """Return the regions of categories: the box-shaped sites of their models, or those in `EXCEPTION_DICT`.
+    """Return category -> names of its regions: the box-shaped sites of its model, or those in `EXCEPTION_DICT`.
 
-    Args:
-        objects: Categories, or a mapping of them such as `get_object_dict()`.
-        verbose: Whether the regions are printed.
-
-    Returns:
-        Category -> names, for the categories that have regions; those without a model have none.
-
-    Raises:
-        UnknownNameError: A category does not exist.
+    Categories without regions or without a model are left out; one that does not exist raises an UnknownNameError.
     """
     pack, found = select_pack(), {}
     for category in objects:

@@ -1,5 +1,6 @@
 """Tasks on registered scenes, and their task files."""
 
+import itertools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,15 +25,8 @@ from libero_env.tasks.bddl import parse
 from libero_env.tasks.builder import entities_in_goal
 
 # Errors in user-defined scenes and tasks; each is reported for its task alone.
-_FAULTS = (
-    LiberoError,
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    TypeError,
-    ValueError,
-    NotImplementedError,
-)
+_FAULTS: tuple[type[Exception], ...] = (LiberoError, ArithmeticError, AttributeError, LookupError)
+_FAULTS += (TypeError, ValueError, NotImplementedError)
 
 
 class TaskInfoTuple(NamedTuple):
@@ -80,8 +74,8 @@ def register_task_info(
     if isinstance(language, type):
         info = _info_of(language())
     else:
-        info = TaskInfoTuple(scene_key(scene_name), language, tuple(objects_of_interest), tuple(goal_states))
-        _check_complete(info)
+        interest, goal = tuple(objects_of_interest), tuple(goal_states)
+        info = _checked(TaskInfoTuple(scene_key(scene_name), language, interest, goal))
     tasks = TASK_INFO.setdefault(info.scene_name, [])
     tasks[:] = [task for task in tasks if task.language != info.language] + [info]
     return language if isinstance(language, type) else info
@@ -95,24 +89,16 @@ def get_task_info(scene_name: str | None = None) -> Any:
 
 
 def generate_bddl_from_task_info(folder: Any = "", output_dir: str | os.PathLike = "") -> Any:
-    """Write the task files of all registered tasks, or of one.
+    """Write the task files of all registered tasks to `folder`, and return (paths, failures).
 
-    Args:
-        folder: Folder of the files. Or one task: an instance of a class that `register_task_info` decorates, or a
-            `TaskInfoTuple`.
-        output_dir: Folder for the file of one task.
-
-    Returns:
-        (paths, failures); for one task its path.
-
-    Raises:
-        LiberoError: The one task cannot be written; the message states why.
+    Or write one task to `output_dir` and return its path: `folder` is an instance of a class that `register_task_info`
+    decorates, or a `TaskInfoTuple`; a LiberoError states why it cannot be written.
     """
     if not isinstance(folder, str | os.PathLike):
         return _write(folder if isinstance(folder, TaskInfoTuple) else _info_of(folder), output_dir)
     paths: list[str] = []
     failures: list[Failure] = []
-    for task in [task for tasks in TASK_INFO.values() for task in tasks]:
+    for task in itertools.chain(*TASK_INFO.values()):
         try:
             paths.append(_write(task, folder or output_dir))
         except _FAULTS as error:
@@ -164,7 +150,7 @@ def _write(task: TaskInfoTuple, folder: str | os.PathLike) -> str:
 
 def _info_of(task: Any) -> TaskInfoTuple:
     """Return the task that an instance of a task class describes."""
-    goal = next((getattr(task, name) for name in ("goal", "goal_states") if hasattr(task, name)), ())
+    goal = getattr(task, "goal", getattr(task, "goal_states", ()))
     keys = ("language_instruction", "language", "task_description")
     info = TaskInfoTuple(
         scene_name=scene_key(str(getattr(task, "scene_name", ""))),
@@ -173,14 +159,15 @@ def _info_of(task: Any) -> TaskInfoTuple:
         goal_states=tuple(goal() if callable(goal) else goal),
         file_name=str(getattr(task, "task_name", "")),
     )
-    _check_complete(info)
-    return info
+    return _checked(info)
 
 
-def _check_complete(task: TaskInfoTuple) -> None:
+def _checked(task: TaskInfoTuple) -> TaskInfoTuple:
+    """Return a task; raise a LiberoError if something is missing."""
     named = {"scene_name": task.scene_name, "language": task.language, "goal_states": task.goal_states}
     if missing := [name for name, value in named.items() if not value]:
         raise LiberoError(
             f"task {task.language or task.file_name!r}: no {' and no '.join(missing)}; expected scene_name, an "
             "instruction, and a goal such as [('On', 'plate_1', 'flat_stove_1_cook_region')]"
         )
+    return task

@@ -52,18 +52,15 @@ class VideoWriter:
 
     def append_obs(self, obs: Obs, done: bool, idx: int = 0, camera_name: str = "agentview_image") -> None:
         """Add the picture of an observation; after success the last picture, tinted green."""
-        if not done:
-            self.last_images[idx] = np.asarray(obs[camera_name])
-            self.append_image(self.last_images[idx], idx)
+        image = np.asarray(obs[camera_name])
+        if done:
+            image = (1 - _TINT_WEIGHT) * self.last_images.get(idx, image) + _TINT_WEIGHT * _TINT
         else:
-            last = self.last_images.get(idx, np.asarray(obs[camera_name]))
-            self.append_image((1 - _TINT_WEIGHT) * last + _TINT_WEIGHT * _TINT, idx)
+            self.last_images[idx] = image
+        self.append_image(image, idx)
 
     def append_vector_obs(
-        self,
-        obs: Sequence[Obs],
-        dones: Sequence[bool],
-        camera_name: str = "agentview_image",
+        self, obs: Sequence[Obs], dones: Sequence[bool], camera_name: str = "agentview_image"
     ) -> None:
         """Add the pictures of several environments."""
         for i, (own, done) in enumerate(zip(obs, dones, strict=True)):
@@ -74,10 +71,9 @@ class VideoWriter:
         if not self.save_video or not self.image_buffer:
             return []
         self.video_path.mkdir(parents=True, exist_ok=True)
+        videos = {f"video_{i}": images for i, images in self.image_buffer.items()}
         if self.single_video:
             videos = {"video": [image for images in self.image_buffer.values() for image in images]}
-        else:
-            videos = {f"video_{i}": images for i, images in self.image_buffer.items()}
         return [_write(self.video_path / name, images, self.fps) for name, images in videos.items()]
 
 

@@ -7,19 +7,9 @@ from libero._adapters.lookup import lookup
 from libero.libero.envs.predicates import base_predicates as known
 from libero_env.errors import UnknownNameError
 
+_FNS = "TruePredicateFn FalsePredicateFn In On Up Stack InContactPredicateFn PrintJointState Open Close TurnOn TurnOff"
 VALIDATE_PREDICATE_FN_DICT: dict[str, Callable[..., bool]] = {
-    "true": known.TruePredicateFn(),
-    "false": known.FalsePredicateFn(),
-    "in": known.In(),
-    "on": known.On(),
-    "up": known.Up(),
-    "stack": known.Stack(),
-    "incontact": known.InContactPredicateFn(),
-    "printjointstate": known.PrintJointState(),
-    "open": known.Open(),
-    "close": known.Close(),
-    "turnon": known.TurnOn(),
-    "turnoff": known.TurnOff(),
+    name.removesuffix("PredicateFn").lower(): getattr(known, name)() for name in _FNS.split()
 }
 
 
