@@ -28,13 +28,7 @@ class DictBatch:
 
 
 class DictWindows:
-    """Any dataset of dictionaries as the windows of a task; see `lifelong.data.windows.TaskWindows`.
-
-    Args:
-        dataset: Dataset whose items are nested dictionaries of tensors.
-        task_id: Position of the task in the sequence.
-        num_workers: Number of processes that `load` reads with.
-    """
+    """Any dataset of nested dictionaries of tensors as `lifelong.data.windows.TaskWindows`; workers read for `load`."""
 
     def __init__(self, dataset: Any, task_id: int, num_workers: int = 0):
         self.dataset, self.task_id, self.num_workers = dataset, task_id, num_workers

@@ -32,9 +32,7 @@ class Config(dict):
     """Dictionary whose keys are attributes too; nested dictionaries are of the same class."""
 
     def __init__(self, values: Mapping[str, Any] | None = None, **more: Any):
-        super().__init__()
-        for key, value in {**(values or {}), **more}.items():
-            self[key] = value
+        super().__init__({key: _wrap(value) for key, value in {**(values or {}), **more}.items()})
 
     def __setitem__(self, key: str, value: Any) -> None:
         super().__setitem__(key, _wrap(value))
@@ -48,8 +46,7 @@ class Config(dict):
     def __setattr__(self, name: str, value: Any) -> None:
         self[name] = value
 
-    def __delattr__(self, name: str) -> None:
-        del self[name]
+    __delattr__ = dict.__delitem__
 
 
 def load_config(*overrides: str) -> Config:
@@ -87,13 +84,10 @@ def assign(node: Any, key: str, value: Any) -> None:
 def notes(cfg: Any) -> list[str]:
     """Return one line for each key that was changed but has no effect."""
     current, defaults = OmegaConf.create(plain(cfg)), OmegaConf.create(plain(load_config()))
-    lines = []
-    for key, why in NO_EFFECT.items():
-        default = OmegaConf.select(defaults, key)
-        value = OmegaConf.select(current, key, default=default)
-        if value != default:
-            lines.append(f"{key}={value} has no effect: {why}")
-    return lines
+    found = {key: OmegaConf.select(defaults, key) for key in NO_EFFECT}
+    values = {key: OmegaConf.select(current, key, default=default) for key, default in found.items()}
+    changed = [key for key in NO_EFFECT if values[key] != found[key]]
+    return [f"{key}={values[key]} has no effect: {NO_EFFECT[key]}" for key in changed]
 
 
 def group_options(group: str) -> list[str]:

@@ -61,7 +61,12 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta):
         self.cfg, self.device, self.shape_meta = cfg, cfg.device, shape_meta
         self.img_names = [key for key in shape_meta["all_shapes"] if "rgb" in key]
         self.use_augmentation = bool(cfg.train.use_augmentation)
-        self.img_aug = DataAugGroup(_augmentations(cfg.policy) if self.use_augmentation else [])
+        augmentations: list[nn.Module] = []
+        for key in ("color_aug", "translation_aug") if self.use_augmentation else ():
+            if node := cfg.policy.get(key):
+                kind = lookup(AUGMENTATIONS, "augmentation", node["network"])
+                augmentations.append(kind(**plain(node["network_kwargs"])))
+        self.img_aug = DataAugGroup(augmentations)
 
     @abstractmethod
     def forward(self, data: Mapping[str, Any]) -> Any:
@@ -100,13 +105,3 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta):
 
     def _get_aug_output_dict(self, out: Sequence[Tensor]) -> dict[str, Tensor]:
         return dict(zip(self.img_names, out, strict=True))
-
-
-def _augmentations(policy_cfg: Any) -> list[nn.Module]:
-    """Return the configured augmentations, colours first."""
-    nodes = [policy_cfg.get(key) for key in ("color_aug", "translation_aug")]
-    return [
-        lookup(AUGMENTATIONS, "augmentation", node["network"])(**plain(node["network_kwargs"]))
-        for node in nodes
-        if node
-    ]

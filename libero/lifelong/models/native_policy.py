@@ -61,11 +61,10 @@ class NativePolicy(BasePolicy):
         """Replace the parts of the network that the configuration changes."""
         if policy.image_encoder.network == "ResnetEncoder":
             for encoder in self.network.encoders.values():
-                configure_resnet(encoder, policy.image_encoder.network_kwargs)
+                configure_resnet(encoder, **policy.image_encoder.network_kwargs)
         if hasattr(self.network, "transformer"):
             kwargs = policy.temporal_position_encoding.network_kwargs
-            codes = self.network.transformer.positions
-            scale = kwargs.get("factor_ratio")
+            codes, scale = self.network.transformer.positions, kwargs.get("factor_ratio")
             new = sinusoidal_positions(codes.shape[0], codes.shape[1], kwargs.inv_freq_factor)
             codes.copy_(new * (1.0 if scale is None else scale))
         for name in ("language", "spatial_language"):
@@ -111,7 +110,7 @@ def resnet_sizes(policy: Any) -> dict[str, Any]:
     node = policy.image_encoder
     if node.network != "ResnetEncoder":
         raise PolicyError(f"image_encoder is {node.network}; this policy needs a ResnetEncoder")
-    return resnet_arguments(node.network_kwargs)
+    return resnet_arguments(**node.network_kwargs)
 
 
 def temporal_sizes(policy: Any, embed_size: int) -> dict[str, Any]:
@@ -152,11 +151,5 @@ def _head_arguments(policy: Any) -> dict[str, Any]:
     if kind is not GMMHead:
         return {"head": "deterministic", **sizes}
     check_activation(kwargs.get("activation", "softplus"))
-    noise = kwargs.get("low_eval_noise", False)
-    return {
-        "head": "gmm",
-        **sizes,
-        "modes": kwargs.num_modes,
-        "min_std": kwargs.min_std,
-        "low_eval_noise": noise,
-    }
+    noise = {"min_std": kwargs.min_std, "low_eval_noise": kwargs.get("low_eval_noise", False)}
+    return {"head": "gmm", **sizes, "modes": kwargs.num_modes, **noise}

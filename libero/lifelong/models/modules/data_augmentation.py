@@ -4,6 +4,7 @@ Images are (B, T, C, H, W) in [0, 1]; all frames of a window change alike. In ev
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -82,27 +83,18 @@ class ImgColorJitterAug(BatchWiseImgColorJitterAug):
 class _AllViews(nn.Module):
     """Changes the images of several cameras alike: forward maps a tuple of (B, T, C, H, W) to another."""
 
-    def __init__(self, change: nn.Module):
-        super().__init__()
-        self.change = change
-
-    def forward(self, x_groups: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        steps = [x.shape[1] for x in x_groups]
-        return torch.split(self.change(torch.cat(list(x_groups), dim=1)), steps, dim=1)
+    def forward(self, x: Any) -> Any:
+        return torch.split(super().forward(torch.cat(list(x), dim=1)), [part.shape[1] for part in x], dim=1)
 
 
-class ImgColorJitterGroupAug(_AllViews):
+class ImgColorJitterGroupAug(_AllViews, BatchWiseImgColorJitterAug):
     """`BatchWiseImgColorJitterAug` with the same change for all cameras."""
 
-    def __init__(self, input_shape: Sequence[int] | None = None, **limits: float):
-        super().__init__(BatchWiseImgColorJitterAug(input_shape, **{"epsilon": 0.05, **limits}))
+    epsilon = 0.05
 
 
-class TranslationAugGroup(_AllViews):
+class TranslationAugGroup(_AllViews, TranslationAug):
     """`TranslationAug` with the same shift for all cameras."""
-
-    def __init__(self, input_shape: Sequence[int] | None = None, translation: int = 8):
-        super().__init__(TranslationAug(input_shape, translation))
 
 
 class DataAugGroup(nn.Module):
@@ -119,6 +111,5 @@ class DataAugGroup(nn.Module):
         return tuple(x_groups)
 
 
-_VIEWS_ALIKE = (ImgColorJitterGroupAug, TranslationAugGroup)
 _EACH_VIEW = (BatchWiseImgColorJitterAug, IdentityAug, ImgColorJitterAug, TranslationAug)
-AUGMENTATIONS = {kind.__name__: kind for kind in (*_EACH_VIEW, *_VIEWS_ALIKE)}
+AUGMENTATIONS = {kind.__name__: kind for kind in (*_EACH_VIEW, ImgColorJitterGroupAug, TranslationAugGroup)}

@@ -3,7 +3,7 @@
 Shape legend: N images, C H W image, K keypoints, L language embedding, E latent.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from torch import Tensor, nn
@@ -51,16 +51,9 @@ class SpatialProjection(nn.Module):
 class ResnetEncoder(nn.Module):
     """First stages of ResNet-18 with FiLM, read out as keypoints; see `lifelong.nn.vision.ResNetFiLMEncoder`.
 
-    Args:
-        input_shape: C, H, W.
-        output_size: E.
-        pretrained: Must be false: no weights come with this package.
-        freeze: Whether the encoder is not trained.
-        remove_layer_num: Number of ResNet-18's ten layers removed at the end: 2 leaves four stages, 5 one.
-        no_stride: Whether the stem keeps the resolution.
-        language_dim: L.
-        language_fusion: `film` or `none`.
-        more: Other arguments of the network, such as `norm="batch"`.
+    Of ResNet-18's ten layers `remove_layer_num` are removed at the end: 2 leaves four stages, 5 one. `no_stride`: the
+    stem keeps the resolution. `freeze`: the encoder is not trained. `language_fusion` is `film` or `none`.
+    `pretrained` must be false. `more` are other arguments of the network, such as `norm="batch"`.
 
     Raises:
         PolicyError: Invalid values, or an image too small for the number of stages.
@@ -80,12 +73,10 @@ class ResnetEncoder(nn.Module):
     ):
         super().__init__()
         self.language_dim, self.output_size = language_dim, output_size
-        kwargs: dict[str, Any] = {"remove_layer_num": remove_layer_num, "no_stride": no_stride}
-        kwargs |= {"freeze": freeze, "pretrained": pretrained, "language_fusion": language_fusion}
-        sizes: dict[str, Any] = {"image_size": tuple(input_shape)[1:]}
-        sizes |= {"language_dim": language_dim, "latent_dim": output_size}
-        self.encoder = vision.ResNetFiLMEncoder(**{**sizes, **resnet_arguments(kwargs), **more})
-        configure_resnet(self.encoder, kwargs)
+        more = {**resnet_arguments(remove_layer_num, no_stride), "latent_dim": output_size, **more}
+        more = {"image_size": tuple(input_shape)[1:], "language_dim": language_dim, **more}
+        self.encoder = vision.ResNetFiLMEncoder(**more)
+        configure_resnet(self.encoder, pretrained, freeze, language_fusion)
 
     def forward(self, x: Tensor, langs: Tensor | None = None) -> Tensor:
         """Encode images (N, C, H, W) as (N, E), given embeddings (M, L) with N a multiple of M, or zeros."""
@@ -129,25 +120,25 @@ class _NoLanguage(nn.Module):
         return h
 
 
-def resnet_arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+def resnet_arguments(remove_layer_num: int = 2, no_stride: bool = False, **_: object) -> dict[str, Any]:
     """Return the native encoder's arguments for the original's; see `ResnetEncoder`."""
-    removed = kwargs.get("remove_layer_num", 2)
-    if not 2 <= removed <= 5:
-        raise PolicyError(f"remove_layer_num is {removed}; valid: 2 (four stages) to 5 (one stage)")
-    stem = {"stem_stride": 1, "stem_pool": False} if kwargs.get("no_stride") else {}
-    return {"stage_blocks": (2,) * (6 - removed), **stem}
+    if not 2 <= remove_layer_num <= 5:
+        raise PolicyError(f"remove_layer_num is {remove_layer_num}; valid: 2 (four stages) to 5 (one stage)")
+    stem = {"stem_stride": 1, "stem_pool": False} if no_stride else {}
+    return {"stage_blocks": (2,) * (6 - remove_layer_num), **stem}
 
 
-def configure_resnet(encoder: vision.ResNetFiLMEncoder, kwargs: Mapping[str, Any]) -> None:
+def configure_resnet(
+    encoder: Any, pretrained: bool = False, freeze: bool = False, language_fusion: str = "film", **_: object
+) -> None:
     """Apply the original's arguments that change a built encoder; see `ResnetEncoder`."""
-    fusion = kwargs.get("language_fusion", "film")
-    if kwargs.get("pretrained"):
+    if pretrained:
         raise PolicyError("no pretrained ResNet comes with this package: set pretrained to false")
-    if fusion not in ("film", "none"):
-        raise PolicyError(f"language_fusion is {fusion!r}; valid: film, none")
-    if fusion == "none":
+    if language_fusion not in ("film", "none"):
+        raise PolicyError(f"language_fusion is {language_fusion!r}; valid: film, none")
+    if language_fusion == "none":
         encoder.films = nn.ModuleList(_NoLanguage() for _ in encoder.films)
-    if kwargs.get("freeze"):
+    if freeze:
         encoder.requires_grad_(False)
 
 

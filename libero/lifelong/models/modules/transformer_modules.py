@@ -10,13 +10,7 @@ from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask,
 
 
 class SinusoidalPositionEncoding(nn.Module):
-    """Sine and cosine codes of time steps (Vaswani et al., 2017, section 3.5).
-
-    Args:
-        input_size: E.
-        inv_freq_factor: Base of the wavelengths; 10000 in the paper.
-        factor_ratio: Factor of the codes.
-    """
+    """Codes of time steps, times `factor_ratio`; see `lifelong.nn.transformer.sinusoidal_positions`."""
 
     def __init__(self, input_size: int, inv_freq_factor: float = 10, factor_ratio: float | None = None):
         super().__init__()
@@ -74,8 +68,7 @@ class TransformerFeedForwardNN(nn.Module):
 class DropPath(nn.Module):
     """Drops a branch of a residual network for random rows in training (Huang et al., ECCV 2016).
 
-    Args:
-        drop_prob: Probability for a row; the other rows are scaled so that the mean stays.
+    `drop_prob` is the probability for a row; the other rows are scaled so that the mean stays.
     """
 
     def __init__(self, drop_prob: float | None = None):
