@@ -123,7 +123,8 @@ def get_dataset(
         raise DemoError(
             f"depth images ({', '.join(depths)}) are not supported; leave obs_modality['depth'] empty"
         )
-    shapes = _shapes(Path(dataset_path), [*views, *proprio])
+    path = Path(dataset_path)
+    shapes = _shapes(path, [*views, *proprio])
     spec = PolicySpec(
         views=tuple(views),
         image_size=tuple(shapes[views[0]][:2]) if views else (0, 0),  # type: ignore[arg-type]
@@ -131,7 +132,13 @@ def get_dataset(
         language_dim=1,
         seq_len=seq_len,
     )
-    windows = _read(Path(dataset_path), spec, filter_key, pairing, labels)
+    reading: Any = {"pairing": pairing, "labels": labels}
+    if filter_key is None:
+        windows = Windows.from_file(path, spec=spec, language=torch.zeros(1), **reading)
+    else:
+        names, demos = _subset(path, filter_key), read_demos(path, [*views, *proprio], **reading)
+        kept = [demo for demo in demos if demo.name in names]
+        windows = Windows.from_demos(kept, spec=spec, language=torch.zeros(1), source=str(path))
     all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in proprio}
     shape_meta = {
         "ac_dim": spec.action_dim,
@@ -163,22 +170,10 @@ def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
         return {key: tuple(obs[key].shape[1:]) for key in keys}
 
 
-def _read(
-    path: Path,
-    spec: PolicySpec,
-    filter_key: str | None,
-    pairing: Literal["stored", "aligned"],
-    labels: Literal["expert", "executed"],
-) -> Windows:
-    language = torch.zeros(1)
-    if filter_key is None:
-        return Windows.from_file(path, spec=spec, language=language, pairing=pairing, labels=labels)
+def _subset(path: Path, filter_key: str) -> set[str]:
+    """Return the names of the demonstrations in a subset of a file."""
     with open_demo_file(path) as handle:
         if filter_key not in handle.get("mask", {}):
             known = ", ".join(handle.get("mask", {})) or "none"
             raise DemoError(f"{path}: no subset {filter_key!r}; there is {known}")
-        names = {name.decode() for name in handle["mask"][filter_key][()]}
-    keys = [*spec.views, *spec.proprio]
-    demos = read_demos(path, keys, pairing=pairing, labels=labels)
-    kept = [demo for demo in demos if demo.name in names]
-    return Windows.from_demos(kept, spec=spec, language=language, source=str(path))
+        return {name.decode() for name in handle["mask"][filter_key][()]}

@@ -10,8 +10,7 @@ from libero._adapters.lifelong.config import group_options
 
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the arguments, by default those of the command line."""
-    text = "Success of a stored policy on a task."
-    parser = argparse.ArgumentParser(prog="lifelong.eval", description=text)
+    parser = argparse.ArgumentParser("lifelong.eval", description="Success of a stored policy on a task.")
     parser.add_argument("--experiment_dir", default="experiments", help="folder of the runs")
     parser.add_argument("--benchmark", required=True, help="name of the benchmark, such as libero_object")
     parser.add_argument("--task_id", type=int, required=True, help="position of the task in the benchmark")

@@ -26,7 +26,7 @@ from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import NUM_INIT_STATES, split_row
 from libero_env.tasks import Task, get_suite, read_task, suite_names
 from lifelong.evaluation.actors import Obs
-from lifelong.evaluation.rollout import Rollouts, run_episodes
+from lifelong.evaluation.rollout import Episode, run_episodes
 from lifelong.seeding import seeded
 
 CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
@@ -45,19 +45,15 @@ def raw_obs_to_tensor_obs(obs: Any, task_emb: Tensor, cfg: Any) -> dict[str, Any
         `obs` {view: (B, C, H, W) in [0, 1], proprioceptive input: (B, D)} and `task_emb` (B, L), on `cfg.device`.
     """
     names = cfg.data.obs_key_mapping
-    stacked = {key: np.stack([one[names.get(key, key)] for one in obs]) for key in _keys(cfg)}
-    return _policy_input(stacked, task_emb, cfg)
+    return _policy_input(lambda key: np.stack([one[names.get(key, key)] for one in obs]), task_emb, cfg)
 
 
-def _policy_input(stacked: Mapping[str, np.ndarray], task_emb: Tensor, cfg: Any) -> dict[str, Any]:
-    """Convert (B, ...) arrays under their names in the demonstration files; images are bottom row first."""
-    rgb = set(cfg.data.obs.modality.get("rgb") or [])
-    obs = {
-        key: image_tensor(value) if key in rgb else torch.from_numpy(np.asarray(value, np.float32))
-        for key, value in stacked.items()
-    }
-    batch = len(next(iter(obs.values())))
-    data = {"obs": obs, "task_emb": torch.as_tensor(task_emb).expand(batch, -1)}
+def _policy_input(read: Callable[[str], np.ndarray], task_emb: Tensor, cfg: Any) -> dict[str, Any]:
+    """Convert (B, ...) arrays, read by their names in the demonstration files; images are bottom row first."""
+    modality = cfg.data.obs.modality
+    obs = {key: image_tensor(read(key)) for key in modality.get("rgb") or []}
+    obs |= {key: torch.as_tensor(read(key), dtype=torch.float32) for key in modality.get("low_dim") or []}
+    data = {"obs": obs, "task_emb": torch.as_tensor(task_emb).expand(len(next(iter(obs.values()))), -1)}
     return map_tensors(data, lambda x: safe_device(x, cfg.device))
 
 
@@ -90,7 +86,7 @@ def evaluate_one_task_success(
     first = max(NUM_INIT_STATES - total, 0) if apart else 0
     rows = [(first + i) % NUM_INIT_STATES for i in range(total)]
     episodes = rollouts(cfg, algo, task, task_emb, task_id, rows, sim_states=sim_states)
-    return sum(e.success for part in episodes for e in part.episodes) / total
+    return sum(episode.success for episode in episodes) / total
 
 
 def rollouts(
@@ -103,7 +99,7 @@ def rollouts(
     *,
     sim_states: list | None = None,
     on_step: Callable[[int, Obs, np.ndarray], None] | None = None,
-) -> list[Rollouts]:
+) -> list[Episode]:
     """Run episodes of an algorithm's policy, `eval.num_procs` at once.
 
     Args:
@@ -113,7 +109,7 @@ def rollouts(
             (B, ...), and which of them are over, (B,) bool.
     """
     at_once = min(int(cfg.eval.num_procs), len(init_states)) if cfg.eval.use_mp else 1
-    results: list[Rollouts] = []
+    episodes: list[Episode] = []
     with seeded(int(cfg.seed), task_id, device=available_device(cfg.device)), acting(algo, task_id) as actor:
         for start in range(0, len(init_states), at_once):
             rows = init_states[start : start + at_once]
@@ -121,26 +117,9 @@ def rollouts(
             with closing(_EvalEnv(cfg, task, len(rows), states, on_step and partial(on_step, start))) as env:
                 policy = _PolicyActor(actor, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
                 horizon = int(cfg.eval.max_steps)
-                results.append(run_episodes(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS))
-    return results
-
-
-def success_rates(
-    cfg: Any,
-    algo: Any,
-    benchmark: Any,
-    task_ids: Sequence[int],
-    sim_states: Callable[[int], list | None] = lambda task_id: None,
-    selecting: bool = False,
-) -> np.ndarray:
-    """Return the success rate on each of the given tasks, (n,); see `evaluate_one_task_success`."""
-    algo.eval()
-    rates = []
-    for i in task_ids:
-        task, emb = benchmark.get_task(i), benchmark.get_task_emb(i)
-        rate = evaluate_one_task_success(cfg, algo, task, emb, i, sim_states(i), selecting=selecting)
-        rates.append(rate)
-    return np.array(rates)
+                part = run_episodes(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS)
+                episodes += part.episodes
+    return episodes
 
 
 def evaluate_success(
@@ -149,24 +128,34 @@ def evaluate_success(
     benchmark: Any,
     task_ids: Sequence[int],
     result_summary: Mapping[str, Any] | None = None,
+    *,
+    key: str | None = None,
+    selecting: bool = False,
 ) -> np.ndarray:
     """Return the success rate on each of the given tasks, (n,).
 
     Args:
-        cfg, algo: See `evaluate_one_task_success`.
+        cfg, algo, selecting: See `evaluate_one_task_success`.
         benchmark: Benchmark with the tasks and their embeddings.
         task_ids: Positions in the benchmark.
-        result_summary: Receives simulator states under `k<last task>_p<task>` if `eval.save_sim_states` is set.
+        result_summary: Receives simulator states under `key` if `eval.save_sim_states` is set.
+        key: Key in `result_summary`; by default `k<last task>_p<task>` for each task.
     """
+    algo.eval()
     kept: Mapping[str, Any] = (result_summary or {}) if cfg.eval.save_sim_states else {}
-    return success_rates(cfg, algo, benchmark, task_ids, lambda i: kept.get(f"k{task_ids[-1]}_p{i}"))
+    rates = []
+    for i in task_ids:
+        states = kept.get(key or f"k{task_ids[-1]}_p{i}")
+        given = benchmark.get_task(i), benchmark.get_task_emb(i), i, states
+        rates.append(evaluate_one_task_success(cfg, algo, *given, selecting=selecting))
+    return np.array(rates)
 
 
 def evaluate_multitask_training_success(
     cfg: Any, algo: Any, benchmark: Any, task_ids: Sequence[int]
 ) -> np.ndarray:
     """Return the success rate on each of the given tasks while they are learned together, (n,)."""
-    return success_rates(cfg, algo, benchmark, task_ids, selecting=True)
+    return evaluate_success(cfg, algo, benchmark, task_ids, selecting=True)
 
 
 def evaluate_loss(cfg: Any, algo: Any, benchmark: Any, datasets: Sequence[Dataset]) -> np.ndarray:
@@ -215,10 +204,13 @@ class _PolicyActor:
         self.algo.reset()
 
     def act(self, obs: Obs) -> np.ndarray:
-        keys, views = _keys(self.cfg), self.views
-        stacked = {key: obs[key][:, ::-1] if key in views else _proprio(obs, key) for key in keys}
-        actions = self.algo.policy.get_action(_policy_input(stacked, self.task_emb, self.cfg))
-        return np.asarray(actions, np.float64).reshape(len(next(iter(stacked.values()))), -1)
+        def read(key: str) -> np.ndarray:
+            if key == "ee_states":  # position and rotation in the demonstration files
+                return np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=-1)
+            return obs[key][:, ::-1] if key in self.views else obs[key]
+
+        data = _policy_input(read, self.task_emb, self.cfg)
+        return np.asarray(self.algo.policy.get_action(data), np.float64).reshape(len(data["task_emb"]), -1)
 
 
 class _EvalEnv(BatchEnv):
@@ -232,7 +224,10 @@ class _EvalEnv(BatchEnv):
             camera_size=(int(cfg.data.img_h), int(cfg.data.img_w)),
             horizon=int(cfg.eval.max_steps) + SETTLE_STEPS,
         )
-        self.rows = _user_init_states(cfg.get("init_states_folder"), task)
+        folder = cfg.get("init_states_folder")
+        path = Path(folder or "", task.problem_folder, task.init_states_file)
+        is_users = folder and folder != generated_paths()["init_states"] and path.is_file()
+        self.rows = read_states(path) if is_users else None
         self.sim_states, self.on_step = sim_states, on_step
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
@@ -250,26 +245,7 @@ class _EvalEnv(BatchEnv):
         simulations, fields = self.world.simulations, self.world.simulations.fields
         if self.sim_states is not None:
             for i in np.flatnonzero(running).tolist():
-                state = np.concatenate([[simulations.time(i)], fields["qpos"][i], fields["qvel"][i]])
-                self.sim_states[i].append(state)
+                self.sim_states[i].append(np.r_[simulations.time(i), fields["qpos"][i], fields["qvel"][i]])
         if self.on_step is not None:
             self.on_step(result[0], ~self.running)
         return result
-
-
-def _user_init_states(folder: str | None, task: Any) -> np.ndarray | None:
-    """Return a task's initial states in a folder that is not this package's own; None if there are none."""
-    path = Path(folder or "", task.problem_folder, task.init_states_file)
-    if not folder or folder == generated_paths()["init_states"] or not path.is_file():
-        return None
-    return read_states(path)
-
-
-def _proprio(obs: Obs, key: str) -> np.ndarray:
-    """Return an observation under its name in the demonstration files; there `ee_states` is position and rotation."""
-    return np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=-1) if key == "ee_states" else obs[key]
-
-
-def _keys(cfg: Any) -> list[str]:
-    modality = cfg.data.obs.modality
-    return [*(modality.get("rgb") or []), *(modality.get("low_dim") or [])]

@@ -26,7 +26,6 @@ from libero.lifelong.algos import Multitask, Sequential, get_algo_class
 from libero.lifelong.datasets import GroupedTaskDataset, SequenceVLDataset, get_dataset
 from libero.lifelong.metric import evaluate_loss, evaluate_success, native_task
 from libero.lifelong.utils import (
-    NpEncoder,
     available_device,
     control_seed,
     create_experiment_dir,
@@ -67,8 +66,14 @@ def run(config: Any) -> Path:
     datasets, cfg.shape_meta = load_datasets(cfg, benchmark)
     done = _open_folder(cfg)
     algo = safe_device(get_algo_class(cfg.lifelong.algo)(len(datasets), cfg), cfg.device)
-    if cfg.pretrain_model_path:
-        load_pretrained(algo, cfg.pretrain_model_path, cfg.device)
+    if path := cfg.pretrain_model_path:
+        policy: Any = algo.policy
+        if path.endswith(".safetensors"):  # a checkpoint of `lifelong`
+            policy, stored = getattr(policy, "network", policy), checkpoints.load(Path(path), cfg.device)
+            weights = stored["policy"]
+        else:
+            weights = torch_load_model(path, cfg.device)[0]
+        checkpoints.load_weights(policy, weights, path)
     mode: Any = os.environ.get("WANDB_MODE", "online") if cfg.use_wandb else "disabled"
     tracker = Tracker(mode=mode, project=cfg.wandb_project)
     tracker.start(cfg.experiment_name, cfg.experiment_dir, plain(cfg))
@@ -126,19 +131,6 @@ def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
     return ensure_demos([task], DEMOS, camera_size=size)[0]
 
 
-def load_pretrained(algo: Sequential, path: str, device: str) -> None:
-    """Load initial weights: a `.pth` of this package, or a `.safetensors` of `lifelong`.
-
-    Raises:
-        CheckpointError: The file is broken, or of another policy.
-    """
-    if path.endswith(".safetensors"):
-        network: Any = getattr(algo.policy, "network", algo.policy)
-        checkpoints.load_weights(network, checkpoints.load(Path(path), device)["policy"], path)
-    else:
-        checkpoints.load_weights(algo.policy, torch_load_model(path, map_location=device)[0], path)
-
-
 def _open_folder(cfg: Any) -> int:
     """Create the folder of the run, or find that of the interrupted one; return the number of tasks done there."""
     if cfg.train.resume:
@@ -151,7 +143,7 @@ def _open_folder(cfg: Any) -> int:
     else:
         create_experiment_dir(cfg)
     folder, done = Path(cfg.experiment_dir), 0
-    (folder / "config.json").write_text(json.dumps(plain(cfg), cls=NpEncoder, indent=1), encoding="utf-8")
+    (folder / "config.json").write_text(json.dumps(plain(cfg), indent=1), encoding="utf-8")
     while (folder / f"task{done}_state.safetensors").exists():
         done += 1
     return done
@@ -203,13 +195,16 @@ class _Run:
             means = {"success/mean": float(rates.mean()), "loss/mean": float(losses.mean())}
             self.tracker.log({**means, "tasks": i + 1})
         with atomic_path(Path(self.cfg.experiment_dir, "result.pt")) as path, open(path, "wb") as file:
-            torch.save(_tensors(summary), file)
+            arrays = {key: torch.as_tensor(summary[key]) for key in RESULTS}
+            rest = {key: value for key, value in summary.items() if key not in RESULTS}
+            states = {key: [[torch.as_tensor(x) for x in one] for one in rest[key]] for key in rest}
+            torch.save({**arrays, **states}, file)
 
     def _empty_summary(self) -> dict[str, Any]:
         """Return results of zeros, with lists for simulator states if they are kept."""
         count, cfg = len(self.datasets), self.cfg
-        shape = (count, count)
-        summary: dict[str, Any] = {name: np.zeros(shape[: 2 if "mat" in name else 1]) for name in RESULTS}
+        shapes = {name: (count, count) if "mat" in name else (count,) for name in RESULTS}
+        summary: dict[str, Any] = {name: np.zeros(shape) for name, shape in shapes.items()}
         if cfg.eval.save_sim_states:
             tasks, points = range(self.benchmark.n_tasks), -(-cfg.train.n_epochs // cfg.eval.eval_every) + 1
             keys = [f"k{k}_p{p}" for k in tasks for p in range(k + 1)]
@@ -230,12 +225,3 @@ class _Run:
 
     def _state_path(self, task: int) -> Path:
         return Path(self.cfg.experiment_dir, f"task{task}_state.safetensors")
-
-
-def _tensors(node: Any) -> Any:
-    """Return nested dictionaries and lists with tensors for arrays, which torch.load reads without executing code."""
-    if isinstance(node, dict):
-        return {key: _tensors(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_tensors(value) for value in node]
-    return torch.from_numpy(node.copy()) if isinstance(node, np.ndarray) else node

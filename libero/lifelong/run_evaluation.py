@@ -41,7 +41,12 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
     benchmark = get_benchmark(args.benchmark)(cfg.data.task_order_index)
     task = benchmark.get_task(args.task_id)
     benchmark.set_task_embs(get_task_embs(cfg, [t.language for t in benchmark.tasks]))
-    algo = _load_algorithm(args, cfg, benchmark, weights, masks)
+    algo = get_algo_class(cfg.lifelong.algo)(benchmark.n_tasks, cfg)
+    algo.policy.load_state_dict(weights)
+    if isinstance(algo, PackNet):
+        algo.load_masks(masks, args.task_id if args.load_task is None else args.load_task)
+        algo = algo.get_eval_algo(args.task_id // int(cfg.data.task_group_size))
+    algo = safe_device(algo, cfg.device)
     emb, view = benchmark.get_task_emb(args.task_id), cfg.data.obs.modality.rgb[0]
     loss = _loss(cfg, algo, benchmark, args.task_id)
     folder = path.parent / f"{path.stem}_on{args.task_id}_videos"
@@ -52,8 +57,8 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
                 video.append_obs({view: obs[view][i][::-1]}, bool(done), start + i, view)
 
         states, on_step = range(cfg.eval.n_eval), record if args.save_videos else None
-        parts = rollouts(cfg, algo, task, emb, args.task_id, states, on_step=on_step)
-    return _report(path, args, task, loss, [e.success for part in parts for e in part.episodes])
+        episodes = rollouts(cfg, algo, task, emb, args.task_id, states, on_step=on_step)
+    return _report(path, args.task_id, task.name, loss, [episode.success for episode in episodes])
 
 
 def checkpoint_path(args: argparse.Namespace) -> Path:
@@ -83,16 +88,6 @@ def checkpoint_path(args: argparse.Namespace) -> Path:
     return path
 
 
-def _load_algorithm(args: Any, cfg: Any, benchmark: Any, weights: Any, masks: Any) -> Sequential:
-    """Return the algorithm with the stored policy, ready to act on the task."""
-    algo = get_algo_class(cfg.lifelong.algo)(benchmark.n_tasks, cfg)
-    algo.policy.load_state_dict(weights)
-    if isinstance(algo, PackNet):
-        algo.load_masks(masks, args.task_id if args.load_task is None else args.load_task)
-        algo = algo.get_eval_algo(args.task_id // int(cfg.data.task_group_size))
-    return safe_device(algo, cfg.device)
-
-
 def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
     """Return the loss on the task's demonstrations, NaN if there are none; none are generated for it."""
     name = benchmark.get_task_demonstration(task_id)
@@ -105,20 +100,14 @@ def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
     return float(evaluate_loss(cfg, algo, benchmark, [dataset])[0])
 
 
-def _report(path: Path, args: Any, task: Any, loss: float, successes: list[bool]) -> dict[str, Any]:
+def _report(path: Path, task_id: int, name: str, loss: float, successes: list[bool]) -> dict[str, Any]:
     """Print and write the results."""
     count, total = sum(successes), len(successes)
-    low, high = wilson_interval(count, total)
-    results = {
-        "loss": loss,
-        "success_rate": count / total,
-        "interval": [float(low), float(high)],
-        "successes": successes,
-        "task": task.name,
-        "checkpoint": str(path),
-    }
-    stats = path.with_name(f"{path.stem}_on{args.task_id}.stats")
+    rate, (low, high) = count / total, map(float, wilson_interval(count, total))
+    results: dict[str, Any] = {"loss": loss, "success_rate": rate, "interval": [low, high]}
+    results |= {"successes": successes, "task": name, "checkpoint": str(path)}
+    stats = path.with_name(f"{path.stem}_on{task_id}.stats")
     torch.save(results, stats)
-    rate = f"{count}/{total} = {count / total:.0%} (95 %: {low:.0%} to {high:.0%})"
-    print(f"{task.name}: success {rate}, loss {loss:.3f}; {stats}")
+    shown = f"{count}/{total} = {rate:.0%} (95 %: {low:.0%} to {high:.0%})"
+    print(f"{name}: success {shown}, loss {loss:.3f}; {stats}")
     return results

@@ -4,6 +4,8 @@ import copy
 import json
 import pickle
 import random
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,9 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, default_collate, random_split
 
 from libero._adapters.lifelong.config import Config, assign, plain
-from libero_env.paths import cache_dir
 from libero_env.storage import atomic_path
 from lifelong.errors import CheckpointError
-from lifelong.language import embed
+from lifelong.language import LanguageEncoder
 from lifelong.results.metrics import wilson_interval
 from lifelong.training.costs import count_flops
 
@@ -114,14 +115,12 @@ def create_experiment_dir(cfg: Any) -> str:
     """
     root = experiment_root(cfg)
     root.mkdir(parents=True, exist_ok=True)
-    number = max((_run_number(path) for path in root.glob("run_*")), default=0) + 1
-    while True:
+    last = max((_run_number(path) for path in root.glob("run_*")), default=0)
+    for number in count(last + 1):
         path = root / f"run_{number:03d}"
-        try:
+        with suppress(FileExistsError):  # another process was first
             path.mkdir()
             break
-        except FileExistsError:  # another process was first
-            number += 1
     assign(cfg, "experiment_dir", str(path))
     assign(cfg, "experiment_name", "_".join(path.parts[-4:]))
     return str(path)
@@ -147,13 +146,11 @@ def get_task_embs(cfg: Any, descriptions: list[str]) -> Tensor:
     Raises:
         LanguageError: The format is unknown, or its weights cannot be obtained; the message names the remedy.
     """
-    kind = cfg.task_embedding_format
-    if kind == "one-hot":
+    if cfg.task_embedding_format == "one-hot":
         offset = int(cfg.task_embedding_one_hot_offset)
-        names = [f"Task {i}" for i in range(offset + len(descriptions))]
-        embs = embed(names, "onehot")[offset:]
+        embs = torch.eye(offset + len(descriptions))[offset:]
     else:
-        embs = embed(descriptions, kind, cache_dir=cache_dir() / "language")
+        embs = LanguageEncoder(cfg.task_embedding_format).embed(descriptions)
     assign(cfg.policy.language_encoder.network_kwargs, "input_size", embs.shape[-1])
     return embs
 

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from libero._adapters.lifelong.batches import DictBatch, DictWindows, map_tensors
 from libero._adapters.lifelong.config import plain
 from libero._adapters.lookup import lookup
-from libero.lifelong.metric import mean_loss, success_rates
+from libero.lifelong.metric import evaluate_success, mean_loss
 from libero.lifelong.models import get_policy_class
 from libero.lifelong.utils import (
     available_device,
@@ -31,6 +31,7 @@ from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 
 REGISTERED_ALGOS: dict[str, type["Sequential"]] = {}
+Measure = Callable[[int], float | None]  # number of an evaluation -> success, None where it is not measured
 
 
 def register_algo(algo_class: type["Sequential"]) -> None:
@@ -58,13 +59,7 @@ class AlgoMeta(type):
 
 @dataclass
 class LearningCurve:
-    """Loss and success at epoch 0 and at each evaluated epoch.
-
-    Attributes:
-        losses: Mean loss of each evaluated epoch.
-        successes: Success rate of each evaluated epoch; 0 where it was not measured.
-        best: Position of the epoch whose weights are kept.
-    """
+    """Loss and success (0 where not measured) at epoch 0 and each evaluated epoch; the weights of `best` are kept."""
 
     losses: list[float] = field(default_factory=list)
     successes: list[float] = field(default_factory=list)
@@ -122,15 +117,12 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
 
     def make_optimizer(self, epochs: int) -> None:
         """Build the configured optimiser, and the scheduler for the given number of epochs."""
-        train = self.cfg.train
-        optimizer = _torch_class(train.optimizer.name, torch.optim)
-        self.optimizer = optimizer(self.policy.parameters(), **plain(train.optimizer.kwargs))
+        optimizer, scheduler = self.cfg.train.optimizer, self.cfg.train.get("scheduler")
+        self.optimizer = _build_torch(optimizer, torch.optim, self.policy.parameters())
         self.scheduler = None
-        if train.get("scheduler"):
-            kwargs = {"T_max": epochs} if train.scheduler.name.endswith("CosineAnnealingLR") else {}
-            kwargs |= plain(train.scheduler.get("kwargs") or {})
-            scheduler = _torch_class(train.scheduler.name, torch.optim.lr_scheduler)
-            self.scheduler = scheduler(self.optimizer, **kwargs)
+        if scheduler:
+            more = {"T_max": epochs} if scheduler.name.endswith("CosineAnnealingLR") else {}
+            self.scheduler = _build_torch(scheduler, torch.optim.lr_scheduler, self.optimizer, **more)
 
     def start_task(self, task: int) -> None:
         """Prepare for the first step on a task."""
@@ -179,16 +171,15 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         self.start_task(task_id)
 
         def measure(number: int) -> float | None:
-            states = result_summary.get(f"k{task_id}_e{number}") if self.cfg.eval.save_sim_states else None
-            return self.measure_success(task_id, benchmark, states)
+            return self.measure_success(task_id, benchmark, result_summary, f"k{task_id}_e{number}")
 
         every, path = self.cfg.eval.eval_every, self.checkpoint(task_id)
         curve = self.train_policy(dataset, self.cfg.train.n_epochs, every, path, measure)
         self.end_task(dataset, task_id, benchmark)
         self.save(path)
-        points = {"success": np.array(curve.successes), "loss": np.array(curve.losses)}
+        points = {"success": curve.successes, "loss": curve.losses}
         log = os.path.join(self.experiment_dir, f"task{task_id}_auc.log")
-        torch.save({name: torch.from_numpy(values) for name, values in points.items()}, log)
+        torch.save({name: torch.tensor(p, dtype=torch.float64) for name, p in points.items()}, log)
         return curve.means()
 
     def learn_all_tasks(
@@ -218,34 +209,23 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         """Write the policy, the configuration, and what else an evaluation needs."""
         torch_save_model(self.policy, path, cfg=self.cfg)
 
-    def measure_success(self, task_id: int, benchmark: Any, sim_states: Any = None) -> float | None:
+    def measure_success(self, task_id: int, benchmark: Any, kept: Any = None, key: str = "") -> float | None:
         """Return the mean success on a task, or group of tasks, that is being learned; None without evaluation."""
         if not self.cfg.eval.eval:
             return None
         size = int(self.cfg.data.task_group_size)
         tasks = range(task_id * size, (task_id + 1) * size)
-        return float(success_rates(self.cfg, self, benchmark, tasks, lambda _: sim_states, True).mean())
+        rates = evaluate_success(self.cfg, self, benchmark, tasks, kept, key=key, selecting=True)
+        return float(rates.mean())
 
     def train_policy(
-        self,
-        dataset: Dataset,
-        epochs: int,
-        every: int,
-        path: str,
-        measure: Callable[[int], float | None],
-        phase: int = 0,
+        self, dataset: Dataset, epochs: int, every: int, path: str, measure: Measure, phase: int = 0
     ) -> LearningCurve:
-        """Train for some epochs with `lifelong.training.fit`, and load the weights of the best evaluation.
+        """Train with `lifelong.training.fit`; load the weights of the best evaluation, or the last if none measures.
 
-        Unlike the original's loader, `fit` fills up the last batch of an epoch with further windows.
-
-        Args:
-            dataset: Windows to train on.
-            epochs: Number of epochs; epoch 0 only measures.
-            every: Number of epochs between two evaluations; the last epoch is evaluated too.
-            path: Path of the checkpoint.
-            measure: Function of the evaluation's number that returns the success. With None the last weights are kept.
-            phase: Number of the training phase within the task; part of the seed.
+        Epoch 0, every `every` epochs and the last are evaluated; the best weights so far are written to `path`. `phase`
+        is the number of the training phase within the task, a part of the seed. Unlike the original's loader, `fit`
+        fills up the last batch of an epoch with further windows.
         """
         curve, train = LearningCurve(), self.cfg.train
 
@@ -259,9 +239,9 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
             print(f"[info] epoch {epoch:3d} | loss {loss:7.3f}{text}", flush=True)
 
         def end_epoch(end: EpochEnd) -> None:
-            if end.epoch and self.scheduler is not None:
-                self.scheduler.step()
             if end.epoch:
+                if self.scheduler is not None:
+                    self.scheduler.step()
                 evaluate(end.epoch, end.loss)
 
         def step(batch: Any, draws: torch.Generator, _: float) -> tuple[Tensor, Tensor]:
@@ -291,7 +271,8 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         return curve
 
 
-def _torch_class(name: str, module: Any) -> Callable[..., Any]:
-    """Return a class of a module of torch by the last part of its name; raise an UnknownNameError if there is none."""
+def _build_torch(node: Any, module: Any, *args: Any, **kwargs: Any) -> Any:
+    """Build an object of the class that `node.name` ends with; raise an UnknownNameError if torch has none."""
     classes = {k: value for k, value in vars(module).items() if isinstance(value, type) and k[0].isupper()}
-    return lookup(classes, module.__name__, name.rpartition(".")[2])
+    kind = lookup(classes, module.__name__, node.name.rpartition(".")[2])
+    return kind(*args, **{**kwargs, **plain(node.get("kwargs") or {})})

@@ -25,16 +25,10 @@ class PackNet(Sequential):
         settings, (train, retrain) = self.cfg.lifelong, self.hooks.phases()
         self.hooks.end_phase(train, self.policy)
         self.hooks.begin_phase(retrain, self.policy)
-        if settings.post_prune_epochs:
-            self.make_optimizer(settings.post_prune_epochs)
-            self.train_policy(
-                dataset,
-                settings.post_prune_epochs,
-                settings.post_eval_every,
-                self.checkpoint(task_id),
-                lambda _: self.measure_success(task_id, benchmark),
-                phase=1,
-            )
+        if epochs := settings.post_prune_epochs:
+            self.make_optimizer(epochs)
+            path, measure = self.checkpoint(task_id), lambda _: self.measure_success(task_id, benchmark)
+            self.train_policy(dataset, epochs, settings.post_eval_every, path, measure, phase=1)
         self.hooks.end_phase(retrain, self.policy)
         self.hooks.end_task(task_id, DictWindows(dataset, task_id), self.policy, self.draws)
 
