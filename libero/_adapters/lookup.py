@@ -7,11 +7,7 @@ from libero_env.errors import UnknownNameError
 
 
 def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
-    """Return the entry of a name; case does not matter.
-
-    Raises:
-        UnknownNameError: The name does not exist; the message lists the valid names.
-    """
+    """Return the entry of a name, ignoring case; raise an UnknownNameError, which lists the valid names."""
     for key, value in table.items():
         if key.lower() == str(name).lower():
             return value

@@ -14,11 +14,7 @@ from libero_env.demos.curate import find_demo_files
     option("--num-demos", type=int, default=50, help="demonstrations expected in each file (default: 50)"),
 )
 def main(args: argparse.Namespace) -> int:
-    """Print one line for each file; return 1 where one is broken or incomplete.
-
-    Raises:
-        DemoError: There are no files.
-    """
+    """Print one line for each file; return 1 where one is broken or incomplete."""
     files = find_demo_files(args.paths or [datasets_folder()])
     broken = check_files(files, args.num_demos)
     print(f"{len(files) - broken} of {len(files)} files are complete")

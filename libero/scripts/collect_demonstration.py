@@ -25,11 +25,7 @@ OPTIONS = (
 
 
 def collect(args: argparse.Namespace) -> int:
-    """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early.
-
-    Raises:
-        LiberoError: The robot or controller does not exist, or the number of demonstrations is below 1.
-    """
+    """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early."""
     robots = [args.robots] if isinstance(args.robots, str) else args.robots
     for flag, got, known in (("--robots", robots, ["Panda"]), ("--controller", args.controller, "OSC_POSE")):
         if got != known:

@@ -26,11 +26,7 @@ KINDS = ("problem_class", "scene", "object", "arena")
     prog="libero.create_template",
 )
 def main(args: argparse.Namespace) -> None:
-    """Write the files and print their paths.
-
-    Raises:
-        LiberoError: An answer is missing or invalid, or a file exists.
-    """
+    """Write the files and print their paths; raise a LiberoError if a file exists or an answer is not valid."""
     kind = args.template or ask(f"Kind of template ({', '.join(KINDS)})", "--template")
     if kind not in KINDS:
         raise LiberoError(f"{kind!r} is not a template; valid: {', '.join(KINDS)}")

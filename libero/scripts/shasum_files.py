@@ -16,11 +16,7 @@ from libero_env.errors import LiberoError
     option("--check", type=Path, metavar="LIST", help="compare with a list that was printed before"),
 )
 def main(args: argparse.Namespace) -> int:
-    """Print the checksums, or compare them; return 1 where one differs.
-
-    Raises:
-        LiberoError: There are no files, or a line of the list has no checksum.
-    """
+    """Print the checksums, or compare them; return 1 where one differs."""
     if args.check:
         return compare(args.check)
     roots = args.paths or [datasets_folder()]

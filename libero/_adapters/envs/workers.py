@@ -79,11 +79,7 @@ class EnvWorker(ABC):
 
     @abstractmethod
     def recv(self) -> Any:
-        """Return the result of the call that was started.
-
-        Raises:
-            WorkerError: The call failed, the process died, or the time is over.
-        """
+        """Return the result of the call; raise a WorkerError if it failed, the process died, or the time is over."""
 
     @abstractmethod
     def close_env(self) -> None:

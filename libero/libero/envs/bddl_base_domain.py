@@ -247,14 +247,11 @@ class BDDLBaseDomain:
         command = self.robots[0].command(action)
         self.timestep += 1
         mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
-        self.simulations.step([0], command[None], before_last_kinematics=self._observe)
+        self.simulations.step([0], command[None], before_last_kinematics=lambda _: self._update_observables())
         self.cur_time += 1.0 / self.control_freq
         reward, self.done, info = self._post_action(action)
         success = self._check_success()
         return self._get_observations(), reward, success, {"success": success, **info}
-
-    def _observe(self, _: mujoco.MjData) -> None:
-        self._observations = self.observer.observe()
 
     def _post_action(self, action: Any) -> tuple[float, bool, dict[str, Any]]:
         return self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
@@ -276,10 +273,9 @@ class BDDLBaseDomain:
         """Return the truth of an atom, `["on", "a_1", "b_1"]`, or of a nested goal; case does not matter."""
         if state[0].lower() in ("and", "or", "not", "forall"):
             return evaluate(BDDLUtils.as_expression(list(state)), self.view)
-        return bool(eval_predicate_fn(state[0], *(self._state(name) for name in state[1:])))
-
-    def _state(self, name: str) -> BaseObjectState:
-        return lookup(self.object_states_dict, "object, fixture or region", name)
+        known = self.object_states_dict
+        states = [lookup(known, "object, fixture or region", name) for name in state[1:]]
+        return bool(eval_predicate_fn(state[0], *states))
 
     # Observations -------------------------------------------------------------------------------------------
 

@@ -79,11 +79,7 @@ class ControlEnv:
         return self.env.step(action)
 
     def reset(self) -> Mapping[str, np.ndarray]:
-        """Sample an initial state and observe it.
-
-        Raises:
-            PlacementError: The objects did not fit in five attempts.
-        """
+        """Sample an initial state and observe it; raise a PlacementError if the objects do not fit, five times."""
         for _ in range(_RESETS - 1):
             try:
                 return self.env.reset()
@@ -108,11 +104,7 @@ class ControlEnv:
         self.env.restart(mujoco_state)
 
     def set_init_state(self, init_state: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Set the state and observe it; the arm holds its pose and the horizon counts from here.
-
-        Args:
-            init_state: [time, qpos, qvel], with or without the poses of the fixtures after it.
-        """
+        """Set the state, see `BDDLBaseDomain.restart`, and observe it; the horizon counts from here."""
         self.env.timestep, self.env.done = 0, False
         return self.regenerate_obs_from_state(init_state)
 
@@ -152,9 +144,7 @@ class OffScreenRenderEnv(ControlEnv):
 class DemoRenderEnv(OffScreenRenderEnv):
     """An environment that renders demonstrations."""
 
-    def _get_observations(self) -> Mapping[str, np.ndarray]:
-        """Return the last observation."""
-        return self.env._get_observations()
+    _get_observations = ControlEnv.get_observation
 
 
 class SegmentationRenderEnv(OffScreenRenderEnv):

@@ -2,7 +2,6 @@
 
 import http.client
 import os
-import urllib.error
 import urllib.request
 import zipfile
 from pathlib import Path
@@ -44,7 +43,7 @@ def url_is_alive(url: str) -> bool:
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=30):
             return True
-    except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError):
+    except (http.client.HTTPException, OSError, ValueError):
         return False
 
 

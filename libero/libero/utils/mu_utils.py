@@ -34,11 +34,7 @@ def scene_key(name: str) -> str:
 
 
 def register_mu(scene_type: str) -> Callable[[Template], Template]:
-    """Class decorator: register a scene by its name; a scene of the same name is replaced.
-
-    Args:
-        scene_type: Type of the scene, such as `kitchen`; any name is valid.
-    """
+    """Return a decorator that registers a scene of any type by its name; a scene of the same name is replaced."""
 
     def register(target_class: Template) -> Template:
         key = scene_key(target_class.__name__)

@@ -56,7 +56,9 @@ def register_task_info(
     objects_of_interest: Sequence[str] = (),
     goal_states: Sequence[Any] = (),
 ) -> Any:
-    """Define a task on a scene; a task of the same scene and instruction is replaced.
+    """Define a task on a scene and return it; a LiberoError states what is missing.
+
+    A task of the same scene and instruction is replaced. As a decorator, it returns the class.
 
     Args:
         language: Instruction of the task. Or, as a class decorator, a class without arguments whose instances have
@@ -64,12 +66,6 @@ def register_task_info(
         scene_name: Name of a registered scene, in any spelling.
         objects_of_interest: Names; by default those in the goal.
         goal_states: Conditions that must all hold, such as `("On", "plate_1", "flat_stove_1_cook_region")`.
-
-    Returns:
-        The task; as a decorator, the class.
-
-    Raises:
-        LiberoError: Scene, instruction or goal is missing.
     """
     if isinstance(language, type):
         info = _info_of(language())
@@ -107,13 +103,7 @@ def generate_bddl_from_task_info(folder: Any = "", output_dir: str | os.PathLike
 
 
 def bddl_text(task: TaskInfoTuple) -> str:
-    """Return the task file of a task.
-
-    Raises:
-        UnknownNameError: A scene, category or predicate does not exist.
-        BDDLError: A condition uses a name that the scene does not have.
-        LiberoError: A condition has too few or too many names.
-    """
+    """Return the task file of a task; raise a LiberoError that names what does not exist or does not fit."""
     scene: InitialSceneTemplates = get_scene_class(task.scene_name)()
     goal, regions = get_goal_state(task.goal_states), region_module((), scene.affordance_region_kwargs_list)
     interest = entities_in_goal(goal, regions, scene.movable_objects, scene.fixtures)

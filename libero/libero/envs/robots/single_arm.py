@@ -37,6 +37,7 @@ class Controller:
 
     Attributes:
         name: Name of the controller, such as `OSC_POSE`.
+        goal_pos, goal_ori: Goal of the grip site under operational space control, (3,) m and (3, 3).
     """
 
     def __init__(self, env: Domain, config: Mapping[str, Any]):
@@ -45,6 +46,8 @@ class Controller:
         env.simulations.controller_state = ControllerState(1, get_controller(self.name.lower(), delta))
 
     _state = property(attrgetter("_env.simulations.controller_state"))
+    goal_pos = property(lambda self: self._state.goal[0])
+    goal_ori = property(lambda self: self._state.memory[0].reshape(3, 3))
     ee_pos = property(attrgetter("_env.view.eef_pos"), doc="Position of the grip site, (3,) m.")
     ee_ori_mat = property(attrgetter("_env.view.eef_mat"), doc="Orientation of the grip site, (3, 3).")
     joint_pos = property(lambda self: self._env.sim.data.qpos[:7].copy(), doc="Joint positions, (7,) rad.")
@@ -62,16 +65,6 @@ class Controller:
     def control_dim(self) -> int:
         """Length of an action without the gripper."""
         return self._state.controller.action_dim - 1
-
-    @property
-    def goal_pos(self) -> np.ndarray:
-        """Goal position of the grip site under operational space control, (3,) m."""
-        return self._state.goal[0]
-
-    @property
-    def goal_ori(self) -> np.ndarray:
-        """Goal orientation of the grip site under operational space control, (3, 3)."""
-        return self._state.memory[0].reshape(3, 3)
 
     def update(self, force: bool = False) -> None:
         """Do nothing: kinematics are read when they are needed."""
@@ -145,11 +138,7 @@ class SingleArm:
         self.sim.forward()
 
     def command(self, action: Any) -> np.ndarray:
-        """Return an action as the controller takes it: of seven numbers for `OSC_POSITION` the rotation is left out.
-
-        Raises:
-            ActionError: The action has the wrong shape or is not finite.
-        """
+        """Return an action, see `checked_actions`; of seven numbers for `OSC_POSITION` the rotation is left out."""
         action = np.asarray(action)
         if self.action_dim == 4 and action.shape == (7,):
             action = action[[0, 1, 2, 6]]
