@@ -13,7 +13,7 @@ from libero.libero.envs.bddl_base_domain import TASK_MAPPING, BDDLBaseDomain
 from libero_env.errors import PlacementError
 
 _RESETS = 5
-_NOT_FORWARDED = ("self", "bddl_file_name", "controller", "kwargs")
+_NOT_FORWARDED = ("self", "bddl_file_name", "controller", "kwargs")  # all others go to the domain as they are
 DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
 
 
@@ -24,7 +24,7 @@ class ControlEnv:
         bddl_file_name: Task file; for the tasks of the benchmark its name without a folder is enough.
         controller: Name of the controller, such as `OSC_POSE`, or its configuration.
         camera_names, camera_heights, camera_widths: One value, or one for each camera.
-        kwargs: Further arguments; they and the other parameters are those of `BDDLBaseDomain`.
+        kwargs: Further arguments of `BDDLBaseDomain`, which also describes the other parameters.
 
     Raises:
         BDDLError: The file is not a task file.
