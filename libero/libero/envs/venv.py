@@ -9,8 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.envs.workers import *  # noqa: F403 - names of the original
-from libero._adapters.envs.workers import DummyEnvWorker, EnvWorker, SubprocEnvWorker, WorkerError
+from libero._adapters.envs.workers import (  # noqa: F401 - names of the original
+    CloudpickleWrapper,
+    DummyEnvWorker,
+    EnvWorker,
+    ShArray,
+    SubprocEnvWorker,
+    WorkerError,
+)
 from libero_env.errors import LiberoError
 
 Ids = int | Sequence[int] | np.ndarray | None

@@ -1,9 +1,20 @@
 """Samplers of positions and of joint positions, by problem and region."""
 
 from libero._adapters.lookup import lookup
-from libero.libero.envs.regions.object_property_sampler import *  # noqa: F403
-from libero.libero.envs.regions.samplers import *  # noqa: F403
-from libero.libero.envs.regions.samplers import Libero100TableRegionSampler, TableRegionSampler
+from libero.libero.envs.regions.object_property_sampler import (
+    ObjectPropertySampler,
+    OpenCloseSampler,
+    TurnOnOffSampler,
+)
+from libero.libero.envs.regions.samplers import (
+    InSiteRegionRandomSampler,
+    Libero100TableRegionSampler,
+    MultiRegionRandomSampler,
+    ObjectBasedSampler,
+    SiteRegionRandomSampler,
+    SiteSequentialCompositeSampler,
+    TableRegionSampler,
+)
 
 _TABLES = {
     "libero_tabletop_manipulation": ("table", TableRegionSampler),
