@@ -247,7 +247,7 @@ def test_the_settings_of_a_run_take_files(tmp_path):
         BenchmarkSettings("own", files=[]),
         BenchmarkSettings("own", files=files[0]),
     ):
-        with pytest.raises(ConfigError, match="name task files"):
+        with pytest.raises(ConfigError, match="give a list of task files"):
             bad.sequence()
     with pytest.raises(ConfigError, match="use benchmark=own"):
         BenchmarkSettings("libero_goal", files=files).sequence()
