@@ -134,11 +134,10 @@ def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
 def _open_folder(cfg: Any) -> int:
     """Create the folder of the run, or find that of the interrupted one; return the number of tasks done there."""
     if cfg.train.resume:
-        path = Path(cfg.train.resume_path) if cfg.train.resume_path else latest_run(experiment_root(cfg))
+        root = experiment_root(cfg)
+        path = Path(cfg.train.resume_path) if cfg.train.resume_path else latest_run(root)
         if path is None or not path.is_dir():
-            raise ConfigError(
-                f"train.resume: no run at {path or experiment_root(cfg)}; set train.resume_path to one"
-            )
+            raise ConfigError(f"train.resume: no run at {path or root}; set train.resume_path to one")
         cfg.experiment_dir, cfg.experiment_name = str(path), "_".join(path.parts[-4:])
     else:
         create_experiment_dir(cfg)
@@ -192,19 +191,15 @@ class _Run:
             summary["S_conf_mat"][i, : i + 1] = rates.reshape(-1, size).mean(1)
             shown = f"success {np.round(rates, 2).tolist()}, loss {np.round(losses, 3).tolist()}"
             print(f"[info] after task {i}: {shown}")
-            means = {"success/mean": float(rates.mean()), "loss/mean": float(losses.mean())}
-            self.tracker.log({**means, "tasks": i + 1})
+            means = {"success/mean": float(rates.mean()), "loss/mean": float(losses.mean()), "tasks": i + 1}
+            self.tracker.log(means)
         with atomic_path(Path(self.cfg.experiment_dir, "result.pt")) as path, open(path, "wb") as file:
-            arrays = {key: torch.as_tensor(summary[key]) for key in RESULTS}
-            rest = {key: value for key, value in summary.items() if key not in RESULTS}
-            states = {key: [[torch.as_tensor(x) for x in one] for one in rest[key]] for key in rest}
-            torch.save({**arrays, **states}, file)
+            torch.save(_tensors(summary), file)
 
     def _empty_summary(self) -> dict[str, Any]:
         """Return results of zeros, with lists for simulator states if they are kept."""
         count, cfg = len(self.datasets), self.cfg
-        shapes = {name: (count, count) if "mat" in name else (count,) for name in RESULTS}
-        summary: dict[str, Any] = {name: np.zeros(shape) for name, shape in shapes.items()}
+        summary: dict[str, Any] = {name: np.zeros([count] * (2 if "mat" in name else 1)) for name in RESULTS}
         if cfg.eval.save_sim_states:
             tasks, points = range(self.benchmark.n_tasks), -(-cfg.train.n_epochs // cfg.eval.eval_every) + 1
             keys = [f"k{k}_p{p}" for k in tasks for p in range(k + 1)]
@@ -225,3 +220,12 @@ class _Run:
 
     def _state_path(self, task: int) -> Path:
         return Path(self.cfg.experiment_dir, f"task{task}_state.safetensors")
+
+
+def _tensors(node: Any) -> Any:
+    """Return nested dictionaries and lists with tensors for arrays, which torch.load reads without executing code."""
+    if isinstance(node, dict):
+        return {key: _tensors(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_tensors(value) for value in node]
+    return torch.from_numpy(node.copy()) if isinstance(node, np.ndarray) else node

@@ -44,9 +44,7 @@ class NpEncoder(json.JSONEncoder):
     """Encodes NumPy and PyTorch arrays as lists, their scalars as numbers."""
 
     def default(self, o: Any) -> Any:
-        if isinstance(o, np.ndarray | Tensor | np.generic):
-            return o.tolist()
-        return super().default(o)
+        return o.tolist() if isinstance(o, np.ndarray | Tensor | np.generic) else super().default(o)
 
 
 def torch_save_model(model: nn.Module, model_path: Any, cfg: Any = None, previous_masks: Any = None) -> None:
@@ -101,8 +99,7 @@ def compute_flops(algo: Any, dataset: Dataset, cfg: Any) -> tuple[float, float]:
     window = algo.map_tensor_to_device(default_collate([dataset[0]]))
     with torch.no_grad(), count_flops() as counter:
         policy(policy.preprocess_input(window, train_mode=True))
-    parameters = sum(p.numel() for p in policy.parameters())
-    gflops, mparams = counter.get_total_flops() / 1e9, parameters / 1e6
+    gflops, mparams = counter.get_total_flops() / 1e9, sum(p.numel() for p in policy.parameters()) / 1e6
     print(f"[info] policy: {gflops:.3f} GFLOPs, {mparams:.3f} M parameters")
     return gflops, mparams
 

@@ -16,7 +16,9 @@ class DictBatch:
     data: Any
 
     def __len__(self) -> int:
-        return _batch_size(self.data)
+        if isinstance(self.data, dict):
+            return max((len(DictBatch(part)) for part in self.data.values()), default=0)
+        return len(self.data) if isinstance(self.data, Tensor) and self.data.dim() else 0
 
     def to(self, device: torch.device | str) -> "DictBatch":
         """Return the batch on another device."""
@@ -57,9 +59,3 @@ def _join(a: Any, b: Any) -> Any:
     if isinstance(a, Tensor):
         return torch.cat([a, b.to(a.device)])
     return {k: _join(v, b[k]) for k, v in a.items() if k in b} if isinstance(a, dict) else a
-
-
-def _batch_size(node: Any) -> int:
-    if isinstance(node, dict):
-        return max((_batch_size(part) for part in node.values()), default=0)
-    return len(node) if isinstance(node, Tensor) and node.dim() else 0

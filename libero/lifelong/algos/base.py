@@ -206,8 +206,8 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         return os.path.join(self.experiment_dir, f"task{task_id}_model.pth")
 
     def save(self, path: str) -> None:
-        """Write the policy, the configuration, and what else an evaluation needs."""
-        torch_save_model(self.policy, path, cfg=self.cfg)
+        """Write the policy, the configuration, and the masks of an algorithm that has them."""
+        torch_save_model(self.policy, path, self.cfg, getattr(self, "previous_masks", None))
 
     def measure_success(self, task_id: int, benchmark: Any, kept: Any = None, key: str = "") -> float | None:
         """Return the mean success on a task, or group of tasks, that is being learned; None without evaluation."""

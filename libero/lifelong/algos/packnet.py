@@ -9,7 +9,6 @@ from torch.utils.data import Dataset
 
 from libero._adapters.lifelong.batches import DictWindows
 from libero.lifelong.algos.base import Sequential
-from libero.lifelong.utils import torch_save_model
 from lifelong import algorithms
 
 
@@ -50,7 +49,3 @@ class PackNet(Sequential):
         other.hooks = algorithms.Sequential()
         other.eval()
         return other
-
-    def save(self, path: str) -> None:
-        """See `Sequential`; with the masks."""
-        torch_save_model(self.policy, path, cfg=self.cfg, previous_masks=self.previous_masks)

@@ -73,9 +73,9 @@ class ResnetEncoder(nn.Module):
     ):
         super().__init__()
         self.language_dim, self.output_size = language_dim, output_size
-        more = {**resnet_arguments(remove_layer_num, no_stride), "latent_dim": output_size, **more}
-        more = {"image_size": tuple(input_shape)[1:], "language_dim": language_dim, **more}
-        self.encoder = vision.ResNetFiLMEncoder(**more)
+        sizes: dict[str, Any] = {"image_size": tuple(input_shape)[1:], "latent_dim": output_size}
+        sizes |= {"language_dim": language_dim, **resnet_arguments(remove_layer_num, no_stride)}
+        self.encoder = vision.ResNetFiLMEncoder(**{**sizes, **more})
         configure_resnet(self.encoder, pretrained, freeze, language_fusion)
 
     def forward(self, x: Tensor, langs: Tensor | None = None) -> Tensor:
