@@ -118,6 +118,20 @@ def test_an_interrupted_run_resumes_to_the_same_weights(folder):
     assert all(torch.equal(kept[n], p) for n, p in states[0]["policy"].items())
 
 
+class NotingAlgorithm(algos.Sequential):
+    """Adds entries of its own to the results."""
+
+    def learn_one_task(self, dataset, task_id, benchmark, result_summary):
+        result_summary["notes"] = {"task": task_id, "norms": np.arange(3.0), "name": "noting"}
+        return super().learn_one_task(dataset, task_id, benchmark, result_summary)
+
+
+def test_results_of_a_user_defined_algorithm_are_written_too(folder):
+    cfg = config(folder, "lifelong.algo=NotingAlgorithm", "eval.eval=false", "train.n_epochs=0")
+    notes = torch.load(run(cfg) / "result.pt")["notes"]
+    assert (notes["task"], notes["norms"].tolist(), notes["name"]) == (1, [0.0, 1.0, 2.0], "noting")
+
+
 def test_missing_demonstrations_are_generated(folder, monkeypatch, capsys):
     """The expert is asked for the demonstrations that the configuration needs; here it returns noise."""
     asked = []
