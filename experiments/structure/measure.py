@@ -121,6 +121,13 @@ def _first(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return 0 if ast.get_docstring(function) else function.body[0].lineno - 1
 
 
+def docstring_lines(trees: Sequence[ast.Module]) -> int:
+    """Return how many lines are docstrings."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    owners = [n for tree in trees for n in ast.walk(tree) if isinstance(n, kinds) and ast.get_docstring(n)]
+    return sum(_end(n.body[0]) - n.body[0].lineno + 1 for n in owners)
+
+
 def exempt_modules(checkout: Path) -> int:
     """Return how many modules mypy leaves out."""
     overrides = tomllib.loads((checkout / "pyproject.toml").read_text())["tool"]["mypy"]["overrides"]
@@ -144,6 +151,7 @@ def measure(checkout: Path) -> dict[str, str]:
     lines = {package: sum(text.count("\n") for text, _ in files) for package, files in read.items()}
     figures["lines"] = f"{sum(lines.values())}: " + ", ".join(f"{k} {v}" for k, v in lines.items())
     trees = [tree for files in read.values() for _, tree in files]
+    figures["lines"] += f"; {docstring_lines(trees)} of them docstrings"
     whole, bodies = long_functions(trees)
     figures[f"functions over {LONG} lines"] = f"{whole}, {bodies} of them without signature and docstring"
     figures["modules exempt from mypy"] = str(exempt_modules(checkout))
