@@ -35,8 +35,21 @@ def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
     return 2 * error[:, :, None] * data.features[:, None, :]  # (N, A, D)
 
 
-def killed_again_and_again(path, algo, monkeypatch):
-    """Learn the sequence, killed in the second write of every process; return the number of processes."""
+def assert_resumed_equals_uninterrupted(folder, algo, monkeypatch):
+    """Learn the sequence uninterrupted, and killed at every few writes; return how many processes that took."""
+    uninterrupted = sequences.run_context(folder / "whole", algo)
+    sequences.sequence(uninterrupted).run()
+    records, state = sequences.outcome(folder / "whole", uninterrupted.directory.log)
+    starts, resumed = _killed_repeatedly(folder / "killed", algo, monkeypatch)
+    assert starts > 2
+    same_records, same_state = sequences.outcome(folder / "killed", resumed.directory.log)
+    assert same_records == records
+    sequences.assert_same(same_state, state)
+    return starts
+
+
+def _killed_repeatedly(path, algo, monkeypatch):
+    """Learn the sequence in processes that are killed; return how many there were, and the context of the last."""
     starts, writes = 0, 1
     while True:
         starts += 1

@@ -19,7 +19,7 @@ from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Observation
 from tests.harness import sequences
-from tests.harness.algorithms import killed_again_and_again, learn, outputs
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn, outputs
 from tests.harness.fakes import DeepPolicy, Windows
 from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
@@ -66,13 +66,7 @@ def harness(monkeypatch):
 
 @pytest.mark.parametrize("algo", ALL)
 def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkeypatch):
-    harness.sequence(p := harness.run_context(tmp_path / "whole", algo)).run()
-    records, state = harness.outcome(tmp_path / "whole", p.directory.log)
-    starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
-    assert starts > 2
-    again, end = harness.outcome(tmp_path / "killed", p.directory.log)
-    assert again == records
-    harness.assert_same(end, state)
+    assert_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch)
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)

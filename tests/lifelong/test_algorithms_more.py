@@ -16,7 +16,7 @@ from lifelong.seeding import generator
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
-from tests.harness.algorithms import SETTINGS, killed_again_and_again, learn
+from tests.harness.algorithms import SETTINGS, assert_resumed_equals_uninterrupted, learn
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 ALL = {
@@ -92,13 +92,7 @@ def harness(monkeypatch):
 
 @pytest.mark.parametrize("algo", ALL)
 def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkeypatch):
-    harness.sequence(p := harness.run_context(tmp_path / "whole", algo)).run()
-    records, state = harness.outcome(tmp_path / "whole", p.directory.log)
-    starts, p = killed_again_and_again(tmp_path / "killed", algo, monkeypatch)
-    assert starts > 2
-    again, end = harness.outcome(tmp_path / "killed", p.directory.log)
-    assert again == records
-    harness.assert_same(end, state)
+    assert_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch)
 
 
 def test_what_an_algorithm_computes_has_the_precision_of_the_loss():

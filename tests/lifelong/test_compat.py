@@ -15,7 +15,7 @@ from lifelong.settings import build
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
-from tests.harness.algorithms import by_hand, killed_again_and_again, learn, outputs
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted, by_hand, learn, outputs
 from tests.harness.configs import CONFIGS, FILES, composed
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
@@ -197,13 +197,7 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
     monkeypatch.setattr(
         sequences, "run_context", lambda *a: dataclasses.replace(run_context(*a), augment=mirrored)
     )
-    sequences.sequence(p := sequences.run_context(tmp_path / "whole", "ewc")).run()
-    records, state = sequences.outcome(tmp_path / "whole", p.directory.log)
-    starts, p = killed_again_and_again(tmp_path / "killed", "ewc", monkeypatch)
-    assert starts > 2
-    again, end = sequences.outcome(tmp_path / "killed", p.directory.log)
-    assert again == records
-    sequences.assert_same(end, state)
+    assert_resumed_equals_uninterrupted(tmp_path, "ewc", monkeypatch)
 
 
 # --- the switch

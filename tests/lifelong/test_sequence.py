@@ -4,13 +4,10 @@ import pytest
 
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.training.costs import COSTS
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.sequences import (
     ALGORITHMS,
     TASKS,
-    Killed,
-    Killer,
-    assert_same,
-    outcome,
     run_context,
     sequence,
 )
@@ -18,25 +15,7 @@ from tests.harness.sequences import (
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_killed_at_every_write_and_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch):
-    sequence(p := run_context(tmp_path / "whole", algo)).run()
-    records, state = outcome(tmp_path / "whole", p.directory.log)
-    path, starts, writes = tmp_path / "killed", 0, 1
-    while True:
-        starts += 1
-        with monkeypatch.context() as patch:
-            p = run_context(path, algo)
-            killer = Killer(patch, writes)
-            patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
-            try:
-                sequence(p).run()
-                break
-            except Killed:
-                writes = 2 + starts % 3  # die after two, three or four more writes
-        assert starts < 100
-    assert starts > 5
-    again, end = outcome(path, p.directory.log)
-    assert again == records
-    assert_same(end, state)
+    assert assert_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch) > 5
 
 
 def test_the_records_are_complete(tmp_path):
