@@ -82,21 +82,16 @@ class DMPEL(Algorithm):
         Raises:
             ConfigError: A number below its smallest valid value.
         """
-        for name, value in {
-            "rank": rank,
-            "experts": experts,
-            "pool": pool,
-            "replay_size": replay_size,
-        }.items():
+        positive = {"rank": rank, "experts": experts, "pool": pool, "replay_size": replay_size}
+        for name, value in positive.items():
             if value < 1:
                 raise ConfigError(f"algo.{name} is {value}; it must be at least 1")
         self.rank, self.scale, self.experts, self.top_k = rank, alpha / rank, experts, top_k
         self.adapted, self.hidden, self.pool = tuple(adapted), hidden, pool
         self.replay, self.replay_size = replay, replay_size
         self.task_index, self._base_left, self._seed = -1, base_tasks, 0
-        self._library: dict[
-            int, dict[str, dict[str, Tensor]]
-        ] = {}  # task -> layer -> a (e r, in), b (out, e r)
+        # task -> layer -> a (e r, in), b (out, e r)
+        self._library: dict[int, dict[str, dict[str, Tensor]]] = {}
         self._router: Router | None = None
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self._episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
