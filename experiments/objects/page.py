@@ -1,4 +1,4 @@
-"""Writes docs/gallery.md: the pictures of the gallery in tables, objects by family and tasks by suite."""
+"""Writes docs/gallery.md: the images of the gallery in tables, objects by family and tasks by suite."""
 
 from collections.abc import Sequence
 from importlib.resources import files
@@ -12,7 +12,7 @@ from libero_env.tasks import Task, get_suite, suite_names
 FAMILIES = {
     "groceries": "Groceries",
     "kitchenware": "Kitchenware",
-    "articulated": "Things with doors, drawers and knobs",
+    "articulated": "Objects with doors, drawers and knobs",
     "furniture": "Books, trays and shelves",
     "": "Others",
 }
