@@ -7,6 +7,7 @@ Imports are those of grimp (the library behind import-linter), inside functions 
 
 import argparse
 import ast
+import json
 import subprocess
 import sys
 import tomllib
@@ -27,8 +28,6 @@ print(json.dumps({m: sorted(graph.find_modules_directly_imported_by(m)) for m in
 
 def import_graph(checkout: Path) -> dict[str, list[str]]:
     """Return module -> modules it imports, read in a process of its own from this checkout."""
-    import json
-
     command = [sys.executable, "-P", "-c", _GRAPH, str(checkout), *PACKAGES]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True, cwd="/").stdout)
 
