@@ -16,6 +16,8 @@ from libero_env.assets.simplify import MeshSource, merge_and_simplify
 from libero_env.errors import MissingPackageError
 from libero_env.mujoco_compat import delete
 
+ROBOTS = ("libero", "robosuite-1.4.1")
+DEFAULT_ROBOT = "libero"
 ROBOSUITE_VERSION = "1.4.1"
 ROBOSUITE_REMEDY = f"pip install --no-deps robosuite=={ROBOSUITE_VERSION}"
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
@@ -71,7 +73,7 @@ def robosuite_version() -> str:
         raise _not_installed() from error
 
 
-def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float]) -> None:
+def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFAULT_ROBOT) -> None:
     """Add the arm with its gripper to a scene, with the names of the original benchmark.
 
     Bodies, joints and sites of the arm start with `robot0_`, those of the gripper with `gripper0_`; the root body is
@@ -80,6 +82,7 @@ def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float]) -> None:
     Args:
         spec: Scene to extend.
         pos_world: Position of the base, (3,) [m].
+        robot: One of `ROBOTS`.
 
     Raises:
         MissingPackageError: Robosuite, which supplies the models, is not installed.

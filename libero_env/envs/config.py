@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
 from libero_env.assets.pack import Pack
+from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import UnknownNameError
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
+from libero_env.sim.scene import DRAWINGS
 
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
@@ -29,9 +31,11 @@ class EnvConfig:
         reward_scale: Reward of success.
         assets: Asset pack of the models: a `Pack`, `builtin`, a folder, or None for the user's choice.
         semantics: Semantics of the predicates: `original`, or `strict`, see `libero_env.sim.predicates`.
+        drawing: How images are drawn: `faithful`, `fast`, or None for the pack's default, see `libero_env.sim.scene`.
+        robot: Model of the arm: `libero`, or `robosuite-1.4.1`, see `libero_env.assets.robot`.
 
     Raises:
-        UnknownNameError: The semantics do not exist.
+        UnknownNameError: The semantics, the drawing or the robot do not exist.
     """
 
     cameras: Sequence[str] = DEFAULT_CAMERAS
@@ -44,6 +48,8 @@ class EnvConfig:
     reward_scale: float = 1.0
     assets: Pack | str | Path | None = None
     semantics: str = "original"
+    drawing: str | None = None
+    robot: str = DEFAULT_ROBOT
 
     def __post_init__(self) -> None:
         height, width = self.camera_size
@@ -52,6 +58,10 @@ class EnvConfig:
         object.__setattr__(self, "observations", tuple(self.observations))
         if self.semantics not in SEMANTICS:
             raise UnknownNameError("semantics", self.semantics, SEMANTICS)
+        if self.drawing is not None and self.drawing not in DRAWINGS:
+            raise UnknownNameError("drawing", self.drawing, DRAWINGS)
+        if self.robot not in ROBOTS:
+            raise UnknownNameError("robot", self.robot, ROBOTS)
 
     @classmethod
     def from_options(cls, config: "EnvConfig | None", options: Mapping[str, Any]) -> "EnvConfig":
@@ -84,6 +94,8 @@ class EnvOptions(TypedDict, total=False):
     reward_scale: float
     assets: Pack | str | Path | None
     semantics: str
+    drawing: str | None
+    robot: str
 
 
 def show_options(constructor: Constructor) -> Constructor:

@@ -61,7 +61,8 @@ class World:
         self.task = get_task(task) if isinstance(task, str) else task
         assets = config.assets
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
-        self.num, self.scene = num, build_scene(self.task.problem, pack)
+        self.num = num
+        self.scene = build_scene(self.task.problem, pack, drawing=config.drawing, robot=config.robot)
         self.simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
         self.simulations.controller_state = ControllerState(num, self.controller)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]

@@ -14,13 +14,14 @@ import numpy as np
 
 from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, load_workspace
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS, add_panda
+from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.tasks.problem import Problem, Region
 from libero_env.timing import TIMESTEP
 
+DRAWINGS = ("fast", "faithful")
 ROBOT = "robot"  # name of arm and gripper in contacts
 _MAX_IMAGE = 1024  # [pixels] largest edge of an image; size of the offscreen buffer
 _FIXTURE_LIFT = 0.01  # [m] height of fixtures over the underside of the table top, as in the original
@@ -39,6 +40,8 @@ class Scene:
         model: Compiled model.
         objects: Movable objects by name, in the order of the task file.
         fixtures: Fixtures by name, without the workspace, in the order of the task file.
+        drawing: How images are drawn, one of `DRAWINGS`.
+        robot: Model of the arm, one of `libero_env.assets.robot.ROBOTS`.
     """
 
     problem: Problem
@@ -48,6 +51,8 @@ class Scene:
     model: mujoco.MjModel
     objects: Mapping[str, ObjectModel]
     fixtures: Mapping[str, ObjectModel]
+    drawing: str
+    robot: str
 
     @property
     def nq_robot(self) -> int:
@@ -103,31 +108,46 @@ class Scene:
         return region.target if region is not None and region.target in self.entities else None
 
 
-def build_scene(problem: Problem, pack: Pack | None = None) -> Scene:
+def build_scene(
+    problem: Problem, pack: Pack | None = None, *, drawing: str | None = None, robot: str = DEFAULT_ROBOT
+) -> Scene:
     """Compile a problem; the result is cached for the process.
 
     Args:
         problem: Problem to compile.
         pack: Asset pack of the models; by default that of `select_pack`.
+        drawing: One of `DRAWINGS`; by default that of `default_drawing`.
+        robot: One of `libero_env.assets.robot.ROBOTS`.
 
     Raises:
         UnknownNameError: A category of objects or fixtures has no model.
     """
-    return _build_scene(problem, pack or select_pack())
+    pack = pack or select_pack()
+    return _build_scene(problem, pack, drawing or default_drawing(pack), robot)
+
+
+def default_drawing(pack: Pack) -> str:
+    """Return how images of a pack's scenes are drawn by default: fast."""
+    return "fast"
 
 
 @lru_cache(maxsize=160)
-def _build_scene(problem: Problem, pack: Pack) -> Scene:
+def _build_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
-    model = scene_spec(problem, pack, entities).compile()
+    model = scene_spec(problem, pack, entities, drawing=drawing, robot=robot).compile()
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
-    return Scene(problem, pack, workspace, name, model, objects, fixtures)
+    return Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot)
 
 
 def scene_spec(
-    problem: Problem, pack: Pack | None = None, entities: Mapping[str, ObjectModel] | None = None
+    problem: Problem,
+    pack: Pack | None = None,
+    entities: Mapping[str, ObjectModel] | None = None,
+    *,
+    drawing: str | None = None,
+    robot: str = DEFAULT_ROBOT,
 ) -> mujoco.MjSpec:
     """Return a new, editable model of a problem's scene.
 
@@ -135,6 +155,8 @@ def scene_spec(
         problem: Problem to build.
         pack: Asset pack of the models; by default that of `select_pack`.
         entities: Models of objects and fixtures by name; by default those of the pack.
+        drawing: One of `DRAWINGS`; by default that of `default_drawing`.
+        robot: One of `libero_env.assets.robot.ROBOTS`.
 
     Raises:
         UnknownNameError: A category of objects or fixtures has no model.
@@ -146,7 +168,7 @@ def scene_spec(
     _set_options(spec)
     pack.add_arena(spec, workspace, problem.scene_properties)
     add_mount(spec, workspace)
-    add_panda(spec, workspace.robot_base_pos)
+    add_panda(spec, workspace.robot_base_pos, robot)
     _add_zones(spec, problem, name, workspace)
     for entity, category in problem.objects.items():
         _add_object(spec, entity, pack.build(category) if entities is None else entities[entity])

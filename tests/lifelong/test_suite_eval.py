@@ -11,7 +11,7 @@ import pytest
 
 from libero_env.tasks import get_suite
 from lifelong.cli import main as cli
-from lifelong.cli.evaluate import load_callable
+from lifelong.evaluation.candidates import load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
 from lifelong.evaluation.protocols import PROTOCOLS, EvalProtocol, choose_init_states
