@@ -11,9 +11,9 @@ import pytest
 
 from libero_env.tasks import get_suite
 from lifelong.cli import main as cli
-from lifelong.evaluation.candidates import load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
+from lifelong.evaluation.candidates import load_callable
 from lifelong.evaluation.protocols import PROTOCOLS, EvalProtocol, choose_init_states
 from lifelong.evaluation.suite import SuiteEvaluation, overall
 from lifelong.results.metrics import wilson_interval
