@@ -33,3 +33,11 @@ class PolicyError(LifelongError, ValueError):
 
 class ResultsError(LifelongError):
     """Raised when results cannot be read or written; the message names the file and what is missing."""
+
+
+class ProtocolError(ConfigError):
+    """Raised for a protocol that is not valid; the message names its file and key."""
+
+
+class ProtocolMismatchError(LifelongError, ValueError):
+    """Raised when a policy was made for another protocol; the message names both values of every field that differs."""
