@@ -41,3 +41,7 @@ class ProtocolError(ConfigError):
 
 class ProtocolMismatchError(LifelongError, ValueError):
     """Raised when a policy was made for another protocol; the message names both values of every field that differs."""
+
+
+class EvaluationFileError(ResultsError, ValueError):
+    """Raised for the result of an evaluation that is missing, broken, or of another format or version."""

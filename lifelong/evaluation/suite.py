@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,39 +21,10 @@ from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.protocols import EvalProtocol
 from lifelong.evaluation.rollout import Rollouts, run_episodes, save_animation
-from lifelong.results.metrics import Estimate, combine_intervals, wilson_interval
+from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, overall, task_result
+from lifelong.results.metrics import Estimate
 from lifelong.results.records import installed_versions, utc_now
-from lifelong.results.subgoals import predicate_of
 from lifelong.results.summary import json_safe
-
-
-@dataclass(frozen=True)
-class TaskResult:
-    """Results of a policy on a task, with one entry per episode; see `lifelong.evaluation.rollout.Episode`."""
-
-    task: str
-    name: str
-    instruction: str
-    init_states: tuple[int, ...]
-    successes: tuple[bool, ...]
-    lengths: tuple[int, ...]
-    seconds: float
-    atoms: tuple[str, ...] = ()
-    atoms_ever: tuple[tuple[bool, ...], ...] = ()
-    atoms_at_end: tuple[tuple[bool, ...], ...] = ()
-
-    @property
-    def success(self) -> Estimate:
-        """Success rate with Wilson's interval."""
-        wins, count = sum(self.successes), len(self.successes)
-        low, high = wilson_interval(wins, count)
-        return Estimate(wins / count, float(low), float(high))
-
-    @property
-    def steps(self) -> float:
-        """Mean length of the successful episodes, [control steps]; NaN if there are none."""
-        lengths = [n for n, won in zip(self.lengths, self.successes, strict=True) if won]
-        return float(np.mean(lengths)) if lengths else float("nan")
 
 
 @dataclass(frozen=True)
@@ -99,25 +70,19 @@ class SuiteEvaluation:
         for task in self.tasks:
             results.append(self._stored_result(task) or self._evaluate(task))
             on_result(results[-1])
-        _write(self.out / "eval.json", self.summary(results))
+        self.result(results).write(self.out / FILE_NAME)
         return results
 
-    def summary(self, results: Sequence[TaskResult]) -> dict[str, Any]:
-        """Return everything as plain data: the policy, and its success on all tasks, each suite and each task."""
-        suites = dict.fromkeys(r.task.partition("/")[0] for r in results)
-        return {
-            "evaluated": dict(self.identity),
-            "protocol": asdict(self.protocol),
-            "init_states": self.init_states,
-            "finished": utc_now(),
-            "versions": dict(self.versions),
-            "success": asdict(overall(results)),
-            "suites": {
-                s: asdict(overall([r for r in results if r.task.startswith(s + "/")])) for s in suites
-            },
-            "predicates": predicate_rates(results),
-            "tasks": [asdict(r) | {"success": asdict(r.success), "mean_steps": r.steps} for r in results],
-        }
+    def result(self, results: Sequence[TaskResult]) -> EvaluationResult:
+        """Return the results of the tasks with all that they depend on."""
+        return EvaluationResult(
+            evaluated=self.identity,
+            protocol=asdict(self.protocol),
+            init_states=self.init_states,
+            versions=self.versions,
+            tasks=tuple(results),
+            times={"finished": utc_now()},
+        )
 
     def _evaluate(self, task: Task) -> TaskResult:
         env = self.env(task)
@@ -149,7 +114,7 @@ class SuiteEvaluation:
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
             digest = found.pop("digest")
-            rows = {f.name: _tuples(found[f.name]) for f in fields(TaskResult)}
+            result = task_result(found)
         except (ValueError, KeyError, AttributeError) as error:
             raise LifelongError(f"{path} is not a valid result of a task ({error}); remove it") from error
         if digest != self._digest(task):
@@ -157,7 +122,7 @@ class SuiteEvaluation:
                 f"{path} was made with another policy, protocol, set of initial states or version of the simulation: "
                 "name another folder with --out, or repeat the evaluation with --again"
             )
-        return TaskResult(**rows)
+        return result
 
     def _path(self, task: Task) -> Path:
         return self.out / "tasks" / f"{task.suite}_{task.index:02d}.json"
@@ -174,29 +139,6 @@ class SuiteEvaluation:
                 outcome = "success" if episode.success else "failure"
                 name = f"{task.suite}_{task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
                 save_animation(frames, folder / name, seconds_per_frame=seconds)
-
-
-def overall(results: Sequence[TaskResult]) -> Estimate:
-    """Return the mean success over tasks, with the interval from Wilson's of the tasks (see `combine_intervals`).
-
-    The tasks are fixed, so the interval covers the chance in the episodes, not the choice of tasks.
-    """
-    found = [r.success for r in results]
-    weights = np.full(len(found), 1 / max(1, len(found)))
-    return combine_intervals(
-        weights, [e.value for e in found], [e.low for e in found], [e.high for e in found]
-    )
-
-
-def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
-    """Return how often atoms of the goals held at any time, by predicate: means over atoms."""
-    rates: dict[str, list[float]] = {}
-    for result in results:
-        for i, atom in enumerate(result.atoms):
-            rates.setdefault(predicate_of(atom), []).append(
-                float(np.mean([row[i] for row in result.atoms_ever]))
-            )
-    return {name: float(np.mean(values)) for name, values in rates.items()}
 
 
 HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"
@@ -228,7 +170,6 @@ def _result(task: Task, done: Rollouts) -> TaskResult:
         init_states=tuple(e.init_state for e in done.episodes),
         successes=tuple(e.success for e in done.episodes),
         lengths=tuple(e.length for e in done.episodes),
-        seconds=done.seconds,
         atoms=done.atoms,
         atoms_ever=tuple(e.ever for e in done.episodes),
         atoms_at_end=tuple(e.at_end for e in done.episodes),
@@ -237,7 +178,3 @@ def _result(task: Task, done: Rollouts) -> TaskResult:
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:
     atomic_write_text(path, json.dumps(json_safe(values), indent=1, ensure_ascii=False) + "\n")
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

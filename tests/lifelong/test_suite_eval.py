@@ -15,7 +15,8 @@ from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
 from lifelong.evaluation.candidates import load_callable
 from lifelong.evaluation.protocols import PROTOCOLS, EvalProtocol, choose_init_states
-from lifelong.evaluation.suite import SuiteEvaluation, overall
+from lifelong.evaluation.suite import SuiteEvaluation
+from lifelong.results.evaluation_file import EvaluationResult, overall
 from lifelong.results.metrics import wilson_interval
 
 pytestmark = pytest.mark.unit
@@ -111,6 +112,7 @@ def test_success_with_intervals_overall_and_by_task(tmp_path):
     assert (results[0].success.low, results[0].success.high) == (low, high)
     assert set(policy.instructions) == {t.language for t in TASKS}
     found = json.loads((tmp_path / "eval.json").read_text())
+    assert EvaluationResult.read(tmp_path).tasks == tuple(results)
     assert found["success"]["value"] == 0.75
     both = overall(results)
     assert low < both.low < 0.75 < both.high < high, "two tasks tell more than one"
