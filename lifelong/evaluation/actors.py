@@ -1,6 +1,6 @@
 """Actors of rollouts: a policy of this package, or any object that answers observations with actions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from lifelong.errors import PolicyError
+from lifelong.evaluation.inputs import Obs
 from lifelong.policies.base import Policy
 from lifelong.training.precision import autocast
 from lifelong.types import Observation, PolicySpec
 
-Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
 ACTION_DIM = 7
 
 

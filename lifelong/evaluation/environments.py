@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lifelong.evaluation.actors import Obs
+from lifelong.evaluation.inputs import Obs
 
 
 class VectorEnv(Protocol):

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lifelong.evaluation.actors import Obs
+Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
 
 
 @dataclass(frozen=True)

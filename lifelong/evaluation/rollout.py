@@ -13,8 +13,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Actor, Obs, PolicyActor
+from lifelong.evaluation.actors import Actor, PolicyActor
 from lifelong.evaluation.environments import VectorEnv
+from lifelong.evaluation.inputs import Obs
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator
 

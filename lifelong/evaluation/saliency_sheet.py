@@ -10,7 +10,8 @@ from PIL import Image
 from libero_env.envs.batch import BatchEnv
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Obs, PolicyActor, observe
+from lifelong.evaluation.actors import PolicyActor, observe
+from lifelong.evaluation.inputs import Obs
 from lifelong.evaluation.restore import LoadedRun, restore
 from lifelong.evaluation.rollout import run_episodes
 from lifelong.evaluation.saliency import SaliencySettings, contact_sheet, saliency, window_at
