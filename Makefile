@@ -1,5 +1,6 @@
 # make train   set everything up, then train and evaluate (ARGS="algo=er seed=2" are Hydra overrides)
 # make test    set everything up, then the checks that CI runs
+# make assets  set everything up, and the original's models (340 MB), with which tests compare pictures
 # make docs    set everything up, then the documentation: build/site/index.html
 PYTHON ?= python3
 ARGS ?=
@@ -7,12 +8,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 GL_STAMP := $(VENV)/.gl
+ASSETS_STAMP := $(VENV)/.assets
 EXTRAS := train,assets,export,language,notebooks,robosuite,wandb,docs,dev
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl train test lint docs clean
+.PHONY: help setup gl assets train test lint docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -39,6 +41,13 @@ $(GL_STAMP): $(STAMP)
 	    apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri libosmesa6; \
 	fi
 	@$(BIN)/libero doctor --gl
+	@touch $@
+
+assets: setup $(ASSETS_STAMP)
+
+$(ASSETS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[original]'
+	$(BIN)/libero assets install
 	@touch $@
 
 train: setup

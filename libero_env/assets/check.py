@@ -9,6 +9,7 @@ from libero_env.assets.download import read_manifest
 from libero_env.assets.hub import broken_files
 from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack
+from libero_env.assets.published import check_folder
 from libero_env.assets.robot import robosuite_assets
 from libero_env.errors import LiberoError, MissingPackageError
 
@@ -18,9 +19,17 @@ def problems(pack: Pack) -> list[str]:
     found = _robot_problems()
     found += [f"{what}: {error}" for what in pack.categories() if (error := _build_error(pack, what))]
     found += [f"{what}: {error}" for what in WORKSPACES if (error := _arena_error(pack, what))]
-    if isinstance(pack, OriginalPack) and (record := read_manifest(Path(pack.root))):
-        found += [f"{name}: missing or changed" for name in broken_files(Path(pack.root), record[1])]
+    if isinstance(pack, OriginalPack):
+        found += _file_problems(Path(pack.root))
     return found
+
+
+def _file_problems(root: Path) -> list[str]:
+    """Return a line for each file that is not as the Hub listed it or, where it did not, as published."""
+    if record := read_manifest(root):
+        return [f"{name}: missing or changed" for name in broken_files(root, record[1])]
+    check_folder.cache_clear()
+    return list(check_folder(root).differences)
 
 
 def _robot_problems() -> list[str]:

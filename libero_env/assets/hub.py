@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from libero_env.errors import LiberoError
 
@@ -34,11 +35,23 @@ class Remote:
         """Return whether a file exists and has this size and digest."""
         if not path.is_file() or path.stat().st_size != self.size:
             return False
-        digest = hashlib.sha256() if self.kind == "sha256" else hashlib.sha1(f"blob {self.size}\0".encode())
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
-        return digest.hexdigest() == self.digest
+        return (_sha256(path) if self.kind == "sha256" else git_digest(path)) == self.digest
+
+
+def git_digest(path: Path) -> str:
+    """Return the id that a file has as a git blob, 40 hexadecimal digits."""
+    return _update(hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False), path)
+
+
+def _sha256(path: Path) -> str:
+    return _update(hashlib.sha256(), path)
+
+
+def _update(digest: Any, path: Path) -> str:
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def broken_files(folder: Path, remote: Mapping[str, Remote]) -> list[str]:

@@ -16,6 +16,7 @@ import mujoco
 from libero_env.assets.arena import Workspace, add_cameras_and_lights
 from libero_env.assets.original_arena import arena_spec
 from libero_env.assets.original_mjcf import object_xml
+from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import simplify_visuals
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.builtin.physics import load_physics
@@ -69,6 +70,11 @@ class OriginalPack:
     def name(self) -> str:
         """Name of the pack: `original`, or such as `original-lod500` with a level of detail."""
         return "original" if self.lod is None else f"original-lod{self.lod}"
+
+    @property
+    def digest(self) -> str:
+        """Digest of the files, that of the published ones or `modified-...`; see `libero_env.assets.published`."""
+        return check_folder(Path(self.root)).digest
 
     def categories(self) -> tuple[str, ...]:
         """Return all categories, those that users registered included, sorted."""

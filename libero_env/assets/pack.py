@@ -1,21 +1,28 @@
 """Which models a scene is built from: the builtin pack, or the original's files where the user has them."""
 
+import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import mujoco
 
 from libero_env.assets.arena import Workspace, add_arena
+from libero_env.assets.download import default_folder
+from libero_env.assets.installed import EXTRA, REMEDY, installed_folder
 from libero_env.assets.original import OriginalPack, is_original
-from libero_env.errors import LiberoError
+from libero_env.assets.published import require_published, require_undamaged
+from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.paths import config_file, read_config
 
 BUILTIN = "builtin"
+ORIGINAL = "original"  # the original's models, wherever they are installed
 VARIABLE = "LIBERO_ASSETS"
+_SOURCES = ("objects", "assets/arena.py", "assets/furniture.py", "assets/object_mjcf.py", "assets/styles.py")
 
 
 class Pack(Protocol):
@@ -26,6 +33,11 @@ class Pack(Protocol):
     @property
     def name(self) -> str:
         """Name of the pack in results and messages."""
+        ...
+
+    @property
+    def digest(self) -> str:
+        """Text that changes with the files of the models, for results: they say which models they were made with."""
         ...
 
     def build(self, category: str) -> ObjectModel:
@@ -61,6 +73,11 @@ class BuiltinPack:
         """Name of the pack: `builtin`."""
         return BUILTIN
 
+    @property
+    def digest(self) -> str:
+        """16 hexadecimal digits that change with the code and the parameters that models are generated from."""
+        return _builtin_digest()
+
     def build(self, category: str) -> ObjectModel:
         """Return a new model of a category; see `Pack`."""
         return get_object(category)
@@ -80,7 +97,7 @@ class Choice(NamedTuple):
     """A pack and why it is used.
 
     Attributes:
-        value: `builtin`, or a folder.
+        value: `builtin`, `original`, or a folder.
         reason: Where the choice was made.
     """
 
@@ -89,7 +106,10 @@ class Choice(NamedTuple):
 
 
 def chosen_assets(assets: str | os.PathLike | None = None) -> Choice:
-    """Return the choice of `select_pack`: the argument, `LIBERO_ASSETS`, the configured `assets`, or the default."""
+    """Return the choice of `select_pack`: the argument, `LIBERO_ASSETS`, the configured `assets`, or `builtin`.
+
+    An installed package does not change it: the same program has the same results with and without.
+    """
     if assets is not None:
         return Choice(os.fspath(assets), "requested by the caller")
     if value := os.environ.get(VARIABLE):
@@ -99,28 +119,80 @@ def chosen_assets(assets: str | os.PathLike | None = None) -> Choice:
     return Choice(BUILTIN, "the default")
 
 
+def facade_assets() -> Choice:
+    """Return the choice for code that was written for the original: as `chosen_assets`, with another default.
+
+    That default is the original's models where they are installed as packages, which was then done for their sake.
+    """
+    choice = chosen_assets()
+    ignored = choice.reason == str(config_file()) and _is_absent(choice.value)
+    if (choice.reason == "the default" or ignored) and installed_folder() is not None:
+        return Choice(
+            ORIGINAL, "the default of the facade where the original's models are installed as packages"
+        )
+    return choice
+
+
 def select_pack(assets: str | os.PathLike | None = None, lod: int | None = None) -> Pack:
     """Return the pack to build scenes from.
 
     Args:
-        assets: `builtin`, or the folder of the original's files. Default: `$LIBERO_ASSETS`, then the key `assets` of
+        assets: `builtin`; `original` for the original's models where they are installed as packages or downloaded; or
+            the folder of the original's files. Default: `$LIBERO_ASSETS`, then the key `assets` of
             `$LIBERO_CONFIG_PATH/config.yaml`, then `builtin`.
         lod: Largest number of triangles of a visual mesh of the original; None keeps all triangles.
 
     Raises:
+        MissingPackageError: `original` was requested, and is not installed.
+        ChangedAssetsError: Files are missing or damaged.
         LiberoError: The folder does not hold the original's files.
     """
-    value, reason = chosen_assets(assets)
-    if value == BUILTIN:
-        return BuiltinPack()
+    return pack_of(chosen_assets(assets), lod)
 
-    root = Path(value).expanduser().absolute()
-    if is_original(root):
-        return OriginalPack(str(root), lod)
-    if reason == str(config_file()) and not root.exists():
+
+def pack_of(choice: Choice, lod: int | None = None) -> Pack:
+    """Return the pack of a choice; see `select_pack`."""
+    value, reason = choice
+    if value == BUILTIN or (reason == str(config_file()) and _is_absent(value)):
         return BuiltinPack()  # the original writes this key whether there are files or not
-    raise LiberoError(
-        f"{root} ({reason}) does not hold the original assets: a folder with articulated_objects, scenes, "
-        f"stable_hope_objects, ... is expected. `libero assets download` downloads them; {VARIABLE}={BUILTIN} "
-        "selects the builtin pack, which needs none"
-    )
+    root = original_folder() if value == ORIGINAL else Path(value).expanduser().absolute()
+    if not is_original(root):
+        raise LiberoError(
+            f"{root} ({reason}) does not hold the original assets: a folder with articulated_objects, scenes, "
+            f"stable_hope_objects, ... is expected. `libero assets install` and `libero assets download` bring them; "
+            f"{VARIABLE}={BUILTIN} selects the builtin pack, which needs none"
+        )
+    if value != ORIGINAL:
+        require_undamaged(root)
+    return OriginalPack(str(root), lod)
+
+
+def original_folder() -> Path:
+    """Return the folder of the original's models: of the installed packages, or else of `libero assets download`.
+
+    Raises:
+        MissingPackageError: There is neither.
+        ChangedAssetsError: Files are missing or have changed.
+    """
+    if folder := installed_folder():
+        require_published(folder, REMEDY)
+        return folder
+    if is_original(folder := default_folder()):
+        require_undamaged(folder)
+        return folder
+    raise MissingPackageError("the original's models are not installed", f"{EXTRA}, or libero assets install")
+
+
+def _is_absent(value: str) -> bool:
+    return value not in (BUILTIN, ORIGINAL) and not Path(value).expanduser().exists()
+
+
+@cache
+def _builtin_digest() -> str:
+    package = Path(__file__).parents[1]
+    found = (path for name in _SOURCES for path in (package / name, *(package / name).rglob("*")))
+    files = sorted(path for path in found if path.suffix in (".py", ".yaml") and path.is_file())
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

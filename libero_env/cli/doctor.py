@@ -11,13 +11,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
 from libero_env.assets.robot import (
     ROBOSUITE_REMEDY,
     ROBOSUITE_VERSION,
     robosuite_assets,
     robosuite_version,
 )
-from libero_env.errors import MissingPackageError
+from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir, demos_dir
 from libero_env.storage import show_bytes
 
@@ -87,7 +88,8 @@ def examine(gl_only: bool = False) -> list[Finding]:
     if gl_only:
         return [check_gl()]
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
-    return [check_python(), *packages, check_robot_models(), check_gl(), check_cache(), check_demos()]
+    models = [check_robot_models(), check_models()]
+    return [check_python(), *packages, *models, check_gl(), check_cache(), check_demos()]
 
 
 def check_python() -> Finding:
@@ -114,6 +116,20 @@ def check_robot_models() -> Finding:
     except MissingPackageError as error:
         return Finding(title, error.reason, False, error.remedy)
     return Finding(title, version, version == ROBOSUITE_VERSION, ROBOSUITE_REMEDY, essential=False)
+
+
+def check_models() -> Finding:
+    """Check the models that scenes are built from; the files of the original's are compared with the published ones."""
+    title = "models"
+    try:
+        choice, facade = chosen_assets(), facade_assets()
+        pack, facade_pack = pack_of(choice), pack_of(facade)
+    except LiberoError as error:
+        return Finding(title, str(error), False, f"libero assets install, or set {VARIABLE}={BUILTIN}")
+    detail = f"{pack.name}, digest {pack.digest}, because of {choice.reason}"
+    if facade_pack != pack:
+        detail += f"; for code written for the original: {facade_pack.name}, digest {facade_pack.digest}"
+    return Finding(title, detail)
 
 
 def check_gl() -> Finding:

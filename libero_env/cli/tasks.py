@@ -83,7 +83,7 @@ def _add_tasks(parser: argparse.ArgumentParser) -> None:
         metavar="TASK",
         help="such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml",
     )
-    parser.add_argument("--assets", help="`builtin`, or the folder of the original's models")
+    parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
 
 
 def _states(text: str) -> int:

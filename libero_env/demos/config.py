@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import robosuite_version
 from libero_env.demos.observe import RenderConfig
 from libero_env.demos.read import Pairing
@@ -102,6 +103,7 @@ class DemoConfig:
             generator=GENERATOR,
             disturbed=self.disturb,
             model_digest=model_digest(task),
+            models=json.dumps({"pack": (pack := select_pack()).name, "digest": pack.digest}),
             versions=json.dumps(versions),
             **self.render_config.header(),
             **self.variation.header(),

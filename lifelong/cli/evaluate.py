@@ -50,7 +50,7 @@ def _add_eval(subparsers: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--threads", type=int, default=0, help="threads of the simulations (default: one for each core)"
     )
-    parser.add_argument("--assets", help="`builtin`, or the folder of the original's models")
+    parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
     parser.add_argument(
         "--out", type=Path, help="folder of the results (default: in the run, or eval/POLICY)"
     )

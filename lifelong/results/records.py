@@ -204,7 +204,10 @@ def utc_now() -> str:
 
 
 def installed_versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages results depend on; `models` names the pack of objects."""
+    """Return the versions of Python and of the packages results depend on.
+
+    `models` names the pack of objects, and `models_digest` changes with its files.
+    """
     from libero_env.assets.pack import select_pack
 
     versions = {"python": ".".join(map(str, sys.version_info[:3]))}
@@ -213,7 +216,8 @@ def installed_versions() -> dict[str, str]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return {**versions, "models": select_pack().name}
+    pack = select_pack()
+    return {**versions, "models": pack.name, "models_digest": pack.digest}
 
 
 def source_commit() -> str | None:

@@ -6,6 +6,8 @@ import pytest
 @pytest.fixture(autouse=True)
 def no_configuration(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path_factory.getbasetemp() / "no-config"))
+    # The facade would use the original's models where they are installed.
+    monkeypatch.setenv("LIBERO_ASSETS", "builtin")
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from libero_env.assets.pack import chosen_assets
+from libero._adapters.envs.models import assets_folder
 from libero_env.init_states.pickles import write_states
 from libero_env.init_states.store import shipped_path
 from libero_env.paths import cache_dir, demos_dir
@@ -19,12 +19,11 @@ _COMPLETE = ".complete"  # written last: after an interruption all files are wri
 def generated_paths() -> dict[str, str]:
     """Return the default folders of task files, initial states, demonstrations and assets; nothing is written."""
     root = cache_dir() / "facade"
-    assets = chosen_assets().value
     return {
         "bddl_files": str(root / f"bddl_files-{_tasks_digest()}"),
         "init_states": str(root / f"init_files-{_states_digest()}"),
         "datasets": str(demos_dir()),
-        "assets": assets if Path(assets).is_dir() else str(Path(__file__).parents[2] / "libero" / "assets"),
+        "assets": str(assets_folder() or Path(__file__).parents[2] / "libero" / "assets"),
     }
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from libero._adapters.envs.mjcf_models import STATES, accept_plain_files, model_of
+from libero._adapters.envs.models import assets_folder, facade_pack
 from libero._adapters.lookup import lookup
-from libero_env.assets.pack import chosen_assets, select_pack
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin import BUILDERS
@@ -169,7 +169,7 @@ class BuiltinObject(BaseObject):
         self.object_properties = _properties(physics.articulation)
 
     def _own_file(self, obj_name: str, joints: Any) -> None:
-        folder = Path(chosen_assets().value) / self.family
+        folder = (assets_folder() or Path("assets")) / self.family
         stem = Path(obj_name)
         if stem.suffix != ".xml":
             stem = folder / (stem if self.in_folders else "") / f"{stem.name}.xml"
@@ -179,7 +179,7 @@ class BuiltinObject(BaseObject):
     @cached_property
     def model(self) -> ObjectModel:
         """Model in the pack in use."""
-        return select_pack().build(self.category_name)
+        return facade_pack().build(self.category_name)
 
 
 def _properties(articulation: Mapping[str, tuple[float, float]]) -> dict[str, Any]:

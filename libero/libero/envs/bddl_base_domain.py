@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from libero._adapters.envs.models import facade_pack
 from libero._adapters.envs.observations import Observer, cameras
 from libero._adapters.envs.sim import ClientSimulations, MjSim
 from libero._adapters.envs.window import Window
@@ -20,7 +21,6 @@ from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteO
 from libero.libero.envs.predicates import eval_predicate_fn
 from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
-from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.errors import LiberoError, UnknownNameError
@@ -146,7 +146,7 @@ class BDDLBaseDomain:
         """Set `placement_initializer`, if at all; called once, before the first reset."""
 
     def _load_model(self) -> None:
-        pack = select_pack()
+        pack = facade_pack()
         self.scene = build_scene(self.problem, pack)
         hooks = ("_load_fixtures_in_arena", "_load_objects_in_arena", "_load_sites_in_arena", "_setup_camera")
         model = self.scene.model

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import mujoco
 
-from libero_env.assets.pack import select_pack
+from libero._adapters.envs.models import facade_pack
 from libero_env.errors import LiberoError
 
 # Category -> names of its regions, where they differ from those of its model.
@@ -22,7 +22,7 @@ def get_affordance_regions(objects: Iterable[str], verbose: bool = False) -> dic
 
     Categories without regions or without a model are left out; one that does not exist raises an UnknownNameError.
     """
-    pack, found = select_pack(), {}
+    pack, found = facade_pack(), {}
     for category in objects:
         if category in EXCEPTION_DICT:
             names = EXCEPTION_DICT[category]

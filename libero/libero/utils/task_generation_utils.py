@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from libero._adapters.envs.models import facade_pack
 from libero._adapters.lookup import lookup
 from libero.libero.envs.predicates import get_predicate_fn
 from libero.libero.utils.bddl_generation_utils import (
@@ -17,7 +18,6 @@ from libero.libero.utils.bddl_generation_utils import (
 )
 from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
 from libero_env.assets.arena import WORKSPACES
-from libero_env.assets.pack import select_pack
 from libero_env.design.lint.checks import KINDS
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.sim.predicates import atoms_of
@@ -120,7 +120,7 @@ def bddl_text(task: TaskInfoTuple) -> str:
         )
     )
     problem = parse(text)
-    categories = {*select_pack().categories(), *WORKSPACES}
+    categories = {*facade_pack().categories(), *WORKSPACES}
     for category in [*problem.fixtures.values(), *problem.objects.values()]:
         if category not in categories:
             raise UnknownNameError("object category", category, categories)

@@ -1,13 +1,12 @@
 """Functions for stored models and pictures."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from libero_env.assets.pack import chosen_assets
+from libero._adapters.envs.models import assets_folder
 from libero_env.assets.robot import robosuite_assets
 
 _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
@@ -20,8 +19,8 @@ def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, 
         file = element.get("file", "")
         if _ROBOSUITE in file:
             element.set("file", str(robosuite_assets() / file.split(_ROBOSUITE)[-1]))
-        elif _ASSETS in file and Path(chosen_assets().value).is_dir():
-            element.set("file", str(Path(chosen_assets().value) / file.split(_ASSETS)[-1]))
+        elif _ASSETS in file and (folder := assets_folder()):
+            element.set("file", str(folder / file.split(_ASSETS)[-1]))
     for camera in root.iter("camera"):
         for key, value in (cameras_dict or {}).get(camera.get("name", ""), {}).items():
             camera.set(key, value if isinstance(value, str) else " ".join(map(str, np.atleast_1d(value))))

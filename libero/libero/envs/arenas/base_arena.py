@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import mujoco
 
+from libero._adapters.envs.models import facade_pack
 from libero_env.assets.arena import load_workspace
-from libero_env.assets.pack import select_pack
 
 
 class Arena:
@@ -62,7 +62,7 @@ class WorkspaceArena(Arena):
         spec = mujoco.MjSpec()
         styles = {"floor": floor_style, "wall": wall_style, "scene": scene}
         self.workspace = load_workspace(self.category)
-        select_pack().add_arena(spec, self.workspace, {k: v for k, v in styles.items() if v is not None})
+        facade_pack().add_arena(spec, self.workspace, {k: v for k, v in styles.items() if v is not None})
         super().__init__(spec)
 
     table_offset = property(attrgetter("workspace.offset"), doc="Origin of the regions, (3,) m.")
