@@ -45,3 +45,15 @@ class ProtocolMismatchError(LifelongError, ValueError):
 
 class EvaluationFileError(ResultsError, ValueError):
     """Raised for the result of an evaluation that is missing, broken, or of another format or version."""
+
+
+class WireError(LifelongError, ValueError):
+    """Raised for bytes or values that are not valid in a policy server's protocol."""
+
+
+class ServerError(LifelongError, RuntimeError):
+    """Raised for a policy server that cannot be reached, fails, or answers what is not valid; the message names it."""
+
+
+class ConnectionLost(ServerError):
+    """Raised when the connection to a policy server breaks; the episodes in flight are repeated from their start."""

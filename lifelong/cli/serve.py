@@ -1,0 +1,43 @@
+"""`libero serve`: a run's policy for clients in openpi's protocol."""
+
+import argparse
+import asyncio
+import contextlib
+from pathlib import Path
+
+
+def register(subparsers: "argparse._SubParsersAction") -> None:
+    """Add the command `libero serve RUN`."""
+    parser = subparsers.add_parser("serve", help="serve a run's policy in openpi's WebSocket protocol")
+    parser.add_argument(
+        "policy", type=Path, metavar="RUN", help="a run's directory, or one of its checkpoints"
+    )
+    parser.add_argument("--after", type=int, help="the policy after this task, from 0 (default: the last)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    parser.add_argument(
+        "--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)"
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of stochastic policies, for clients that send none (default: 0)",
+    )
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.set_defaults(run=run_serve)
+
+
+def run_serve(args: argparse.Namespace) -> None:
+    """Serve until interrupted; the address is printed once clients are accepted."""
+    from lifelong.evaluation.restore import restore
+    from lifelong.evaluation.servers.serving import PolicyServer
+    from lifelong.evaluation.servers.sessions import ServedPolicy
+
+    served = ServedPolicy(restore(args.policy, after=args.after, device=args.device), seed=args.seed)
+    server = PolicyServer(served.metadata, served.session, host=args.host, port=args.port)
+
+    def ready(port: int) -> None:
+        print(f"serving {args.policy} after task {served.run.learned} at ws://{args.host}:{port}", flush=True)
+
+    with contextlib.suppress(asyncio.CancelledError):
+        asyncio.run(server.run(ready))
