@@ -56,6 +56,39 @@ def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def create_text(target: Path, text: str) -> bool:
+    """Write a UTF-8 text file in one step unless it exists; of several processes that try, the first one wins.
+
+    The content has reached the disk before the file gets its name.
+
+    Args:
+        target: File to write; its folder is created.
+        text: Content of the file.
+
+    Returns:
+        Whether this call wrote the file. On file systems without hard links two calls at the same moment may both
+        write it; then the last one wins.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if target.exists():
+        return False
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
+    try:
+        with open(temporary, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(temporary, target)
+        except FileExistsError:
+            return False
+        except OSError:
+            os.replace(temporary, target)
+        return True
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def atomic_write_npz(target: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays to a compressed npz file in one step; see `atomic_path`."""
     with atomic_path(target) as temporary, open(temporary, "wb") as file:

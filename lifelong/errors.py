@@ -57,3 +57,7 @@ class ServerError(LifelongError, RuntimeError):
 
 class ConnectionLost(ServerError):
     """Raised when the connection to a policy server breaks; the episodes in flight are repeated from their start."""
+
+
+class EvaluationIncompleteError(LifelongError, RuntimeError):
+    """Raised when units of an evaluation ended with errors; the others are kept, the same command tries again."""

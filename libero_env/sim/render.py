@@ -74,6 +74,23 @@ def choose_backend() -> str:
     return name
 
 
+@lru_cache(maxsize=1)
+def renderer_name() -> tuple[str, str]:
+    """Return the names of the OpenGL backend and of the renderer, such as `egl` and `llvmpipe (LLVM 15.0.6)`.
+
+    Raises:
+        RenderError: No backend works here.
+    """
+    backend, context = open_context(64, 64)
+    try:
+        context.make_current()
+        gl = importlib.import_module("OpenGL.GL")  # after the context, which chooses PyOpenGL's platform
+        name = gl.glGetString(gl.GL_RENDERER)
+    finally:
+        context.free()
+    return backend, name.decode(errors="replace") if name else "unknown"
+
+
 @dataclass(frozen=True)
 class RenderTarget:
     """Arrays that the image of one camera is written to, first row on top. Arrays that are None are not rendered.

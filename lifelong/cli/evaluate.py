@@ -1,12 +1,17 @@
 """`libero eval` and `libero saliency`: the success of a policy, and where it looks."""
 
 import argparse
-import shutil
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from libero_env.errors import LiberoError
+from libero_env.parallel import cpu_count
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,7 +30,14 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
 
 def _add_eval(subparsers: "argparse._SubParsersAction") -> None:
     parser = subparsers.add_parser("eval", help="success of a policy on tasks; resumes where it was stopped")
-    parser.add_argument("policy", help=POLICY_HELP)
+    parser.add_argument("policy", nargs="?", help=POLICY_HELP)
+    _add_episode_options(parser)
+    _add_work_options(parser)
+    parser.set_defaults(run=run_eval)
+
+
+def _add_episode_options(parser: argparse.ArgumentParser) -> None:
+    """Add what decides the numbers: tasks, starts, protocol, models."""
     parser.add_argument("--suite", nargs="+", metavar="SUITE", help="suites or tasks (default: the run's)")
     parser.add_argument(
         "--after", type=int, help="of a run: the policy after this task, from 0 (default: the last)"
@@ -46,16 +58,43 @@ def _add_eval(subparsers: "argparse._SubParsersAction") -> None:
     )
     parser.add_argument("--videos", type=int, default=0, metavar="N", help="record N episodes of each task")
     parser.add_argument("--seed", type=int, default=0, help="seed of stochastic policies (default: 0)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument(
-        "--threads", type=int, default=0, help="threads of the simulations (default: one for each core)"
-    )
     parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
+    parser.add_argument(
+        "--unit-starts",
+        type=int,
+        metavar="N",
+        help="episodes of a task that are run in one batch (default: 10)",
+    )
+    parser.add_argument(
+        "--policy-threads",
+        type=int,
+        metavar="N",
+        help="threads of a policy on the CPU (default: 1 for a run's)",
+    )
+
+
+def _add_work_options(parser: argparse.ArgumentParser) -> None:
+    """Add what does not change the numbers: folder, processes, device."""
     parser.add_argument(
         "--out", type=Path, help="folder of the results (default: in the run, or eval/POLICY)"
     )
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="processes that share the work (default: 1)"
+    )
+    parser.add_argument(
+        "--retries", type=int, default=1, metavar="N", help="further attempts after an error (default: 1)"
+    )
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=0,
+        help="threads of the simulations (default: all cores, shared by the workers)",
+    )
     parser.add_argument("--again", action="store_true", help="repeat what is done already")
-    parser.set_defaults(run=run_eval)
+    parser.add_argument(
+        "--status", type=Path, metavar="OUT", help="only say how far the evaluation in this folder is"
+    )
 
 
 def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
@@ -82,15 +121,60 @@ def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
 
 def run_eval(args: argparse.Namespace) -> None:
     """Evaluate a policy; print a row for each task, the mean, and the file of the results."""
-    from lifelong.evaluation.suite import HEADER, table_row, total_row
+    from lifelong.evaluation.crew import Crew
+    from lifelong.evaluation.progress import HEADER, table_row, total_row
+    from lifelong.evaluation.status import describe_status
+    from lifelong.evaluation.worker import Worker
+    from lifelong.results.evaluation_file import FILE_NAME
 
+    if args.status:
+        print(describe_status(args.status))
+        return
+    check_eval(args)
+    args.threads = args.threads or max(1, cpu_count() // args.workers)
     plan = plan_eval(args)
     if args.again:
-        shutil.rmtree(plan.out / "tasks", ignore_errors=True)
-    print(HEADER)
-    results = plan.run(on_result=lambda r: print(table_row(r), flush=True))
-    print(total_row(results))
-    print(plan.out / "eval.json")
+        plan.folder.clear()
+    print(HEADER, flush=True)
+    helpers = argparse.Namespace(**(vars(args) | {"again": False}))
+    with _ending_politely(), policy_threads(plan), Crew(args.workers - 1, help_eval, helpers) as crew:
+        worker = Worker(
+            plan,
+            on_result=lambda row: print(table_row(row), flush=True),
+            on_progress=_print_progress,
+            on_wait=crew.tend,
+        )
+        result = worker.run()
+    print(total_row(result.tasks))
+    print(plan.out / FILE_NAME)
+
+
+def help_eval(args: argparse.Namespace) -> None:
+    """Work on the evaluation that another process of this command prints; errors go to the standard error."""
+    from lifelong.evaluation.worker import Worker
+
+    with suppress(KeyboardInterrupt), _ending_politely():
+        try:
+            plan = plan_eval(args)
+            with policy_threads(plan):
+                Worker(plan).run()
+        except (LiberoError, OSError) as error:
+            sys.exit(f"libero: a worker ended: {error}")
+
+
+def check_eval(args: argparse.Namespace) -> None:
+    """Check the numbers among the arguments.
+
+    Raises:
+        ConfigError: No policy is named, or a number is too small.
+    """
+    if args.policy is None:
+        raise ConfigError("no policy is named: libero eval RUN_DIR, or libero eval my_module:function")
+    for name, least in (("workers", 1), ("retries", 0), ("threads", 0), ("videos", 0)):
+        if getattr(args, name) < least:
+            raise ConfigError(f"--{name} is {getattr(args, name)}; it must be at least {least}")
+    if args.policy_threads is not None and args.policy_threads < 1:
+        raise ConfigError(f"--policy-threads is {args.policy_threads}; it must be at least 1")
 
 
 def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
@@ -104,6 +188,8 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     from lifelong.evaluation.candidates import RunPolicy, UserPolicy
     from lifelong.evaluation.protocols import PROTOCOLS, choose_init_states
     from lifelong.evaluation.suite import SuiteEvaluation
+    from lifelong.evaluation.units import UNIT_STARTS
+    from lifelong.results.records import installed_versions
 
     if args.protocol not in PROTOCOLS:
         raise UnknownNameError("protocol", args.protocol, list(PROTOCOLS))
@@ -117,15 +203,53 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     init_states = choose_init_states(args.starts, args.episodes, policy.selection)
     return SuiteEvaluation(
         identity={**policy.identity, "seed": args.seed},
-        tasks=tasks,
+        tasks=tuple(dict.fromkeys(tasks)),
         init_states=init_states,
         protocol=protocol,
         out=args.out or policy.out,
-        env=lambda task: policy.env(task, len(init_states), protocol),
-        actor=lambda task: policy.actor(task, init_states, protocol),
+        env=lambda task, count: policy.env(task, count, protocol),
+        actor=lambda task, states: policy.actor(task, states, protocol),
+        unit_starts=UNIT_STARTS if args.unit_starts is None else args.unit_starts,
+        retries=args.retries,
         videos=args.videos,
-        progress=sys.stderr.isatty(),
+        progress=sys.stderr.isatty() and args.workers == 1,
+        versions=installed_versions(args.assets),
+        policy_threads=args.policy_threads or (1 if policy.on_cpu else None),
     )
+
+
+@contextmanager
+def policy_threads(plan: "SuiteEvaluation") -> Iterator[None]:
+    """Give PyTorch the number of threads that the evaluation names; their number changes the bits of a policy."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(plan.policy_threads or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _ending_politely() -> Iterator[None]:
+    """End at SIGTERM, which batch systems send, as at Ctrl-C: what was claimed is given back."""
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _print_progress(progress: object) -> None:
+    print(progress, file=sys.stderr, flush=True)
 
 
 def _is_callable(text: str) -> bool:

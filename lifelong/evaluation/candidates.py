@@ -33,12 +33,14 @@ class PolicyUnderTest(ABC):
         out: Default folder of the results.
         tasks: Tasks of its run, if it has one.
         selection: Initial states by which it may have been chosen.
+        on_cpu: Whether it is a network of this package on the CPU, whose bits depend on its number of threads.
     """
 
     identity: Mapping[str, Any]
     out: Path
     tasks: Sequence[Task] = ()
     selection: Sequence[int]
+    on_cpu: bool = False
 
     @abstractmethod
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
@@ -67,6 +69,7 @@ class RunPolicy(PolicyUnderTest):
         self.out = self.run.path / "eval" / f"after_{self.run.learned:02d}"
         self.tasks = self.run.tasks
         self.selection = tuple(self.run.eval.init_states("curve"))
+        self.on_cpu = self.run.device.type == "cpu"
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
         settings = self.run.eval

@@ -1,30 +1,35 @@
-"""Success of a policy on tasks of the benchmark: fixed initial states, all episodes of a task at once.
+"""Success of a policy on tasks of the benchmark, from fixed initial states.
 
-Each task's result is written when the task is done, so a stopped evaluation resumes after it.
+An evaluation is a list of units, each a task and a range of its initial states. Any number of processes take units from
+a folder they share, see `lifelong.evaluation.worker`; each may be killed, and the result is that of one process.
 """
 
-import hashlib
-import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_PERIOD
-from lifelong.errors import ConfigError, LifelongError
+from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor
-from lifelong.evaluation.environments import VectorEnv
+from lifelong.evaluation.claims import LEASE
+from lifelong.evaluation.environment_record import common_environment, describe_environment
+from lifelong.evaluation.environments import EnvPool, VectorEnv
+from lifelong.evaluation.progress import busy_seconds
 from lifelong.evaluation.protocols import EvalProtocol
-from lifelong.evaluation.rollout import Rollouts, run_episodes, save_animation
-from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, overall, task_result
-from lifelong.results.metrics import Estimate
-from lifelong.results.records import installed_versions, utc_now
+from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_animation
+from lifelong.evaluation.units import UNIT_STARTS, Unit, partition
+from lifelong.evaluation.work_folder import PLAN_FORMAT, UnitResult, WorkFolder, describe, this_process
+from lifelong.results.evaluation_file import EvaluationResult, TaskResult
+from lifelong.results.records import installed_versions
 from lifelong.results.summary import json_safe
+
+DECISIVE = ("mujoco", "models", "models_digest")  # versions that the results of one evaluation must share
 
 
 @dataclass(frozen=True)
@@ -37,12 +42,19 @@ class SuiteEvaluation:
         init_states: Initial states of each task.
         protocol: How episodes are run.
         out: Folder of the results.
-        env: Function that builds the environment of a task, with one simulation for each initial state.
-        actor: Function that returns the context manager of a task's actor.
+        env: Function that builds the environment of a task with the given number of simulations.
+        actor: Function that returns the context manager of the actor of a task and its initial states.
+        unit_starts: Number of initial states of a unit, which are run in one batch.
+        retries: How often a unit that ends with an error is tried again.
+        errors_are_failures: Whether an episode that ends with an error is a failed one, as some protocols have it.
+            Otherwise its unit is not counted, and there is no result until it has been run without an error.
         videos: Number of recorded episodes of each task.
         record_every: Number of control steps between two frames.
         progress: Whether to show progress bars.
         versions: Versions of the packages and models.
+        policy_threads: Number of threads of the policy on the CPU, on which its bits depend; None where the policy is
+            not one of this package, or runs elsewhere. Whoever runs the evaluation sets it.
+        lease: Time after which a unit of a silent process is given to another, [s].
     """
 
     identity: Mapping[str, Any]
@@ -50,131 +62,201 @@ class SuiteEvaluation:
     init_states: tuple[int, ...]
     protocol: EvalProtocol
     out: Path
-    env: Callable[[Task], VectorEnv]
-    actor: Callable[[Task], AbstractContextManager[Actor]]
+    env: Callable[[Task, int], VectorEnv]
+    actor: Callable[[Task, Sequence[int]], AbstractContextManager[Actor]]
+    unit_starts: int = UNIT_STARTS
+    retries: int = 1
+    errors_are_failures: bool = False
     videos: int = 0
     record_every: int = 4
     progress: bool = False
     versions: Mapping[str, str] = field(default_factory=installed_versions)
+    policy_threads: int | None = None
+    lease: float = LEASE
 
-    def run(self, on_result: Callable[[TaskResult], None] = lambda _: None) -> list[TaskResult]:
-        """Evaluate the tasks whose results are not on disk yet, and write `eval.json`.
+    @cached_property
+    def units(self) -> tuple[Unit, ...]:
+        """Units in order."""
+        return partition(self.tasks, self.init_states, self.unit_starts)
+
+    @cached_property
+    def folder(self) -> WorkFolder:
+        """The folder of the results, which other processes may share."""
+        simulation = {k: v for k, v in self.versions.items() if k in DECISIVE}
+        plan = {
+            "format": PLAN_FORMAT,
+            "evaluated": dict(self.identity),
+            "protocol": self._resolved_protocol,
+            "init_states": self.init_states,
+            "unit_starts": self.unit_starts,
+            "errors_are_failures": self.errors_are_failures,
+            "policy_threads": self.policy_threads,
+            "simulation": simulation,
+        }
+        return WorkFolder(self.out, plan, self.lease)
+
+    @property
+    def _resolved_protocol(self) -> dict[str, Any]:
+        return json_safe(asdict(self.protocol))
+
+    def pool(self) -> EnvPool:
+        """Return a pool that keeps the environment of the last unit open, for the next one of the same task."""
+        by_id = {task.id: task for task in self.tasks}
+        return EnvPool(lambda key: self.env(by_id[key[0]], key[1]), capacity=1)
+
+    def evaluate(self, unit: Unit, pool: EnvPool, label: str = "") -> UnitResult:
+        """Run the episodes of a unit.
 
         Args:
-            on_result: Function called with each task's result, as soon as it is known.
+            unit: Unit of this evaluation.
+            pool: Open environments, see `pool`.
+            label: Text before the progress bar.
+        """
+        started = time.time()
+        env = pool.get((unit.task.id, len(unit.starts)))
+        done = self._run(unit, env, label)
+        self._save_videos(unit, done)
+        return self._unit_result(unit, done, env, started)
+
+    def evaluate_apart(self, unit: Unit, pool: EnvPool) -> UnitResult:
+        """Run the episodes of a unit one by one; those that end with an error are failures.
 
         Raises:
-            ConfigError: The folder holds results of another evaluation.
+            Exception: All episodes end with an error, which is that of the policy and not of an episode.
         """
-        results = []
-        for task in self.tasks:
-            results.append(self._stored_result(task) or self._evaluate(task))
-            on_result(results[-1])
-        self.result(results).write(self.out / FILE_NAME)
-        return results
+        started, parts, errors = time.time(), [], []
+        for start in unit.starts:
+            alone = Unit(unit.task, (start,))
+            env = pool.get((unit.task.id, 1))
+            try:
+                parts.append(self._run(alone, env))
+                errors.append(None)
+            except Exception as error:  # noqa: BLE001 - policies raise errors of any type
+                if len(errors) == len(unit.starts) - 1 and all(errors):
+                    raise
+                atoms = tuple(getattr(env, "atoms", ()))
+                none = (False,) * len(atoms)
+                parts.append(Rollouts((Episode(start, False, 0, none, none, none),), 0.0, atoms))
+                errors.append(describe(error))
+        done = Rollouts(tuple(p.episodes[0] for p in parts), sum(p.seconds for p in parts), parts[0].atoms)
+        return self._unit_result(unit, done, env, started, tuple(errors))
 
-    def result(self, results: Sequence[TaskResult]) -> EvaluationResult:
-        """Return the results of the tasks with all that they depend on."""
+    def task_result(self, task: Task, done: Mapping[str, UnitResult]) -> TaskResult | None:
+        """Return the results of a task from those of its units, or None while some are missing."""
+        names = [unit.name for unit in self.units if unit.task is task]
+        if not all(name in done for name in names):
+            return None
+        return _joined([done[name].result for name in names])
+
+    def result(self, done: Mapping[str, UnitResult]) -> EvaluationResult:
+        """Return the results of all tasks with all that they depend on; it depends on the units' files only.
+
+        Args:
+            done: Results of all units by name.
+
+        Raises:
+            ConfigError: A unit is missing.
+        """
+        tasks = [self.task_result(task, done) for task in self.tasks]
+        found = [done[unit.name] for unit in self.units if unit.name in done]
+        if len(found) != len(self.units):
+            raise ConfigError(f"{len(found)} of {len(self.units)} units are done: there is no result yet")
         return EvaluationResult(
             evaluated=self.identity,
-            protocol=asdict(self.protocol),
+            protocol=self._resolved_protocol,
             init_states=self.init_states,
-            versions=self.versions,
-            tasks=tuple(results),
-            times={"finished": utc_now()},
+            versions=common_environment([one.versions for one in found]),
+            environment=common_environment([one.environment for one in found]),
+            unit_starts=self.unit_starts,
+            tasks=tuple(task for task in tasks if task is not None),
+            times=self._times(done),
         )
 
-    def _evaluate(self, task: Task) -> TaskResult:
-        env = self.env(task)
-        try:
-            with self.actor(task) as actor:
-                done = run_episodes(
-                    actor,
-                    env,
-                    self.init_states,
-                    horizon=self.protocol.steps(task),
-                    settle_steps=self.protocol.settle_steps,
-                    settle_action=self.protocol.settle_action,
-                    record_every=self.record_every if self.videos else 0,
-                    recorded=range(min(self.videos, len(self.init_states))),
-                    label=task.id,
-                    progress=self.progress,
-                )
-        finally:
-            env.close()
-        result = _result(task, done)
-        self._save_videos(task, done)
-        _write(self._path(task), {"digest": self._digest(task), **asdict(result)})
-        return result
-
-    def _stored_result(self, task: Task) -> TaskResult | None:
-        path = self._path(task)
-        if not path.is_file():
-            return None
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            digest = found.pop("digest")
-            result = task_result(found)
-        except (ValueError, KeyError, AttributeError) as error:
-            raise LifelongError(f"{path} is not a valid result of a task ({error}); remove it") from error
-        if digest != self._digest(task):
-            raise ConfigError(
-                f"{path} was made with another policy, protocol, set of initial states or version of the simulation: "
-                "name another folder with --out, or repeat the evaluation with --again"
+    def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
+        filmed = [i for i, start in enumerate(unit.starts) if start in self.init_states[: self.videos]]
+        with self.actor(unit.task, unit.starts) as actor:
+            return run_episodes(
+                actor,
+                env,
+                unit.starts,
+                horizon=self.protocol.steps(unit.task),
+                settle_steps=self.protocol.settle_steps,
+                settle_action=self.protocol.settle_action,
+                record_every=self.record_every if filmed else 0,
+                recorded=filmed,
+                label=label or unit.task.id,
+                progress=self.progress,
             )
-        return result
 
-    def _path(self, task: Task) -> Path:
-        return self.out / "tasks" / f"{task.suite}_{task.index:02d}.json"
+    def _unit_result(
+        self,
+        unit: Unit,
+        done: Rollouts,
+        env: VectorEnv,
+        started: float,
+        errors: tuple[str | None, ...] = (),
+    ) -> UnitResult:
+        result = TaskResult(
+            task=unit.task.id,
+            name=unit.task.name,
+            instruction=unit.task.language,
+            init_states=tuple(e.init_state for e in done.episodes),
+            successes=tuple(e.success for e in done.episodes),
+            lengths=tuple(e.length for e in done.episodes),
+            atoms=done.atoms,
+            atoms_ever=tuple(e.ever for e in done.episodes),
+            atoms_at_end=tuple(e.at_end for e in done.episodes),
+            errors=errors if any(errors) else (),
+        )
+        environment = describe_environment(env)
+        return UnitResult(result, environment, self.versions, this_process(), started, time.time())
 
-    def _digest(self, task: Task) -> str:
-        simulation = {k: v for k, v in self.versions.items() if k in ("mujoco", "models")}
-        parts = [dict(self.identity), asdict(self.protocol), self.init_states, simulation, task.bddl_text]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+    def _times(self, done: Mapping[str, UnitResult]) -> dict[str, Any]:
+        spans = {unit: done[unit.name] for unit in self.units}
+        started, finished = (
+            min(s.started for s in spans.values()),
+            max(s.finished for s in spans.values()),
+        )
+        return {
+            "started": _iso(started),
+            "finished": _iso(finished),
+            "busy_seconds": round(busy_seconds((s.started, s.finished) for s in spans.values()), 2),
+            "seconds": {
+                task.id: round(sum(s.finished - s.started for u, s in spans.items() if u.task is task), 2)
+                for task in self.tasks
+            },
+            "processes": len({s.process for s in spans.values()}),
+        }
 
-    def _save_videos(self, task: Task, done: Rollouts) -> None:
+    def _save_videos(self, unit: Unit, done: Rollouts) -> None:
         folder, seconds = self.out / "videos", CONTROL_PERIOD * self.record_every
-        for frames, episode in zip(done.recordings, done.episodes, strict=False):
+        filmed = [e for e in done.episodes if e.init_state in self.init_states[: self.videos]]
+        for frames, episode in zip(done.recordings, filmed, strict=False):
             if frames:
                 outcome = "success" if episode.success else "failure"
-                name = f"{task.suite}_{task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
+                name = (
+                    f"{unit.task.suite}_{unit.task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
+                )
                 save_animation(frames, folder / name, seconds_per_frame=seconds)
 
 
-HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"
-
-
-def table_row(result: TaskResult) -> str:
-    """Format a task's row under `HEADER`: successes, rate and interval in percent, mean steps of the successes."""
-    wins = f"{sum(result.successes)}/{len(result.successes)}"
-    steps = f"{result.steps:.0f}" if np.isfinite(result.steps) else "-"
-    return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}"
-
-
-def total_row(results: Sequence[TaskResult]) -> str:
-    """Format the row of all tasks together."""
-    wins, episodes = sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results)
-    return f"{'mean over tasks':<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}"
-
-
-def _percent(e: Estimate) -> str:
-    interval = f"[{100 * e.low:.1f}, {100 * e.high:.1f}]"
-    return f"{100 * e.value:6.1f} {interval:>13}"
-
-
-def _result(task: Task, done: Rollouts) -> TaskResult:
+def _joined(parts: Sequence[TaskResult]) -> TaskResult:
+    """Return the results of a task from those of parts of its episodes, in order."""
+    first = parts[0]
+    raised = any(part.errors for part in parts)
     return TaskResult(
-        task=task.id,
-        name=task.name,
-        instruction=task.language,
-        init_states=tuple(e.init_state for e in done.episodes),
-        successes=tuple(e.success for e in done.episodes),
-        lengths=tuple(e.length for e in done.episodes),
-        atoms=done.atoms,
-        atoms_ever=tuple(e.ever for e in done.episodes),
-        atoms_at_end=tuple(e.at_end for e in done.episodes),
+        task=first.task,
+        name=first.name,
+        instruction=first.instruction,
+        init_states=tuple(i for part in parts for i in part.init_states),
+        successes=tuple(won for part in parts for won in part.successes),
+        lengths=tuple(n for part in parts for n in part.lengths),
+        atoms=first.atoms,
+        atoms_ever=tuple(row for part in parts for row in part.atoms_ever),
+        atoms_at_end=tuple(row for part in parts for row in part.atoms_at_end),
+        errors=tuple(e for p in parts for e in (p.errors or (None,) * len(p.init_states))) if raised else (),
     )
 
 
-def _write(path: Path, values: Mapping[str, Any]) -> None:
-    atomic_write_text(path, json.dumps(json_safe(values), indent=1, ensure_ascii=False) + "\n")
+def _iso(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")

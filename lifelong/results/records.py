@@ -203,10 +203,13 @@ def utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def installed_versions() -> dict[str, str]:
+def installed_versions(assets: str | None = None) -> dict[str, str]:
     """Return the versions of Python and of the packages results depend on.
 
     `models` names the pack of objects, and `models_digest` changes with its files.
+
+    Args:
+        assets: Pack as an argument of `libero_env.assets.pack.select_pack`; None for the user's choice.
     """
     from libero_env.assets.pack import select_pack
 
@@ -216,7 +219,7 @@ def installed_versions() -> dict[str, str]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    pack = select_pack()
+    pack = select_pack(assets)
     return {**versions, "models": pack.name, "models_digest": pack.digest}
 
 

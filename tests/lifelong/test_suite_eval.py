@@ -3,24 +3,20 @@
 import argparse
 import json
 import sys
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from libero_env.tasks import get_suite
 from lifelong.cli import main as cli
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
 from lifelong.evaluation.candidates import load_callable
 from lifelong.evaluation.protocols import PROTOCOLS, EvalProtocol, choose_init_states
-from lifelong.evaluation.suite import SuiteEvaluation
 from lifelong.results.evaluation_file import EvaluationResult, overall
 from lifelong.results.metrics import wilson_interval
+from tests.harness.evaluations import TASKS, Countdown, Still, evaluate
 
 pytestmark = pytest.mark.unit
-TASKS = get_suite("libero_goal").tasks[:2]
 MODULE = """
 import numpy as np
 
@@ -45,74 +41,17 @@ def nothing():
 """
 
 
-class Countdown:
-    """Simulation i succeeds after as many steps as the index of its initial state; its goal has two atoms."""
-
-    atoms = ("(Turnon stove_1)", "(On pot_1 stove_1)")
-
-    def __init__(self, num_envs: int):
-        self.num_envs = num_envs
-
-    def reset(self, *, seed=None, options=None):
-        self.goal, self.steps = np.asarray(options["init_state"]), 0
-        return {"x": np.zeros((self.num_envs, 1))}, self._info()
-
-    def _info(self):
-        done = self.steps >= self.goal
-        return {"success": done, "progress": np.stack([2 * self.steps >= self.goal, done], 1)}
-
-    def step(self, actions):
-        self.steps += 1
-        reached = self.steps == self.goal
-        return (
-            {"x": np.zeros((self.num_envs, 1))},
-            reached,
-            reached,
-            np.zeros(self.num_envs, bool),
-            self._info(),
-        )
-
-    def close(self):
-        pass
-
-
-class Still:
-    def __init__(self):
-        self.instructions = []
-
-    def predict(self, observations):
-        self.instructions.append(observations["instruction"])
-        return np.zeros((len(observations["x"]), 7))
-
-
-def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
-    policy = policy or Still()
-
-    @contextmanager
-    def actor(task):
-        yield CallableActor(policy, task.language, views=())
-
-    arguments = {
-        "identity": {"policy": "still"},
-        "tasks": TASKS,
-        "init_states": (3, 4, 9, 20),
-        "protocol": EvalProtocol(horizon=10, settle_steps=0),
-        "env": lambda task: Countdown(4),
-        "versions": {"mujoco": "3"},
-    }
-    return SuiteEvaluation(out=out, actor=actor, **(arguments | changes))
-
-
 def test_success_with_intervals_overall_and_by_task(tmp_path):
     policy = Still()
-    results = evaluation(tmp_path, policy).run()
+    result = evaluate(tmp_path, policy)
+    results = result.tasks
     assert [r.successes for r in results] == [(True, True, True, False)] * 2
     assert results[0].lengths == (3, 4, 9, 10) and results[0].steps == pytest.approx(16 / 3)
     low, high = wilson_interval(3, 4)
     assert (results[0].success.low, results[0].success.high) == (low, high)
     assert set(policy.instructions) == {t.language for t in TASKS}
     found = json.loads((tmp_path / "eval.json").read_text())
-    assert EvaluationResult.read(tmp_path).tasks == tuple(results)
+    assert EvaluationResult.read(tmp_path) == result
     assert found["success"]["value"] == 0.75
     both = overall(results)
     assert low < both.low < 0.75 < both.high < high, "two tasks tell more than one"
@@ -121,13 +60,13 @@ def test_success_with_intervals_overall_and_by_task(tmp_path):
 
 
 def test_tasks_with_results_are_not_evaluated_again(tmp_path):
-    first = evaluation(tmp_path, tasks=TASKS[:1]).run()
+    first = evaluate(tmp_path, tasks=TASKS[:1])
 
-    def env(task):
+    def env(task, count):
         assert task is TASKS[1], "the first task's results are on disk"
-        return Countdown(4)
+        return Countdown(count)
 
-    assert evaluation(tmp_path, env=env).run()[0] == first[0]
+    assert evaluate(tmp_path, env=env).tasks[0] == first.tasks[0]
 
 
 @pytest.mark.parametrize(
@@ -141,9 +80,10 @@ def test_tasks_with_results_are_not_evaluated_again(tmp_path):
     ids=lambda c: next(iter(c)),
 )
 def test_results_of_another_evaluation_are_not_mixed_in(tmp_path, changes):
-    evaluation(tmp_path).run()
-    with pytest.raises(ConfigError, match=r"libero_goal_00\.json.*--again"):
-        evaluation(tmp_path, **changes).run()
+    evaluate(tmp_path)
+    name = {"identity": "evaluated.policy", "versions": "simulation.mujoco"}.get(*changes, *changes)
+    with pytest.raises(ConfigError, match=rf"another evaluation: {name}.* there and .* here.*--again"):
+        evaluate(tmp_path, **changes)
 
 
 def test_selection_and_reporting_states_are_disjoint():

@@ -1,0 +1,78 @@
+"""Evaluations whose outcomes are known: no simulator, and a policy that stands still."""
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from libero_env.tasks import get_suite
+from lifelong.evaluation.actors import CallableActor
+from lifelong.evaluation.protocols import EvalProtocol
+from lifelong.evaluation.suite import SuiteEvaluation
+from lifelong.evaluation.worker import Worker
+from lifelong.results.evaluation_file import EvaluationResult
+
+TASKS = get_suite("libero_goal").tasks[:2]
+
+
+class Countdown:
+    """Simulation i succeeds after as many steps as the index of its initial state; its goal has two atoms."""
+
+    atoms = ("(Turnon stove_1)", "(On pot_1 stove_1)")
+
+    def __init__(self, num_envs: int):
+        self.num_envs = num_envs
+
+    def reset(self, *, seed=None, options=None):
+        self.goal, self.steps = np.asarray(options["init_state"]), 0
+        return {"x": np.zeros((self.num_envs, 1))}, self._info()
+
+    def _info(self):
+        done = self.steps >= self.goal
+        return {"success": done, "progress": np.stack([2 * self.steps >= self.goal, done], 1)}
+
+    def step(self, actions):
+        self.steps += 1
+        reached = self.steps == self.goal
+        return (
+            {"x": np.zeros((self.num_envs, 1))},
+            reached,
+            reached,
+            np.zeros(self.num_envs, bool),
+            self._info(),
+        )
+
+    def close(self):
+        pass
+
+
+class Still:
+    def __init__(self):
+        self.instructions = []
+
+    def predict(self, observations):
+        self.instructions.append(observations["instruction"])
+        return np.zeros((len(observations["x"]), 7))
+
+
+def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
+    policy = policy or Still()
+
+    @contextmanager
+    def actor(task, states):
+        yield CallableActor(policy, task.language, views=())
+
+    arguments = {
+        "identity": {"policy": "still"},
+        "tasks": TASKS,
+        "init_states": (3, 4, 9, 20),
+        "protocol": EvalProtocol(horizon=10, settle_steps=0),
+        "env": lambda task, count: Countdown(count),
+        "versions": {"mujoco": "3"},
+    }
+    return SuiteEvaluation(out=out, actor=actor, **(arguments | changes))
+
+
+def evaluate(out: Path, policy=None, **changes) -> EvaluationResult:
+    """Evaluate in this process, quietly."""
+    return Worker(evaluation(out, policy, **changes), on_error=lambda _: None).run()
