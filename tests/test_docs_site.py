@@ -86,6 +86,15 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     tiny = ["--suite", "libero_object/0", "--episodes", "2", "--horizon", "3"]
     assert main(["eval", "my_policy:make", *tiny]) == 0
     assert "eval/my_policy.make/eval.json" in capsys.readouterr().out
+    (reading,) = re.findall(
+        r"^```python\n(from lifelong.results.evaluation_file.*?)^```",
+        text(DOCS / "evaluating.md"),
+        re.M | re.S,
+    )
+    exec(compile(reading, "evaluating.md", "exec"), {})  # noqa: S102
+    assert "libero_object/0 Estimate(value=0.0" in capsys.readouterr().out
+    assert main(["eval", "--status", "eval/my_policy.make"]) == 0
+    assert "1 of 1 units, 2 of 2 episodes" in capsys.readouterr().out
     monkeypatch.delitem(sys.modules, "my_policy")
 
 

@@ -124,7 +124,8 @@ class SuiteEvaluation:
         Raises:
             Exception: All episodes end with an error, which is that of the policy and not of an episode.
         """
-        started, parts, errors = time.time(), [], []
+        started, parts = time.time(), []
+        errors: list[str | None] = []
         for start in unit.starts:
             alone = Unit(unit.task, (start,))
             env = pool.get((unit.task.id, 1))

@@ -109,7 +109,7 @@ class Worker:
         self._task = unit.task.id
         with self._folder.claims.keeping(claim, on_beat=self._beat):
             try:
-                found = self._evaluation.evaluate(unit, self._pool, self._label(unit))
+                found: UnitResult | None = self._evaluation.evaluate(unit, self._pool, self._label(unit))
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
                 self._pool.close()
                 found = self._after_error(unit, error)

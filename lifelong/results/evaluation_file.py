@@ -78,7 +78,7 @@ class TaskResult:
 
     def _problems(self) -> list[str]:
         count = len(self.init_states)
-        rows = {"successes": self.successes, "lengths": self.lengths}
+        rows: dict[str, Sequence[Any]] = {"successes": self.successes, "lengths": self.lengths}
         rows |= {"errors": self.errors} if self.errors else {}
         rows |= {"atoms_ever": self.atoms_ever, "atoms_at_end": self.atoms_at_end} if self.atoms else {}
         found = [
@@ -286,7 +286,7 @@ def _from_plain(values: Any) -> EvaluationResult:
         environment=values.get("environment", {}),
         unit_starts=values.get("unit_starts"),
         times=values.get("times", {"finished": values.get("finished")}),
-        format=written_as,
+        format=str(written_as),
     )
     if written_as == FORMAT and values.get("outcomes") != result.outcomes:
         raise EvaluationFileError("the digest `outcomes` is not that of the tasks: the file was edited")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -369,34 +370,21 @@ def test_what_processes_measured_differently_is_listed(tmp_path):
 # --- further processes
 
 
-def note_and_wait(folder: Path) -> None:
-    (folder / f"{os.getpid()}").touch()
-    time.sleep(600)
-
-
-def note(folder: Path) -> None:
-    (folder / f"{os.getpid()}").touch()
-
-
-def wait_for(count: int, folder: Path) -> None:
-    while len(list(folder.iterdir())) < count:
-        time.sleep(0.02)
-
-
 @pytest.mark.slow
-def test_a_killed_process_is_replaced_while_there_is_progress(tmp_path, capfd):
-    with pytest.raises(KeyboardInterrupt), Crew(1, note_and_wait, tmp_path) as crew:
+def test_a_killed_process_is_replaced_while_there_is_progress(capfd):
+    with pytest.raises(KeyboardInterrupt), Crew(1, time.sleep, 600) as crew:
         for deaths in range(1, 5):
-            wait_for(deaths, tmp_path)
-            (process,) = crew._processes
-            process.kill()
-            process.join()
+            (pid,) = crew.pids
+            os.kill(pid, signal.SIGKILL)
+            while crew.pids == [pid]:
+                time.sleep(0.01)
             crew.tend(done=0)
-        assert crew.pids == [] and capfd.readouterr().err.count("another is started") == 3
+            assert len(crew.pids) == (deaths <= 3), "the fourth without progress is not replaced"
+        assert capfd.readouterr().err.count("another is started") == 3
         raise KeyboardInterrupt
-    with Crew(1, note, tmp_path) as crew:
-        wait_for(5, tmp_path)
-        crew._processes[0].join()
+    with Crew(1, time.sleep, 0) as crew:
+        while crew.pids:
+            time.sleep(0.01)
         crew.tend(done=0)
         assert crew.pids == [], "it has ended by itself"
 
