@@ -1,11 +1,12 @@
 """Vector environments in this process and in others."""
 
+import gymnasium
 import numpy as np
 import pytest
 
 from libero._adapters.envs.workers import WorkerError
 from libero.libero.envs import ControlEnv, DummyVectorEnv, SubprocVectorEnv
-from libero.libero.envs.venv import CloudpickleWrapper, ShArray
+from libero.libero.envs.venv import BaseVectorEnv, CloudpickleWrapper, EnvWorker, ShArray
 from libero_env.errors import LiberoError
 
 pytestmark = pytest.mark.sim
@@ -62,6 +63,94 @@ def test_subprocesses_give_the_results_of_one_process(suite):
             env.reset()
     for one, many in zip(*results, strict=True):
         assert (one == many).all()
+
+
+class Wrapped(gymnasium.Env):
+    """An environment of Gymnasium's interface around one of the original's, as QueST has it."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
+    observation_space = gymnasium.spaces.Dict({"pos": gymnasium.spaces.Box(-np.inf, np.inf, (3,))})
+
+    def __init__(self, path):
+        self.env = ControlEnv(bddl_file_name=path, use_camera_obs=False)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.first = seed
+        return {"pos": self.env.reset()["robot0_eef_pos"]}, {"first": seed}
+
+    def step(self, action):
+        obs, reward, _, info = self.env.step(action)
+        return {"pos": obs["robot0_eef_pos"]}, reward, self.env.check_success(), False, info
+
+    def set_init_state(self, state):
+        self.env.set_init_state(state)
+
+    def render(self):
+        return np.zeros((2, 2, 3), np.uint8)
+
+    def close(self):
+        self.env.close()
+
+
+class Stacked(gymnasium.Wrapper):
+    def set_init_state(self, state):
+        return self.env.set_init_state(state)
+
+
+@pytest.mark.parametrize(
+    ("make", "options"), [(DummyVectorEnv, {}), (SubprocVectorEnv, {"share_memory": True})]
+)
+def test_environments_of_gymnasiums_interface_are_carried(suite, make, options):
+    path, rows = suite.get_task_bddl_file_path(0), suite.get_task_init_states(0)[:2]
+    env = make([lambda: Stacked(Wrapped(path))] * 2, **options)
+    space = gymnasium.vector.utils.batch_space(env.action_space[0], 2)
+    assert env.observation_space[1] == Wrapped.observation_space
+    obs, info = env.reset()
+    assert obs.shape == (2,)
+    assert info == [{"first": None}] * 2
+    assert env.set_init_state(rows).tolist() == [None, None]
+    obs, reward, terminated, truncated, info = env.step(np.zeros(space.shape))
+    assert [o["pos"].shape for o in obs] == [(3,)] * 2
+    assert (reward.shape, terminated.tolist(), truncated.tolist()) == ((2,), [False] * 2, [False] * 2)
+    assert [i["env_id"] for i in info] == [0, 1]
+    assert env.seed([3, 4]) == [[3], [4]]
+    assert env.get_env_attr("first") == [3, 4]
+    env.set_env_attr("mark", 5)
+    assert env.get_env_attr("mark") == [5, 5]
+    assert env.render()[0].shape == (2, 2, 3)
+    with pytest.raises(AttributeError, match="get_env_attr"):
+        env.nothing  # noqa: B018 - the access is what raises
+    env.close()
+
+
+def test_workers_of_a_clients_own_have_the_original_methods():
+    class Own(EnvWorker):
+        def __init__(self, env_fn):
+            super().__init__(env_fn)
+            self.env = env_fn()
+
+        def send(self, action, **kwargs):
+            self.result = self.env.reset(**kwargs) if action is None else self.env.step(action)
+
+        def recv(self):
+            return self.result
+
+        def get_env_attr(self, key):
+            return getattr(self.env, key)
+
+        def set_env_attr(self, key, value):
+            setattr(self.env, key, value)
+
+        def close_env(self):
+            self.env.close()
+
+    env = BaseVectorEnv([Slow, Slow], Own)
+    assert env.reset()[0]["count"].tolist() == [0.0, 0.0]
+    assert env.step([1, 2])[0][1]["count"].tolist() == [2.0, 2.0]
+    assert env.workers[0].step(1)[0]["count"].tolist() == [2.0, 2.0]
+    assert env.get_env_attr("count") == [2, 2]
+    env.close()
 
 
 def test_failures_are_reported_and_other_workers_continue():

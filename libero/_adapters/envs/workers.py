@@ -6,7 +6,6 @@ A worker answers requests in order: `send` starts one and `recv` waits for its a
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from multiprocessing import connection
 from operator import attrgetter
 from typing import Any
@@ -17,10 +16,6 @@ from gymnasium.vector import utils
 from libero_env.envs.worker import Worker, shut_down, wait_for
 from libero_env.envs.worker_host import CallHost, Shared
 from libero_env.errors import LiberoError
-
-# Methods of the environment that a worker has, too: each sends the call and waits for the answer.
-METHODS = {"reset", "step", "seed", "render", "check_success", "get_segmentation_of_interest"}
-METHODS |= {"get_sim_state", "set_init_state"}
 
 
 class WorkerError(LiberoError, RuntimeError):
@@ -63,19 +58,18 @@ class ShArray:
 
 
 class EnvWorker(ABC):
-    """One environment. The methods in `METHODS` call those of the environment and return their results."""
+    """One environment, of the original's interface or of Gymnasium's: its results are passed on as they are.
+
+    A class of a client's own, such as one written for Tianshou, has to define `send`, `recv`, `get_env_attr`,
+    `set_env_attr` and `close_env`.
+    """
 
     def __init__(self, env_fn: Callable[[], Any]):
-        self._env_fn, self.is_closed = env_fn, False
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        if name in METHODS:
-            return partial(self._ask, name)
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self._env_fn, self.is_closed, self.result = env_fn, False, None
 
     @abstractmethod
-    def _send(self, command: str, *args: Any) -> None:
-        """Start a command of `VectorHost`."""
+    def send(self, action: Any, **kwargs: Any) -> None:
+        """Start a step with an action, or with None a reset with keyword arguments."""
 
     @abstractmethod
     def recv(self) -> Any:
@@ -85,19 +79,56 @@ class EnvWorker(ABC):
     def close_env(self) -> None:
         """Close the environment, by force where it does not answer."""
 
-    def send(self, method: str, *args: Any, **kwargs: Any) -> None:
-        """Start a call of a method of the environment."""
-        self._send("call", method, args, kwargs)
-
+    @abstractmethod
     def get_env_attr(self, key: str) -> Any:
         """Return an attribute of the environment; of one in another process a copy."""
-        self._send("get", key)
-        return self.recv()
 
+    @abstractmethod
     def set_env_attr(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment, or of its inner environment where only that has it."""
-        self._send("set", key, value)
-        self.recv()
+        """Set an attribute of the environment without its wrappers, where it or its inner environment has it."""
+
+    def start(self, method: str, *args: Any, **kwargs: Any) -> None:
+        """Start a call of a method of the environment, whose result `finish` returns."""
+        if method in ("reset", "step"):
+            self.send(*(args or (None,)), **kwargs)
+        else:
+            self.result = getattr(self, method)(*args, **kwargs)
+
+    def finish(self, method: str) -> Any:
+        """Return the result of the call that was started."""
+        return self.recv() if method in ("reset", "step") else self.result
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Reset the environment; return the observation, or (observation, info)."""
+        return self._ask("reset", **kwargs)
+
+    def step(self, action: Any) -> tuple:
+        """Act in the environment; return its four or five results."""
+        return self._ask("step", action)
+
+    def seed(self, seed: int | None = None) -> Any:
+        """Seed the environment, by a reset where it has no `seed`."""
+        return self._ask("seed", seed)
+
+    def render(self, **kwargs: Any) -> Any:
+        """Return what the environment's `render` returns."""
+        return self._ask("render", **kwargs)
+
+    def check_success(self) -> bool:
+        """Return whether the goal of the environment holds."""
+        return self._ask("check_success")
+
+    def get_segmentation_of_interest(self, segmentation_image: np.ndarray) -> np.ndarray:
+        """Return the objects of interest in a segmentation picture."""
+        return self._ask("get_segmentation_of_interest", segmentation_image)
+
+    def get_sim_state(self) -> np.ndarray:
+        """Return [time, qpos, qvel] of the environment."""
+        return self._ask("get_sim_state")
+
+    def set_init_state(self, init_state: np.ndarray) -> Any:
+        """Set the state of the environment and return its observation."""
+        return self._ask("set_init_state", init_state)
 
     def close(self) -> None:
         """Close the environment. Idempotent."""
@@ -111,18 +142,51 @@ class EnvWorker(ABC):
         return workers
 
     def _ask(self, method: str, *args: Any, **kwargs: Any) -> Any:
-        self.send(method, *args, **kwargs)
+        self.start(method, *args, **kwargs)
+        return self.finish(method)
+
+
+class _HostWorker(EnvWorker):
+    """A worker whose environment is in a `VectorHost`."""
+
+    @abstractmethod
+    def _send(self, command: str, *args: Any) -> None:
+        """Start a command of `VectorHost`."""
+
+    def send(self, action: Any, **kwargs: Any) -> None:
+        """Start a step with an action, or with None a reset with keyword arguments."""
+        if action is None:
+            self.start("reset", **kwargs)
+        else:
+            self.start("step", action)
+
+    def start(self, method: str, *args: Any, **kwargs: Any) -> None:
+        """Start a call of a method of the environment, whose result `finish` returns."""
+        self._send("call", method, args, kwargs)
+
+    def finish(self, method: str) -> Any:
+        """Return the result of the call that was started."""
         return self.recv()
 
+    def get_env_attr(self, key: str) -> Any:
+        """Return an attribute of the environment; of one in another process a copy."""
+        self._send("get", key)
+        return self.recv()
 
-class DummyEnvWorker(EnvWorker):
+    def set_env_attr(self, key: str, value: Any) -> None:
+        """Set an attribute of the environment without its wrappers, where it or its inner environment has it."""
+        self._send("set", key, value)
+        self.recv()
+
+
+class DummyEnvWorker(_HostWorker):
     """An environment in this process."""
 
     def __init__(self, env_fn: Callable[[], Any]):
         super().__init__(env_fn)
         self._host = VectorHost(env_fn)
         self._host.open()
-        self.env, self.result = self._host.env, None
+        self.env = self._host.env
 
     def _send(self, command: str, *args: Any) -> None:
         self.result = getattr(self._host, command)(*args)
@@ -136,7 +200,7 @@ class DummyEnvWorker(EnvWorker):
         self._host.close()
 
 
-class SubprocEnvWorker(EnvWorker):
+class SubprocEnvWorker(_HostWorker):
     """An environment in a process of its own, which is spawned: no GL context is inherited.
 
     Args:
@@ -210,6 +274,11 @@ class VectorHost(CallHost):
 
     def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Call a method; None stands for arrays of an observation that are in shared memory."""
+        if method == "seed" and not hasattr(
+            self.env, "seed"
+        ):  # Gymnasium's environments are seeded by a reset
+            self.env.reset(seed=args[0])
+            return [args[0]]
         result = super().call(method, args, kwargs)
         if observation := _observation(result):
             arrays = _arrays(observation)
@@ -219,6 +288,18 @@ class VectorHost(CallHost):
                     view[...] = arrays[key]
                     observation[key] = None
         return result
+
+    def get(self, key: str) -> Any:
+        """Return an attribute of the environment, of its wrappers first."""
+        return getattr(self.env if hasattr(self.env, key) else getattr(self.env, "unwrapped", self.env), key)
+
+    def set(self, key: str, value: Any) -> None:
+        """Set an attribute of the environment without its wrappers."""
+        wrapped, self.env = self.env, getattr(self.env, "unwrapped", self.env)
+        try:
+            super().set(key, value)
+        finally:
+            self.env = wrapped
 
     def attach(self, name: str) -> None:
         """Write observations to shared memory, laid out as the first observation was."""

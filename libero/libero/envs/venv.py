@@ -1,6 +1,7 @@
 """Several environments together, with the interface that the original took from Tianshou.
 
-Observations are object arrays of dictionaries; rewards and successes are stacked.
+They may be of the original's interface, whose `reset` returns an observation and whose `step` returns four results, or
+of Gymnasium's, with (observation, info) and five. Results are stacked: dictionaries as an object array of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from libero._adapters.envs.workers import (  # noqa: F401 - names of the original
     CloudpickleWrapper,
@@ -19,6 +21,11 @@ from libero._adapters.envs.workers import (  # noqa: F401 - names of the origina
 )
 from libero_env.errors import LiberoError
 
+# Attributes of a vector that are those of its environments, in a list.
+GYM_RESERVED_KEYS = ["metadata", "reward_range", "spec", "action_space", "observation_space"]
+
+gym_old_venv_step_type = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+gym_new_venv_step_type = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 Ids = int | Sequence[int] | np.ndarray | None
 
 
@@ -59,6 +66,13 @@ class BaseVectorEnv:
         self.waiting_id: list[int] = []
         self.ready_id = list(range(self.env_num))
 
+    def __getattr__(self, key: str) -> Any:
+        """Return the attribute of each environment, of those in `GYM_RESERVED_KEYS`."""
+        if key in GYM_RESERVED_KEYS:
+            return self.get_env_attr(key)
+        hint = f"; get_env_attr({key!r}) returns that of each environment"
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {key!r}{hint}")
+
     def __len__(self) -> int:
         """Return the number of environments."""
         return self.env_num
@@ -72,26 +86,33 @@ class BaseVectorEnv:
         for i in self._ids(id):
             self.workers[i].set_env_attr(key, value)
 
-    def reset(self, id: Ids = None, **kwargs: Any) -> np.ndarray:
-        """Reset the environments and return their observations (k,)."""
-        return _objects(self._call("reset", self._ids(id), **kwargs))
+    def reset(self, id: Ids = None, **kwargs: Any) -> Any:
+        """Reset the environments; return their observations (k,), or these and a list of their infos."""
+        results = self._call("reset", self._ids(id), **kwargs)
+        if all(isinstance(r, tuple | list) and len(r) == 2 and isinstance(r[1], dict) for r in results):
+            return _stack([observation for observation, _ in results]), [info for _, info in results]
+        return _stack(results)
 
-    def step(self, action: Any, id: Ids = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Act in the environments, actions (k, 7); return observations, rewards, successes and infos, each (k,)."""
-        ids = self._ids(id)
-        if len(action) != len(ids):
+    def step(self, action: Any, id: Ids = None) -> tuple[np.ndarray, ...]:
+        """Act in the environments, actions (k, 7); with `wait_num` or `timeout`, None only waits for those that act.
+
+        Returns:
+            Observations, rewards, successes and infos, each (k,); of environments of Gymnasium's interface
+            observations, rewards, terminated, truncated and infos.
+        """
+        ids = self._ids(id) if action is not None else []
+        if action is not None and len(action) != len(ids):
             raise LiberoError(f"step: {len(action)} actions for {len(ids)} environments")
-        for i, row in zip(ids, action, strict=True):
-            self.workers[i].send("step", row)
+        for i, row in zip(ids, () if action is None else action, strict=True):
+            self.workers[i].start("step", row)
         if self.is_async:
             self.waiting_id += ids
             self.ready_id = [i for i in self.ready_id if i not in ids]
             ids = self._wait()
-        results = self._receive(ids)
-        for i, (_, _, _, info) in zip(ids, results, strict=True):
-            info["env_id"] = i
-        observations, rewards, successes, infos = zip(*results, strict=True)
-        return _objects(observations), np.array(rewards), np.array(successes), _objects(infos)
+        results = self._receive("step", ids)
+        for i, result in zip(ids, results, strict=True):
+            result[-1]["env_id"] = i
+        return tuple(map(_stack, zip(*results, strict=True)))
 
     def _wait(self) -> list[int]:
         """Wait for some environments, and move them from waiting to ready."""
@@ -128,7 +149,7 @@ class BaseVectorEnv:
 
     def set_init_state(self, init_state: Sequence[np.ndarray], id: Ids = None) -> np.ndarray:
         """Set the state of each environment and return their observations (k,)."""
-        return _objects(self._call("set_init_state", self._ids(id), init_state))
+        return _stack(self._call("set_init_state", self._ids(id), init_state))
 
     def close(self) -> None:
         """Close all environments. Idempotent."""
@@ -142,27 +163,36 @@ class BaseVectorEnv:
         if arguments is not None and len(arguments) != len(ids):
             raise LiberoError(f"{method}: {len(arguments)} values for {len(ids)} environments")
         for k, i in enumerate(ids):
-            self.workers[i].send(method, *(() if arguments is None else (arguments[k],)), **kwargs)
-        return self._receive(ids)
+            self.workers[i].start(method, *(() if arguments is None else (arguments[k],)), **kwargs)
+        return self._receive(method, ids)
 
-    def _receive(self, ids: Sequence[int]) -> list[Any]:
+    def _receive(self, method: str, ids: Sequence[int]) -> list[Any]:
         """Return all answers; a failure is raised once no answer is left for the next call."""
         results, failures = [], []
         for i in ids:
             try:
-                results.append(self.workers[i].recv())
+                results.append(self.workers[i].finish(method))
             except WorkerError as error:
                 failures.append(error)
         if failures:
             raise failures[0]
         return results
 
-    def _ids(self, id: Ids) -> list[int]:
+    def _assert_is_not_closed(self) -> None:
         if self.is_closed:
             raise LiberoError("this vector of environments is closed; make a new one")
-        ids = list(range(self.env_num)) if id is None else [int(i) for i in np.atleast_1d(id)]
-        if busy := [i for i in ids if i in self.waiting_id]:
+
+    def _wrap_id(self, id: Ids = None) -> list[int]:
+        return list(range(self.env_num)) if id is None else [int(i) for i in np.atleast_1d(id)]
+
+    def _assert_id(self, id: Sequence[int]) -> None:
+        if busy := [i for i in id if i in self.waiting_id]:
             raise LiberoError(f"environments {busy} are still at their last step; call step to wait for them")
+
+    def _ids(self, id: Ids) -> list[int]:
+        self._assert_is_not_closed()
+        ids = self._wrap_id(id)
+        self._assert_id(ids)
         return ids
 
 
@@ -194,9 +224,21 @@ class SubprocVectorEnv(BaseVectorEnv):
         super().__init__(env_fns, worker_fn, **kwargs)
 
 
-def _objects(items: Sequence[Any]) -> np.ndarray:
-    """Return an object array (k,) of the items."""
-    array = np.empty(len(items), object)
-    for i, item in enumerate(items):
-        array[i] = item
-    return array
+def _stack(items: Sequence[Any]) -> np.ndarray:
+    """Return an array (k, ...) of the items; an object array (k,) of dictionaries, and of arrays of unequal shape."""
+    try:
+        return np.stack(items)
+    except ValueError:
+        array = np.empty(len(items), object)
+        for i, item in enumerate(items):
+            array[i] = item
+        return array
+
+
+def _setup_buf(space: spaces.Space) -> Any:
+    """Return shared memory for observations of a space: an array, or a dictionary or tuple of them."""
+    if isinstance(space, spaces.Dict):
+        return {key: _setup_buf(part) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(map(_setup_buf, space.spaces))
+    return ShArray(space.dtype, space.shape or ())
