@@ -13,6 +13,24 @@ from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.scene import Scene, scene_spec
 from libero_env.tasks.problem import Problem
 
+_TEXTURE_FIELDS = (
+    *(
+        "type",
+        "builtin",
+        "mark",
+        "rgb1",
+        "rgb2",
+        "markrgb",
+        "random",
+        "width",
+        "height",
+        "nchannel",
+        "data",
+        "file",
+    ),
+    *("cubefiles", "content_type", "gridlayout", "gridsize", "hflip", "vflip", "colorspace"),
+)
+
 
 def spec_without_textures(problem: Problem, pack: Pack | None = None) -> mujoco.MjSpec:
     """Return the scene of a problem as an editable model without textures."""
@@ -23,6 +41,50 @@ def spec_without_textures(problem: Problem, pack: Pack | None = None) -> mujoco.
         delete(spec, texture)
     spec.compile()
     return spec
+
+
+def compile_stored(xml: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a stored model; materials that were stored without their textures get those of the task's scene.
+
+    Args:
+        xml: Stored model, with or without edits.
+        spec: Scene of the same task, complete. It is not changed.
+
+    Raises:
+        DemoError: MuJoCo cannot compile the model, as when its files are elsewhere; the message is MuJoCo's.
+    """
+    try:
+        stored = mujoco.MjSpec.from_string(xml)
+        stored.assets = {**spec.assets, **stored.assets}  # contents of files that are not on disk
+        _add_textures(stored, spec)
+        return stored.compile()
+    except ValueError as error:
+        raise DemoError(f"the stored model does not compile: {error}") from error
+
+
+def _add_textures(stored: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
+    known = {texture.name: texture for texture in spec.textures}
+    own = {texture.name for texture in stored.textures}
+    ours = {material.name: list(material.textures) for material in spec.materials}
+    for material in stored.materials:
+        textures = ours.get(material.name, [])
+        if any(material.textures) or not any(textures):
+            continue
+        material.textures = textures
+        for name in filter(None, textures):
+            if name not in own:
+                own.add(name)
+                _copy_texture(stored, known[name])
+    for name, texture in known.items():  # no material names the sky
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX and not own.intersection({name}):
+            _copy_texture(stored, texture)
+
+
+def _copy_texture(spec: mujoco.MjSpec, texture: mujoco.MjsTexture) -> None:
+    copied = spec.add_texture(name=texture.name)
+    for field in _TEXTURE_FIELDS:
+        if hasattr(texture, field):  # MuJoCo 3.3 has no colour space of the scene's textures to keep
+            setattr(copied, field, getattr(texture, field))
 
 
 def model_xml(spec: mujoco.MjSpec, poses: Mapping[str, np.ndarray]) -> str:

@@ -1,6 +1,7 @@
 """Environments: observations, states, fixtures, success and cameras."""
 
 import json
+import re
 
 import mujoco
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
-from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.assets.robot import REST_QPOS
+from libero_env.errors import ActionError, DemoError, LiberoError, UnknownNameError
 from libero_env.sim.render import Renderer, RenderTarget
 
 pytestmark = pytest.mark.sim
@@ -152,6 +154,35 @@ def _stove_task() -> str:
 
     goal = benchmark.get_benchmark("libero_goal")()
     return goal.get_task_bddl_file_path(goal.get_task_names().index("turn_on_the_stove"))
+
+
+def test_a_model_is_built_again_from_its_text():
+    env = OffScreenRenderEnv(bddl_file_name=_stove_task(), camera_heights=64, camera_widths=64)
+    env.seed(0)
+    env.reset()
+    state, xml = env.get_sim_state(), env.sim.model.get_xml()
+    before = env.set_init_state(state)
+    env.reset_from_xml_string(xml)
+    assert np.allclose(env.get_sim_state()[1:8], REST_QPOS), "the arm is at rest"
+    same = env.set_init_state(state)
+    assert (env.get_sim_state() == state).all()
+    assert np.allclose(same["object-state"], before["object-state"], atol=1e-6)
+    images = {key: before[key].astype(int) for key in before if key.endswith("_image")}
+    assert all(np.abs(same[key] - image).mean() < 0.1 for key, image in images.items()), "with its textures"
+    moved = re.sub(r'(<camera[^>]*name="agentview"[^>]*pos=")[^"]*', r"\g<1>1 0.5 2", xml)
+    assert moved != xml
+    env.reset_from_xml_string(moved)
+    assert env.sim.model.cam_pos[env.sim.model.camera_name2id("agentview")].tolist() == [1.0, 0.5, 2.0]
+    assert np.abs(env.set_init_state(state)["agentview_image"] - images["agentview_image"]).mean() > 10
+    assert 'pos="1 0.5 2"' in env.sim.model.get_xml(), "the edit is part of the model"
+    env.step(np.zeros(7))
+    with pytest.raises(DemoError, match="not XML"):
+        env.reset_from_xml_string("<mujoco")
+    with pytest.warns(UserWarning, match="only the poses of the fixtures"):
+        env.reset_from_xml_string('<mujoco><asset><mesh name="a" file="/absent/a.obj"/></asset></mujoco>')
+    with pytest.raises(LiberoError, match="another task"):
+        env.reset_from_xml_string("<mujoco/>")
+    env.close()
 
 
 def test_turning_a_stove_on_is_success():

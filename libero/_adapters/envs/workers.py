@@ -294,12 +294,11 @@ class VectorHost(CallHost):
         return getattr(self.env if hasattr(self.env, key) else getattr(self.env, "unwrapped", self.env), key)
 
     def set(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment without its wrappers."""
-        wrapped, self.env = self.env, getattr(self.env, "unwrapped", self.env)
-        try:
+        """Set an attribute of the environment: of Gymnasium's interface of the one in the wrappers."""
+        if hasattr(self.env, "unwrapped"):
+            setattr(self.env.unwrapped, key, value)
+        else:
             super().set(key, value)
-        finally:
-            self.env = wrapped
 
     def attach(self, name: str) -> None:
         """Write observations to shared memory, laid out as the first observation was."""

@@ -1,8 +1,10 @@
 """The environment behind the wrappers: one simulation of a task file, stepped as robosuite steps it."""
 
 import os
+import warnings
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from inspect import signature
 from operator import attrgetter
 from typing import Any
@@ -22,8 +24,13 @@ from libero.libero.envs.predicates import eval_predicate_fn
 from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
-from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.demos.stored_model import (
+    compile_stored,
+    model_xml,
+    read_fixture_poses,
+    spec_without_textures,
+)
+from libero_env.errors import DemoError, LiberoError, UnknownNameError
 from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
 from libero_env.sim.controller import ControllerState
@@ -125,6 +132,7 @@ class BDDLBaseDomain:
         self.rng = np.random.default_rng()
         self.timestep, self.cur_time, self.done = 0, 0.0, False
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
+        self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
         self._load_model()
         self._setup_references(controller_configs, robots)
 
@@ -157,6 +165,9 @@ class BDDLBaseDomain:
             for hook in hooks:
                 getattr(self, hook)(arena)
             model = arena.spec.compile()
+        self._simulate(model)
+
+    def _simulate(self, model: mujoco.MjModel) -> None:
         self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
         self.sim = MjSim(self.simulations, self.get_xml)
         self.view = StateView(self.scene, self.simulations, 0)
@@ -318,16 +329,58 @@ class BDDLBaseDomain:
     def get_xml(self) -> str:
         """Return the scene as MJCF without textures, with the present poses of the fixtures."""
         poses = dict(zip(self.scene.fixtures, self.simulations.read_fixtures(), strict=True))
-        return model_xml(spec_without_textures(self.problem, self.scene.pack), poses)
+        spec = (
+            mujoco.MjSpec.from_string(self._xml)
+            if self._xml
+            else spec_without_textures(self.problem, self.scene.pack)
+        )
+        return model_xml(spec, poses)
 
     def reset_from_xml_string(self, xml_string: str) -> None:
-        """Set the poses of the fixtures from a stored model of this task, and everything else to its initial state."""
-        for name, pose in read_fixture_poses(xml_string, self.scene).items():
-            self.sim.model.body_pos[self.obj_body_id[name]] = pose[:3]
-            self.sim.model.body_quat[self.obj_body_id[name]] = pose[3:]
+        """Build the model again from MJCF, edited or not; the arm is at rest and objects are where the text has them.
+
+        Of a text whose files are missing, such as one of the original without its models, only the poses of the
+        fixtures are taken, with a warning.
+
+        Raises:
+            DemoError: The text is not MJCF.
+            LiberoError: The text is a model of another task.
+        """
+        poses = read_fixture_poses(xml_string, self.scene)
+        try:
+            model = compile_stored(xml_string, scene_spec(self.problem, self.scene.pack))
+        except DemoError as error:
+            warnings.warn(f"{error}; only the poses of the fixtures are taken from it", stacklevel=2)
+            for name, pose in poses.items():
+                self.sim.model.body_pos[self.obj_body_id[name]] = pose[:3]
+                self.sim.model.body_quat[self.obj_body_id[name]] = pose[3:]
+        else:
+            self._check_names(model)
+            self.sim.free()
+            self.scene, self._xml = replace(self.scene, model=model), xml_string
+            self._simulate(model)
+            self._setup_references(self._controller_configs, self._robots)
         self.sim.reset()
+        self.sim.data.qpos[: len(REST_QPOS)] = REST_QPOS
         self.sim.forward()
+        self.simulations.controller_state.restart(
+            [0], self.view.eef_pos[None], self.view.eef_mat.reshape(1, 9)
+        )
         self.timestep, self.cur_time, self.done = 0, 0.0, False
+
+    def _check_names(self, model: mujoco.MjModel) -> None:
+        """Raise a LiberoError unless a model has the joints and sites of the task, in their order."""
+        for kind, count in (("joint", "njnt"), ("site", "nsite")):
+            own, other = (
+                [getattr(m, kind)(i).name for i in range(getattr(m, count))]
+                for m in (self.scene.model, model)
+            )
+            missing = [name for name in own if name and name not in other]
+            if missing or (kind == "joint" and own != other):
+                named = missing[0] if missing else "the joints in their order"
+                raise LiberoError(
+                    f"the model lacks {kind} {named!r} of {self.bddl_file_name}: is it of another task?"
+                )
 
     def close(self) -> None:
         """Free the simulation, its GL contexts and its window. Idempotent."""

@@ -116,7 +116,7 @@ class ControlEnv:
         return self.env._get_observations()
 
     def reset_from_xml_string(self, xml_string: str) -> None:
-        """Set the poses of the fixtures from a stored model, see `BDDLBaseDomain.reset_from_xml_string`."""
+        """Build the model again from MJCF, see `BDDLBaseDomain.reset_from_xml_string`."""
         self.env.reset_from_xml_string(xml_string)
 
     def seed(self, seed: int) -> None:
