@@ -58,13 +58,16 @@ def get_path_dict() -> dict[str, str]:
 def get_libero_path(query_key: str) -> str:
     """Return one of the paths, and warn if it does not exist; raise an UnknownNameError if the key does not exist."""
     from libero._adapters.envs.files import ensure
+    from libero._adapters.unpickling import allow_arrays
 
     if query_key not in _KEYS:
         raise UnknownNameError("path", query_key, _KEYS)
+    allow_arrays()
     path = get_path_dict()[query_key]
     ensure(query_key, path)
     if not os.path.exists(path):
-        warnings.warn(f"{query_key}: {path} does not exist (see {_config_file()})", stacklevel=2)
+        where = f"as {_config_file()} configures" if query_key in read_config() else "the default"
+        warnings.warn(f"{query_key}: {path}, {where}, does not exist", stacklevel=2)
     return path
 
 

@@ -123,7 +123,7 @@ def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
 def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
     """Return the file of a task's demonstrations; generate them if there is none."""
     path = Path(cfg.folder, benchmark.get_task_demonstration(i))
-    if path.exists():
+    if path.exists() and not path.is_symlink():  # a link is to a recording, which may have too few
         return path
     size = int(cfg.data.img_h), int(cfg.data.img_w)
     task = native_task(benchmark.get_task(i), cfg.bddl_folder)

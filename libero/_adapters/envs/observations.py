@@ -87,6 +87,19 @@ class Observer:
             found["object-state"] = np.concatenate(list(objects.values()))
         return found
 
+    def groups(self) -> dict[str, list[str]]:
+        """Return the names of the observations, without the concatenated ones, by robosuite's modality."""
+        images = [
+            f"{camera.name}_{kind}"
+            for camera in self.cameras
+            for kind in (
+                "image",
+                *["depth"] * camera.depth,
+                *(f"segmentation_{k}" for k in camera.segmentations),
+            )
+        ]
+        return {"robot0_proprio": list(self._robot()), "image": images, "object": list(self._objects())}
+
     def _robot(self) -> dict[str, np.ndarray]:
         data = self.sim.data
         joints = data.qpos[:7].copy()

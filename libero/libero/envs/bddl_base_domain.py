@@ -14,6 +14,7 @@ import numpy as np
 
 from libero._adapters.envs.models import facade_pack
 from libero._adapters.envs.observations import Observer, cameras
+from libero._adapters.envs.robosuite_methods import RobosuiteMethods
 from libero._adapters.envs.sim import ClientSimulations, MjSim
 from libero._adapters.envs.window import Window
 from libero._adapters.lookup import lookup
@@ -23,6 +24,7 @@ from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteO
 from libero.libero.envs.predicates import eval_predicate_fn
 from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
+from libero.libero.utils.utils import postprocess_model_xml
 from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
 from libero_env.demos.stored_model import (
     compile_stored,
@@ -59,7 +61,7 @@ def register_problem(target_class: type["BDDLBaseDomain"]) -> type["BDDLBaseDoma
     return target_class
 
 
-class BDDLBaseDomain:
+class BDDLBaseDomain(RobosuiteMethods):
     """One simulation of a task file.
 
     Attributes:
@@ -189,10 +191,11 @@ class BDDLBaseDomain:
         states = self.object_states_dict.values()
         self.tracking_object_states_changes = [s for s in states if getattr(s, "has_turnon_affordance", 0)]
         self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
-        self.model = TaskModel(scene, self.sim.model._model)
+        self.model = TaskModel(scene, self.sim.model._model, self.get_xml)
         drawn = self.camera_list if self.use_camera_obs else ()
         observed = list(scene.objects) if self.use_object_obs else []
         self.observer = Observer(self.sim, observed, drawn, self.model.segments)
+        self._observables = self._setup_observables()
         self._add_placement_initializer()
 
     # Episodes -----------------------------------------------------------------------------------------------
@@ -203,6 +206,12 @@ class BDDLBaseDomain:
 
     def reset(self) -> "OrderedDict[str, np.ndarray]":
         """Sample an initial state and observe it; raise a PlacementError if the objects do not fit."""
+        self._reset_internal()
+        self.timestep, self.cur_time, self.done = 0, 0.0, False
+        return self._get_observations(force_update=True)
+
+    def _reset_internal(self) -> None:
+        """Set the state to a sampled initial state; a subclass may change it afterwards."""
         start = self._sample()
         qpos = start.qpos.copy()
         if self.initialization_noise is None:
@@ -212,8 +221,6 @@ class BDDLBaseDomain:
                 joint = self.scene.model.joint(f"{name}_joint0").qposadr[0]
                 qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
-        self.timestep, self.cur_time, self.done = 0, 0.0, False
-        return self._get_observations(force_update=True)
 
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
@@ -255,6 +262,7 @@ class BDDLBaseDomain:
             raise EpisodeOverError(
                 f"the horizon of {self.horizon} steps is reached: call reset(), or set horizon or ignore_done"
             )
+        self._pre_action(action, policy_step=True)
         command = self.robots[0].command(action)
         self.timestep += 1
         mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
@@ -263,6 +271,9 @@ class BDDLBaseDomain:
         reward, self.done, info = self._post_action(action)
         success = self._check_success()
         return self._get_observations(), reward, success, {"success": success, **info}
+
+    def _pre_action(self, action: Any, policy_step: bool = False) -> None:
+        """Do nothing; a subclass may change the simulation before each control step."""
 
     def _post_action(self, action: Any) -> tuple[float, bool, dict[str, Any]]:
         return self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
@@ -292,7 +303,7 @@ class BDDLBaseDomain:
 
     def _update_observables(self, force: bool = False) -> None:
         """Observe the present state."""
-        self._observations = self.observer.observe()
+        self._observations = self._observe()
 
     def _get_observations(self, force_update: bool = False) -> "OrderedDict[str, np.ndarray]":
         """Return the last observation."""
@@ -381,6 +392,10 @@ class BDDLBaseDomain:
                 raise LiberoError(
                     f"the model lacks {kind} {named!r} of {self.bddl_file_name}: is it of another task?"
                 )
+
+    def edit_model_xml(self, xml_str: str) -> str:
+        """Return a stored model with the paths of this machine."""
+        return postprocess_model_xml(xml_str)
 
     def close(self) -> None:
         """Free the simulation, its GL contexts and its window. Idempotent."""

@@ -1,6 +1,6 @@
 """A compiled task as objects of the original: instances, regions, and the instance of each geom."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -65,8 +65,9 @@ class TaskModel:
         segments: `instance` and `class` -> number of each geom, (ngeom + 1,), from 1; 0 is everything else.
     """
 
-    def __init__(self, scene: Scene, model: mujoco.MjModel):
+    def __init__(self, scene: Scene, model: mujoco.MjModel, xml: Callable[[], str] | None = None):
         self.mujoco_model = model
+        self._xml = xml
         bodies, robot = {name: scene.bodies[name] for name in scene.entities}, _robot_bodies(model)
         categories = {name: item.category for name, item in scene.entities.items()}
         classes = {name: getattr(OBJECTS_DICT.get(c), "__name__", c) for name, c in categories.items()}
@@ -81,6 +82,11 @@ class TaskModel:
         self.geom_ids_to_classes = _inverse(self.classes_to_ids)
         ids_of = {"instance": self.instances_to_ids, "class": self.classes_to_ids}
         self.segments = {kind: _numbers(ids, model.ngeom) for kind, ids in ids_of.items()}
+
+    def get_xml(self) -> str:
+        """Return the scene as MJCF."""
+        assert self._xml is not None, "made by an environment"
+        return self._xml()
 
 
 def _robot_bodies(model: mujoco.MjModel) -> dict[str, list[int]]:

@@ -9,11 +9,15 @@ import numpy as np
 from libero._adapters.envs.domain import Domain
 from libero.libero.envs.robots.mounted_panda import MountedPanda
 from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
+from libero_env.assets.robot import GRIP_SITE, OPEN_FINGERS
 from libero_env.envs.checks import checked_actions
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.sim.controller import CONTROLLERS as KINDS
 from libero_env.sim.controller import ControllerState, get_controller
+from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 
+_GAIN = 150.0  # [1/s^2] of operational space control; robosuite's controllers/config/osc_pose.json
+_SCALES = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3)
 CONTROLLERS = tuple(name.upper() for name in KINDS)
 
 
@@ -61,6 +65,15 @@ class Controller:
     def use_delta(self, value: bool) -> None:
         self._state.controller = get_controller(self.name.lower(), bool(value))
 
+    kp = property(lambda self: np.full(6, _GAIN), doc="Gains on pose errors, (6,) 1/s^2.")
+    kd = property(lambda self: np.full(6, 2 * np.sqrt(_GAIN)), doc="Gains on velocities, (6,).")
+    input_max = property(lambda self: np.ones(self.control_dim), doc="Largest action, without the gripper.")
+    input_min = property(lambda self: -np.ones(self.control_dim), doc="Smallest action, without the gripper.")
+    output_max = property(
+        lambda self: _SCALES[: self.control_dim], doc="Motion of the largest action, m and rad."
+    )
+    output_min = property(lambda self: -_SCALES[: self.control_dim], doc="Motion of the smallest action.")
+
     @property
     def control_dim(self) -> int:
         """Length of an action without the gripper."""
@@ -83,9 +96,31 @@ class Gripper:
     """The two fingers."""
 
     dof = 1
+    init_qpos = np.array(OPEN_FINGERS)
+    naming_prefix = "gripper0_"
+    important_sites: Mapping[str, str] = {
+        "grip_site": GRIP_SITE,
+        "grip_cylinder": "gripper0_grip_site_cylinder",
+    }
+    important_geoms: Mapping[str, list[str]] = {
+        name: [f"gripper0_finger{finger}{part}_collision" for part in parts]
+        for name, finger, parts in (
+            ("left_finger", 1, ("", "_pad")),
+            ("right_finger", 2, ("", "_pad")),
+            ("left_fingerpad", 1, ("_pad",)),
+            ("right_fingerpad", 2, ("_pad",)),
+        )
+    }
 
     def __init__(self, env: Domain):
         self._env = env
+
+    @property
+    def contact_geoms(self) -> list[str]:
+        """Names of the collision geoms."""
+        model = self._env.sim.model
+        names = enumerate(model.geom_names)
+        return [name for i, name in names if name.startswith(self.naming_prefix) and model.geom_group[i] == 0]
 
     @property
     def current_action(self) -> np.ndarray:

@@ -1,0 +1,191 @@
+"""Methods that environments of robosuite have: contacts between geoms, and observables that can be changed."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from libero._adapters.envs.observations import Observer
+from libero._adapters.envs.sim import MjSim
+from libero._adapters.lookup import lookup
+from libero_env.errors import LiberoError
+
+_SETTERS = ("sensor", "corrupter", "filter", "delayer", "sampling_rate", "enabled", "active")
+
+
+class Observable:
+    """One observation, with the interface of robosuite's class, whose instances are accepted beside it.
+
+    Args:
+        name: Name in observations.
+        sensor: Function of the observations made before it, by name, that returns the value; None for the value that
+            the environment has for this name.
+        corrupter: Function of the value, such as noise.
+        filter: Function of the corrupted value.
+        enabled: Whether it is measured.
+        active: Whether it is among the observations; others may use it in any case.
+        modality: Group of the observations that `<modality>-state` concatenates.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        sensor: Callable[[Mapping[str, Any]], Any] | None = None,
+        corrupter: Callable[[Any], Any] | None = None,
+        filter: Callable[[Any], Any] | None = None,
+        enabled: bool = True,
+        active: bool = True,
+        modality: str = "",
+    ):
+        self.name, self.obs = name, None
+        self.modality = modality or getattr(sensor, "__modality__", "")
+        self._settings: dict[str, Any] = {"sensor": sensor, "corrupter": corrupter, "filter": filter}
+        self._settings |= {"enabled": enabled, "active": active}
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is the environment's own observation, unchanged."""
+        functions = [self._settings[key] for key in ("sensor", "corrupter", "filter")]
+        return functions == [None] * 3 and self.is_enabled() and self.is_active()
+
+    def is_enabled(self) -> bool:
+        """Return whether it is measured."""
+        return bool(self._settings["enabled"])
+
+    def is_active(self) -> bool:
+        """Return whether it is among the observations."""
+        return bool(self._settings["active"])
+
+    def set(self, attribute: str, value: Any) -> None:
+        """Set one of the arguments; raise a LiberoError for those that a control step of 50 ms has no place for."""
+        if attribute in ("delayer", "sampling_rate"):
+            raise LiberoError(
+                f"{self.name}: {attribute} cannot be changed; observations are made at each control step"
+            )
+        self._settings[attribute] = value
+
+    def update(self, timestep: float, obs_cache: dict[str, Any], force: bool = False) -> None:
+        """Measure it, and write the value into the observations made so far."""
+        sensor = self._settings["sensor"]
+        value = obs_cache.get(self.name) if sensor is None else np.asarray(sensor(obs_cache))
+        for function in filter(None, (self._settings["corrupter"], self._settings["filter"])):
+            value = function(value)
+        self.obs = obs_cache[self.name] = value
+
+
+class RobosuiteMethods:
+    """Contacts and observables of an environment with `sim`, `observer` and `control_freq`."""
+
+    sim: MjSim
+    observer: Observer
+    control_freq: float
+    _observables: "OrderedDict[str, Any]"
+
+    # Contacts -----------------------------------------------------------------------------------------------
+
+    def check_contact(self, geoms_1: Any, geoms_2: Any = None) -> bool:
+        """Return whether a geom of the first group touches one of the second, or any other geom if that is None.
+
+        A group is a name, names, or an object with `contact_geoms`.
+        """
+        first, second = _geoms(geoms_1), None if geoms_2 is None else _geoms(geoms_2)
+        pairs = [pair for touching in self._contacts() for pair in (touching, touching[::-1])]
+        return any(a in first and (second is None or b in second) for a, b in pairs)
+
+    def get_contacts(self, model: Any) -> set[str]:
+        """Return the names of the geoms that touch an object, without its own."""
+        own = _geoms(model)
+        pairs = [pair for touching in self._contacts() for pair in (touching, touching[::-1])]
+        return {b for a, b in pairs if a in own and b not in own}
+
+    def _check_grasp(self, gripper: Any, object_geoms: Any) -> bool:
+        """Return whether each finger pad of the gripper, or each given group of geoms, touches the object."""
+        if hasattr(gripper, "important_geoms"):
+            gripper = [gripper.important_geoms[f"{side}_fingerpad"] for side in ("left", "right")]
+        groups = [gripper] if isinstance(gripper, str) else gripper
+        return all(self.check_contact(group, object_geoms) for group in groups)
+
+    def _gripper_to_target(
+        self, gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False
+    ) -> Any:
+        """Return the vector from the grip site to a target, (3,) m, or its length."""
+        if hasattr(target, "root_body"):
+            target, target_type = target.root_body, "body"
+        read = getattr(self.sim.data, f"get_{target_type}_xpos")
+        difference = read(target) - self.sim.data.get_site_xpos(gripper.important_sites["grip_site"])
+        return float(np.linalg.norm(difference)) if return_distance else difference
+
+    def _contacts(self) -> list[tuple[str, str]]:
+        name, data = self.sim.model.geom_id2name, self.sim.data
+        return [(name(c.geom1), name(c.geom2)) for c in data.contact[: data.ncon]]
+
+    # Observables --------------------------------------------------------------------------------------------
+
+    def _setup_observables(self) -> "OrderedDict[str, Any]":
+        """Return the observables by name; a subclass may add some."""
+        groups = self.observer.groups().items()
+        return OrderedDict(
+            (name, Observable(name, modality=group)) for group, names in groups for name in names
+        )
+
+    def add_observable(self, observable: Any) -> None:
+        """Add an observable; raise a LiberoError if there is one of this name."""
+        if observable.name in self._observables:
+            raise LiberoError(f"there is an observable {observable.name!r}: change it with modify_observable")
+        self._observables[observable.name] = observable
+
+    def modify_observable(self, observable_name: str, attribute: str, modifier: Any) -> None:
+        """Set `sensor`, `corrupter`, `filter`, `enabled` or `active` of an observable."""
+        observable = lookup(self._observables, "observable", observable_name)
+        lookup(dict.fromkeys(_SETTERS), "attribute of an observable", attribute)
+        if isinstance(observable, Observable):
+            observable.set(attribute, modifier)
+        else:  # of robosuite's class
+            getattr(observable, f"set_{attribute}")(modifier)
+
+    @property
+    def observation_names(self) -> set[str]:
+        """Names of all observables."""
+        return set(self._observables)
+
+    @property
+    def enabled_observables(self) -> set[str]:
+        """Names of the observables that are measured."""
+        return {name for name, observable in self._observables.items() if observable.is_enabled()}
+
+    @property
+    def active_observables(self) -> set[str]:
+        """Names of the observables that are among the observations."""
+        return {name for name, observable in self._observables.items() if observable.is_active()}
+
+    @property
+    def observation_modalities(self) -> set[str]:
+        """Groups of the observables."""
+        return {observable.modality for observable in self._observables.values()}
+
+    def _observe(self) -> "OrderedDict[str, np.ndarray]":
+        """Return the observations of the present state, as the observables have them."""
+        found = self.observer.observe()
+        if all(isinstance(o, Observable) and o.is_plain for o in self._observables.values()):
+            return found
+        cache: dict[str, Any] = {name: value for name, value in found.items() if name in self._observables}
+        active: OrderedDict[str, np.ndarray] = OrderedDict()
+        groups: dict[str, list[np.ndarray]] = {}
+        for name, observable in self._observables.items():
+            if not observable.is_enabled():
+                cache.pop(name, None)
+                continue
+            observable.update(timestep=1.0 / self.control_freq, obs_cache=cache, force=True)
+            if observable.is_active():
+                active[name] = observable.obs
+                if observable.modality and np.ndim(observable.obs) <= 1:
+                    groups.setdefault(observable.modality, []).append(np.atleast_1d(observable.obs))
+        return OrderedDict(
+            active | {f"{group}-state": np.concatenate(rows) for group, rows in groups.items()}
+        )
+
+
+def _geoms(group: Any) -> Sequence[str] | Iterable[str]:
+    """Return the names of a group of geoms: a name, names, or an object with `contact_geoms`."""
+    return [group] if isinstance(group, str) else getattr(group, "contact_geoms", group)
