@@ -1,8 +1,10 @@
 """The `libero` command: its output, and one clear line on errors."""
 
 import argparse
+import importlib.util
 import subprocess
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +154,19 @@ def test_doctor_survives_a_machine_without_gl(monkeypatch):
 def test_doctor_finds_what_is_not_installed():
     finding = doctor.check_package("no-such-package-at-all")
     assert not finding.ok and finding.remedy == "make setup"
+
+
+def test_doctor_names_a_package_that_hides_libero(tmp_path, monkeypatch):
+    assert doctor.check_facade().ok
+    monkeypatch.setattr(doctor, "_installed", lambda name: name == "hf-libero")
+    finding = doctor.check_facade()
+    assert not finding.ok and "hf-libero writes to" in finding.detail
+    assert finding.remedy.startswith("pip uninstall hf-libero")
+    (tmp_path / "libero").mkdir()
+    (tmp_path / "libero" / "__init__.py").touch()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: PathFinder.find_spec(name, [str(tmp_path)]))
+    finding = doctor.check_facade()
+    assert not finding.ok and f"{tmp_path / 'libero'} is of hf-libero, and hides" in finding.detail
 
 
 def test_doctor_checks_folders(tmp_path, monkeypatch):

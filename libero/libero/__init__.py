@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "config_file",
+    "get_assets_path",
     "get_default_path_dict",
     "get_libero_path",
     "libero_config_path",
@@ -69,6 +70,11 @@ def get_libero_path(query_key: str) -> str:
         where = f"as {_config_file()} configures" if query_key in read_config() else "the default"
         warnings.warn(f"{query_key}: {path}, {where}, does not exist", stacklevel=2)
     return path
+
+
+def get_assets_path() -> str:
+    """Return the folder of the models, `get_libero_path("assets")`."""
+    return get_libero_path("assets")
 
 
 def set_libero_default_path(custom_location: str | os.PathLike | None = None) -> None:

@@ -7,6 +7,20 @@ from pathlib import Path
 
 from libero._adapters.lifelong.config import group_options
 
+benchmark_map = {f"libero_{name}": f"LIBERO_{name.upper()}" for name in ("10", "spatial", "object", "goal")}
+algo_map = {
+    "base": "Sequential",
+    "er": "ER",
+    "ewc": "EWC",
+    "packnet": "PackNet",
+    "multitask": "Multitask",
+}
+policy_map = {
+    "bc_rnn_policy": "BCRNNPolicy",
+    "bc_transformer_policy": "BCTransformerPolicy",
+    "bc_vilt_policy": "BCViLTPolicy",
+}
+
 
 def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the arguments, by default those of the command line."""

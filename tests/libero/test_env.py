@@ -288,6 +288,7 @@ def test_observations_match_the_recordings(shared, make_env):
 def test_contacts_and_grasps_have_robosuites_methods(make_env):
     env = make_env(**BLIND)
     env.reset()
+    env.step(REST)
     domain, gripper = env.env, env.robots[0].gripper
     names = set(env.sim.model.geom_names)
     assert all(geom in names for geoms in gripper.important_geoms.values() for geom in geoms)

@@ -12,15 +12,16 @@ from libero_env.errors import LiberoError
 pytestmark = pytest.mark.sim
 
 NAMES = {
-    "libero.libero": """libero_config_path config_file get_default_path_dict get_libero_path
+    "libero.libero": """libero_config_path config_file get_default_path_dict get_libero_path get_assets_path
         set_libero_default_path""",
-    "libero.libero.utils": "get_path_dict get_libero_path set_libero_path",
+    "libero.libero.utils": "get_path_dict get_libero_path set_libero_path libero_config_path config_file",
     "libero.libero.utils.video_utils": "VideoWriter",
     "libero.libero.utils.time_utils": "Timer",
     "libero.libero.utils.dataset_utils": "get_dataset_info",
-    "libero.libero.utils.log_utils": "get_logger",
+    "libero.libero.utils.log_utils": "get_logger get_project_logger",
     "libero.libero.utils.download_utils": """DATASET_LINKS HF_REPO_ID libero_dataset_download download_from_huggingface
-        download_url url_is_alive DownloadProgressBar check_libero_dataset""",
+        download_assets_from_huggingface HF_ASSETS_REPO_ID download_url url_is_alive DownloadProgressBar
+        check_libero_dataset""",
     "libero.libero.utils.mu_utils": """register_mu MU_DICT SCENE_DICT get_scene_dict get_scene_class
         InitialSceneTemplates""",
     "libero.libero.utils.task_generation_utils": """register_task_info get_task_info TASK_INFO TaskInfoTuple
@@ -45,7 +46,8 @@ NAMES = {
         SubprocVectorEnv TASK_MAPPING register_problem""",
     "libero.libero.envs.env_wrapper": "ControlEnv OffScreenRenderEnv DemoRenderEnv SegmentationRenderEnv",
     "libero.libero.envs.venv": """BaseVectorEnv DummyVectorEnv SubprocVectorEnv EnvWorker DummyEnvWorker
-        SubprocEnvWorker ShArray CloudpickleWrapper""",
+        SubprocEnvWorker ShArray CloudpickleWrapper GYM_RESERVED_KEYS _setup_buf gym_old_venv_step_type
+        gym_new_venv_step_type""",
     "libero.libero.envs.bddl_utils": "get_problem_info robosuite_parse_problem get_regions get_scenes",
     "libero.libero.envs.bddl_base_domain": "BDDLBaseDomain TASK_MAPPING register_problem",
     "libero.libero.envs.problems": """Libero_Tabletop_Manipulation Libero_Kitchen_Tabletop_Manipulation
@@ -66,7 +68,11 @@ NAMES = {
     "libero.libero.envs.robots": "MountedPanda OnTheGroundPanda ROBOT_CLASS_MAPPING",
     "libero.libero.envs.arenas": """TableArena KitchenTableArena LivingRoomTableArena StudyTableArena CoffeeTableArena
         EmptyArena""",
-    "libero.libero.envs.arenas.style": "get_texture_filename",
+    "libero.libero.envs.arenas.style": "get_texture_filename STYLE_MAPPING FLOOR_STYLE WALL_STYLE",
+    "libero.libero.envs.regions.base_region_sampler": "MultiRegionRandomSampler SiteRegionRandomSampler",
+    "libero.libero.envs.regions.workspace_region_sampler": "TableRegionSampler Libero100TableRegionSampler",
+    "libero.lifelong.evaluate": "benchmark_map algo_map policy_map",
+    "libero.lifelong.algos.er": "cycle merge_datas",
     "libero.libero.envs.textures": "TEXTURE_MAPPING get_texture_file_list",
 }
 CONTROL_ENV = """step reset check_success get_sim_state set_state set_init_state regenerate_obs_from_state
@@ -74,6 +80,8 @@ CONTROL_ENV = """step reset check_success get_sim_state set_state set_init_state
     problem_name domain_name language_instruction"""
 DOMAIN = """_load_fixtures_in_arena _load_objects_in_arena _load_sites_in_arena _add_placement_initializer
     _check_success _eval_predicate _setup_camera _setup_references set_visualization is_fixture get_object
+    check_contact get_contacts _check_grasp _gripper_to_target modify_observable add_observable observation_names
+    active_observables enabled_observables _observables edit_model_xml _reset_internal _pre_action _setup_observables
     get_robot_state_vector language_instruction fixtures_dict objects_dict
     object_states_dict object_sites_dict parsed_problem robots"""
 STATES = """get_geom_state check_contact check_contain check_ontop get_joint_state set_joint is_open is_close turn_on

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from libero._adapters.lifelong.config import Config, plain
 from libero.lifelong import algos, metric, utils
 from libero.lifelong.algos import multitask
+from libero.lifelong.algos.er import cycle, merge_datas
 from libero.lifelong.metric import evaluate_loss
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class
 from libero.lifelong.models.bc_transformer_policy import ExtraModalityTokens
@@ -184,6 +185,10 @@ def test_er_replays_a_sample_of_each_task(files, succeed, monkeypatch):
     assert (embs[:4] == data[1].task_emb).all() and (embs[4:] == data[0].task_emb).all()
     algo.end_task(data[1], 1, Tasks())
     assert algo.hooks.memory.shares == {0: 3, 1: 3}
+    batches = cycle(DataLoader(data[0], 2))
+    pair = [next(batches) for _ in range(2)]
+    joined = merge_datas(*pair)
+    assert torch.equal(joined["actions"], torch.cat([batch["actions"] for batch in pair]))
 
 
 def test_ewc_penalises_and_agem_projects(files, succeed):
@@ -194,6 +199,8 @@ def test_ewc_penalises_and_agem_projects(files, succeed):
     with torch.no_grad():
         next(algo.policy.network.head.means.parameters()).add_(0.1)
     assert algo.hooks.penalty(algo.policy).item() > 0
+    assert torch.isclose(7 * algo.penalty(), algo.hooks.penalty(algo.policy))
+    assert algo.get_params().shape == algo.get_grads().shape
     algo, data, _ = learner(files, "agem")
     algo.learn_one_task(data[0], 0, Tasks(), {})
     algo.start_task(1)

@@ -9,6 +9,7 @@ import pytest
 
 from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
+from libero_env.demos.curate import find_demo_files
 from libero_env.errors import UnknownNameError
 from libero_env.init_states.pickles import read_states, write_states
 from libero_env.tasks import bddl
@@ -46,7 +47,7 @@ def test_configured_paths(tmp_path, monkeypatch):
     assert libero.libero.config_file == str(tmp_path / "config" / "config.yaml")
     set_libero_default_path(tmp_path / "here")
     assert get_default_path_dict(tmp_path / "here")["init_states"] == str(tmp_path / "here" / "init_files")
-    with pytest.warns(UserWarning, match=r"bddl_files: .*here/bddl_files does not exist"):
+    with pytest.warns(UserWarning, match=r"here/bddl_files, as .*config.yaml configures, does not exist"):
         assert get_libero_path("bddl_files") == str(tmp_path / "here" / "bddl_files")
     with pytest.raises(UnknownNameError, match="Did you mean 'bddl_files'"):
         get_libero_path("bddl_file")
@@ -69,6 +70,48 @@ def test_init_state_files_are_read_by_torch():
     task = benchmark.get_benchmark("libero_object")().get_task(4)
     path = Path(get_libero_path("init_states"), task.problem_folder, task.init_states_file)
     assert (torch.load(path, weights_only=False) == read_states(path)).all()
+
+
+def test_a_bare_torch_load_reads_arrays(tmp_path):
+    torch = pytest.importorskip("torch")
+    rows = np.arange(6.0).reshape(2, 3)
+    write_states(tmp_path / "a.pruned_init", rows)
+    torch.save({"S_conf_mat": rows, "L_fwd": np.float64(2.0), "n": np.int64(3)}, tmp_path / "result.pt")
+    torch.serialization.clear_safe_globals()
+    with pytest.raises(Exception, match="weights_only"):
+        torch.load(tmp_path / "a.pruned_init")
+    get_libero_path("benchmark_root")
+    assert (torch.load(tmp_path / "a.pruned_init") == rows).all()
+    stored = torch.load(tmp_path / "result.pt")
+    assert (stored["S_conf_mat"] == rows).all() and stored["L_fwd"] == 2.0
+
+
+def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))
+    suite = benchmark.get_benchmark("libero_object")()
+    name = suite.get_task_demonstration(0)
+    folders = [tmp_path / "libero_object" / f for f in ("128x128-seed0-expert9", "256x256-seed0-expert9")]
+    for number, folder in enumerate(folders):
+        folder.mkdir(parents=True)
+        (folder / Path(name).name).write_text(str(number))
+    found = Path(get_libero_path("datasets"), name)
+    assert found.is_symlink() and found.read_text() == "0", "images of 128 pixels come first"
+    newer = tmp_path / "libero_object" / "128x128-seed0-expert10"
+    newer.mkdir()
+    (newer / Path(name).name).write_text("newer")
+    get_libero_path("datasets")
+    assert found.read_text() == "newer"
+    assert sorted(find_demo_files([tmp_path])) == sorted(f / Path(name).name for f in (*folders, newer))
+    found.unlink()
+    found.write_text("a file of the user's")
+    get_libero_path("datasets")
+    assert found.read_text() == "a file of the user's"
+
+
+def test_a_warning_names_the_configuration_only_where_it_exists(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "none"))
+    with pytest.warns(UserWarning, match="none, the default, does not exist"):
+        get_libero_path("datasets")
 
 
 def test_init_states_of_a_configured_folder(tmp_path, monkeypatch):

@@ -130,7 +130,8 @@ class BaseObject:
     _fixed = False
 
     def _names(self, elements: Any) -> list[str]:
-        return [f"{self.name}_{element.name}" for element in elements]
+        # a model that is part of a scene has the prefix already
+        return [f"{self.name}_{element.name.removeprefix(self.naming_prefix)}" for element in elements]
 
 
 class BuiltinObject(BaseObject):

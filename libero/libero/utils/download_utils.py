@@ -10,6 +10,8 @@ from tqdm import tqdm
 
 from libero.libero import get_path_dict
 from libero.libero.benchmark import get_benchmark
+from libero_env.assets.download import REPO as HF_ASSETS_REPO_ID  # noqa: F401 - name of the original
+from libero_env.assets.download import download as _download_assets
 from libero_env.assets.http import fetch
 from libero_env.assets.hub import DownloadError
 from libero_env.demos.download import REPO as HF_REPO_ID  # noqa: F401 - name of the original
@@ -77,6 +79,11 @@ def download_from_huggingface(
     With `check_overwrite`, different files of the same names are kept, and a DownloadError names one.
     """
     return download_demos([dataset_name], Path(download_dir), overwrite=not check_overwrite)
+
+
+def download_assets_from_huggingface(download_dir: Dir | None = None) -> str:
+    """Download and verify the original's models, see `libero_env.assets.download`, and return their folder."""
+    return str(_download_assets(None if download_dir is None else Path(download_dir)))
 
 
 def libero_dataset_download(

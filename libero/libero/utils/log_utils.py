@@ -19,3 +19,6 @@ def get_logger(
             logger.addHandler(handler)
         logger.setLevel(level)
     return logger
+
+
+get_project_logger = get_logger

@@ -9,6 +9,7 @@ import numpy as np
 from libero._adapters.envs.models import assets_folder
 from libero_env.assets.robot import robosuite_assets
 
+DIR = str(Path(__file__).parent)
 _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
 
 

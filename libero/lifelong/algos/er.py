@@ -1,12 +1,27 @@
 """Experience replay."""
 
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+import torch
 from torch.utils.data import Dataset
 
 from libero.lifelong.algos.base import Sequential
 from lifelong import algorithms
 from lifelong.data.memory import ReplayMemory
+
+
+def cycle(dl: Iterable[Any]) -> Iterator[Any]:
+    """Yield the items of a loader, again and again."""
+    while True:
+        yield from dl
+
+
+def merge_datas(x: Any, y: Any) -> Any:
+    """Return two batches joined: dictionaries of tensors, whose first dimension is the batch."""
+    if isinstance(x, Mapping):
+        return type(x)((key, merge_datas(x[key], y[key])) for key in x)
+    return torch.cat([x, y], dim=0)
 
 
 class ER(Sequential):

@@ -51,6 +51,11 @@ class GMMHead(_Head):
         sizes |= {"hidden": hidden_size, "layers": num_layers}
         super().__init__(heads.GMMHead(in_dim=input_size, action_dim=output_size, **sizes), loss_coef)
 
+    def forward_fn(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return means and standard deviations (..., K, A), and logits (..., K), given latents (..., E)."""
+        params = self.head(x)
+        return params["means"], params["stds"], params["logits"]
+
     def forward(self, x: Tensor) -> MixtureSameFamily:
         """Return the distribution over actions (..., A) given latents (..., E)."""
         params = self.head(x)

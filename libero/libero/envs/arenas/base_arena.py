@@ -66,3 +66,7 @@ class WorkspaceArena(Arena):
         super().__init__(spec)
 
     table_offset = property(attrgetter("workspace.offset"), doc="Origin of the regions, (3,) m.")
+    table_top_abs = property(attrgetter("workspace.offset"), doc="Position of the table top, (3,) m.")
+
+    def configure_location(self) -> None:
+        """Do nothing: tables have the sizes and places of the benchmark."""

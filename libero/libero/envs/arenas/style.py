@@ -5,6 +5,7 @@ from libero_env.assets.original_arena import TEXTURES
 
 STYLE_KINDS = ("floor", "wall")
 STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
+FLOOR_STYLE, WALL_STYLE = STYLE_MAPPING["floor"], STYLE_MAPPING["wall"]
 
 
 def get_texture_filename(type: str, style: str) -> str:

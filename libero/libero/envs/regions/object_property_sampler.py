@@ -1,6 +1,6 @@
 """Joint positions of articulated objects at the start."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,9 +34,19 @@ class ObjectPropertySampler:
     ):
         if self.states and state_type not in self.states:
             raise UnknownNameError(f"state of {name}", state_type, self.states)
-        self.name, self.state_type, self.mujoco_objects = name, state_type, mujoco_objects
+        self.name, self.state_type = name, state_type
+        self.mujoco_objects: list[Any] = []
+        self.add_objects(() if mujoco_objects is None else mujoco_objects)
         self.joint_ranges = tuple(joint_ranges)
         self.rng = np.random.default_rng() if rng is None else rng
+
+    def add_objects(self, mujoco_objects: Any) -> None:
+        """Add objects with the joint."""
+        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
+
+    def reset(self) -> None:
+        """Remove all objects."""
+        self.mujoco_objects = []
 
     def sample(self) -> float:
         """Return a position in the range."""

@@ -49,6 +49,7 @@ class MultiRegionRandomSampler:
         self.whole, self.apart = ensure_object_boundary_in_range, ensure_valid_placement
         self.reference_pos, self.z_offset = np.asarray(reference_pos, np.float64), z_offset
         self.rng = np.random.default_rng() if rng is None else rng
+        self.idx = 0  # of the rectangle that is sampled
         self.mujoco_objects: list[Any] = []
         self.add_objects(mujoco_objects if mujoco_objects is not None else ())
 
@@ -87,15 +88,21 @@ class MultiRegionRandomSampler:
     def _place(self, item: Any, origin: np.ndarray, placed: Placements) -> Any:
         margin = item.horizontal_radius if self.whole else 0.0
         for _ in range(_TRIES):
-            k = int(self.rng.integers(len(self.x_ranges)))
-            xy = [self._draw(ranges[k], margin) for ranges in (self.x_ranges, self.y_ranges)]
+            self.idx = int(self.rng.integers(len(self.x_ranges)))
+            xy = self._sample_x(margin), self._sample_y(margin)
             pos = origin + (*xy, self.z_offset - item.bottom_offset[-1])
             if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
-                return tuple(pos), self._quat(item), item
+                return tuple(pos), self._sample_quat(), item
         raise PlacementError(
             f"{self.name}: no free placement for {item.name} in {_TRIES} tries. (1) Make the ranges larger, (2) use "
             "fewer or smaller objects"
         )
+
+    def _sample_x(self, object_horizontal_radius: float) -> float:
+        return self._draw(self.x_ranges[self.idx], object_horizontal_radius)
+
+    def _sample_y(self, object_horizontal_radius: float) -> float:
+        return self._draw(self.y_ranges[self.idx], object_horizontal_radius)
 
     def _draw(self, limits: Sequence[float], margin: float) -> float:
         low, high = min(limits) + margin, max(limits) - margin
@@ -109,7 +116,7 @@ class MultiRegionRandomSampler:
         apart = distance > item.horizontal_radius + other_item.horizontal_radius
         return bool(apart or pos[2] + item.bottom_offset[-1] >= other_pos[2] + other_item.top_offset[-1])
 
-    def _quat(self, item: Any) -> np.ndarray:
+    def _sample_quat(self) -> np.ndarray:
         if self.rotation is None:
             angle = self.rng.uniform(0.0, 2 * np.pi)
         else:

@@ -29,6 +29,7 @@ class Panda:
     base_xpos_offset: ClassVar[dict[str, Any]] = {}
     dof: ClassVar[int] = len(ARM_JOINTS)
     horizontal_radius: ClassVar[float] = 0.5
+    _horizontal_radius: ClassVar[float] = 0.5
 
     def __init__(self, idn: int = 0):
         self.idn, self.name = idn, f"Panda{idn}"
