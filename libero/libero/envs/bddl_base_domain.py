@@ -374,9 +374,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.sim.reset()
         self.sim.data.qpos[: len(REST_QPOS)] = REST_QPOS
         self.sim.forward()
-        self.simulations.controller_state.restart(
-            [0], self.view.eef_pos[None], self.view.eef_mat.reshape(1, 9)
-        )
+        present = self.view.eef_pos[None], self.view.eef_mat.reshape(1, 9)
+        self.simulations.controller_state.restart(np.zeros(1, np.int64), *present)
         self.timestep, self.cur_time, self.done = 0, 0.0, False
 
     def _check_names(self, model: mujoco.MjModel) -> None:

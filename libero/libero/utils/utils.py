@@ -1,5 +1,6 @@
 """Functions for stored models and pictures."""
 
+import os
 from collections.abc import Mapping
 from typing import Any
 from xml.etree import ElementTree
@@ -9,7 +10,7 @@ import numpy as np
 from libero._adapters.envs.models import assets_folder
 from libero_env.assets.robot import robosuite_assets
 
-DIR = str(Path(__file__).parent)
+DIR = os.path.dirname(__file__)
 _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
 
 

@@ -1,6 +1,6 @@
 """Experience replay."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ def cycle(dl: Iterable[Any]) -> Iterator[Any]:
 
 def merge_datas(x: Any, y: Any) -> Any:
     """Return two batches joined: dictionaries of tensors, whose first dimension is the batch."""
-    if isinstance(x, Mapping):
+    if isinstance(x, dict):
         return type(x)((key, merge_datas(x[key], y[key])) for key in x)
     return torch.cat([x, y], dim=0)
 
