@@ -1,5 +1,6 @@
 """The evaluation loop. The package has no other."""
 
+import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +33,7 @@ class Episode:
             report it.
         ever: Whether each atom held at any time from then on.
         at_end: Whether each atom held at the end.
+        actions: Digest of the actions, (length, 7) float64: two episodes agree to the bit where it is the same.
     """
 
     init_state: int
@@ -40,6 +42,7 @@ class Episode:
     at_start: tuple[bool, ...] = ()
     ever: tuple[bool, ...] = ()
     at_end: tuple[bool, ...] = ()
+    actions: str = ""
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,7 @@ def run_episodes(
         obs = tracker.step(np.tile(settling, (env.num_envs, 1)))
     tracker.start()
     lengths = np.zeros(env.num_envs, int)
+    digests = [hashlib.sha256() for _ in init_states]
     recordings: list[list[np.ndarray]] = [[] for _ in (recorded if record_every else ())]
     bar = tqdm(range(horizon), desc=label, disable=not progress, unit="step", leave=False)
     for step in bar:
@@ -176,10 +180,13 @@ def run_episodes(
         if tracker.over.all():
             break
         lengths += ~tracker.over
-        obs = tracker.step(actor.act(obs))
+        actions = actor.act(obs)
+        for i in np.flatnonzero(~tracker.over):
+            digests[i].update(np.asarray(actions[i], "<f8").tobytes())
+        obs = tracker.step(actions)
         bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
-    episodes = tracker.episodes(init_states, lengths)
+    episodes = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
 
 
@@ -227,10 +234,14 @@ class EpisodeTracker:
         self.over = self.over | terminated | truncated
         return obs
 
-    def episodes(self, init_states: Sequence[int], lengths: np.ndarray) -> tuple[Episode, ...]:
+    def episodes(
+        self, init_states: Sequence[int], lengths: np.ndarray, actions: Sequence[str]
+    ) -> tuple[Episode, ...]:
         """Return the outcome of each simulation."""
         atoms = [list(map(tuple, a.tolist())) for a in (self._start, self._ever, self._now)]
-        rows = zip(map(int, init_states), self.success.tolist(), lengths.tolist(), *atoms, strict=True)
+        rows = zip(
+            map(int, init_states), self.success.tolist(), lengths.tolist(), *atoms, actions, strict=True
+        )
         return tuple(Episode(*row) for row in rows)
 
     def _progress(self, info: Mapping[str, Any]) -> np.ndarray:

@@ -13,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from libero_env.errors import LiberoError
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.errors import ConfigError
@@ -122,6 +123,7 @@ class SuiteEvaluation:
         """Run the episodes of a unit one by one; those that end with an error are failures.
 
         Raises:
+            LiberoError: The policy's answers are not valid, or it cannot be reached: nothing is counted.
             Exception: All episodes end with an error, which is that of the policy and not of an episode.
         """
         started, parts = time.time(), []
@@ -132,6 +134,8 @@ class SuiteEvaluation:
             try:
                 parts.append(self._run(alone, env))
                 errors.append(None)
+            except LiberoError:
+                raise
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
                 if len(errors) == len(unit.starts) - 1 and all(errors):
                     raise
@@ -208,6 +212,7 @@ class SuiteEvaluation:
             atoms_ever=tuple(e.ever for e in done.episodes),
             atoms_at_end=tuple(e.at_end for e in done.episodes),
             errors=errors if any(errors) else (),
+            actions=tuple(e.actions for e in done.episodes),
         )
         environment = describe_environment(env)
         return UnitResult(result, environment, self.versions, this_process(), started, time.time())
@@ -256,6 +261,7 @@ def _joined(parts: Sequence[TaskResult]) -> TaskResult:
         atoms_ever=tuple(row for part in parts for row in part.atoms_ever),
         atoms_at_end=tuple(row for part in parts for row in part.atoms_at_end),
         errors=tuple(e for p in parts for e in (p.errors or (None,) * len(p.init_states))) if raised else (),
+        actions=tuple(digest for part in parts for digest in part.actions),
     )
 
 

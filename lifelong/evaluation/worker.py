@@ -124,16 +124,15 @@ class Worker:
             raise error
         found = self._folder.add_error(unit, error)
         tries = self._tries(unit, {unit.name: found})
-        last = tries > self._evaluation.retries
         self._on_error(
             f"{unit.name}: attempt {tries} ended with {describe(error)}; traceback in {found.path}"
         )
-        if last and self._evaluation.errors_are_failures:
-            return self._evaluation.evaluate_apart(unit, self._pool)
-        if not self._evaluation.errors_are_failures and not self._succeeded and not self._folder.has_results:
-            raise error
+        if self._evaluation.errors_are_failures and not isinstance(error, LiberoError):
+            last = tries > self._evaluation.retries
+            return self._evaluation.evaluate_apart(unit, self._pool) if last else None
         self._in_a_row += 1
-        if self._in_a_row >= FAILURES_IN_A_ROW and not self._evaluation.errors_are_failures:
+        never_worked = not self._succeeded and not self._folder.has_results
+        if never_worked or self._in_a_row >= FAILURES_IN_A_ROW:
             raise error
         return None
 

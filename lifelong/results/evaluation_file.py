@@ -43,6 +43,8 @@ class TaskResult:
         atoms_ever: Whether each atom held at any time, (episodes, atoms).
         atoms_at_end: Whether each atom held at the end, (episodes, atoms).
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
+        actions: Digest of the actions of each episode, by which episodes can be compared to the bit; empty if they
+            were not recorded.
 
     Raises:
         EvaluationFileError: The arrays have different lengths, or values of the wrong kind.
@@ -58,6 +60,7 @@ class TaskResult:
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
     errors: tuple[str | None, ...] = ()
+    actions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for problem in self._problems():
@@ -80,6 +83,7 @@ class TaskResult:
         count = len(self.init_states)
         rows: dict[str, Sequence[Any]] = {"successes": self.successes, "lengths": self.lengths}
         rows |= {"errors": self.errors} if self.errors else {}
+        rows |= {"actions": self.actions} if self.actions else {}
         rows |= {"atoms_ever": self.atoms_ever, "atoms_at_end": self.atoms_at_end} if self.atoms else {}
         found = [
             f"{name} has {len(values)} entries, init_states has {count}"
@@ -101,6 +105,8 @@ class TaskResult:
                 found.append(f"{name} are not all whole numbers from 0 on")
         if not all(text is None or isinstance(text, str) for text in self.errors):
             found.append("errors are not all texts or null")
+        if not all(isinstance(text, str) for text in self.actions):
+            found.append("actions are not all digests")
         return found
 
 
@@ -152,9 +158,15 @@ class EvaluationResult:
 
     @property
     def outcomes(self) -> str:
-        """Digest of everything that was measured, without times, versions and the environment."""
-        rows = sorted((json_safe(asdict(r)) for r in self.tasks), key=lambda row: row["task"])
-        return "sha256:" + hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()
+        """Digest of everything that was measured, without actions, times, versions and the environment."""
+        rows = [{k: v for k, v in asdict(r).items() if k != "actions"} for r in self.tasks]
+        return _digest(sorted(rows, key=lambda row: row["task"]))
+
+    @property
+    def actions(self) -> str | None:
+        """Digest of all actions: evaluations where it is the same agree to the bit. None if they were not recorded."""
+        rows = sorted((r.task, *r.actions) for r in self.tasks)
+        return _digest(rows) if all(r.actions for r in self.tasks) else None
 
     @classmethod
     def read(cls, path: Path | str) -> "EvaluationResult":
@@ -209,6 +221,7 @@ class EvaluationResult:
             "versions": dict(self.versions),
             "environment": dict(self.environment),
             "outcomes": self.outcomes,
+            "actions": self.actions,
             "success": asdict(self.success),
             "suites": {name: asdict(estimate) for name, estimate in self.suites.items()},
             "predicates": predicate_rates(self.tasks),
@@ -291,6 +304,10 @@ def _from_plain(values: Any) -> EvaluationResult:
     if written_as == FORMAT and values.get("outcomes") != result.outcomes:
         raise EvaluationFileError("the digest `outcomes` is not that of the tasks: the file was edited")
     return result
+
+
+def _digest(rows: Any) -> str:
+    return "sha256:" + hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()
 
 
 def _check_format(name: Any) -> None:

@@ -1,5 +1,7 @@
 """The rollout loop and its environments, with an environment whose outcomes are known."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
@@ -87,6 +89,12 @@ def test_an_episodes_random_draws_do_not_depend_on_other_episodes():
     alone, _ = run([5])
     beside, _ = run([2, 5, 3])
     assert [d[0] for d in alone.draws] == [d[1] for d in beside.draws]
+
+
+def test_the_digest_of_an_episode_is_that_of_its_actions_until_it_ends():
+    _, rollouts = run([3, 5])
+    expected = [hashlib.sha256(np.ones((n, 7), "<f8").tobytes()).hexdigest()[:16] for n in (3, 5)]
+    assert [e.actions for e in rollouts.episodes] == expected
 
 
 def test_frames_of_the_first_episode_are_recorded_until_it_ends(tmp_path):

@@ -58,11 +58,17 @@ def test_the_digest_is_that_of_the_outcomes():
     assert replace(first, tasks=(changed, first.tasks[1])).outcomes != first.outcomes
 
 
+def test_the_digest_of_actions_tells_bits_apart_that_outcomes_do_not_show():
+    first, second = (result(tasks=(task(actions=("01", "02", last)),)) for last in ("03", "04"))
+    assert first.outcomes == second.outcomes and first.actions != second.actions
+    assert result().actions is None, "they were not recorded"
+
+
 def test_files_of_the_first_version_are_read(tmp_path):
     values = result(tasks=(task(errors=()),)).to_plain()
-    for key in ("format", "unit_starts", "environment", "outcomes", "times"):
+    for key in ("format", "unit_starts", "environment", "outcomes", "actions", "times"):
         del values[key]
-    del values["tasks"][0]["errors"]
+    del values["tasks"][0]["errors"], values["tasks"][0]["actions"]
     values["tasks"][0]["seconds"], values["finished"] = 3.5, "2026-01-01T00:00:00+00:00"
     (tmp_path / "eval.json").write_text(json.dumps(values))
     found = EvaluationResult.read(tmp_path)
@@ -100,6 +106,7 @@ def with_task(**changes) -> str:
         (with_task(init_states=[0, 1, 1]), "counted twice"),
         (with_task(atoms_ever=[[True], [False], []]), "a column for each"),
         (with_task(task="libero_spatial/4"), "tasks are counted twice: libero_spatial/4"),
+        (with_task(actions=["00"]), "actions has 1 entries"),
         (with_task(successes=[True, True, True]), "the file was edited"),
     ],
 )

@@ -62,7 +62,7 @@ def test_every_start_is_in_one_unit_and_units_do_not_depend_on_other_tasks():
 def test_the_result_is_the_same_however_episodes_are_divided(tmp_path):
     whole = evaluate(tmp_path / "whole", unit_starts=4)
     parts = evaluate(tmp_path / "parts", **TWO)
-    assert parts.tasks == whole.tasks and parts.outcomes == whole.outcomes
+    assert parts.tasks == whole.tasks and parts.outcomes == whole.outcomes and parts.actions == whole.actions
     assert (whole.unit_starts, parts.unit_starts) == (4, 2)
     assert len(list((tmp_path / "parts" / "units").iterdir())) == 4
 
