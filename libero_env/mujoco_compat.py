@@ -24,3 +24,6 @@ def set_damping(joint: mujoco.MjsJoint, damping: float) -> None:
 
 # Sparse mass matrix in MjData: rows of the lower triangle; before MuJoCo 3.3.3 for each joint its chain to the root.
 MASS_FIELD = "M" if hasattr(mujoco.MjModel, "M_rowadr") else "qM"
+
+# Before MuJoCo 3.3.6 mj_forward, too, replaces the solver's warm start: calling it before a step changes the step.
+FORWARD_WARM_STARTS = tuple(int(part) for part in mujoco.__version__.split(".")[:3]) < (3, 3, 6)

@@ -146,8 +146,12 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     delete(mount, mount.geom("pedestal_vis"))  # too detailed: 33,000 triangles
     delete(mount, mount.mesh("pedestal"))
     add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
-    pos = (*workspace.robot_base_pos[:2], workspace.robot_base_pos[2] + _MOUNT_LIFT)
-    spec.attach(mount, prefix="mount0_", frame=spec.worldbody.add_frame(pos=pos))
+    arm = spec.body(
+        "robot0_base"
+    )  # as in the original the arm carries its mount, which decides how sums round
+    base = (0.0, 0.0, 0.0) if arm else workspace.robot_base_pos
+    frame = (arm or spec.worldbody).add_frame(pos=(*base[:2], base[2] + _MOUNT_LIFT))
+    spec.attach(mount, prefix="mount0_", frame=frame)
 
 
 def _add_room(

@@ -37,6 +37,7 @@ ARMATURE = tuple(5.0 / (i + 1) for i in range(7))  # [kg m^2] robosuite adds it 
 FRICTIONLOSS = 0.1  # [N m] robosuite adds it to every joint
 
 _ARM_FILE, _GRIPPER_FILE = "robots/panda/robot.xml", "grippers/panda_gripper.xml"
+_WRIST, _WRIST_GEOM = "link7", "link7_collision"  # body, and its collision mesh in robosuite 1.4.1
 _FACES_PER_GEOM = 260  # triangles of a simplified visual mesh
 
 _VisualKey = tuple[str, tuple[float, ...]]  # name of the body and colour, rgba
@@ -89,6 +90,7 @@ def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFA
     """
     root = robosuite_assets()
     arm, gripper = _load(root / _ARM_FILE), _load(root / _GRIPPER_FILE)
+    _set_wrist_collision(arm, robot)
     _replace_visuals(arm, "arm")
     _replace_visuals(gripper, "gripper")
     for i in range(7):
@@ -96,6 +98,16 @@ def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFA
         joint.armature, joint.frictionloss = ARMATURE[i], FRICTIONLOSS
     spec.attach(arm, prefix="robot0_", frame=spec.worldbody.add_frame(pos=list(pos_world)))
     spec.attach(gripper, prefix="gripper0_", frame=spec.body("robot0_right_hand").add_frame())
+
+
+def _set_wrist_collision(arm: mujoco.MjSpec, robot: str) -> None:
+    """Remove the collision mesh of link 7, or add it, whichever robosuite is installed."""
+    existing = arm.geom(_WRIST_GEOM)
+    if robot == DEFAULT_ROBOT and existing is not None:
+        delete(arm, existing)
+    elif robot != DEFAULT_ROBOT and existing is None:
+        mesh = mujoco.mjtGeom.mjGEOM_MESH
+        arm.body(_WRIST).add_geom(name=_WRIST_GEOM, type=mesh, meshname=_WRIST, group=0)
 
 
 def _not_installed() -> MissingPackageError:

@@ -22,7 +22,7 @@ from libero_env.sim.scene import build_scene
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
 
-GENERATOR = "scripted-expert-8"  # change it when the same seed yields different demonstrations
+GENERATOR = "scripted-expert-9"  # change it when the same seed yields different demonstrations
 
 
 @dataclass(frozen=True)

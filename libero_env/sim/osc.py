@@ -109,19 +109,31 @@ def goals_from_poses(ids, poses, goal_pos, goal_mat):
 
 @njit(cache=True, nogil=True)
 def rotate(w, current, out):
-    """Write exp([w]x) current to `out` by the formula of Rodrigues; (3,), (9,) -> (9,)."""
+    """Write exp([w]x) current to `out`; (3,), (9,) -> (9,).
+
+    The rotation is rounded to single precision as robosuite does it (`quat2mat` in its `utils/transform_utils.py`): its
+    goals differ from exact ones by 1e-7, which contact would amplify.
+    """
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
-    x, y, z = w[0] / angle, w[1] / angle, w[2] / angle
-    c, s = np.cos(angle), np.sin(angle)
-    t = 1.0 - c
-    r = (
-        (t * x * x + c, t * x * y - s * z, t * x * z + s * y),
-        (t * x * y + s * z, t * y * y + c, t * y * z - s * x),
-        (t * x * z - s * y, t * y * z + s * x, t * z * z + c),
-    )
+    q = np.empty(4, np.float32)  # wxyz
+    q[0] = np.cos(angle / 2.0)
+    norm = 0.0
+    for i in range(3):
+        q[1 + i] = w[i] / angle * np.sin(angle / 2.0)
+    for i in range(4):
+        norm += np.float64(q[i] * q[i])  # as BLAS sums single precision
+    scale = np.sqrt(2.0 / np.float64(np.float32(norm)))
+    for i in range(4):
+        q[i] = q[i] * scale
+    r = np.empty((3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        r[i, i] = 1.0 - q[1 + j] * q[1 + j] - q[1 + k] * q[1 + k]
+        r[i, j] = q[1 + i] * q[1 + j] - q[1 + k] * q[0]
+        r[j, i] = q[1 + i] * q[1 + j] + q[1 + k] * q[0]
     for i in range(3):
         for j in range(3):
-            out[3 * i + j] = r[i][0] * current[j] + r[i][1] * current[3 + j] + r[i][2] * current[6 + j]
+            out[3 * i + j] = r[i, 0] * current[j] + r[i, 1] * current[3 + j] + r[i, 2] * current[6 + j]
 
 
 @njit(cache=True, nogil=True)

@@ -167,8 +167,8 @@ def scene_spec(
     spec.modelname = "libero"
     _set_options(spec)
     pack.add_arena(spec, workspace, problem.scene_properties)
-    add_mount(spec, workspace)
     add_panda(spec, workspace.robot_base_pos, robot)
+    add_mount(spec, workspace)
     _add_zones(spec, problem, name, workspace)
     for entity, category in problem.objects.items():
         _add_object(spec, entity, pack.build(category) if entities is None else entities[entity])

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.mujoco_compat import MASS_FIELD
+from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.osc import REST, ArmIndex
 from libero_env.timing import SUBSTEPS
@@ -37,6 +37,9 @@ _FIELDS = (
     MASS_FIELD,
     "qfrc_bias",
 )
+
+# The original calls mj_forward twice in each substep. Where that moves the solver's warm start we do it, too.
+_SOLVES_BEFORE_STEP = 2 if FORWARD_WARM_STARTS else 0
 
 Indices = Sequence[int] | np.ndarray
 KinematicsHook = Callable[[mujoco.MjData], None]
@@ -234,6 +237,8 @@ class LoopSimulations(Simulations):
                 self.pose_fixtures(i)
             goal, memory, gripper = (array[row] for array in state)
             for substep in range(SUBSTEPS):
+                for _ in range(_SOLVES_BEFORE_STEP):
+                    mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, True)
                 kernel(first, actions[row], *inputs, goal, memory, gripper, ctrl, *constants)
                 mujoco.mj_step2(model, data)
                 if before_last_kinematics is not None and substep == SUBSTEPS - 2:

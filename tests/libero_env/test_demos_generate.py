@@ -145,8 +145,8 @@ def test_files_are_recorded_once_and_found_again(whole, tmp_path):
 @pytest.mark.parametrize(
     ("config", "folder"),
     [
-        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-8"),
-        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-8-d9a2a37b"),
+        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-9"),
+        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-9-d9a2a37b"),
         (
             DemoConfig(
                 "libero_goal/3",
@@ -155,9 +155,9 @@ def test_files_are_recorded_once_and_found_again(whole, tmp_path):
                 cameras=("agentview",),
                 modalities=("rgb", "depth"),
             ),
-            "128x128-seed0-scripted-expert-8-800fa04f",
+            "128x128-seed0-scripted-expert-9-800fa04f",
         ),
-        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-8-bf1e44b3"),
+        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-9-bf1e44b3"),
     ],
 )
 def test_folders_of_earlier_versions_are_found(config, folder, tmp_path):
