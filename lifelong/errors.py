@@ -1,6 +1,8 @@
 """Errors of the learning side; all derive from `LifelongError`."""
 
-from libero_env.errors import LiberoError
+from importlib.util import find_spec
+
+from libero_env.errors import LiberoError, MissingPackageError
 
 
 class LifelongError(LiberoError):
@@ -61,3 +63,21 @@ class ConnectionLost(ServerError):
 
 class EvaluationIncompleteError(LifelongError, RuntimeError):
     """Raised when units of an evaluation ended with errors; the others are kept, the same command tries again."""
+
+
+class ComparisonError(LifelongError, ValueError):
+    """Raised when results cannot be compared; the message names both values of every field that differs."""
+
+
+def require_package(name: str, extra: str) -> None:
+    """Check that an optional package is installed.
+
+    Args:
+        name: Name of its module.
+        extra: Extra of this distribution that installs it.
+
+    Raises:
+        MissingPackageError: It is not; the message has the command that installs it.
+    """
+    if find_spec(name) is None:
+        raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")

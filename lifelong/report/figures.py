@@ -22,8 +22,8 @@ from lifelong.results.metrics import Curve, mean_and_standard_error, wilson_inte
 # Okabe and Ito's colours, distinguishable for colour-blind readers, without yellow, which is too light on white
 LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-_INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
-_STYLE = {
+INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
+STYLE = {
     "svg.fonttype": "none",
     "svg.hashsalt": "lifelong",
     "pdf.fonttype": 42,
@@ -34,11 +34,11 @@ _STYLE = {
     "ytick.major.width": 0.7,
     "xtick.major.size": 2.5,
     "ytick.major.size": 2.5,
-    "text.color": _INK,
-    "axes.edgecolor": _INK,
-    "axes.labelcolor": _INK,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "legend.frameon": False,
 }
 
@@ -90,7 +90,7 @@ def heatmap_figure(panels: Sequence[Panel]) -> Figure:
     """Draw success matrices side by side, up to four in a row, in percent, with one colour bar."""
     columns = min(len(panels), 4)
     rows = math.ceil(len(panels) / columns)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         single = len(panels) == 1
         width, height = (4.4, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
         figure = Figure(figsize=(width, height), layout="constrained")
@@ -133,7 +133,7 @@ def learning_figure(
     limits = _loss_limits(losses)
     epochs = [c.epochs for c in curves.values()] + [e for e, _ in losses.values()]
     last = max(1, *(int(e.max(initial=1)) for e in epochs))
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height))
         for place, task in enumerate(tasks):
             row, column = divmod(place, columns)
@@ -165,7 +165,7 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
     If there are more lines than colours, the further ones are dashed with open markers.
     """
     named = any(line.label for line in lines)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(5.6, 3.1) if named else (3.5, 2.7), layout="constrained")
         axes = figure.subplots()
         for number, line in enumerate(lines):
@@ -185,8 +185,8 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         axes.set_xticks(range(1, longest + 1, max(1, longest // 10)))
         axes.set_xlabel("tasks learned")
         axes.set_ylabel("average success (%)")
-        axes.grid(axis="y", lw=0.4, alpha=0.3, color=_INK)
-        _hide_spines(axes)
+        axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
+        hide_spines(axes)
         if named:
             axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
     return figure
@@ -195,10 +195,10 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
 def as_svg(figure: Figure) -> str:
     """Return the figure as an inline SVG with transparent background, in the page's font and text colour."""
     buffer = io.StringIO()
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
-    text = text[text.index("<svg") :].replace(_INK, "currentColor")
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r"(font(?:-family)?: [^;\"]*?)'DejaVu Sans'[^;\"]*", r"\1inherit", text)
     # "font: 8px inherit" is not valid CSS: name the page's family through a variable instead.
@@ -207,7 +207,7 @@ def as_svg(figure: Figure) -> str:
 
 def save(figure: Figure, stem: Path) -> None:
     """Write `stem`.png (300 dpi) and `stem`.pdf, black on white."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         FigureCanvasAgg(figure)
         for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
             figure.savefig(
@@ -251,7 +251,7 @@ def _draw_matrix(axes: Axes, panel: Panel, label_rows: bool) -> matplotlib.image
 
 def _draw_curve(axes: Axes, curve: Curve | None) -> None:
     axes.set_ylim(0, 100)
-    axes.grid(axis="y", lw=0.4, alpha=0.3, color=_INK)
+    axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
     if curve is None or len(curve.rates) == 0:
         return
     low, high = wilson_interval(curve.rates * curve.episodes, curve.episodes)
@@ -259,11 +259,11 @@ def _draw_curve(axes: Axes, curve: Curve | None) -> None:
     axes.fill_between(curve.epochs, 100 * low, 100 * high, color=colour, alpha=0.16, lw=0)
     axes.plot(curve.epochs, 100 * curve.rates, color=colour, lw=1.4, marker="o", ms=2.6, clip_on=False)
     best = (curve.epochs[curve.best], 100 * curve.rates[curve.best])
-    axes.plot(*best, "o", ms=6.5, mfc="none", mec=_INK, mew=0.9, clip_on=False)
+    axes.plot(*best, "o", ms=6.5, mfc="none", mec=INK, mew=0.9, clip_on=False)
 
 
 def _set_epoch_axis(axes: Axes, last: int, labelbottom: bool) -> None:
-    _hide_spines(axes)
+    hide_spines(axes)
     axes.set_xlim(-0.03 * last, 1.03 * last)
     axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     axes.tick_params(labelbottom=labelbottom)
@@ -278,5 +278,6 @@ def _loss_limits(losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float6
     return float(values.min()) - margin, float(values.max()) + margin
 
 
-def _hide_spines(axes: Axes) -> None:
+def hide_spines(axes: Axes) -> None:
+    """Remove the upper and right edge of a plot."""
     axes.spines[["top", "right"]].set_visible(False)

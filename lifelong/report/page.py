@@ -3,11 +3,9 @@
 import base64
 import os
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from libero_env.storage import atomic_write_text
@@ -25,6 +23,7 @@ from lifelong.report.figures import (
 from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import atom_rows, cost_table, duration, most_forgotten, task_costs
+from lifelong.report.templates import page_template
 from lifelong.results.metrics import METRIC_NAMES, average_success
 from lifelong.results.records import RunRecord
 
@@ -68,7 +67,7 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
-        page = _template().render(**context, metric_texts=METRIC_TEXTS)
+        page = page_template("page.html").render(**context, metric_texts=METRIC_TEXTS)
         atomic_write_text(out, page)
     except OSError as error:
         raise LifelongError(f"{out}: the report cannot be written ({error})") from error
@@ -255,20 +254,3 @@ def _media(folder: Path) -> dict[str, Any]:
             {"url": f"data:{kind};base64,{data}", "video": kind.startswith("video"), "caption": caption}
         )
     return {"items": items, "left_out": left_out}
-
-
-def _percent(value: float | None, digits: int = 1) -> str:
-    """Format a share as percent with a typographic minus sign; a dash where it is undefined."""
-    if value is None or np.isnan(value):
-        return "–"
-    text = f"{100 * value:.{digits}f}"
-    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
-
-
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["percent"] = _percent
-    text = resources.files("lifelong.report").joinpath("page.html").read_text(encoding="utf-8")
-    return environment.from_string(text)

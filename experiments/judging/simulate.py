@@ -1,0 +1,172 @@
+"""Error rates of the tests and coverage of the intervals of `libero compare`, on simulated evaluations.
+
+    python experiments/judging/simulate.py [--simulations 4000]
+
+Each start has a success probability of its own (Beta), which both policies share if they are equal; given it, episodes
+are independent. "Interaction": each policy is better on half of the tasks, and both are equal on average. "Quirks":
+each is better in half of the starts, at random.
+"""
+
+import argparse
+from functools import cache
+
+import numpy as np
+from scipy import stats
+
+from lifelong.results.differences import (
+    Counts,
+    Pairs,
+    bootstrap_starts,
+    holm,
+    mcnemar_exact,
+    score_interval,
+    sign_flip_test,
+)
+from lifelong.results.sequential import sequential_test
+
+TASKS = 10
+
+
+def evaluate(rng, *, rate, spread, starts=50, gap=0.0, interaction=0.0, quirk=0.0, runs=1) -> Pairs:
+    """Draw the outcomes of two policies; the first is better by `gap`, in probability, on average over starts."""
+    count = TASKS * starts
+    hard = rng.beta(rate * spread, (1 - rate) * spread, size=count)
+    tasks = np.repeat(np.arange(TASKS), starts)
+    shift = np.where(tasks % 2 == 0, interaction, -interaction)
+    shift = shift + quirk * rng.choice([-1, 1], size=count)
+    chances = [np.clip(hard + sign * (gap + shift) / 2, 0, 1) for sign in (1, -1)]
+    columns = [rng.random((count, runs)) < p[:, None] for p in chances]
+    return Pairs(tasks, np.tile(np.arange(starts), TASKS), *columns)
+
+
+def outcome(pairs: Pairs) -> Counts:
+    both, first = (pairs.first & pairs.second).sum(), pairs.first.sum()
+    second = pairs.second.sum()
+    return Counts(int(both), int(first - both), int(second - both), int(len(pairs) - first - second + both))
+
+
+@cache
+def mcnemar(counts: Counts) -> float:
+    return mcnemar_exact(counts)
+
+
+@cache
+def interval(counts: Counts):
+    return score_interval(counts)
+
+
+def unpaired(counts: Counts) -> float:
+    """The two-proportion z-test of most papers, which ignores that the starts are the same."""
+    n = counts.pairs
+    first, second = (counts.both + counts.only_first) / n, (counts.both + counts.only_second) / n
+    pooled = (first + second) / 2
+    spread = np.sqrt(2 * pooled * (1 - pooled) / n)
+    return float(2 * stats.norm.sf(abs(first - second) / spread)) if spread else 1.0
+
+
+def peeking(pairs: Pairs, every: int = 50) -> bool:
+    """McNemar's test after every fifty pairs, stopped as soon as it is below 0.05: what must not be done."""
+    order = np.lexsort((pairs.tasks, pairs.starts))
+    ends = range(every, len(pairs) + 1, every)
+    parts = (
+        Pairs(*(a[order[:end]] for a in (pairs.tasks, pairs.starts, pairs.first, pairs.second)))
+        for end in ends
+    )
+    return any(mcnemar(outcome(part)) <= 0.05 for part in parts)
+
+
+def false_positives(rng, simulations: int) -> None:
+    print(
+        "\n| equal policies | McNemar | unpaired z | looks every 50: McNemar | looks at every pair: sequential |"
+    )
+    print("|---|---|---|---|---|")
+    cases = {
+        "90 %, hard starts differ": {"rate": 0.9, "spread": 0.5},
+        "90 %, starts alike": {"rate": 0.9, "spread": 50},
+        "50 %, hard starts differ": {"rate": 0.5, "spread": 1},
+        "97 %, 10 starts": {"rate": 0.97, "spread": 1, "starts": 10},
+        "80 %, interaction ± 20 points": {"rate": 0.8, "spread": 5, "interaction": 0.2},
+    }
+    for name, case in cases.items():
+        found = np.zeros(4)
+        for _ in range(simulations):
+            pairs = evaluate(rng, **case)
+            counts = outcome(pairs)
+            sequential = sequential_test(pairs).decided_after is not None
+            found += (mcnemar(counts) <= 0.05, unpaired(counts) <= 0.05, peeking(pairs), sequential)
+        print(f"| {name} | " + " | ".join(f"{100 * f:.1f} %" for f in found / simulations) + " |")
+
+
+def families(rng, simulations: int) -> None:
+    each, adjusted = 0, 0
+    for _ in range(simulations):
+        p = [mcnemar(outcome(evaluate(rng, rate=0.8, spread=2))) for _ in range(4)]
+        each += min(p) <= 0.05
+        adjusted += min(holm(p)) <= 0.05
+    print("\n| four suites, equal policies: at least one difference | |\n|---|---|")
+    print(
+        f"| each at 5 % | {100 * each / simulations:.1f} % |\n| Holm | {100 * adjusted / simulations:.1f} % |"
+    )
+
+
+def several_runs(rng, simulations: int) -> None:
+    print(
+        "\n| three runs of each, equal policies | random swaps of starts | McNemar, each run as a start |"
+        "\n|---|---|---|"
+    )
+    for name, quirk in {"equal in every start": 0.0, "quirks ± 40 points": 0.8}.items():
+        flips, pooled = 0, 0
+        for _ in range(simulations):
+            pairs = evaluate(rng, rate=0.5, spread=5, runs=3, starts=20, quirk=quirk)
+            flips += sign_flip_test(pairs.differences, draws=999) <= 0.05
+            columns = [x.reshape(-1, 1) for x in (pairs.first, pairs.second)]
+            pooled += (
+                mcnemar(outcome(Pairs(np.repeat(pairs.tasks, 3), np.repeat(pairs.starts, 3), *columns)))
+                <= 0.05
+            )
+        print(f"| {name} | {100 * flips / simulations:.1f} % | {100 * pooled / simulations:.1f} % |")
+
+
+def coverage(rng, simulations: int) -> None:
+    print(
+        "\n| true difference | success | starts | Tango covers | mean width | bootstrap over starts covers |"
+    )
+    print("|---|---|---|---|---|---|")
+    for rate, gap, starts in (
+        (0.9, 0.0, 50),
+        (0.9, 0.03, 50),
+        (0.6, 0.1, 50),
+        (0.95, 0.02, 10),
+        (0.6, 0.1, 5),
+    ):
+        case = {"rate": rate, "spread": 2, "gap": gap, "starts": starts}
+        truth = np.mean([evaluate(rng, **case, runs=50).differences.mean() for _ in range(300)])
+        covered, widths, boot, booted = 0, 0.0, 0, max(1, simulations // 10)
+        for number in range(simulations):
+            pairs = evaluate(rng, **case)
+            e = interval(outcome(pairs))
+            covered, widths = covered + (e.low <= truth <= e.high), widths + e.high - e.low
+            if number < booted:
+                e = bootstrap_starts(pairs, draws=999, seed=number)
+                boot += e.low <= truth <= e.high
+        print(
+            f"| {100 * truth:+.1f} points | {100 * rate:.0f} % | {TASKS} × {starts} | "
+            f"{100 * covered / simulations:.1f} % | "
+            f"{100 * widths / simulations:.1f} points | {100 * boot / booted:.1f} % |"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--simulations", type=int, default=4000)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    rng = np.random.default_rng(args.seed)
+    false_positives(rng, args.simulations)
+    families(rng, args.simulations)
+    several_runs(rng, args.simulations // 4)
+    coverage(rng, args.simulations)
+
+
+if __name__ == "__main__":
+    main()
