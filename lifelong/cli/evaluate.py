@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from lifelong.evaluation.suite import SuiteEvaluation
 
 POLICY_HELP = (
-    "a run's directory, one of its checkpoints, or module:function that returns an object with predict"
+    "a run's directory, one of its checkpoints, module:function that returns an object with predict, or the "
+    "address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://..."
 )
 
 
@@ -90,6 +91,15 @@ def _add_work_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         help="threads of the simulations (default: all cores, shared by the workers)",
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=300.0, help="seconds until a policy server must answer (default: 300)"
+    )
+    parser.add_argument(
+        "--in-flight",
+        type=int,
+        metavar="N",
+        help="requests that a policy server gets before it has answered (default: one for each episode of a batch)",
     )
     parser.add_argument("--again", action="store_true", help="repeat what is done already")
     parser.add_argument(
@@ -173,6 +183,10 @@ def check_eval(args: argparse.Namespace) -> None:
     for name, least in (("workers", 1), ("retries", 0), ("threads", 0), ("videos", 0)):
         if getattr(args, name) < least:
             raise ConfigError(f"--{name} is {getattr(args, name)}; it must be at least {least}")
+    if args.timeout <= 0:
+        raise ConfigError(f"--timeout is {args.timeout:g} s; it must be positive")
+    if args.in_flight is not None and args.in_flight < 1:
+        raise ConfigError(f"--in-flight is {args.in_flight}; it must be at least 1")
     if args.policy_threads is not None and args.policy_threads < 1:
         raise ConfigError(f"--policy-threads is {args.policy_threads}; it must be at least 1")
 
@@ -185,7 +199,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     """
     from libero_env.cli.tasks import find_tasks
     from libero_env.errors import UnknownNameError
-    from lifelong.evaluation.candidates import RunPolicy, UserPolicy
+    from lifelong.evaluation.candidates import PolicyUnderTest, RunPolicy, UserPolicy
     from lifelong.evaluation.protocols import PROTOCOLS, choose_init_states
     from lifelong.evaluation.suite import SuiteEvaluation
     from lifelong.evaluation.units import UNIT_STARTS
@@ -193,7 +207,13 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
 
     if args.protocol not in PROTOCOLS:
         raise UnknownNameError("protocol", args.protocol, list(PROTOCOLS))
-    policy = UserPolicy(args) if _is_callable(args.policy) else RunPolicy(args)
+    policy: PolicyUnderTest
+    if "://" in args.policy:
+        from lifelong.evaluation.servers.policy import ServerPolicy
+
+        policy = ServerPolicy(args)
+    else:
+        policy = UserPolicy(args) if _is_callable(args.policy) else RunPolicy(args)
     tasks = find_tasks(args.suite) if args.suite else policy.tasks
     if not tasks:
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")

@@ -24,16 +24,27 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
         help="seed of stochastic policies, for clients that send none (default: 0)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument(
+        "--policy-threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="threads of a policy on the CPU, as of `libero eval` (default: 1)",
+    )
     parser.set_defaults(run=run_serve)
 
 
 def run_serve(args: argparse.Namespace) -> None:
     """Serve until interrupted; the address is printed once clients are accepted."""
+    import torch
+
     from lifelong.evaluation.restore import restore
     from lifelong.evaluation.servers.serving import PolicyServer
     from lifelong.evaluation.servers.sessions import ServedPolicy
 
     served = ServedPolicy(restore(args.policy, after=args.after, device=args.device), seed=args.seed)
+    if served.run.device.type == "cpu":
+        torch.set_num_threads(max(1, args.policy_threads))
     server = PolicyServer(served.metadata, served.session, host=args.host, port=args.port)
 
     def ready(port: int) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -33,6 +33,14 @@ class Actor(Protocol):
 
     def act(self, obs: Obs) -> np.ndarray:
         """Return (B, A) float64 actions for the observations."""
+
+
+@runtime_checkable
+class TakesNote(Protocol):
+    """An actor that is told, before each `act` and at the end, which episodes are over."""
+
+    def note(self, over: np.ndarray, success: np.ndarray) -> None:
+        """Take note of which episodes are over, (B,) bool, and which have succeeded, (B,) bool."""
 
 
 @dataclass

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Actor, PolicyActor
+from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.inputs import Obs
 from lifelong.policies.base import Policy
@@ -180,12 +180,14 @@ def run_episodes(
         if tracker.over.all():
             break
         lengths += ~tracker.over
+        _tell(actor, tracker)
         actions = actor.act(obs)
         for i in np.flatnonzero(~tracker.over):
             digests[i].update(np.asarray(actions[i], "<f8").tobytes())
         obs = tracker.step(actions)
         bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
+    _tell(actor, tracker)
     episodes = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
 
@@ -248,6 +250,12 @@ class EpisodeTracker:
         """Return whether each atom holds, (B, atoms) bool."""
         shape = (self._env.num_envs, len(self.atoms))
         return np.asarray(info["progress"], bool).reshape(shape) if self.atoms else np.zeros(shape, bool)
+
+
+def _tell(actor: Actor, tracker: EpisodeTracker) -> None:
+    """Tell an actor that wants to know which episodes are over."""
+    if isinstance(actor, TakesNote):
+        actor.note(tracker.over, tracker.success)
 
 
 def _frame(obs: Obs, views: Sequence[str], i: int) -> np.ndarray:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from libero_env.errors import LiberoError
-from lifelong.errors import EvaluationIncompleteError
+from lifelong.errors import ConnectionLost, EvaluationIncompleteError
 from lifelong.evaluation.claims import Claim
 from lifelong.evaluation.progress import Progress, measure_progress
 from lifelong.evaluation.suite import SuiteEvaluation
@@ -132,6 +132,8 @@ class Worker:
             return self._evaluation.evaluate_apart(unit, self._pool) if last else None
         self._in_a_row += 1
         never_worked = not self._succeeded and not self._folder.has_results
+        if isinstance(error, ConnectionLost) and tries <= self._evaluation.retries:
+            return None
         if never_worked or self._in_a_row >= FAILURES_IN_A_ROW:
             raise error
         return None

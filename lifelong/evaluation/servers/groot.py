@@ -110,7 +110,8 @@ class GrootWire:
             raise ServerError(f"{self.address} sent a {type(found).__name__} as its modality configuration")
         for modality, known in _KEYS.items():
             config = found.get(modality)
-            keys = config.get("modality_keys") if isinstance(config, Mapping) else None
+            config = config if isinstance(config, Mapping) else {}
+            keys = config.get("modality_keys")
             if not keys or not set(keys) <= set(known):
                 raise ServerError(
                     f"{self.address} has {modality} keys {keys}; LIBERO's are {', '.join(known)}: "

@@ -118,7 +118,7 @@ class ServedPolicy:
         if PREFIX + "image" in message and PREFIX + self.run.policy.spec.views[0] not in message:
             message = self._from_openpi(message)
         spec = self.run.policy.spec
-        shapes = dict.fromkeys(spec.views, (*spec.image_size, 3))
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
         shapes |= {name: (size,) for name, size in spec.proprio.items()}
         first = np.ndim(message.get(PREFIX + spec.views[0], 0))
         rows = first == 4
