@@ -93,7 +93,10 @@ def _add_work_options(parser: argparse.ArgumentParser) -> None:
         help="threads of the simulations (default: all cores, shared by the workers)",
     )
     parser.add_argument(
-        "--timeout", type=float, default=300.0, help="seconds until a policy server must answer (default: 300)"
+        "--timeout",
+        type=float,
+        default=300.0,
+        help="seconds until a policy server must answer (default: 300)",
     )
     parser.add_argument(
         "--in-flight",

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import UnknownNameError
@@ -17,7 +16,6 @@ from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.protocols import SELECTION, EvalProtocol
-from lifelong.evaluation.servers.actor import RemoteActor
 from lifelong.evaluation.servers.announcements import groot_fields, openpi_fields, vla_eval_fields
 from lifelong.evaluation.servers.connections import Limits
 from lifelong.evaluation.servers.groot import GrootWire
@@ -30,8 +28,6 @@ from lifelong.evaluation.servers.wires import (
     WebSocketWire,
     Wire,
     plain,
-    same,
-    summary,
 )
 
 # scheme of an address -> scheme of the transport, and what the server's announcement says about the protocol
@@ -64,8 +60,8 @@ class ServerPolicy(PolicyUnderTest):
         self.own = self.announced.get("server") == SERVER  # a policy of this package
         if self.own and self.announced.get("format") != FORMAT:
             raise ServerError(
-                f"{args.policy} is of format {self.announced.get('format')!r}; this version knows {FORMAT}: serve the run "
-                "with the version that evaluates it"
+                f"{args.policy} is of format {self.announced.get('format')!r}; this version knows {FORMAT}: "
+                "serve the run with the version that evaluates it"
             )
         self.identity = {"server": args.policy, "announced": plain(self.announced)}
         self.out = Path("eval") / re.sub(r"\W+", "_", args.policy).strip("_")
