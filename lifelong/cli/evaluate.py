@@ -160,6 +160,12 @@ def run_eval(args: argparse.Namespace) -> None:
         result = worker.run()
     print(total_row(result.tasks))
     print(plan.out / FILE_NAME)
+    for name in ("renderer", "instruction_set"):
+        if isinstance(values := result.environment.get(name), list):
+            print(
+                f"the processes differ in {name} ({', '.join(map(str, values))}): bits may too",
+                file=sys.stderr,
+            )
 
 
 def help_eval(args: argparse.Namespace) -> None:

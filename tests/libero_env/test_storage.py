@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from libero_env.storage import atomic_folder, atomic_path, atomic_write_npz, atomic_write_text
+from libero_env.storage import (
+    atomic_folder,
+    atomic_path,
+    atomic_write_npz,
+    atomic_write_text,
+    create_text,
+)
 
 pytestmark = pytest.mark.unit
 
@@ -46,6 +52,25 @@ def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
             second.write_text("second")
         assert target.read_text() == "second"
     assert target.read_text() == "first"
+
+
+def test_of_several_writers_the_first_one_wins(tmp_path, monkeypatch):
+    target = tmp_path / "new" / "file.txt"
+    assert create_text(target, "first") and not create_text(target, "second")
+    assert target.read_text() == "first"
+    monkeypatch.setattr(type(target), "exists", lambda path: False)  # both looked before either had written
+    assert not create_text(target, "third")
+    assert target.read_text() == "first" and list(target.parent.iterdir()) == [target]
+
+
+def test_a_file_is_written_once_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    def link(*_):
+        raise PermissionError("Operation not permitted")
+
+    monkeypatch.setattr("os.link", link)
+    target = tmp_path / "file.txt"
+    assert create_text(target, "first") and not create_text(target, "second")
+    assert target.read_text() == "first" and list(tmp_path.iterdir()) == [target]
 
 
 def test_a_folder_gets_its_name_when_it_is_complete(tmp_path):

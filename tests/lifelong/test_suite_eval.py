@@ -163,6 +163,25 @@ def test_a_user_defined_policy_from_the_command_line(module, tmp_path, capsys):
     assert "--again" in capsys.readouterr().err
 
 
+@pytest.mark.sim
+@pytest.mark.slow
+def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_path, capsys):
+    command = ["eval", f"{module}:make", "--suite", "libero_object/3", "libero_goal/0", "--episodes", "5"]
+    command += ["--protocol", "openpi", "--horizon", "3", "--unit-starts", "2"]
+    assert cli.main([*command, "--out", "one"]) == 0
+    assert cli.main([*command, "--out", "two", "--workers", "2"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.count("libero_goal/0") == 2 and "6 of 6 units, 10 of 10 episodes" in printed.err
+    one, two = (EvaluationResult.read(tmp_path / name) for name in ("one", "two"))
+    assert one == two and one.actions == two.actions and one.unit_starts == 2
+    assert (one.environment["robot"], one.environment["models"]) == ("libero", "builtin")
+    assert cli.main([*command, "--out", "two", "--unit-starts", "5"]) == 2
+    assert "unit_starts is 2 there and 5 here" in capsys.readouterr().err
+    for option, message in (("--workers", "at least 1"), ("--unit-starts", "at least 1")):
+        assert cli.main([*command, option, "0"]) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
     for argv, message in (
         ([f"{module}:make"], "no tasks are given"),

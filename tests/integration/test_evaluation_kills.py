@@ -1,0 +1,22 @@
+"""Repeated kill -9 of processes that share an evaluation: the result is that of one process, to the bit."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "evaluation" / "kills.py"
+SMALL = ["--suite", "libero_goal/3", "libero_object/0", "--episodes", "8", "--unit-starts", "2"]
+SMALL += ["--horizon", "20", "--pause", "0.5"]
+
+
+def test_killed_three_times_three_processes_end_with_the_result_of_one():
+    done = subprocess.run(
+        [sys.executable, SCRIPT, "--kills", "3", *SMALL], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "kills: 3" in done.stdout and "units: 8, episodes: 16" in done.stdout
+    assert "different: nothing but times; left behind: nothing" in done.stdout
