@@ -113,7 +113,7 @@ def register_report(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--out",
         type=Path,
-        help="the page, or a folder for it (default: report.html in the run directory, or here for several)",
+        help="the page, or a folder for it (default: report.html in the run directory; for several, comparison/ here)",
     )
     parser.set_defaults(run=run_report)
 

@@ -166,7 +166,8 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
     """
     named = any(line.label for line in lines)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(5.6, 3.1) if named else (3.5, 2.7), layout="constrained")
+        room = 0.18 * _legend_rows([line.label for line in lines])
+        figure = Figure(figsize=(5.6, 2.8 + room) if named else (3.5, 2.7), layout="constrained")
         axes = figure.subplots()
         for number, line in enumerate(lines):
             columns = [mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T]
@@ -188,7 +189,7 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
         hide_spines(axes)
         if named:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
+            legend_below(figure)
     return figure
 
 
@@ -276,6 +277,24 @@ def _loss_limits(losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float6
         return 0.0, 1.0
     margin = 0.06 * max(float(np.ptp(values)), 1e-6)
     return float(values.min()) - margin, float(values.max()) + margin
+
+
+def legend_below(figure: Figure) -> None:
+    """Put the legend of a figure's labelled lines under it, so that long names take no room from the plot."""
+    found = [axes.get_legend_handles_labels() for axes in figure.axes]
+    handles = [h for hs, _ in found for h in hs]
+    labels = [name for _, names in found for name in names]
+    if handles:
+        figure.legend(handles, labels, loc="outside lower left", ncols=_legend_columns(labels))
+
+
+def _legend_columns(labels: Sequence[str]) -> int:
+    longest = max((len(name) for name in labels), default=0)
+    return max(1, min(4, 88 // (longest + 8)))
+
+
+def _legend_rows(labels: Sequence[str]) -> int:
+    return math.ceil(len(labels) / _legend_columns(labels))
 
 
 def hide_spines(axes: Axes) -> None:

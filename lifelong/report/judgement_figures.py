@@ -1,12 +1,12 @@
 """Figures of a comparison: differences by task, evidence as episodes come in, performance profiles."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, shorten
+from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, legend_below, shorten
 from lifelong.report.judgement import Comparison, Part
 from lifelong.results.group_scores import Profile
 from lifelong.results.sequential import SequentialTest
@@ -99,13 +99,3 @@ def profile_figure(profiles: Mapping[str, Profile]) -> Figure:
         hide_spines(axes)
         legend_below(figure)
     return figure
-
-
-def legend_below(figure: Figure) -> None:
-    """Put the legend of a figure's labelled lines under it, so that long names take no room from the plot."""
-    found = [axes.get_legend_handles_labels() for axes in figure.axes]
-    handles: Sequence = [h for hs, _ in found for h in hs]
-    labels = [name for _, names in found for name in names]
-    if handles:
-        columns = 1 if max(map(len, labels)) > 24 else min(3, len(labels))
-        figure.legend(handles, labels, loc="outside lower left", ncols=columns)

@@ -49,8 +49,8 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
 
     Args:
         run_dirs: Directory of one run to describe, or of several to compare. Runs need not be finished.
-        out: File of the page, or an existing folder for it. Default: the run directory; for several runs, the
-            current folder.
+        out: File of the page, or a folder for it. Default: the run directory; for several runs, `comparison` in the
+            current folder, which git ignores.
 
     Returns:
         Path of the page. It needs no other file and no network.
@@ -61,17 +61,27 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
     if not run_dirs:
         raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
     runs = [load_run(Path(d)) for d in run_dirs]
-    out = Path(out) if out is not None else (runs[0].path if len(runs) == 1 else Path.cwd())
-    if out.is_dir() or out.suffix == "":
-        out = out / "report.html"
     try:
+        out = Path(out) if out is not None else _default_folder([r.path for r in runs])
+        if out.is_dir() or out.suffix == "":
+            out = out / "report.html"
         out.parent.mkdir(parents=True, exist_ok=True)
         context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
         page = page_template("page.html").render(**context, metric_texts=METRIC_TEXTS)
         atomic_write_text(out, page)
     except OSError as error:
-        raise LifelongError(f"{out}: the report cannot be written ({error})") from error
+        raise LifelongError(f"{out or Path.cwd()}: the report cannot be written ({error})") from error
     return out
+
+
+def _default_folder(paths: Sequence[Path]) -> Path:
+    """Return where a page is written: in the only run, or in a folder of its own, which git ignores, for several."""
+    if len(paths) == 1:
+        return paths[0]
+    folder = Path.cwd() / "comparison"
+    folder.mkdir(exist_ok=True)
+    (folder / ".gitignore").write_text("*\n", encoding="utf-8")
+    return folder
 
 
 def _single_run(run: Run, folder: Path) -> dict[str, Any]:
@@ -135,8 +145,16 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
     benchmarks = sorted({r.record.benchmark for r in runs})
     return {
         "title": f"{len(groups)} methods on {', '.join(benchmarks)}" if len(groups) > 1 else groups[0].label,
-        "facts": [("runs", len(runs)), ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs}))))],
-        "notes": [f"{r.path}: {note}" for r in runs for note in r.notes],
+        "facts": [
+            ("runs", sum(len(g.runs) for g in groups)),
+            ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs})))),
+        ],
+        "notes": [f"{r.path}: {note}" for r in runs for note in r.notes]
+        + [
+            f"{r.path}: a further run of seed {r.record.seed} of {g.label}; it is not counted"
+            for g in groups
+            for r in g.repeats
+        ],
         "groups": _group_rows(groups, found),
         "differences": found["differences"],
         "forgotten_tasks": _forgotten_tasks(groups, found),

@@ -48,10 +48,17 @@ class Run:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ only in their seed and the order of their tasks."""
+    """Runs that differ only in their seed and the order of their tasks.
+
+    Attributes:
+        label: Name of the method.
+        runs: One run of each seed and order.
+        repeats: Further runs of these, which add no evidence and are not counted.
+    """
 
     label: str
     runs: tuple[Run, ...]
+    repeats: tuple[Run, ...] = ()
 
     @property
     def labels(self) -> list[str]:
@@ -107,9 +114,18 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
         groups.setdefault(_identity(run), []).append(run)
     identities = [dict(key) for key in groups]
     return [
-        Group(_label(identity, identities), tuple(members))
+        _one_of_each(_label(identity, identities), members)
         for identity, members in zip(identities, groups.values(), strict=True)
     ]
+
+
+def _one_of_each(label: str, members: Sequence[Run]) -> Group:
+    """Return the group with one run of each seed and order: that which learned most tasks, of these the latest."""
+    kept: dict[tuple[Any, ...], Run] = {}
+    for run in sorted(members, key=lambda r: (r.learned, r.record.started)):
+        kept[run.record.seed, run.record.tasks, str(run.config.get("init_from"))] = run
+    counted = [run for run in members if any(run is k for k in kept.values())]
+    return Group(label, tuple(counted), tuple(run for run in members if not any(run is k for k in counted)))
 
 
 def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:

@@ -18,7 +18,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from lifelong.results.metrics import METRIC_NAMES, Cells, Estimate, Floats, Scores, cells
+from lifelong.results.metrics import METRIC_NAMES, METRIC_RANGES, Cells, Estimate, Floats, Scores, cells
 
 DRAWS = 4000
 
@@ -49,13 +49,14 @@ class Resamples:
     draws: Mapping[str, Floats]
 
     def interval(self, name: str, confidence: float = 0.95) -> Estimate:
-        """Return the percentile interval of a metric."""
-        return _percentiles(self.values[name], self.draws[name], confidence)
+        """Return the percentile interval of a metric, within the values that it can have."""
+        return _percentiles(self.values[name], self.draws[name], confidence, METRIC_RANGES[name])
 
     def difference(self, other: "Resamples", name: str, confidence: float = 0.95) -> Estimate:
         """Return this group's metric minus the other's, which was resampled independently (with another seed)."""
-        value = self.values[name] - other.values[name]
-        return _percentiles(value, self.draws[name] - other.draws[name], confidence)
+        value, (low, high) = self.values[name] - other.values[name], METRIC_RANGES[name]
+        draws = self.draws[name] - other.draws[name]
+        return _percentiles(value, draws, confidence, (low - high, high - low))
 
 
 def resample(members: Sequence[Member], *, seed: int | Sequence[int] = 0, draws: int = DRAWS) -> Resamples:
@@ -121,7 +122,8 @@ def _weighted_sum(row: Cells, name: str, rates: Floats) -> Floats:
     return rates[..., used] @ row.weights[name][used]
 
 
-def _percentiles(value: float, draws: Floats, confidence: float) -> Estimate:
+def _percentiles(value: float, draws: Floats, confidence: float, possible: tuple[float, float]) -> Estimate:
+    """Return percentiles of the draws, cut off where the metric ends; shifted rates leave [0, 1] for few episodes."""
     tail = (1 - confidence) / 2
     low, high = np.quantile(draws, [tail, 1 - tail]) if np.isfinite(draws).all() else (np.nan, np.nan)
-    return Estimate(value, float(low), float(high))
+    return Estimate(value, *(float(np.clip(end, *possible)) for end in (low, high)))

@@ -106,6 +106,7 @@ class Metrics:
 
 
 METRIC_NAMES = ("fwt", "nbt", "auc", "final_success", "just_learned")
+METRIC_RANGES = {name: (-1.0 if name == "nbt" else 0.0, 1.0) for name in METRIC_NAMES}
 
 
 def forward_transfer(curves: Sequence[Curve]) -> Floats:

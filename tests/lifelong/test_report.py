@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from lifelong.errors import LifelongError
@@ -17,7 +18,7 @@ from lifelong.report.figures import Line, forgetting_figure
 from lifelong.report.page import write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
 from lifelong.results.log import ResultLog
-from lifelong.results.metrics import METRIC_NAMES
+from lifelong.results.metrics import METRIC_NAMES, METRIC_RANGES
 from lifelong.results.records import (
     CostRecord,
     EvalRecord,
@@ -261,6 +262,56 @@ def test_several_runs_side_by_side(tmp_path: Path):
         "comparison.json",
         *(f"{stem}.{kind}" for stem in ("heatmap", "forgetting") for kind in ("png", "pdf")),
     }
+
+
+def test_the_page_of_several_runs_has_a_folder_that_git_ignores(tmp_path: Path, monkeypatch):
+    runs = [make_run(tmp_path / "runs" / a, a, tasks=2) for a in ("er", "ewc")]
+    monkeypatch.chdir(tmp_path)
+    assert write_report(runs) == tmp_path / "comparison" / "report.html"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison", "runs"]
+    assert (tmp_path / "comparison" / ".gitignore").read_text() == "*\n"
+
+
+def test_two_runs_of_one_seed_count_once(tmp_path: Path):
+    first, again = (make_run(tmp_path / name, "er", 1, tasks=2) for name in ("first", "again"))
+    partial = make_run(tmp_path / "partial", "er", 1, tasks=2, done=1)
+    other = make_run(tmp_path / "other", "er", 2, tasks=2)
+    (group,) = group_runs([load_run(p) for p in (first, again, partial, other)])
+    assert len(group.runs) == 2 and {r.record.seed for r in group.runs} == {1, 2}
+    assert partial in {r.path for r in group.repeats} and len(group.repeats) == 2
+    page = Page(write_report([first, partial, other], tmp_path / "out").read_text())
+    assert f"{partial}: a further run of seed 1 of er; it is not counted" in page.text
+
+
+def test_intervals_stay_where_the_metric_can_be(tmp_path: Path, monkeypatch):
+    """Two episodes that both failed: the interval starts at 0, and that of a difference is within ±100 %."""
+    monkeypatch.setitem(CHARACTERS, "er", (0.0, 1.0))
+    runs = []
+    for algo in ("er", "ewc"):
+        folder = make_run(tmp_path / algo, algo, tasks=2)
+        rows = [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+        for row in rows:
+            if row["kind"] == "eval":
+                few = {k: v[:2] for k, v in row.items() if k.startswith("atoms_")}
+                row |= {**few, "successes": [False] * 2, "lengths": [9, 9], "init_states": [0, 1]}
+        (folder / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+        runs.append(folder)
+    page = write_report(runs, tmp_path / "out")
+    found = json.loads((page.parent / "comparison.json").read_text())
+    for group in found["groups"].values():
+        for name, (low, high) in METRIC_RANGES.items():
+            metric = group["metrics"][name]
+            assert low <= metric["low"] <= metric["mean"] == 0 <= metric["high"] <= high
+    assert all(-1 <= m["low"] <= m["high"] <= 1 for m in found["differences"][0]["metrics"].values() if m)
+
+
+def test_long_names_do_not_squeeze_the_plot(tmp_path: Path):
+    names = [f"er (policy bc_transformer_small, memory {i}00, epochs 50)" for i in range(3)]
+    for labels in (names, ["a", "b"]):
+        figure = forgetting_figure([Line(name, np.full((1, 4), 0.5)) for name in labels])
+        FigureCanvasAgg(figure).draw()
+        box = figure.axes[0].get_position()
+        assert box.width > 0.85 and box.height * figure.get_size_inches()[1] > 1.9
 
 
 @pytest.fixture(scope="module")
