@@ -1,6 +1,6 @@
 """Where a task happens: floor or table, cameras, lights, walls, and the builtin pack's furniture around them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -123,17 +123,44 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     for name, camera in workspace.parameters["cameras"].items():
         world.add_camera(name=name, pos=camera["pos"], quat=camera["quat"], fovy=camera["fovy_degrees"])
     for name, light in workspace.parameters["lights"].items():
-        added = world.add_light(name=name, pos=light["pos"], dir=light["dir"], castshadow=False)
-        added.diffuse, added.specular = [0.8] * 3, [light.get("specular", 0.3)] * 3
-        if light.get("directional"):
-            if hasattr(mujoco, "mjtLightType"):
-                added.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-            else:  # before MuJoCo 3.4
-                added.directional = True
+        add_light(
+            spec,
+            name,
+            pos=light["pos"],
+            dir=light["dir"],
+            diffuse=[0.8] * 3,
+            specular=[light.get("specular", 0.3)] * 3,
+            directional=light.get("directional", False),
+        )
 
 
-def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
+def add_light(
+    spec: mujoco.MjSpec,
+    name: str,
+    *,
+    pos: Sequence[float],
+    dir: Sequence[float],  # noqa: A002 - MuJoCo's name
+    diffuse: Sequence[float],
+    specular: Sequence[float],
+    directional: bool,
+) -> None:
+    """Add a light that casts no shadow to the world; arguments as in MJCF."""
+    light = spec.worldbody.add_light(name=name, pos=list(pos), dir=list(dir), castshadow=False)
+    light.diffuse, light.specular = list(diffuse), list(specular)
+    if directional:
+        if hasattr(mujoco, "mjtLightType"):
+            light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        else:  # before MuJoCo 3.4
+            light.directional = True
+
+
+def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False) -> None:
     """Add the mount below the arm, if the workspace has one: names start with `mount0_`, the root is `mount0_base`.
+
+    Args:
+        spec: Scene to extend.
+        workspace: Workspace of the scene.
+        detailed: Whether it has robosuite's visual mesh of 33,000 triangles.
 
     Raises:
         MissingPackageError: robosuite, which supplies the model, is not installed.
@@ -143,9 +170,12 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     mount = mujoco.MjSpec.from_file(str(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml"))
     mount.compiler.degree = False
     mount.body("base").pos = [0.0, 0.0, 0.0]
-    delete(mount, mount.geom("pedestal_vis"))  # too detailed: 33,000 triangles
-    delete(mount, mount.mesh("pedestal"))
-    add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
+    if detailed:
+        mount.geom("pedestal_vis").mass = 0.0
+    else:
+        delete(mount, mount.geom("pedestal_vis"))
+        delete(mount, mount.mesh("pedestal"))
+        add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
     arm = spec.body(
         "robot0_base"
     )  # as in the original the arm carries its mount, which decides how sums round

@@ -14,7 +14,8 @@ from typing import Any
 import mujoco
 
 from libero_env.assets.arena import Workspace, add_cameras_and_lights
-from libero_env.assets.original_arena import arena_spec
+from libero_env.assets.original_arena import arena_spec, scene_file
+from libero_env.assets.original_drawing import restore_drawing
 from libero_env.assets.original_mjcf import object_xml
 from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import simplify_visuals
@@ -130,6 +131,22 @@ class OriginalPack:
                 _ROOM
             )  # MuJoCo warns about an empty prefix; assets keep theirs
         add_cameras_and_lights(spec, workspace)
+
+    def restore_drawing(
+        self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
+    ) -> None:
+        """Make a complete scene of this pack look as the original's own, see `libero_env.assets.original_drawing`.
+
+        Raises:
+            LiberoError: The pack is simplified, or a file is missing.
+        """
+        if self.lod is not None:
+            raise LiberoError(
+                f"drawing: a pack whose meshes are simplified to {self.lod} triangles cannot be drawn faithfully; "
+                "leave out lod, or draw it fast"
+            )
+        scene = scene_file(Path(self.root), workspace.name, scene_properties.get("scene", "base"))
+        restore_drawing(spec, Path(self.root), workspace, scene)
 
     def _simplify(self, spec: mujoco.MjSpec) -> None:
         if self.lod is not None:

@@ -74,7 +74,9 @@ def robosuite_version() -> str:
         raise _not_installed() from error
 
 
-def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFAULT_ROBOT) -> None:
+def add_panda(
+    spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFAULT_ROBOT, detailed: bool = False
+) -> None:
     """Add the arm with its gripper to a scene, with the names of the original benchmark.
 
     Bodies, joints and sites of the arm start with `robot0_`, those of the gripper with `gripper0_`; the root body is
@@ -84,6 +86,7 @@ def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFA
         spec: Scene to extend.
         pos_world: Position of the base, (3,) [m].
         robot: One of `ROBOTS`.
+        detailed: Whether it has robosuite's visual meshes and materials, not one simplified mesh for each colour.
 
     Raises:
         MissingPackageError: Robosuite, which supplies the models, is not installed.
@@ -91,8 +94,12 @@ def add_panda(spec: mujoco.MjSpec, pos_world: Sequence[float], robot: str = DEFA
     root = robosuite_assets()
     arm, gripper = _load(root / _ARM_FILE), _load(root / _GRIPPER_FILE)
     _set_wrist_collision(arm, robot)
-    _replace_visuals(arm, "arm")
-    _replace_visuals(gripper, "gripper")
+    if detailed:
+        for geom in (g for part in (arm, gripper) for g in part.geoms if g.group == 1):
+            geom.mass = 0.0
+    else:
+        _replace_visuals(arm, "arm")
+        _replace_visuals(gripper, "gripper")
     for i in range(7):
         joint = arm.joint(f"joint{i + 1}")
         joint.armature, joint.frictionloss = ARMATURE[i], FRICTIONLOSS

@@ -32,9 +32,11 @@ _TEXTURE_FIELDS = (
 )
 
 
-def spec_without_textures(problem: Problem, pack: Pack | None = None) -> mujoco.MjSpec:
-    """Return the scene of a problem as an editable model without textures."""
-    spec = scene_spec(problem, pack)
+def spec_without_textures(
+    problem: Problem, pack: Pack | None = None, drawing: str | None = None
+) -> mujoco.MjSpec:
+    """Return the scene of a problem as an editable model without textures; arguments as of `scene_spec`."""
+    spec = scene_spec(problem, pack, drawing=drawing)
     for material in spec.materials:
         material.textures = [""] * len(list(material.textures))
     for texture in list(spec.textures):

@@ -32,7 +32,7 @@ from libero_env.geometry import quat_multiply, quat_rotate, quat_to_axis_angle
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.predicates import glowing_sites
 from libero_env.sim.render import Renderer, RenderTarget
-from libero_env.sim.scene import Scene
+from libero_env.sim.scene import FAITHFUL, Scene
 from libero_env.sim.segmentation import SEGMENTATIONS, Labels, segmentation_labels
 from libero_env.sim.simulation import Indices, Simulations
 from libero_env.sim.state import StateView
@@ -91,7 +91,7 @@ class Observer:
             raise LiberoError(f"observations: one kind of segmentation at a time, got {', '.join(kinds)}")
         self.scene, self.simulations, self.views = scene, simulations, views
         self.camera_size = (int(camera_size[0]), int(camera_size[1]))
-        self.renderer = Renderer(scene.model, *self.camera_size)
+        self.renderer = Renderer(scene.model, *self.camera_size, faithful=scene.drawing == FAITHFUL)
         self.segmentation = kinds[0] if kinds else None
         self._kinds = [k for k in ("rgb", "depth") if k in observations] + (["segmentation"] if kinds else [])
         self._cameras = {name: self.renderer.camera_id(name) for name in cameras}

@@ -99,12 +99,14 @@ class RenderTarget:
         camera: Index of the camera in the model.
         rgb: Colours, (height, width, 3) uint8.
         depth: Distance along the optical axis, (height, width) float32, m; that of the far plane in the background.
+        depth_buffer: OpenGL's depth, (height, width) float32: 0 at the near plane and 1 at the far plane.
         segmentation: Rendered elements, (height, width) int32: 1 + geom, 1 + ngeom + site, 0 for the background.
     """
 
     camera: int
     rgb: np.ndarray | None = None
     depth: np.ndarray | None = None
+    depth_buffer: np.ndarray | None = None
     segmentation: np.ndarray | None = None
 
 
@@ -118,18 +120,19 @@ class Renderer:
         model: Model to render.
         height: Height of the images, pixels.
         width: Width of the images, pixels.
+        faithful: Whether reflections and sites are drawn, as the original does. Multisampling is the model's.
 
     Raises:
         RenderError: The images are larger than the model's offscreen buffer.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int):
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, *, faithful: bool = False):
         largest = min(model.vis.global_.offheight, model.vis.global_.offwidth)
         if not (0 < height <= largest and 0 < width <= largest):
             raise RenderError(
                 f"an image of {height}x{width} pixels is not valid; height and width must be between 1 and {largest}"
             )
-        self._model, self._height, self._width = model, height, width
+        self._model, self._height, self._width, self._faithful = model, height, width, faithful
         self._gl: GLContext | None = None
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
@@ -174,7 +177,7 @@ class Renderer:
                     self._add_site(data, site)
             else:
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
-            if target.rgb is not None or target.depth is not None:
+            if any(out is not None for out in (target.rgb, target.depth, target.depth_buffer)):
                 self._render_rgb_and_depth(target)
             if target.segmentation is not None:
                 self._render_segmentation(target.segmentation)
@@ -182,10 +185,12 @@ class Renderer:
     def _render_rgb_and_depth(self, target: RenderTarget) -> None:
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         pixels = None if target.rgb is None else self._pixels
-        depth = None if target.depth is None else self._depth
+        depth = None if target.depth is None and target.depth_buffer is None else self._depth
         mujoco.mjr_readPixels(pixels, depth, self._viewport, self._context)
         if target.rgb is not None:
             target.rgb[:] = self._pixels[::-1]  # OpenGL's first row is the lowest
+        if target.depth_buffer is not None:
+            target.depth_buffer[:] = 1.0 - self._depth[::-1]
         if target.depth is not None:
             # The buffer holds 1 at the near plane and 0 at the far plane, hyperbolic between them.
             near, far = (getattr(self._model.vis.map, n) * self._model.stat.extent for n in ("znear", "zfar"))
@@ -221,7 +226,10 @@ class Renderer:
             data.site_xmat[site],
             rgba.astype(np.float32),
         )
-        geom.emission = 1.0 if material < 0 else model.mat_emission[material]
+        if material >= 0:
+            geom.emission = model.mat_emission[material]
+        elif not self._faithful:
+            geom.emission = 1.0
         geom.objtype, geom.objid, geom.segid = mujoco.mjtObj.mjOBJ_SITE, site, scene.ngeom
         geom.category = mujoco.mjtCatBit.mjCAT_DYNAMIC
         scene.ngeom += 1
@@ -253,7 +261,7 @@ class Renderer:
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + 100)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = int(self._faithful)
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 0
         self._options.geomgroup[1] = 1

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, load_workspace
+from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import UnknownNameError
@@ -21,7 +22,7 @@ from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.tasks.problem import Problem, Region
 from libero_env.timing import TIMESTEP
 
-DRAWINGS = ("fast", "faithful")
+FAST, FAITHFUL = DRAWINGS = ("fast", "faithful")
 ROBOT = "robot"  # name of arm and gripper in contacts
 _MAX_IMAGE = 1024  # [pixels] largest edge of an image; size of the offscreen buffer
 _FIXTURE_LIFT = 0.01  # [m] height of fixtures over the underside of the table top, as in the original
@@ -127,8 +128,8 @@ def build_scene(
 
 
 def default_drawing(pack: Pack) -> str:
-    """Return how images of a pack's scenes are drawn by default: fast."""
-    return "fast"
+    """Return how images of a pack's scenes are drawn by default: the original's faithfully, all others fast."""
+    return FAITHFUL if isinstance(pack, OriginalPack) and pack.lod is None else FAST
 
 
 @lru_cache(maxsize=160)
@@ -165,10 +166,11 @@ def scene_spec(
     name, workspace = workspace_of(problem)
     spec = mujoco.MjSpec()
     spec.modelname = "libero"
-    _set_options(spec)
+    faithful = (drawing or default_drawing(pack)) == FAITHFUL
+    _set_options(spec, samples=4 if faithful else 0)
     pack.add_arena(spec, workspace, problem.scene_properties)
-    add_panda(spec, workspace.robot_base_pos, robot)
-    add_mount(spec, workspace)
+    add_panda(spec, workspace.robot_base_pos, robot, detailed=faithful)
+    add_mount(spec, workspace, detailed=faithful)
     _add_zones(spec, problem, name, workspace)
     for entity, category in problem.objects.items():
         _add_object(spec, entity, pack.build(category) if entities is None else entities[entity])
@@ -176,6 +178,8 @@ def scene_spec(
         if entity != name:
             item = pack.build(category) if entities is None else entities[entity]
             _add_fixture(spec, entity, item, fixture_pose(problem, name, workspace, entity, item))
+    if faithful and isinstance(pack, OriginalPack):
+        pack.restore_drawing(spec, workspace, problem.scene_properties)
     return spec
 
 
@@ -250,7 +254,7 @@ def initial_qpos(scene: Scene) -> np.ndarray:
     return qpos
 
 
-def _set_options(spec: mujoco.MjSpec) -> None:
+def _set_options(spec: mujoco.MjSpec, samples: int) -> None:
     spec.compiler.degree = False
     option = spec.option
     option.timestep = TIMESTEP
@@ -259,8 +263,8 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     option.density, option.viscosity = 1.2, 2e-5
     visual = spec.visual
     visual.map.znear = 0.001
-    visual.quality.offsamples = 0  # multisampling doubles the cost of an image
-    visual.quality.shadowsize = 0
+    visual.quality.offsamples = samples  # four double the cost of an image
+    visual.quality.shadowsize = 0  # no light casts a shadow, in the original neither
     visual.global_.offwidth = visual.global_.offheight = _MAX_IMAGE
     visual.headlight.ambient, visual.headlight.diffuse = [0.1] * 3, [0.4] * 3
     visual.headlight.specular = [0.5] * 3

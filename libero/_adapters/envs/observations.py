@@ -145,9 +145,10 @@ class Observer:
             else:
                 found[f"{camera.name}_image"] = render()
             if camera.segmentations:
-                elements = render(segmentation=True)[..., 1:]
                 for kind in camera.segmentations:
+                    element = kind == "element"
+                    numbers = render(segmentation=True, hidden_sites=element)[..., 1:]
                     # the background, -1, is the last entry
-                    numbers = elements if kind == "element" else self.segments[kind][elements]
+                    numbers = numbers if element else self.segments[kind][numbers]
                     found[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
         return {key: np.ascontiguousarray(value) for key, value in found.items()}

@@ -20,6 +20,7 @@ _NAMES = ("body", "joint", "geom", "site", "light", "camera", "actuator", "senso
 KINDS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in _NAMES}
 _COUNTS = {"body": "nbody", "joint": "njnt", "camera": "ncam", "actuator": "nu"}  # the others are `n<kind>`
 _FREE = mujoco.mjtJoint.mjJNT_FREE
+_SHOWN_SITE_GROUPS = 3  # groups 0 to 2
 
 
 class MjSimState(NamedTuple):
@@ -175,14 +176,18 @@ class MjSim:
     Args:
         simulations: One simulation.
         xml: Function that returns the scene as MJCF.
+        faithful: Whether images are drawn as `libero_env.sim.render.Renderer` describes.
     """
 
-    def __init__(self, simulations: LoopSimulations, xml: Callable[[], str] | None = None):
+    def __init__(
+        self, simulations: LoopSimulations, xml: Callable[[], str] | None = None, *, faithful: bool = True
+    ):
         self._simulations = simulations
         self.model = MjModel(simulations.model, xml)
         self.data = MjData(self.model, simulations.data(0))
         self.glowing: Callable[[], Iterable[int]] = tuple
         self._renderers: dict[tuple[int, int], Renderer] = {}
+        self._faithful = faithful
 
     def reset(self) -> None:
         """Set the state to the initial state of the model."""
@@ -228,25 +233,32 @@ class MjSim:
         mode: str = "offscreen",
         device_id: int = -1,
         segmentation: bool = False,
+        hidden_sites: bool = True,
     ) -> Any:
         """Draw one picture in OpenGL's order, lowest row first.
+
+        Segmentations of the original contain sites that it hides from pictures, such as those of the gripper, because
+        robosuite hides them by a negative alpha; `hidden_sites=False`, an addition, leaves them out.
 
         Returns:
             (H, W, 3) uint8; with `segmentation` (H, W, 2) int32 of kind and index, -1 for the background; with `depth`
             a pair of it and (H, W) float32 in [0, 1], the normalised depth buffer.
         """
         height, width = height or 480, width or 640
+        image = np.empty(
+            (height, width) if segmentation else (height, width, 3), np.int32 if segmentation else np.uint8
+        )
+        buffer = np.empty((height, width), np.float32) if depth else None
         renderer = self._renderer(height, width)
         camera = renderer.camera_id(camera_name or "frontview")
-        colours = np.empty((height, width, 3), np.uint8)
-        distance = np.empty((height, width), np.float32) if depth else None
-        numbers = np.empty((height, width), np.int32) if segmentation else None
-        target = RenderTarget(camera, None if segmentation else colours, distance, numbers)
-        renderer.render(self.data._data, [target], self.glowing())
-        image = colours if numbers is None else self._elements(numbers)
-        if distance is None:
-            return image[::-1]
-        return image[::-1], self._normalised(distance)[::-1]
+        target = RenderTarget(
+            camera, depth_buffer=buffer, **{"segmentation" if segmentation else "rgb": image}
+        )
+        sites = self._segmented_sites() if segmentation and hidden_sites else self.glowing()
+        renderer.render(self.data._data, [target], sites)
+        if segmentation:
+            image = self._elements(image)
+        return image[::-1] if buffer is None else (image[::-1], buffer[::-1])
 
     def _elements(self, numbers: np.ndarray) -> np.ndarray:
         """Return kind and index (H, W, 2) of the elements whose numbers (H, W) were drawn."""
@@ -255,15 +267,16 @@ class MjSim:
         index = np.where(numbers > ngeom, numbers - 1 - ngeom, numbers - 1)
         return np.stack([kind, index], axis=-1).astype(np.int32)
 
-    def _normalised(self, distance: np.ndarray) -> np.ndarray:
-        """Return OpenGL's depth buffer of distances in metres: 0 at the near plane and 1 at the far plane."""
-        map_, extent = self.model.vis.map, self.model.stat.extent
-        near, far = map_.znear * extent, map_.zfar * extent
-        return ((1.0 - near / distance.astype(np.float64)) / (1.0 - near / far)).astype(np.float32)
+    def _segmented_sites(self) -> list[int]:
+        """Return the sites that are not transparent, of the groups that the original shows."""
+        model = self.model
+        return np.flatnonzero((model.site_rgba[:, 3] != 0) & (model.site_group < _SHOWN_SITE_GROUPS)).tolist()
 
     def _renderer(self, height: int, width: int) -> Renderer:
         if (height, width) not in self._renderers:
-            self._renderers[height, width] = Renderer(self.model._model, height, width)
+            self._renderers[height, width] = Renderer(
+                self.model._model, height, width, faithful=self._faithful
+            )
         return self._renderers[height, width]
 
     def free(self) -> None:

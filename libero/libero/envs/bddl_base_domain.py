@@ -37,7 +37,7 @@ from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
-from libero_env.sim.scene import build_scene, scene_spec
+from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
 from libero_env.sim.state import StateView
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
@@ -82,6 +82,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         horizon: Control steps after which `step` raises, unless `ignore_done`.
         placement_initializer: Object whose `sample()` returns name -> (pos, quat wxyz, object); by default the regions
             of the task file are sampled.
+        drawing: How images are drawn: `faithful`, to the bit of the original's with its models and MuJoCo 3.3.2, or
+            `fast`; an addition.
         kwargs: Arguments of the original's classes in `WITHOUT_EFFECT` are accepted and have no effect.
 
     Raises:
@@ -110,6 +112,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         camera_widths: int | Sequence[int] = 256,
         camera_depths: bool | Sequence[bool] = False,
         camera_segmentations: Any = None,
+        drawing: str = FAITHFUL,
         **kwargs: Any,
     ):
         if unknown := [key for key in kwargs if key not in WITHOUT_EFFECT]:
@@ -117,6 +120,9 @@ class BDDLBaseDomain(RobosuiteMethods):
             raise UnknownNameError("argument", unknown[0], valid)
         if control_freq != CONTROL_FREQ:
             raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
+        if drawing not in DRAWINGS:
+            raise UnknownNameError("drawing", drawing, DRAWINGS)
+        self.drawing = drawing
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
         self.problem = BDDLUtils.read_problem(bddl_file_name)
         self.parsed_problem = BDDLUtils.robosuite_parse_problem(bddl_file_name)
@@ -157,13 +163,13 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _load_model(self) -> None:
         pack = facade_pack()
-        self.scene = build_scene(self.problem, pack)
+        self.scene = build_scene(self.problem, pack, drawing=self.drawing)
         hooks = ("_load_fixtures_in_arena", "_load_objects_in_arena", "_load_sites_in_arena", "_setup_camera")
         model = self.scene.model
         if any(getattr(type(self), hook) is not getattr(BDDLBaseDomain, hook) for hook in hooks):
             from libero.libero.envs.arenas import Arena
 
-            arena = Arena(scene_spec(self.problem, pack))
+            arena = Arena(scene_spec(self.problem, pack, drawing=self.drawing))
             for hook in hooks:
                 getattr(self, hook)(arena)
             model = arena.spec.compile()
@@ -171,9 +177,10 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _simulate(self, model: mujoco.MjModel) -> None:
         self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
-        self.sim = MjSim(self.simulations, self.get_xml)
+        self.sim = MjSim(self.simulations, self.get_xml, faithful=self.drawing == FAITHFUL)
         self.view = StateView(self.scene, self.simulations, 0)
-        self.sim.glowing = lambda: glowing_sites(self.view)
+        self._glowing: set[int] = set()
+        self.sim.glowing = lambda: self._glowing
 
     def _setup_references(self, controller_configs: Any, robots: Any) -> None:
         scene = self.scene
@@ -221,6 +228,7 @@ class BDDLBaseDomain(RobosuiteMethods):
                 joint = self.scene.model.joint(f"{name}_joint0").qposadr[0]
                 qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
+        self._glowing = set()
 
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
@@ -276,10 +284,13 @@ class BDDLBaseDomain(RobosuiteMethods):
         """Do nothing; a subclass may change the simulation before each control step."""
 
     def _post_action(self, action: Any) -> tuple[float, bool, dict[str, Any]]:
-        return self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
+        result = self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
+        self._post_process()
+        return result
 
     def _post_process(self) -> None:
-        """Update the states of objects that can be turned on; their appearance follows from the simulation."""
+        """Update the states of objects that can be turned on; as in the original, they begin to glow only now."""
+        self._glowing = glowing_sites(self.view)
         for state in self.tracking_object_states_changes:
             state.update_state()
 
@@ -343,7 +354,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         spec = (
             mujoco.MjSpec.from_string(self._xml)
             if self._xml
-            else spec_without_textures(self.problem, self.scene.pack)
+            else spec_without_textures(self.problem, self.scene.pack, self.drawing)
         )
         return model_xml(spec, poses)
 
@@ -359,7 +370,9 @@ class BDDLBaseDomain(RobosuiteMethods):
         """
         poses = read_fixture_poses(xml_string, self.scene)
         try:
-            model = compile_stored(xml_string, scene_spec(self.problem, self.scene.pack))
+            model = compile_stored(
+                xml_string, scene_spec(self.problem, self.scene.pack, drawing=self.drawing)
+            )
         except DemoError as error:
             warnings.warn(f"{error}; only the poses of the fixtures are taken from it", stacklevel=2)
             for name, pose in poses.items():
