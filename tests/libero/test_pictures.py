@@ -1,0 +1,132 @@
+"""The original's pictures, depth and segmentation, recorded from its own environments.
+
+Under MuJoCo 3.3.2, which drew the recordings, they agree to the bit. `LIBERO_PICTURES=all` compares all recordings of
+../shared/pixels instead of a few.
+"""
+
+import json
+import os
+import runpy
+from collections import Counter
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from libero_env.assets.pack import original_folder
+from libero_env.errors import LiberoError, UnknownNameError
+
+pytestmark = pytest.mark.sim
+
+FEW = ("libero_10-00", "libero_90-27", "libero_goal-00", "libero_object-02")
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+SIZE = 64
+RECORDED = sorted((Path(__file__).parent / "data").glob("*.npz"))
+GEOM, SITE = 5, 6
+
+
+@pytest.fixture
+def original(monkeypatch):
+    try:
+        folder = original_folder()
+    except LiberoError as error:
+        pytest.skip(f"the original's whole models are needed: {error}")
+    monkeypatch.setenv("LIBERO_ASSETS", str(folder))
+
+
+@pytest.fixture
+def whole(original, make_env):
+    """A factory of environments with the original's models, in a recorded state."""
+    from libero.libero import benchmark, get_libero_path
+
+    def make(recorded, **kwargs):
+        task = benchmark.get_benchmark_dict()[str(recorded["suite"])]().get_task(int(recorded["task_id"]))
+        file = os.path.join(get_libero_path("bddl_files"), task.problem_folder, task.bddl_file)
+        env = OffScreenRenderEnv(bddl_file_name=file, camera_heights=SIZE, camera_widths=SIZE, **kwargs)
+        made.append(env)
+        for name, pose in json.loads(str(recorded["fixtures"])).items():
+            body = env.sim.model.body_name2id(env.env.fixtures_dict[name].root_body)
+            env.sim.model.body_pos[body], env.sim.model.body_quat[body] = pose[:3], pose[3:]
+        return env
+
+    from libero.libero.envs import OffScreenRenderEnv
+
+    made = []
+    yield make
+    for env in made:
+        env.close()
+
+
+def recordings(shared):
+    paths = sorted((shared / "pixels").glob("*.npz"))
+    return paths if os.environ.get("LIBERO_PICTURES") == "all" else [p for p in paths if p.stem in FEW]
+
+
+def test_pictures_are_the_originals(original, shared):
+    compare = runpy.run_path(str(shared / "pixels" / "compare.py"))["compare"]
+    paths = recordings(shared)
+    assert paths
+    short = {path.stem: text for path in paths for good, text in [compare(path)] if not good}
+    assert not short
+
+
+@pytest.mark.parametrize("path", RECORDED, ids=lambda path: path.stem)
+def test_depth_and_segmentation_are_the_originals(whole, path):
+    recorded = np.load(path)
+    exact = mujoco.__version__ == str(recorded["mujoco"])
+    env = whole(recorded, camera_depths=True)
+    observed = env.set_init_state(recorded["state"])
+    names = element_names(env.sim.model._model)
+    for camera in CAMERAS:
+        depth, want = observed[f"{camera}_depth"][..., 0], recorded[f"{camera}_depth"]
+        near = np.isclose(depth, want, rtol=0, atol=0 if exact else 2e-6)
+        assert near.mean() >= (1.0 if exact else 0.99)
+        picture = env.sim.render(camera_name=camera, width=SIZE, height=SIZE, segmentation=True)
+        found = np.vectorize(lambda kind, index: names.get((kind, index), ""))(*np.moveaxis(picture, -1, 0))
+        wanted = np.append(recorded["elements"], "")[recorded[f"{camera}_segmentation"]]
+        assert (found == wanted).mean() >= (1.0 if exact else 0.99)
+
+
+def test_burners_glow_as_the_originals(whole):
+    recorded = np.load(next(path for path in RECORDED if "state_on" in np.load(path).files))
+    env = whole(recorded)
+    off = env.set_init_state(recorded["state"])
+    on = env.set_init_state(recorded["state_on"])
+    for camera in CAMERAS:
+        difference = np.abs(on[f"{camera}_image"].astype(int) - recorded[f"{camera}_on"])
+        if mujoco.__version__ == str(recorded["mujoco"]):
+            assert difference.max() == 0
+        assert difference.mean() <= 0.5 and (difference.max(-1) > 2).mean() <= 0.03
+    assert (on["agentview_image"] != off["agentview_image"]).any()
+
+
+def element_names(model):
+    """Names of visual geoms and sites as in experiments/pixels/record.py: (kind, index) -> name."""
+    names, count = {}, Counter()
+    for geom in range(model.ngeom):
+        if model.geom_group[geom] == 1:
+            body = model.body(model.geom_bodyid[geom]).name
+            names[GEOM, geom] = f"geom:{body}:{count[body]}"
+            count[body] += 1
+    return names | {(SITE, site): f"site:{model.site(site).name}" for site in range(model.nsite)}
+
+
+def test_segmentation_of_observations_has_no_hidden_sites(make_env):
+    env = make_env(camera_names="robot0_eye_in_hand", camera_segmentations="instance")
+    env.reset()
+    with_sites = env.sim.render(128, 128, camera_name="robot0_eye_in_hand", segmentation=True)
+    without = env.sim.render(
+        128, 128, camera_name="robot0_eye_in_hand", segmentation=True, hidden_sites=False
+    )
+    assert SITE in with_sites[..., 0] and SITE not in without[..., 0]
+
+
+def test_the_drawing_can_be_asked_for(make_env):
+    faithful, fast = make_env(), make_env(drawing="fast")
+    state = faithful.reset() and faithful.get_sim_state()
+    pictures = [env.set_init_state(state)["agentview_image"].astype(int) for env in (faithful, fast)]
+    assert 0 < np.abs(pictures[0] - pictures[1]).mean() < 10
+    assert np.array_equal(faithful.get_sim_state(), fast.get_sim_state())
+    with pytest.raises(UnknownNameError, match="drawing"):
+        make_env(drawing="quick")
