@@ -54,9 +54,7 @@ def record(path: Path) -> dict[str, Any]:
     z = np.load(path)
     task = benchmark.get_benchmark_dict()[str(z["suite"])]().get_task(int(z["task_id"]))
     bddl = os.path.join(get_libero_path("bddl_files"), task.problem_folder, task.bddl_file)
-    env = OffScreenRenderEnv(
-        bddl_file_name=bddl, camera_heights=SIZE, camera_widths=SIZE, camera_depths=True
-    )
+    env = OffScreenRenderEnv(bddl_file_name=bddl, camera_heights=SIZE, camera_widths=SIZE, camera_depths=True)
     env.seed(0)
     env.reset()
     sim, names = env.sim, element_names(env.sim.model._model)
@@ -80,7 +78,9 @@ def record(path: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("states", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 
 from libero_env.assets.furniture import add_furniture, add_visual_mesh, furniture, solid_mesh
-from libero_env.assets.robot import robosuite_assets
+from libero_env.assets.robot import load_robosuite, robosuite_assets
 from libero_env.assets.styles import add_material, furniture_of, styles_of
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import delete
@@ -167,8 +167,7 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False)
     """
     if workspace.mount is None:
         return
-    mount = mujoco.MjSpec.from_file(str(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml"))
-    mount.compiler.degree = False
+    mount = load_robosuite(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml")
     mount.body("base").pos = [0.0, 0.0, 0.0]
     if detailed:
         mount.geom("pedestal_vis").mass = 0.0
@@ -176,9 +175,8 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False)
         delete(mount, mount.geom("pedestal_vis"))
         delete(mount, mount.mesh("pedestal"))
         add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
-    arm = spec.body(
-        "robot0_base"
-    )  # as in the original the arm carries its mount, which decides how sums round
+    # As in the original the arm carries its mount, which decides how sums round.
+    arm = spec.body("robot0_base")
     base = (0.0, 0.0, 0.0) if arm else workspace.robot_base_pos
     frame = (arm or spec.worldbody).add_frame(pos=(*base[:2], base[2] + _MOUNT_LIFT))
     spec.attach(mount, prefix="mount0_", frame=frame)

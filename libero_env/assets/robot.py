@@ -92,7 +92,7 @@ def add_panda(
         MissingPackageError: Robosuite, which supplies the models, is not installed.
     """
     root = robosuite_assets()
-    arm, gripper = _load(root / _ARM_FILE), _load(root / _GRIPPER_FILE)
+    arm, gripper = load_robosuite(root / _ARM_FILE), load_robosuite(root / _GRIPPER_FILE)
     _set_wrist_collision(arm, robot)
     if detailed:
         for geom in (g for part in (arm, gripper) for g in part.geoms if g.group == 1):
@@ -122,7 +122,8 @@ def _not_installed() -> MissingPackageError:
     return MissingPackageError(reason, ROBOSUITE_REMEDY)
 
 
-def _load(path: Path) -> mujoco.MjSpec:
+def load_robosuite(path: Path) -> mujoco.MjSpec:
+    """Return one of robosuite's models, with angles in radians and absolute paths of its meshes."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.compiler.degree = False
     for mesh in spec.meshes:  # absolute paths survive being attached to another spec
