@@ -2,10 +2,10 @@
 
     LIBERO_CONFIG_PATH=<the original's configuration> python experiments/pixels/record.py STATE.npz... --out FOLDER
 
-Runs in the original's environment, see experiments/benchmarks/README.md. A STATE.npz has `suite`, `task_id`, `state` and
+Runs in the original's environment, see experiments/benchmarks/README.md. STATE.npz has `suite`, `task_id`, `state` and
 `fixtures` (JSON: name -> position and quaternion wxyz). `tests/libero/data` has what this wrote for two of them.
 
-Elements are named so that they can be found in another model of the same scene: `geom:BODY:K` is the k-th visual geom of
+Elements are named so that another model of the same scene has them too: `geom:BODY:K` is the k-th visual geom of
 a body, `site:NAME` a site.
 """
 
@@ -18,6 +18,7 @@ from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
+
 from libero.libero import benchmark, get_libero_path
 from libero.libero.envs import OffScreenRenderEnv
 
