@@ -54,7 +54,7 @@ def main() -> int:
         one, shared = (json.loads((out / name / "eval.json").read_text()) for name in ("one", "shared"))
         times = one.pop("times"), shared.pop("times")
         different = [key for key in one if one[key] != shared[key]]
-        units = len(list((out / "shared" / "units").glob("*.json")))
+        units = finished(out / "shared")
         episodes = sum(len(task["init_states"]) for task in shared["tasks"])
         print(
             f"kills: {sum(kills.values())} ({', '.join(f'{n} {when}' for when, n in sorted(kills.items()))})"
@@ -68,16 +68,18 @@ def main() -> int:
         print(
             f"different: {different or 'nothing but times'}; left behind: {[p.name for p in left] or 'nothing'}"
         )
-        return int(bool(different) or units != len(list((out / "one" / "units").iterdir())))
+        return int(bool(different) or units != finished(out / "one"))
 
 
 def kill_and_finish(args: argparse.Namespace, out: Path) -> Counter[str]:
     """Kill one of the processes after the other; return how many were killed in which state."""
     draws, kills = random.Random(args.seed), Counter()
+    units = len(args.suite) * -(-args.episodes // args.unit_starts)
     processes = [start(args, out) for _ in range(args.workers)]
     while sum(kills.values()) < args.kills:
         starting = draws.random() < START_UP
-        while not starting and not (holders(out) & {process.pid for process in processes}):
+        done = min(finished(out) + draws.choice((0, 0, 1, 2)), units - args.workers)
+        while not starting and (finished(out) < done or not holders(out) & {p.pid for p in processes}):
             time.sleep(0.01)
             assert any(process.poll() is None for process in processes), f"all have ended\n{log(out)}"
         working = [i for i, process in enumerate(processes) if process.pid in holders(out)]
@@ -102,6 +104,11 @@ def holders(out: Path) -> set[int]:
         except (OSError, ValueError):
             continue  # it was given back, or is being written
     return found
+
+
+def finished(out: Path) -> int:
+    """Return the number of units that are done."""
+    return len(list((out / "units").glob("*.json")))
 
 
 def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:

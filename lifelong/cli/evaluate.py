@@ -16,6 +16,7 @@ from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from lifelong.evaluation.suite import SuiteEvaluation
+    from lifelong.results.evaluation_file import EvaluationResult
 
 POLICY_HELP = (
     "a run's directory, one of its checkpoints, module:function that returns an object with predict, or the "
@@ -32,12 +33,12 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
 def _add_eval(subparsers: "argparse._SubParsersAction") -> None:
     parser = subparsers.add_parser("eval", help="success of a policy on tasks; resumes where it was stopped")
     parser.add_argument("policy", nargs="?", help=POLICY_HELP)
-    _add_episode_options(parser)
-    _add_work_options(parser)
+    _add_episode_options(parser.add_argument_group("what is measured"))
+    _add_work_options(parser.add_argument_group("how it is run"))
     parser.set_defaults(run=run_eval)
 
 
-def _add_episode_options(parser: argparse.ArgumentParser) -> None:
+def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
     """Add what decides the numbers: tasks, starts, protocol, models."""
     parser.add_argument("--suite", nargs="+", metavar="SUITE", help="suites or tasks (default: the run's)")
     parser.add_argument(
@@ -74,7 +75,7 @@ def _add_episode_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_work_options(parser: argparse.ArgumentParser) -> None:
+def _add_work_options(parser: argparse._ArgumentGroup) -> None:
     """Add what does not change the numbers: folder, processes, device."""
     parser.add_argument(
         "--out", type=Path, help="folder of the results (default: in the run, or eval/POLICY)"
@@ -135,7 +136,7 @@ def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
 def run_eval(args: argparse.Namespace) -> None:
     """Evaluate a policy; print a row for each task, the mean, and the file of the results."""
     from lifelong.evaluation.crew import Crew
-    from lifelong.evaluation.progress import HEADER, table_row, total_row
+    from lifelong.evaluation.progress import HEADER, table_row, total_rows
     from lifelong.evaluation.status import describe_status
     from lifelong.evaluation.worker import Worker
     from lifelong.results.evaluation_file import FILE_NAME
@@ -150,22 +151,28 @@ def run_eval(args: argparse.Namespace) -> None:
         plan.folder.clear()
     print(HEADER, flush=True)
     helpers = argparse.Namespace(**(vars(args) | {"again": False}))
-    with _ending_politely(), policy_threads(plan), Crew(args.workers - 1, help_eval, helpers) as crew:
-        worker = Worker(
-            plan,
-            on_result=lambda row: print(table_row(row), flush=True),
-            on_progress=_print_progress,
-            on_wait=crew.tend,
-        )
-        result = worker.run()
-    print(total_row(result.tasks))
+    try:
+        with _ending_politely(), policy_threads(plan), Crew(args.workers - 1, help_eval, helpers) as crew:
+            result = Worker(
+                plan,
+                on_result=lambda row: print(table_row(row), flush=True),
+                on_progress=_print_progress,
+                on_wait=crew.tend,
+            ).run()
+    except KeyboardInterrupt:
+        print(f"{plan.out} keeps what is done; the same command goes on", file=sys.stderr)
+        raise
+    for row in total_rows(result.tasks):
+        print(row)
     print(plan.out / FILE_NAME)
+    _warn_of_differences(result)
+
+
+def _warn_of_differences(result: "EvaluationResult") -> None:
     for name in ("renderer", "instruction_set"):
         if isinstance(values := result.environment.get(name), list):
-            print(
-                f"the processes differ in {name} ({', '.join(map(str, values))}): bits may too",
-                file=sys.stderr,
-            )
+            found = ", ".join(map(str, values))
+            print(f"the processes differ in {name} ({found}): bits may too", file=sys.stderr)
 
 
 def help_eval(args: argparse.Namespace) -> None:
@@ -188,7 +195,7 @@ def check_eval(args: argparse.Namespace) -> None:
         ConfigError: No policy is named, or a number is too small.
     """
     if args.policy is None:
-        raise ConfigError("no policy is named: libero eval RUN_DIR, or libero eval my_module:function")
+        raise ConfigError("no policy is named; it comes first: libero eval RUN_DIR --suite libero_goal")
     for name, least in (("workers", 1), ("retries", 0), ("threads", 0), ("videos", 0)):
         if getattr(args, name) < least:
             raise ConfigError(f"--{name} is {getattr(args, name)}; it must be at least {least}")

@@ -106,10 +106,18 @@ def table_row(result: TaskResult) -> str:
     return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
 
 
-def total_row(results: Sequence[TaskResult]) -> str:
-    """Format the row of all tasks together."""
+def total_rows(results: Sequence[TaskResult]) -> list[str]:
+    """Format the rows of each suite, where there are several, and of all tasks together."""
+    suites: dict[str, list[TaskResult]] = {}
+    for result in results:
+        suites.setdefault(result.task.partition("/")[0], []).append(result)
+    rows = suites if len(suites) > 1 else {}
+    return [_total_row(name, found) for name, found in {**rows, "mean over tasks": results}.items()]
+
+
+def _total_row(name: str, results: Sequence[TaskResult]) -> str:
     wins, episodes = sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results)
-    return f"{'mean over tasks':<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}"
+    return f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}"
 
 
 def _percent(e: Estimate) -> str:

@@ -58,6 +58,8 @@ class Worker:
         evaluation, folder = self._evaluation, self._folder
         folder.join(evaluation.units)
         self._attempts_before = {name: found.attempts for name, found in folder.errors().items()}
+        if done := self._look():  # somebody has begun
+            self._say(done)
         with evaluation.pool() as self._pool:
             while len(done := self._look()) < len(evaluation.units):
                 self._on_wait(len(done))
