@@ -140,7 +140,8 @@ def run_episodes(
     """Run episodes of an actor from the given initial states, all at once.
 
     Each step is one call of the actor on all simulations. Finished simulations keep their row, so that the results of
-    the others do not depend on when they finished, but they are neither stepped nor rendered.
+    the others do not depend on when they finished, but they are neither stepped nor rendered. Images that nobody sees
+    are not rendered: those of settling, and those between the observations of an actor that executes chunks.
 
     Args:
         actor: Actor that answers observations with actions.
@@ -163,10 +164,12 @@ def run_episodes(
         )
     started = time.perf_counter()
     actor.reset(env.num_envs)
+    _draw(env, not settle_steps)
     obs, info = env.reset(options={"init_state": np.asarray(init_states)})
     tracker = EpisodeTracker(env, info)
     settling = np.zeros(actor.action_dim) if settle_action is None else np.asarray(settle_action, float)
-    for _ in range(settle_steps):
+    for left in reversed(range(settle_steps)):
+        _draw(env, not left)
         obs = tracker.step(np.tile(settling, (env.num_envs, 1)))
     tracker.start()
     lengths = np.zeros(env.num_envs, int)
@@ -184,9 +187,12 @@ def run_episodes(
         actions = actor.act(obs)
         for i in np.flatnonzero(~tracker.over):
             digests[i].update(np.asarray(actions[i], "<f8").tobytes())
+        filmed = bool(recordings) and (step + 1) % record_every == 0
+        _draw(env, filmed or getattr(actor, "sees_next", True))
         obs = tracker.step(actions)
         bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
+    _draw(env, True)
     _tell(actor, tracker)
     episodes = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
@@ -250,6 +256,12 @@ class EpisodeTracker:
         """Return whether each atom holds, (B, atoms) bool."""
         shape = (self._env.num_envs, len(self.atoms))
         return np.asarray(info["progress"], bool).reshape(shape) if self.atoms else np.zeros(shape, bool)
+
+
+def _draw(env: VectorEnv, wanted: bool) -> None:
+    """Let an environment that can leave out images render them, or not."""
+    if hasattr(env, "render_images"):
+        env.render_images = wanted
 
 
 def _tell(actor: Actor, tracker: EpisodeTracker) -> None:

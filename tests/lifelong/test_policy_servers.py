@@ -11,6 +11,7 @@ import pytest
 from libero_env.tasks import get_suite
 from lifelong.errors import ConnectionLost, ServerError, WireError
 from lifelong.evaluation.inputs import PolicyInput
+from lifelong.evaluation.rollout import run_episodes
 from lifelong.evaluation.servers.actor import RemoteActor, checked_actions
 from lifelong.evaluation.servers.codecs import GROOT, OPENPI, VLA_EVAL
 from lifelong.evaluation.servers.connections import Limits
@@ -51,7 +52,7 @@ class Plain:
 def observations(count: int, step: int) -> dict[str, np.ndarray]:
     x = np.zeros((count, 8))
     x[:, 0], x[:, 1] = np.arange(count), step
-    return {"x": x}
+    return {"x": x, "image": np.zeros((count, 1, 1, 3), np.uint8)}
 
 
 def chunk(state: np.ndarray, length: int) -> np.ndarray:
@@ -147,6 +148,39 @@ def test_openpi_observations_and_chunks():
         "prompt",
     }
     assert seen[0]["observation/image"].dtype == np.uint8 and seen[0]["prompt"] == TASK.language
+
+
+class Drawing:
+    """An environment that notes when it draws; its episodes end after nine steps."""
+
+    num_envs = 1
+
+    def reset(self, *, seed=None, options=None):
+        self.drawn, self.step_ = [self.render_images], 0
+        return observations(1, 0), {"success": np.zeros(1, bool)}
+
+    def step(self, actions):
+        self.drawn.append(self.render_images)
+        self.step_ += 1
+        over = np.array([self.step_ == 9])
+        return observations(1, self.step_), np.zeros(1), over, over, {"success": over}
+
+
+@pytest.mark.parametrize(
+    ("settle", "record", "drawn"),
+    [(0, 0, {0, 3, 6}), (2, 0, {2, 5, 8}), (0, 4, {0, 3, 4, 6, 8})],
+)
+def test_only_images_that_are_seen_are_drawn(settle, record, drawn):
+    answer = lambda observation: {"actions": chunk(observation["observation/state"], 3)}  # noqa: E731
+    env = Drawing()
+    env.render_images = True
+    with policy_servers.openpi(answer) as address:
+        wire = WebSocketWire(address, OpenpiDialect(), SHORT)
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 0)], replan=3, views=("image",))
+        rollouts = run_episodes(actor, env, [0], horizon=20, settle_steps=settle, record_every=record)
+        wire.close()
+    assert {i for i, seen in enumerate(env.drawn) if seen} - {9} == drawn, "9: it was not known to be over"
+    assert rollouts.episodes[0].success and env.render_images
 
 
 def test_the_order_of_answers_makes_no_difference():

@@ -42,6 +42,11 @@ class RemoteActor:
         self._chunks: list[deque[np.ndarray]] = []
         self._over = np.zeros(len(episodes), bool)
 
+    @property
+    def sees_next(self) -> bool:
+        """Whether the next observation is sent to the server; the others need no images."""
+        return any(not chunk for chunk, over in zip(self._chunks, self._over, strict=True) if not over)
+
     def reset(self, num_envs: int) -> None:
         """Begin the episodes on the server; see `lifelong.evaluation.actors.Actor`."""
         assert num_envs == len(self._episodes), "one simulation for each episode"
