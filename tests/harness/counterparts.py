@@ -11,7 +11,9 @@ import pytest
 from filelock import FileLock
 
 
-def counterpart(*requirements: str, no_deps: Sequence[str] = (), python: str = sys.executable) -> Path:
+def counterpart(
+    *requirements: str, no_deps: Sequence[str] = (), python: str = sys.executable, build: bool = True
+) -> Path:
     """Return the Python of an environment with these distributions; it is made once and kept.
 
     Environments lie in `LIBERO_COUNTERPARTS`, by default `~/.cache/libero-lifelong/counterparts`. Where the packages
@@ -21,6 +23,7 @@ def counterpart(*requirements: str, no_deps: Sequence[str] = (), python: str = s
         requirements: Distributions as pip takes them, with what they depend on.
         no_deps: Distributions without what they depend on.
         python: Interpreter of the environment.
+        build: Whether it is made where it is not there yet; otherwise the test is skipped.
     """
     default = Path.home() / ".cache" / "libero-lifelong" / "counterparts"
     base = Path(os.environ.get("LIBERO_COUNTERPARTS", default))
@@ -30,6 +33,8 @@ def counterpart(*requirements: str, no_deps: Sequence[str] = (), python: str = s
     folder = base / hashlib.sha256(wanted.encode()).hexdigest()[:16]
     with FileLock(f"{folder}.lock"):
         if not (folder / "complete").is_file():
+            if not build:
+                pytest.skip(f"there is no environment with {requirements[0]}, and it is made on demand only")
             _run(python, "-m", "venv", "--clear", str(folder))
             pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet"]
             _run(*pip, *requirements)

@@ -1,0 +1,105 @@
+"""vla-eval and LeRobot in environments of their own, from which this checkout can be imported too."""
+
+import json
+import os
+import shutil
+import subprocess
+import sysconfig
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from tests.harness.counterparts import counterpart
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = Path(__file__).parent / "peer_scripts"
+PLUGIN = ROOT / "integrations" / "lerobot_env_libero_lifelong"
+# Starts a script with the folders of a variable after those of its own environment
+_START = (
+    "import os, runpy, sys; sys.path += os.environ['PEER_PATH'].split(os.pathsep); "
+    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+)
+
+
+@dataclass(frozen=True)
+class Peer:
+    """An environment with another package.
+
+    Attributes:
+        python: Its interpreter.
+        path: Folders that are searched after its own.
+    """
+
+    python: Path
+    path: tuple[str, ...]
+
+    def run(self, script: str, *arguments: object, cwd: Path, timeout: float = 300, **variables: str) -> dict:
+        """Run a script of `peer_scripts` and return the JSON object that it prints last.
+
+        Args:
+            script: Its file name.
+            *arguments: Arguments.
+            cwd: Working directory.
+            timeout: Largest time, [s].
+            **variables: Environment variables.
+        """
+        known = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PEER_PATH": os.pathsep.join(self.path)}
+        command = [str(self.python), "-c", _START, str(SCRIPTS / script), *map(str, arguments)]
+        done = subprocess.run(
+            command,
+            cwd=cwd,
+            env={**os.environ, **known, **variables},
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+        assert done.returncode == 0, f"{script}:\n{done.stdout[-3000:]}\n{done.stderr[-6000:]}"
+        return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def vla_eval() -> Peer:
+    """Return vla-eval's environment; what this package needs comes from the environment of the tests."""
+    same = [f"{name}=={version(name)}" for name in ("numpy", "pillow", "omegaconf")]
+    python = counterpart("vla-eval==0.8.0", *same)
+    return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
+
+
+def lerobot() -> Peer:
+    """Return LeRobot's environment with the plug-in; 5.4 GB, so it is made only where LIBERO_BUILD_LEROBOT is set."""
+    python = os.environ.get("LIBERO_PYTHON312") or shutil.which("python3.12")
+    if python is None:
+        pytest.skip(
+            "LeRobot 0.6 needs Python 3.12, and there is no python3.12; LIBERO_PYTHON312 names another"
+        )
+    needed = ("numba", "lazy_loader", "h5py", "fast-simplification", "trimesh", "cloudpickle", "hatchling")
+    found = counterpart(
+        "lerobot[evaluation,dataset]==0.6.1",
+        "torch==2.11.0",
+        f"mujoco=={version('mujoco')}",
+        *needed,
+        no_deps=("robosuite==1.4.1",),
+        python=python,
+        build="LIBERO_BUILD_LEROBOT" in os.environ,
+    )
+    return Peer(found, (str(ROOT), str(_installed_plugin(found))))
+
+
+def _installed_plugin(python: Path) -> Path:
+    """Return a folder with the plug-in as pip installs it: LeRobot asks the metadata of distributions."""
+    folder = python.parents[1] / "plugin"
+    command = [
+        str(python),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--upgrade",
+    ]
+    done = subprocess.run([*command, "--target", str(folder), str(PLUGIN)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder
