@@ -141,13 +141,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--policy", default="kills:make")
-    parser.add_argument(
-        "--suite", nargs="+", default=["libero_goal/3", "libero_object/0", "libero_spatial/5"]
-    )
+    parser.add_argument("--suite", nargs="+", default=["libero_goal/3", "libero_object/0"])
     parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--unit-starts", type=int, default=5)
-    parser.add_argument("--horizon", type=int, default=40)
-    parser.add_argument("--pause", type=float, default=2.0, help="longest pause before a kill, s")
+    parser.add_argument("--unit-starts", type=int, default=3)
+    parser.add_argument("--horizon", type=int, default=60)
+    parser.add_argument("--pause", type=float, default=0.5, help="longest pause before a kill, s")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder that is kept")
     return parser.parse_args()

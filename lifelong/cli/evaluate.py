@@ -285,7 +285,9 @@ def _ending_politely() -> Iterator[None]:
 
 
 def _print_progress(progress: object) -> None:
-    print(progress, file=sys.stderr, flush=True)
+    from tqdm import tqdm
+
+    tqdm.write(str(progress), file=sys.stderr)  # above the bar of a terminal
 
 
 def _is_callable(text: str) -> bool:

@@ -137,8 +137,9 @@ class Claims:
 
     def held(self) -> dict[str, Held]:
         """Return the claims that are not abandoned, by unit."""
-        now = self._now()
-        found = [self._read(path.stem, now) for path in self._folder.glob("*.json")]
+        paths = list(self._folder.glob("*.json"))
+        now = self._now() if paths else 0.0
+        found = [self._read(path.stem, now) for path in paths]
         return {h.unit: h for h in found if h is not None and not h.is_abandoned(self._lease)}
 
     def _path(self, unit: str) -> Path:

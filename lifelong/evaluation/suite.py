@@ -119,12 +119,17 @@ class SuiteEvaluation:
         self._save_videos(unit, done)
         return self._unit_result(unit, done, env, started)
 
-    def evaluate_apart(self, unit: Unit, pool: EnvPool) -> UnitResult:
+    def evaluate_apart(self, unit: Unit, pool: EnvPool, *, has_worked: bool) -> UnitResult:
         """Run the episodes of a unit one by one; those that end with an error are failures.
+
+        Args:
+            unit: Unit of this evaluation.
+            pool: Open environments, see `pool`.
+            has_worked: Whether the policy is known to run; otherwise one episode must.
 
         Raises:
             LiberoError: The policy's answers are not valid, or it cannot be reached: nothing is counted.
-            Exception: All episodes end with an error, which is that of the policy and not of an episode.
+            Exception: No episode has ever run: the error is that of the policy and not of an episode.
         """
         started, parts = time.time(), []
         errors: list[str | None] = []
@@ -137,7 +142,7 @@ class SuiteEvaluation:
             except LiberoError:
                 raise
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
-                if len(errors) == len(unit.starts) - 1 and all(errors):
+                if not has_worked and len(errors) == len(unit.starts) - 1 and all(errors):
                     raise
                 atoms = tuple(getattr(env, "atoms", ()))
                 none = (False,) * len(atoms)

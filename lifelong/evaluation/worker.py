@@ -130,8 +130,9 @@ class Worker:
             f"{unit.name}: attempt {tries} ended with {describe(error)}; traceback in {found.path}"
         )
         if self._evaluation.errors_are_failures and not isinstance(error, LiberoError):
-            last = tries > self._evaluation.retries
-            return self._evaluation.evaluate_apart(unit, self._pool) if last else None
+            if tries <= self._evaluation.retries:
+                return None
+            return self._evaluation.evaluate_apart(unit, self._pool, has_worked=self._folder.has_results)
         self._in_a_row += 1
         never_worked = not self._succeeded and not self._folder.has_results
         if isinstance(error, ConnectionLost) and tries <= self._evaluation.retries:

@@ -34,15 +34,15 @@ def hasty(monkeypatch):
 
 
 class Raising(Still):
-    """Raises an error for a task's unit that has as many simulations, the first few times."""
+    """Raises an error on some tasks, the first few times."""
 
-    def __init__(self, task: int, times: int, error: Exception | None = None):
+    def __init__(self, *tasks: int, times: int = 100, error: Exception | None = None):
         super().__init__()
-        self.task, self.times, self.calls = task, times, 0
+        self.tasks, self.times, self.calls = {TASKS[i].language for i in tasks}, times, 0
         self.error = error or RuntimeError("the socket is closed")
 
     def predict(self, observations):
-        if observations["instruction"] == TASKS[self.task].language and self.calls < self.times:
+        if observations["instruction"] in self.tasks and self.calls < self.times:
             self.calls += 1
             raise self.error
         return super().predict(observations)
@@ -208,7 +208,7 @@ def test_a_unit_that_two_processes_run_counts_once(tmp_path):
 
 def test_a_unit_that_fails_once_is_tried_again_after_the_others(tmp_path):
     said = []
-    policy = Raising(task=1, times=1)
+    policy = Raising(1, times=1)
     result = Worker(evaluation(tmp_path, policy, **TWO), on_error=said.append).run()
     assert result.outcomes == evaluate(tmp_path.with_name(f"{tmp_path.name}_alone"), **TWO).outcomes
     assert len(said) == 1 and "attempt 1 ended with RuntimeError: the socket is closed" in said[0]
@@ -217,7 +217,7 @@ def test_a_unit_that_fails_once_is_tried_again_after_the_others(tmp_path):
 
 def test_units_that_fail_are_not_counted_and_the_others_are_kept(tmp_path):
     with pytest.raises(EvaluationIncompleteError, match="2 of 4 units .*not counted.*socket is closed"):
-        evaluate(tmp_path, Raising(task=1, times=100), **TWO, retries=0)
+        evaluate(tmp_path, Raising(1), **TWO, retries=0)
     assert not (tmp_path / "eval.json").exists()
     entry = json.loads((tmp_path / "errors" / "libero_goal_01_starts_03_04.json").read_text())
     assert "Traceback" in entry["errors"][0]["traceback"]
@@ -228,7 +228,7 @@ def test_units_that_fail_are_not_counted_and_the_others_are_kept(tmp_path):
 
 
 def test_a_policy_that_never_works_ends_the_evaluation_with_its_own_error(tmp_path):
-    policy = Raising(task=0, times=100, error=KeyError("agentview_image"))
+    policy = Raising(0, error=KeyError("agentview_image"))
     with pytest.raises(KeyError, match="agentview_image"):
         evaluate(tmp_path, policy, **TWO)
     assert policy.calls == 1
@@ -254,8 +254,12 @@ def test_errors_are_failures_only_where_the_protocol_says_so(tmp_path):
     assert [r.successes for r in result.tasks] == [(True, True, False, False)] * 2
     assert result.tasks[0].errors == (None, None, "RuntimeError: lost the cup", None)
     assert EvaluationResult.read(tmp_path / "lenient") == result
-    with pytest.raises(RuntimeError, match="socket"):  # none of the episodes runs: that is no failed episode
-        evaluate(tmp_path / "down", Raising(task=0, times=100), errors_are_failures=True)
+    alone = evaluate(
+        tmp_path / "alone", Stumbling(), errors_are_failures=True, **changes | {"unit_starts": 1}
+    )
+    assert alone.outcomes == result.outcomes
+    with pytest.raises(RuntimeError, match="socket"):  # no episode has ever run: that is no failed one
+        evaluate(tmp_path / "down", Raising(0, 1), errors_are_failures=True)
 
 
 # --- bad input
