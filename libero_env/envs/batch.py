@@ -95,6 +95,9 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         Args:
             seed: One seed for each simulation, or one number from which they count up.
             options: `init_state`: index of one stored state, or of one for each simulation, (num_envs,).
+                `start`: instead of it, a state for each simulation, [time, qpos, qvel, poses of the fixtures].
+                `outdated_controller`: whether the controller takes the arm to be in its rest pose at first, as that of
+                the original, see `libero_env.sim.simulation.Simulations.outdate_controller`.
                 `reset_mask`: which simulations to reset, (num_envs,) bool; by default all.
 
         Raises:
@@ -103,17 +106,21 @@ class BatchEnv(gymnasium.vector.VectorEnv):
             PlacementError: The objects do not fit.
         """
         options = options or {}
-        check_options(options, valid=("init_state", "reset_mask"))
+        check_options(options, valid=("init_state", "start", "outdated_controller", "reset_mask"))
         request = ResetRequest.from_arguments(self.num_envs, seed, options)
         if not (ids := request.ids).size:
             return self._observe(ids), self._info()
         for i in ids:
             if (new_seed := request.seeds[i]) is not None:
                 self._generators[i] = np.random.Generator(np.random.PCG64(new_seed))
-        if request.init_states is not None:
+        if request.starts is not None:
+            self.world.reset_to(ids, request.starts[ids])
+        elif request.init_states is not None:
             self.world.reset_to_init(ids, request.init_states[ids])
         else:
             self.world.reset_random(ids, [self._generators[i] for i in ids])
+        if options.get("outdated_controller"):
+            self.world.simulations.outdate_controller(ids)
         self._steps[ids], self._running[ids], self._success[ids] = 0, True, False
         self._check_goals(ids)
         return self._observe(ids), self._info()

@@ -55,11 +55,13 @@ class ResetRequest:
         ids: Indices of the environments to reset.
         seeds: Seed of each environment, (num_envs,); None continues its generator.
         init_states: Index of the initial state of each environment, (num_envs,); None for new placements.
+        starts: State that each environment starts in, (num_envs, size); None for stored states or new placements.
     """
 
     ids: np.ndarray
     seeds: list[int | None]
     init_states: np.ndarray | None
+    starts: np.ndarray | None = None
 
     @classmethod
     def from_arguments(
@@ -70,10 +72,10 @@ class ResetRequest:
         Args:
             num_envs: Number of environments.
             seed: One seed for each environment, or one number from which they count up.
-            options: Reset options `init_state` and `reset_mask`; others are ignored.
+            options: Reset options `init_state`, `start` and `reset_mask`; others are ignored.
 
         Raises:
-            LiberoError: Seeds, mask or initial states have the wrong length.
+            LiberoError: Seeds, mask, initial states or starts have the wrong length.
         """
         mask = np.asarray(options.get("reset_mask", np.ones(num_envs, bool)), bool)
         if mask.shape != (num_envs,):
@@ -86,7 +88,12 @@ class ResetRequest:
                     f"init_state: expected one or {num_envs} integers, got shape {init_states.shape}"
                 )
             init_states = np.broadcast_to(init_states, (num_envs,))
-        return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states)
+        starts = None
+        if "start" in options:
+            starts = np.asarray(options["start"], np.float64)
+            if starts.ndim != 2 or len(starts) != num_envs or not np.isfinite(starts).all():
+                raise LiberoError(f"start: expected {num_envs} rows of finite numbers, got shape {starts.shape}")
+        return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts)
 
 
 def _seeds(num_envs: int, seed: int | Sequence[int | None] | None) -> list[int | None]:

@@ -101,6 +101,26 @@ class World:
         qpos, qvel, fixtures = split_row(self.scene.model, stored[chosen])
         self.simulations.reset(ids, qpos, qvel, fixtures=fixtures)
 
+    def reset_to(self, ids: Indices, rows: np.ndarray) -> None:
+        """Start simulations from given states.
+
+        Args:
+            ids: Indices of the simulations, (k,).
+            rows: States [time, qpos, qvel, pose of each fixture], (k, 1 + nq + nv + 7 nfixtures).
+
+        Raises:
+            LiberoError: The states have another length.
+        """
+        model, fixtures = self.scene.model, len(self.scene.fixtures)
+        size = 1 + model.nq + model.nv + 7 * fixtures
+        if rows.shape != (len(ids), size):
+            raise LiberoError(
+                f"{self.task.id}: a start has {size} numbers, [time, qpos, qvel] and the poses of {fixtures} fixtures; "
+                f"got {rows.shape[-1]}. Is it one of another task?"
+            )
+        qpos, qvel, poses = split_row(model, rows)
+        self.simulations.reset(ids, qpos, qvel, fixtures=poses)
+
     def reset_random(self, ids: Indices, generators: Sequence[np.random.Generator]) -> None:
         """Start simulations from new placements.
 

@@ -12,9 +12,10 @@ from tqdm import tqdm
 
 from libero_env.assets.pack import BUILTIN
 from libero_env.errors import LiberoError
+from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import sample_settled
 from libero_env.parallel import spawn_pool
-from libero_env.paths import cache_dir
+from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.storage import atomic_write_npz
@@ -80,6 +81,19 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
     states = generate_init_states(task, scene)
     atomic_write_npz(path, {"states": states})
     return states
+
+
+def load_original_states(task: Task) -> np.ndarray | None:
+    """Return the initial states that LIBERO publishes for a task, rows [time, qpos, qvel]; None without them.
+
+    They are in the folder `init_states` of the configuration file, laid out as LIBERO's `init_files`.
+
+    Raises:
+        StateFileError: The task's file is broken.
+    """
+    folder = read_config().get("init_states")
+    path = Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init" if folder else None
+    return read_states(path) if path is not None and path.is_file() else None
 
 
 def cache_init_states(task: Task) -> Path:

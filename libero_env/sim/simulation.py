@@ -8,6 +8,7 @@ substeps. Each substep runs the controller on the current kinematics, then the r
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -70,6 +71,7 @@ class Simulations(ABC):
         self.arm = ArmIndex.from_model(model)
         self.controller_state = ControllerState(num)
         self.fields: dict[str, np.ndarray] = {}
+        self._outdated = np.zeros(num, bool)
 
     @abstractmethod
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
@@ -77,9 +79,13 @@ class Simulations(ABC):
 
     @abstractmethod
     def _substeps(
-        self, ids: np.ndarray, actions: np.ndarray, before_last_kinematics: KinematicsHook | None
+        self,
+        ids: np.ndarray,
+        actions: np.ndarray,
+        before_last_kinematics: KinematicsHook | None,
+        believed: dict[str, np.ndarray],
     ) -> None:
-        """Run one control period with the goals that are set."""
+        """Run one control period with the goals that are set; in its first substep the controller sees `believed`."""
 
     @abstractmethod
     def _warm_start(self, i: int) -> list[np.ndarray]:
@@ -118,8 +124,44 @@ class Simulations(ABC):
         if fixtures is not None:
             self.fixtures[ids] = fixtures
         self._start(ids, qpos, qvel, time)
+        self._outdated[ids] = False
         pos, mat = self._grip_site()
         self.controller_state.restart(ids, pos[ids], mat[ids])
+
+    def outdate_controller(self, ids: Indices) -> None:
+        """Let the controller take the arm to be in its rest pose until the end of the next substep.
+
+        The original's controller does so between `reset`, which measures the arm in its rest pose, and the first substep
+        after `set_init_state`, which moves it: robosuite 1.4.0, controllers/base_controller.py, `new_update`. The first
+        goal is therefore relative to the rest pose.
+
+        Args:
+            ids: Indices of the simulations.
+        """
+        ids = np.asarray(ids, np.int64)
+        self._outdated[ids] = True
+        site, rest = self.arm.site, self._rest_fields
+        pos, mat = (np.repeat(rest[name][:, site], len(ids), 0) for name in ("site_xpos", "site_xmat"))
+        self.controller_state.restart(ids, pos, mat)
+
+    @cached_property
+    def _rest_fields(self) -> dict[str, np.ndarray]:
+        """Fields of a simulation whose arm is in its rest pose, (1, ...)."""
+        data = mujoco.MjData(self.model)
+        data.qpos[: len(REST)] = REST
+        mujoco.mj_forward(self.model, data)
+        found = {name: np.array(getattr(data, name))[None] for name in _FIELDS}
+        return {**found, "site_xmat": found["site_xmat"].reshape(1, self.model.nsite, 9)}
+
+    def _believed(self, ids: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the fields that the controller believes, (num, ...): those of the rest pose where it is outdated."""
+        if not self._outdated[ids].any():
+            return self.fields
+        believed = dict(self.fields)
+        for name in ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", MASS_FIELD):
+            believed[name] = self.fields[name].copy()
+            believed[name][self._outdated] = self._rest_fields[name]
+        return believed
 
     def pose_fixtures(self, i: int) -> None:
         """Write the poses of the fixtures of simulation i to the model."""
@@ -138,11 +180,11 @@ class Simulations(ABC):
                 integration and before its kinematics; there the original LIBERO observes. `LoopSimulations` only.
         """
         ids = np.asarray(ids, np.int64)
-        state = self.controller_state
-        state.controller.set_goals(
-            ids, actions, self.fields["qpos"], *self._grip_site(), state.goal, state.memory
-        )
-        self._substeps(ids, actions, before_last_kinematics)
+        state, believed, site = self.controller_state, self._believed(ids), self.arm.site
+        pos, mat = believed["site_xpos"][:, site], believed["site_xmat"][:, site]
+        state.controller.set_goals(ids, actions, believed["qpos"], pos, mat, state.goal, state.memory)
+        self._substeps(ids, actions, before_last_kinematics, believed)
+        self._outdated[ids] = False
 
     def get_state(self, i: int) -> np.ndarray:
         """Return all that the future of simulation i depends on, (state_size,).
@@ -227,7 +269,11 @@ class LoopSimulations(Simulations):
         self._gather(ids)
 
     def _substeps(
-        self, ids: np.ndarray, actions: np.ndarray, before_last_kinematics: KinematicsHook | None
+        self,
+        ids: np.ndarray,
+        actions: np.ndarray,
+        before_last_kinematics: KinematicsHook | None,
+        believed: dict[str, np.ndarray],
     ) -> None:
         model, constants, first = self.model, self._constants(), np.zeros(1, np.int64)
         kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
@@ -239,7 +285,10 @@ class LoopSimulations(Simulations):
             for substep in range(SUBSTEPS):
                 for _ in range(_SOLVES_BEFORE_STEP):
                     mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, True)
-                kernel(first, actions[row], *inputs, goal, memory, gripper, ctrl, *constants)
+                seen = inputs
+                if substep == 0 and believed is not self.fields:
+                    seen = self._inputs({name: values[row] for name, values in believed.items()})
+                kernel(first, actions[row], *seen, goal, memory, gripper, ctrl, *constants)
                 mujoco.mj_step2(model, data)
                 if before_last_kinematics is not None and substep == SUBSTEPS - 2:
                     before_last_kinematics(data)
@@ -290,14 +339,20 @@ class BatchSimulations(Simulations):
         self._qacc_warmstart[ids] = 0.0
 
     def _substeps(
-        self, ids: np.ndarray, actions: np.ndarray, before_last_kinematics: KinematicsHook | None
+        self,
+        ids: np.ndarray,
+        actions: np.ndarray,
+        before_last_kinematics: KinematicsHook | None,
+        believed: dict[str, np.ndarray],
     ) -> None:
         if before_last_kinematics is not None:
             raise LiberoError("batched simulations take no before_last_kinematics hook; use LoopSimulations")
         kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
-        inputs, ctrl, constants = self._inputs(self.fields), self.fields["ctrl"], self._constants()
+        inputs, ctrl, constants = self._inputs(believed), self.fields["ctrl"], self._constants()
         stage = mujoco.mjtStage.mjSTAGE_VEL
-        for _ in range(SUBSTEPS):
+        for substep in range(SUBSTEPS):
+            if substep == 1 and believed is not self.fields:
+                inputs = self._inputs(self.fields)
             kernel(ids, actions, *inputs, *state, ctrl, *constants)
             self._batch.step(ids, nstep=1, stage=stage)
 

@@ -1,58 +1,32 @@
-"""Protocols of an evaluation: horizons, settling, image sizes, and the initial states that are used."""
+"""Protocols by name, and the initial states that are used."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 
 from libero_env.init_states.store import NUM_INIT_STATES
-from libero_env.tasks import Task
 from lifelong.errors import ConfigError
+from lifelong.evaluation.card import Card
+from lifelong.evaluation.card_files import card_names, load_card
 
 # Initial states by which a checkpoint is chosen by default
 SELECTION = range(NUM_INIT_STATES - 20, NUM_INIT_STATES)
 
 
-@dataclass(frozen=True)
-class EvalProtocol:
-    """How episodes are run.
+class _Protocols(Mapping[str, Card]):
+    """The package's cards by name, read when they are asked for."""
 
-    Attributes:
-        horizon: Maximum number of control steps, or that of each suite.
-        settle_steps: Number of steps before the policy acts.
-        settle_action: Action of these steps; None for zeros.
-        camera_size: Image size (height, width), [pixels], for policies that do not define it.
-        original: Whether observations have the names and flipped images of LIBERO's own environments.
-    """
+    def __getitem__(self, name: str) -> Card:
+        if name not in card_names():
+            raise KeyError(name)
+        return load_card(name)
 
-    horizon: int | Mapping[str, int] = 600
-    settle_steps: int = 5
-    settle_action: tuple[float, ...] | None = None
-    camera_size: tuple[int, int] = (128, 128)
-    original: bool = False
+    def __iter__(self) -> Iterator[str]:
+        return iter(card_names())
 
-    def steps(self, task: Task) -> int:
-        """Return the maximum number of control steps on a task."""
-        if isinstance(self.horizon, int):
-            return self.horizon
-        return self.horizon.get(task.suite, max(self.horizon.values()))
+    def __len__(self) -> int:
+        return len(card_names())
 
 
-# `libero`: Liu et al. 2023, appendix B. `openpi`: the evaluation scripts of openpi and OpenVLA-OFT.
-PROTOCOLS = {
-    "libero": EvalProtocol(),
-    "openpi": EvalProtocol(
-        horizon={
-            "libero_spatial": 220,
-            "libero_object": 280,
-            "libero_goal": 300,
-            "libero_10": 520,
-            "libero_90": 400,
-        },
-        settle_steps=10,
-        settle_action=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0),
-        camera_size=(256, 256),
-        original=True,
-    ),
-}
+PROTOCOLS: Mapping[str, Card] = _Protocols()
 
 
 def choose_init_states(

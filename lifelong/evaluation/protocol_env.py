@@ -1,0 +1,105 @@
+"""Simulations of a task that start as a protocol says."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from libero_env.envs.batch import BatchEnv
+from libero_env.init_states.original_resets import OriginalResets, drawn_fixtures
+from libero_env.init_states.store import load_original_states
+from libero_env.sim.scene import Scene
+from libero_env.tasks import Task
+from lifelong.errors import ConfigError
+from lifelong.evaluation.card import Card
+from lifelong.evaluation.inputs import Obs
+
+
+class ProtocolEnv:
+    """A `BatchEnv` whose initial states are a protocol's, fixtures included.
+
+    What an episode starts in depends on protocol, task and initial state alone, so that any part of the initial states
+    can be run by itself.
+
+    Attributes:
+        env: The simulations.
+        card: The protocol.
+        num_envs: Number of simulations.
+    """
+
+    def __init__(self, env: BatchEnv, card: Card):
+        self.env, self.card, self.num_envs = env, card, env.num_envs
+
+    @property
+    def atoms(self) -> tuple[str, ...]:
+        """Atoms of the goal, in the order of `progress` in infos."""
+        return self.env.atoms
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict]:
+        """Start episodes in the initial states of the option `init_state`, (num_envs,) indices.
+
+        Raises:
+            ConfigError: An initial state does not exist.
+        """
+        options = dict(options or {})
+        if self.card.world.fixture_poses == "stored" or "init_state" not in options:
+            return self.env.reset(seed=seed, options=options)
+        starts = np.broadcast_to(options.pop("init_state"), (self.num_envs,)).tolist()
+        rows = start_rows(self.env.task, self.env.world.scene, self.card, starts, self._stored())
+        return self.env.reset(seed=seed, options={**options, "start": rows, "outdated_controller": True})
+
+    def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict]:
+        """Apply actions, see `BatchEnv.step`."""
+        return self.env.step(actions)
+
+    def close(self) -> None:
+        """Free the simulations."""
+        self.env.close()
+
+    def _stored(self) -> np.ndarray:
+        """Return the initial states of the task that the protocol names, rows that begin with [time, qpos, qvel]."""
+        if self.card.world.init_states == "builtin":
+            return self.env.world.init_states
+        states = load_original_states(self.env.task)
+        if states is None:
+            raise ConfigError(
+                f"{self.env.task.id}: protocol {self.card.name} starts from the states that LIBERO publishes, which are "
+                "not here: name LIBERO's folder init_files under init_states in ~/.libero/config.yaml"
+            )
+        return states
+
+
+def start_rows(
+    task: Task, scene: Scene, card: Card, starts: Sequence[int], stored: np.ndarray
+) -> np.ndarray:
+    """Return the states in which episodes of a protocol start.
+
+    Args:
+        task: Task.
+        scene: Compiled scene of the task.
+        card: Protocol whose fixtures are drawn.
+        starts: Indices of the initial states.
+        stored: Initial states of the task, rows that begin with [time, qpos, qvel].
+
+    Returns:
+        Rows [time, qpos, qvel, poses of the fixtures], one for each start.
+
+    Raises:
+        ConfigError: An initial state does not exist.
+    """
+    if not all(0 <= i < len(stored) for i in starts):
+        raise ConfigError(f"{task.id} has initial states 0 to {len(stored) - 1}; got {list(starts)}")
+    size = 1 + scene.model.nq + scene.model.nv
+    poses = fixture_poses(task, scene, card, starts)
+    return np.stack([np.concatenate([stored[i][:size], poses[i].ravel()]) for i in starts])
+
+
+def fixture_poses(task: Task, scene: Scene, card: Card, starts: Sequence[int]) -> dict[int, np.ndarray]:
+    """Return the poses of the fixtures at the start of episodes, (nfixtures, 7), by initial state."""
+    if not scene.fixtures:
+        return {i: np.zeros((0, 7)) for i in starts}
+    loads = card.world.loads or 1
+    if card.world.seeding == "once":
+        drawn = list(drawn_fixtures(scene, card.env_seed(task, 0) or 0, max(starts) + 1, loads))
+        return {i: drawn[i] for i in starts}
+    return {i: OriginalResets(scene, card.env_seed(task, i) or 0, loads).reset() for i in set(starts)}
