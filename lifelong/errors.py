@@ -33,6 +33,12 @@ class PolicyError(LifelongError, ValueError):
     """Raised when a policy is built or used in an invalid way; the message states what is valid."""
 
 
+class MissingObservationError(PolicyError, KeyError):
+    """Raised when a policy asks for an observation that it is not given; the message lists those that it is."""
+
+    __str__ = PolicyError.__str__  # that of KeyError quotes the message
+
+
 class ResultsError(LifelongError):
     """Raised when results cannot be read or written; the message names the file and what is missing."""
 

@@ -92,7 +92,9 @@ class ResetRequest:
         if "start" in options:
             starts = np.asarray(options["start"], np.float64)
             if starts.ndim != 2 or len(starts) != num_envs or not np.isfinite(starts).all():
-                raise LiberoError(f"start: expected {num_envs} rows of finite numbers, got shape {starts.shape}")
+                raise LiberoError(
+                    f"start: expected {num_envs} rows of finite numbers, got shape {starts.shape}"
+                )
         return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts)
 
 

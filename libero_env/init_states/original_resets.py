@@ -27,7 +27,11 @@ _MAX_TRIES = 5000  # of one object, as in the original
 _MAX_RESETS = 100  # for one episode: the original repeats a reset whose objects do not fit, without end
 _LIFT = 0.01  # [m] of objects over their surface, and of fixtures over the underside of the table top
 _JOINT_STATES = ("Open", "Close", "Turnon", "Turnoff")
-_WITHIN_BOUNDS = ("libero_tabletop", "libero_floor", "libero_coffee_table")  # whose objects lie whole in their region
+_WITHIN_BOUNDS = (
+    "libero_tabletop",
+    "libero_floor",
+    "libero_coffee_table",
+)  # whose objects lie whole in their region
 
 
 class OriginalResets:
@@ -220,7 +224,10 @@ class _Plan:
         if not self.on_sites:
             return {}
         model = copy(scene.model)
-        model.body_pos[scene.fixture_bodies], model.body_quat[scene.fixture_bodies] = 0.0, (1.0, 0.0, 0.0, 0.0)
+        model.body_pos[scene.fixture_bodies], model.body_quat[scene.fixture_bodies] = (
+            0.0,
+            (1.0, 0.0, 0.0, 0.0),
+        )
         data = mujoco.MjData(model)
         for name, value in zip(self.joint_names, joints, strict=True):
             for joint in scene.joints.get(name, ()):

@@ -131,9 +131,9 @@ class Simulations(ABC):
     def outdate_controller(self, ids: Indices) -> None:
         """Let the controller take the arm to be in its rest pose until the end of the next substep.
 
-        The original's controller does so between `reset`, which measures the arm in its rest pose, and the first substep
-        after `set_init_state`, which moves it: robosuite 1.4.0, controllers/base_controller.py, `new_update`. The first
-        goal is therefore relative to the rest pose.
+        The original's controller does so between `reset`, which measures the arm in its rest pose, and the first
+        substep after `set_init_state`, which moves it: robosuite 1.4.0, controllers/base_controller.py, `new_update`.
+        The first goal is therefore relative to the rest pose.
 
         Args:
             ids: Indices of the simulations.

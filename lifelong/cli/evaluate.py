@@ -6,7 +6,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,14 +48,20 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
         "--episodes", type=int, help="number of these starts, from the first on (default: all of them)"
     )
     parser.add_argument(
-        "--protocol", default="libero", help="libero, or openpi with its horizons, settling, images and names"
+        "--protocol",
+        default="libero",
+        metavar="CARD",
+        help="libero, openpi, ..., see `libero protocols list`; or a card of your own, my.yaml (default: libero)",
     )
     parser.add_argument(
         "--horizon", type=int, help="maximum number of control steps (default: the protocol's)"
     )
     parser.add_argument("--size", type=int, help="image size in pixels, for a policy that does not define it")
     parser.add_argument(
-        "--names", choices=("native", "original"), help="names of observations (default: the protocol's)"
+        "--names",
+        choices=("native", "original", "protocol"),
+        help="what a policy of your own receives: this package's observations, the original's, or the protocol's "
+        "inputs (default: native for upright images, otherwise original)",
     )
     parser.add_argument("--videos", type=int, default=0, metavar="N", help="record N episodes of each task")
     parser.add_argument("--seed", type=int, default=0, help="seed of stochastic policies (default: 0)")
@@ -214,15 +219,15 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
         LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
     """
     from libero_env.cli.tasks import find_tasks
-    from libero_env.errors import UnknownNameError
     from lifelong.evaluation.candidates import PolicyUnderTest, RunPolicy, UserPolicy
-    from lifelong.evaluation.protocols import PROTOCOLS, choose_init_states
+    from lifelong.evaluation.card_files import load_card
+    from lifelong.evaluation.protocol_env import resolve_world
+    from lifelong.evaluation.protocols import choose_init_states
     from lifelong.evaluation.suite import SuiteEvaluation
     from lifelong.evaluation.units import UNIT_STARTS
     from lifelong.results.records import installed_versions
 
-    if args.protocol not in PROTOCOLS:
-        raise UnknownNameError("protocol", args.protocol, list(PROTOCOLS))
+    card = load_card(args.protocol)
     policy: PolicyUnderTest
     if "://" in args.policy:
         from lifelong.evaluation.servers.policy import ServerPolicy
@@ -233,9 +238,12 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     tasks = find_tasks(args.suite) if args.suite else policy.tasks
     if not tasks:
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
-    protocol = policy.protocol(PROTOCOLS[args.protocol])
+    protocol, notes = resolve_world(policy.protocol(card), tasks, args.assets)
     if args.horizon:
-        protocol = replace(protocol, horizon=args.horizon)
+        protocol = protocol.changed({"episode.horizon": args.horizon})
+    protocol.require()
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr, flush=True)
     init_states = choose_init_states(args.starts, args.episodes, policy.selection)
     return SuiteEvaluation(
         identity={**policy.identity, "seed": args.seed},
@@ -247,6 +255,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
         actor=lambda task, states: policy.actor(task, states, protocol),
         unit_starts=UNIT_STARTS if args.unit_starts is None else args.unit_starts,
         retries=args.retries,
+        errors_are_failures=protocol.episode.errors == "failure",
         videos=args.videos,
         progress=sys.stderr.isatty() and args.workers == 1,
         versions=installed_versions(args.assets),

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lifelong.errors import PolicyError
-from lifelong.evaluation.inputs import Obs
+from lifelong.errors import MissingObservationError, PolicyError
+from lifelong.evaluation.inputs import Adapter, Obs, PolicyInput
 from lifelong.policies.base import Policy
 from lifelong.training.precision import autocast
 from lifelong.types import Observation, PolicySpec
@@ -106,6 +106,16 @@ def as_original(obs: Obs) -> dict[str, np.ndarray]:
     return found
 
 
+class Observations(dict[str, Any]):
+    """Observations by name; a name that is not among them is an error that says which there are."""
+
+    def __missing__(self, name: str) -> Any:
+        hint = "protocols with the original's names have no others; --names native gives this package's"
+        if name in ORIGINAL_NAMES.values():
+            hint = "--names original gives the original's names"
+        raise MissingObservationError(f"there is no observation {name!r}, but {', '.join(self)}; {hint}")
+
+
 @dataclass
 class CallableActor:
     """A user-defined object with `predict(observations) -> actions`.
@@ -141,8 +151,8 @@ class CallableActor:
             PolicyError: The actions have the wrong shape, or are not finite.
         """
         given = as_original(obs) if self.original else obs
-        answer = self.policy.predict({**given, "instruction": self.instruction})
-        actions = np.asarray(answer.detach().cpu() if isinstance(answer, Tensor) else answer, np.float64)
+        answer = self.policy.predict(Observations(given, instruction=self.instruction))
+        actions = _as_array(answer)
         expected = (len(next(iter(obs.values()))), self.action_dim)
         name = f"{type(self.policy).__name__}.predict"
         if actions.shape != expected:
@@ -150,6 +160,73 @@ class CallableActor:
         if not np.isfinite(actions).all():
             raise PolicyError(f"{name} returned actions that are not finite")
         return actions
+
+
+@dataclass
+class ProtocolActor:
+    """A user-defined object that is given a protocol's inputs, and answers in the protocol's convention.
+
+    Its `predict` receives for the running simulations that need actions: an array (B, H, W, 3) by name of each camera,
+    `state` (B, 8), and `instruction`. It returns (B, 7) actions, or chunks (B, H, 7), of which the protocol executes as
+    many as it says before it asks again.
+
+    Attributes:
+        policy: The object.
+        adapter: Conversion of observations and actions under the protocol.
+        replan: Number of actions of a chunk that are executed; None for all.
+        views: Names of the observed images that recorded rollouts show.
+        action_dim: Dimension A of actions.
+    """
+
+    policy: Any
+    adapter: Adapter
+    replan: int | None
+    views: tuple[str, ...]
+    action_dim: int = ACTION_DIM
+
+    def reset(self, num_envs: int) -> None:
+        """Forget what was predicted, and call the object's `reset`, if it has one; see `Actor`."""
+        self._waiting: list[np.ndarray] = []
+        self._num_envs = num_envs
+        self._reset_policy = True
+
+    def act(self, obs: Obs) -> np.ndarray:
+        """Return the object's actions; see `Actor`.
+
+        Raises:
+            PolicyError: The actions have the wrong shape, are too few, or are not finite.
+        """
+        if not self._waiting:
+            inputs = self.adapter.inputs(obs)
+            if self._reset_policy and hasattr(self.policy, "reset"):
+                self.policy.reset(inputs[0].prompt, self._num_envs)
+            self._reset_policy = False
+            self._waiting = self._predict(inputs)
+        return self._waiting.pop(0)
+
+    def _predict(self, inputs: Sequence[PolicyInput]) -> list[np.ndarray]:
+        """Return the actions (B, A) of the next steps."""
+        images = {name: np.stack([one.images[name] for one in inputs]) for name in inputs[0].images}
+        given = Observations(
+            images, state=np.stack([one.state for one in inputs]), instruction=inputs[0].prompt
+        )
+        found, name = _as_array(self.policy.predict(given)), f"{type(self.policy).__name__}.predict"
+        chunks = found[:, None] if found.ndim == 2 else found
+        if chunks.ndim != 3 or chunks.shape[::2] != (len(inputs), self.action_dim):
+            raise PolicyError(
+                f"{name} returned actions of shape {found.shape}; expected ({len(inputs)}, {self.action_dim}), or "
+                f"chunks ({len(inputs)}, H, {self.action_dim})"
+            )
+        count = chunks.shape[1] if self.replan is None or found.ndim == 2 else self.replan
+        if chunks.shape[1] < count:
+            raise PolicyError(
+                f"{name} returned {chunks.shape[1]} actions; the protocol executes {count} of them"
+            )
+        return list(self.adapter.actions(chunks[:, :count]).swapaxes(0, 1))
+
+
+def _as_array(answer: Any) -> np.ndarray:
+    return np.asarray(answer.detach().cpu() if isinstance(answer, Tensor) else answer, np.float64)
 
 
 def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) -> Observation:

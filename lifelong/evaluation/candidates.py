@@ -8,20 +8,24 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import LifelongError
-from lifelong.evaluation.actors import Actor, CallableActor, PolicyActor
+from lifelong.evaluation.actors import Actor, CallableActor, PolicyActor, ProtocolActor
+from lifelong.evaluation.adapter import CardAdapter
+from lifelong.evaluation.card import Card
 from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.protocols import SELECTION, EvalProtocol
+from lifelong.evaluation.protocol_env import ProtocolEnv
+from lifelong.evaluation.protocols import SELECTION
 from lifelong.evaluation.restore import restore
 from lifelong.seeding import generator
 
+OBSERVATIONS = ("rgb", "proprioception", "ee_quat")
 ROLLOUT = 4  # first word of the seeds of stochastic policies; those of runs are in lifelong.sequence
 
 
@@ -43,17 +47,15 @@ class PolicyUnderTest(ABC):
     on_cpu: bool = False
 
     @abstractmethod
-    def protocol(self, base: EvalProtocol) -> EvalProtocol:
-        """Return a protocol with the policy's own image size and steps."""
+    def protocol(self, base: Card) -> Card:
+        """Return the protocol as it is run with the policy, such as with the image size that it was trained on."""
 
     @abstractmethod
-    def env(self, task: Task, count: int, protocol: EvalProtocol) -> VectorEnv:
+    def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
         """Build the environment of a task with the given number of simulations."""
 
     @abstractmethod
-    def actor(
-        self, task: Task, states: Sequence[int], protocol: EvalProtocol
-    ) -> AbstractContextManager[Actor]:
+    def actor(self, task: Task, states: Sequence[int], protocol: Card) -> AbstractContextManager[Actor]:
         """Return the context manager of the task's actor, which starts in the given initial states."""
 
 
@@ -71,26 +73,26 @@ class RunPolicy(PolicyUnderTest):
         self.selection = tuple(self.run.eval.init_states("curve"))
         self.on_cpu = self.run.device.type == "cpu"
 
-    def protocol(self, base: EvalProtocol) -> EvalProtocol:
-        settings = self.run.eval
-        if self.args.protocol == "libero":  # a run may have other values
-            base = replace(base, horizon=settings.horizon, settle_steps=settings.settle_steps)
-        return replace(base, camera_size=self.run.policy.spec.image_size, original=False)
+    def protocol(self, base: Card) -> Card:
+        """Return the protocol with the run's images and one prediction for each step; see `PolicyUnderTest`."""
+        settings, size = self.run.eval, self.run.policy.spec.image_size
+        return run_protocol(base, size, settings.horizon, settings.settle_steps)
 
-    def env(self, task: Task, count: int, protocol: EvalProtocol) -> VectorEnv:
+    def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
 
-        return BatchEnv(
+        cameras = tuple(CAMERAS[view] for view in self.run.policy.spec.views)
+        return make_env(
             task,
             count,
-            num_threads=self.args.threads,
-            cameras=tuple(CAMERAS[view] for view in self.run.policy.spec.views),
-            camera_size=protocol.camera_size,
-            horizon=protocol.steps(task) + protocol.settle_steps,
+            protocol,
+            cameras=cameras,
+            threads=self.args.threads,
             assets=self.args.assets,
+            drawing=None,
         )
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+    def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
 
         run = self.run
         draws = [generator(self.args.seed, ROLLOUT, task.index, state) for state in states]
@@ -109,32 +111,106 @@ class UserPolicy(PolicyUnderTest):
         self.out = Path("eval") / args.policy.replace(":", ".")
         self.selection = SELECTION
 
-    def protocol(self, base: EvalProtocol) -> EvalProtocol:
-        args, size = self.args, tuple(getattr(self.policy, "camera_size", base.camera_size))
-        if args.size:
-            size = (args.size, args.size)
-        original = base.original if args.names is None else args.names == "original"
-        return replace(base, camera_size=size, original=original)
+    def protocol(self, base: Card) -> Card:
+        """Return the protocol with the policy's own image size, if it has one; see `PolicyUnderTest`."""
+        size = getattr(self.policy, "camera_size", None)
+        if self.args.size:
+            size = (self.args.size, self.args.size)
+        return base if size is None else base.changed({"pixels.render_size": tuple(size)})
 
-    def env(self, task: Task, count: int, protocol: EvalProtocol) -> VectorEnv:
+    def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
 
-        default = ("rgb", "proprioception", "ee_quat")
-        return BatchEnv(
+        return make_env(
             task,
             count,
-            num_threads=self.args.threads,
+            protocol,
             cameras=self.cameras,
-            camera_size=protocol.camera_size,
-            horizon=protocol.steps(task) + protocol.settle_steps,
-            observations=tuple(getattr(self.policy, "observations", default)),
+            observations=tuple(getattr(self.policy, "observations", OBSERVATIONS)),
+            threads=self.args.threads,
             assets=self.args.assets,
         )
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+    def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
 
         views = tuple(f"{camera.removeprefix('robot0_')}_rgb" for camera in self.cameras)
-        yield CallableActor(self.policy, task.language, views, protocol.original)
+        names = self.args.names or ("native" if protocol.pixels.orientation == "upright" else "original")
+        if names == "protocol":
+            yield ProtocolActor(self.policy, CardAdapter(protocol, task), protocol.action.replan, views)
+        else:
+            yield CallableActor(self.policy, protocol.prompt(task), views, names == "original")
+
+
+def run_protocol(base: Card, image_size: tuple[int, int], horizon: int, settle_steps: int) -> Card:
+    """Return a protocol as it is run with a policy of this package.
+
+    The policy sees upright images of the size that it was trained on, and predicts an action for each step. Under
+    `libero`, episodes have the run's own length and settling.
+
+    Args:
+        base: Protocol.
+        image_size: Height and width of the policy's images, [pixels].
+        horizon: Maximum number of control steps of an episode of the run.
+        settle_steps: Number of steps before the policy acts in the run.
+    """
+    own: dict[str, Any] = {
+        "pixels.render_size": tuple(image_size),
+        "pixels.orientation": "upright",
+        "pixels.resize": "none",
+        "pixels.resize_size": None,
+        "pixels.crop": 1.0,
+        "action.gripper": "as_predicted",
+        "action.chunk": 1,
+        "action.replan": 1,
+    }
+    if base.name == "libero":
+        own |= {"episode.horizon": horizon, "episode.settle_steps": settle_steps}
+        own["episode.settle_action"] = base.settle_action if settle_steps else None
+    return base.changed(own)
+
+
+def make_env(
+    task: Task,
+    count: int,
+    protocol: Card,
+    *,
+    cameras: Sequence[str] | None = None,
+    observations: Sequence[str] = OBSERVATIONS,
+    threads: int = 0,
+    assets: str | None = None,
+    drawing: str | None = "protocol",
+) -> ProtocolEnv:
+    """Build the environment of a task under a protocol.
+
+    Args:
+        task: Task.
+        count: Number of simulations.
+        protocol: Protocol.
+        cameras: Cameras that are rendered; by default the protocol's.
+        observations: Names of observations, see `libero_env.sim.observations`.
+        threads: Number of threads of the simulations; 0 is one for each core.
+        assets: Models, see `libero_env.envs.config.EnvConfig`.
+        drawing: How images are drawn; by default as the protocol says, None for the models' default.
+    """
+    world = protocol.world
+    size = protocol.pixels.render_size
+    assert size is not None, "the protocol has been checked by require()"
+    env = BatchEnv(
+        task,
+        count,
+        num_threads=threads,
+        cameras=protocol.pixels.cameras if cameras is None else tuple(cameras),
+        camera_size=size,
+        horizon=protocol.steps(task) + protocol.settle_steps,
+        observations=tuple(observations),
+        controller=world.controller,
+        control_delta=world.delta,
+        semantics=world.predicates,
+        assets=assets,
+        drawing=world.drawing if drawing == "protocol" else drawing,
+        robot=world.robot or DEFAULT_ROBOT,
+    )
+    return ProtocolEnv(env, protocol)
 
 
 def load_callable(text: str) -> Any:

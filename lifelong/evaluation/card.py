@@ -1,8 +1,8 @@
 """Protocol cards: everything that decides what a policy sees and how its episodes are judged.
 
 A card is a YAML file; `lifelong.evaluation.card_files` reads it. The dataclasses below are its sections. A value of
-null means that the source of the protocol does not state it: it is never guessed, and a card is run only when all that a
-run needs is stated.
+null means that the source of the protocol does not state it: it is never guessed, and a card is run only when all that
+a run needs is stated.
 """
 
 import hashlib
@@ -355,7 +355,7 @@ class Card:
         Raises:
             ProtocolMismatchError: Values differ; the message names both of each.
         """
-        own = self.flat()
+        own = {k: v for k, v in self.flat().items() if "." in k}
         given = {k: v for k, v in _flat(announced) if k in own}
         wrong = [
             f"{name}: protocol {self.name} has {own[name]!r}, the policy {value!r}"

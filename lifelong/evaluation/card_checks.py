@@ -33,9 +33,7 @@ def _matches(value: Any, hint: Any) -> bool:
     if origin is tuple and args[-1] is Ellipsis:
         return isinstance(value, tuple) and all(_matches(v, args[0]) for v in value)
     if origin is tuple:
-        return (
-            isinstance(value, tuple) and len(value) == len(args) and all(map(_matches, value, args))
-        )
+        return isinstance(value, tuple) and len(value) == len(args) and all(map(_matches, value, args))
     if origin is not None and issubclass(origin, Mapping):
         return isinstance(value, Mapping) and all(
             _matches(k, args[0]) and _matches(v, args[1]) for k, v in value.items()
@@ -70,7 +68,13 @@ def contradictions(v: Mapping[str, Any]) -> list[str]:
         v: Values by dotted name.
     """
     found = [text for text in (*_episode(v), *_pixels(v), *_action(v), *_world(v)) if text]
-    for name in ("sampling.denoising_steps", "sampling.batch", "counting.tasks", "counting.trials", "action.chunk"):
+    for name in (
+        "sampling.denoising_steps",
+        "sampling.batch",
+        "counting.tasks",
+        "counting.trials",
+        "action.chunk",
+    ):
         if v[name] is not None and v[name] < 1:
             found.append(f"{name} is {v[name]}; it must be at least 1")
     if "{instruction}" not in v["language.template"]:

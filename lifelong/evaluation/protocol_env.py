@@ -5,12 +5,15 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.assets.pack import BUILTIN, select_pack
 from libero_env.envs.batch import BatchEnv
+from libero_env.envs.config import EnvConfig
+from libero_env.envs.world import World
 from libero_env.init_states.original_resets import OriginalResets, drawn_fixtures
 from libero_env.init_states.store import load_original_states
 from libero_env.sim.scene import Scene
 from libero_env.tasks import Task
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, ProtocolMismatchError
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.inputs import Obs
 
@@ -29,6 +32,16 @@ class ProtocolEnv:
 
     def __init__(self, env: BatchEnv, card: Card):
         self.env, self.card, self.num_envs = env, card, env.num_envs
+
+    @property
+    def world(self) -> World:
+        """Simulations, scene and observer."""
+        return self.env.world
+
+    @property
+    def config(self) -> EnvConfig:
+        """Configuration of the simulations."""
+        return self.env.config
 
     @property
     def atoms(self) -> tuple[str, ...]:
@@ -63,15 +76,45 @@ class ProtocolEnv:
         states = load_original_states(self.env.task)
         if states is None:
             raise ConfigError(
-                f"{self.env.task.id}: protocol {self.card.name} starts from the states that LIBERO publishes, which are "
-                "not here: name LIBERO's folder init_files under init_states in ~/.libero/config.yaml"
+                f"{self.env.task.id}: protocol {self.card.name} starts from the states that LIBERO publishes, which "
+                "are not here: name LIBERO's folder init_files under init_states in ~/.libero/config.yaml"
             )
         return states
 
 
-def start_rows(
-    task: Task, scene: Scene, card: Card, starts: Sequence[int], stored: np.ndarray
-) -> np.ndarray:
+def resolve_world(card: Card, tasks: Sequence[Task], assets: str | None = None) -> tuple[Card, list[str]]:
+    """Return a card with the models and initial states that are here, and a line for each that is not as it says.
+
+    Args:
+        card: Protocol.
+        tasks: Tasks that are to be run.
+        assets: Models that the user has chosen, see `libero_env.assets.pack.select_pack`.
+
+    Raises:
+        ProtocolMismatchError: The models have another digest than the card names.
+    """
+    changes: dict[str, Any] = {}
+    notes: list[str] = []
+    pack = select_pack(assets)
+    digest = getattr(pack, "digest", None)
+    if card.world.models_digest is not None and card.world.models_digest != digest:
+        raise ProtocolMismatchError(
+            f"world.models_digest: protocol {card.name} has {card.world.models_digest}, the models here {digest}"
+        )
+    here = "builtin" if pack.name == BUILTIN else "original"
+    if card.world.models not in ("any", here):
+        changes["world.models"] = here
+        notes.append(f"models: {here}, where protocol {card.name} has {card.world.models} (see --assets)")
+    if card.world.init_states == "original" and any(load_original_states(t) is None for t in tasks):
+        changes["world.init_states"] = "builtin"
+        notes.append(
+            f"initial states: this package's, where protocol {card.name} has those that LIBERO publishes "
+            "(init_states in ~/.libero/config.yaml)"
+        )
+    return card.changed(changes), notes
+
+
+def start_rows(task: Task, scene: Scene, card: Card, starts: Sequence[int], stored: np.ndarray) -> np.ndarray:
     """Return the states in which episodes of a protocol start.
 
     Args:

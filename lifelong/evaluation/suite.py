@@ -7,7 +7,7 @@ a folder they share, see `lifelong.evaluation.worker`; each may be killed, and t
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -18,11 +18,11 @@ from libero_env.tasks import Task
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor
+from lifelong.evaluation.card import Card
 from lifelong.evaluation.claims import LEASE
 from lifelong.evaluation.environment_record import common_environment, describe_environment
 from lifelong.evaluation.environments import EnvPool, VectorEnv
 from lifelong.evaluation.progress import busy_seconds
-from lifelong.evaluation.protocols import EvalProtocol
 from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_animation
 from lifelong.evaluation.units import UNIT_STARTS, Unit, partition
 from lifelong.evaluation.work_folder import PLAN_FORMAT, UnitResult, WorkFolder, describe, this_process
@@ -61,7 +61,7 @@ class SuiteEvaluation:
     identity: Mapping[str, Any]
     tasks: Sequence[Task]
     init_states: tuple[int, ...]
-    protocol: EvalProtocol
+    protocol: Card
     out: Path
     env: Callable[[Task, int], VectorEnv]
     actor: Callable[[Task, Sequence[int]], AbstractContextManager[Actor]]
@@ -98,7 +98,7 @@ class SuiteEvaluation:
 
     @property
     def _resolved_protocol(self) -> dict[str, Any]:
-        return json_safe(asdict(self.protocol))
+        return json_safe(self.protocol.resolved())
 
     def pool(self) -> EnvPool:
         """Return a pool that keeps the environment of the last unit open, for the next one of the same task."""

@@ -7,12 +7,15 @@ import numpy as np
 
 from libero_env.tasks import get_suite
 from lifelong.evaluation.actors import CallableActor
-from lifelong.evaluation.protocols import EvalProtocol
+from lifelong.evaluation.protocols import PROTOCOLS
 from lifelong.evaluation.suite import SuiteEvaluation
 from lifelong.evaluation.worker import Worker
 from lifelong.results.evaluation_file import EvaluationResult
 
 TASKS = get_suite("libero_goal").tasks[:2]
+QUICK = PROTOCOLS["libero"].changed(
+    {"episode.horizon": 10, "episode.settle_steps": 0, "episode.settle_action": None}
+)
 
 
 class Countdown:
@@ -66,7 +69,7 @@ def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
         "identity": {"policy": "still"},
         "tasks": TASKS,
         "init_states": (3, 4, 9, 20),
-        "protocol": EvalProtocol(horizon=10, settle_steps=0),
+        "protocol": QUICK,
         "env": lambda task, count: Countdown(count),
         "versions": {"mujoco": "3"},
     }

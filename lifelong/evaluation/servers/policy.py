@@ -4,18 +4,19 @@ import argparse
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
-from libero_env.envs.batch import BatchEnv
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Task, get_task
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ServerError
 from lifelong.evaluation.actors import Actor
-from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest
+from lifelong.evaluation.adapter import CardAdapter
+from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest, make_env, run_protocol
+from lifelong.evaluation.card import Card
 from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.protocols import SELECTION, EvalProtocol
+from lifelong.evaluation.protocols import SELECTION
+from lifelong.evaluation.servers.actor import RemoteActor
 from lifelong.evaluation.servers.announcements import groot_fields, openpi_fields, vla_eval_fields
 from lifelong.evaluation.servers.connections import Limits
 from lifelong.evaluation.servers.groot import GrootWire
@@ -68,32 +69,43 @@ class ServerPolicy(PolicyUnderTest):
         self.selection = tuple(self.announced["selection"]) if self.own else SELECTION
         self.tasks = tuple(self._tasks())
 
-    def protocol(self, base: EvalProtocol) -> EvalProtocol:
-        """Return the protocol; see `PolicyUnderTest`. Of a served run it is the one that the run has in process."""
-        if not self.own:
-            raise ServerError(f"{self.args.policy} does not serve a run")
-        if self.args.protocol == "libero":
-            base = replace(
-                base, horizon=self.announced["horizon"], settle_steps=self.announced["settle_steps"]
-            )
-        return replace(base, camera_size=self._image_size(), original=False)
+    def protocol(self, base: Card) -> Card:
+        """Return the protocol, after what the server announces has been compared with it; see `PolicyUnderTest`.
 
-    def env(self, task: Task, count: int, protocol: EvalProtocol) -> VectorEnv:
+        Of a served run it is the one that the run has in process.
+
+        Raises:
+            ProtocolMismatchError: The server's policy was made for another protocol.
+        """
+        if self.own:
+            horizon, settle_steps = self.announced["horizon"], self.announced["settle_steps"]
+            return run_protocol(base, self._image_size(), horizon, settle_steps)
+        scheme = self.args.policy.partition("://")[0]
+        base.check(SCHEMES[scheme][1](self.announced))
+        return base
+
+    def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
         """Build the environment of a task; see `PolicyUnderTest`."""
-        return BatchEnv(
-            task,
-            count,
-            num_threads=self.args.threads,
-            cameras=tuple(CAMERAS[view] for view in self._views()),
-            camera_size=protocol.camera_size,
-            horizon=protocol.steps(task) + protocol.settle_steps,
-            assets=self.args.assets,
+        cameras = tuple(CAMERAS[view] for view in self._views()) if self.own else None
+        drawing = None if self.own else "protocol"
+        threads, assets = self.args.threads, self.args.assets
+        return make_env(
+            task, count, protocol, cameras=cameras, threads=threads, assets=assets, drawing=drawing
         )
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+    def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
         """Yield the actor of episodes, with connections of its own; see `PolicyUnderTest`."""
         episodes = [EpisodeStart(task, state) for state in states]
+        if not self.own:
+            views = tuple(f"{camera.removeprefix('robot0_')}_rgb" for camera in protocol.pixels.cameras)
+            wire = self._wire()
+            try:
+                adapter = CardAdapter(protocol, task)
+                yield RemoteActor(wire, adapter, episodes, views=views, replan=protocol.action.replan)
+            finally:
+                wire.close()
+            return
         seeds = [(self.args.seed, ROLLOUT, task.index, state) for state in states]
         served = ServedActor(self.args.policy, self.announced, episodes, seeds, self.limits)
         try:
