@@ -17,7 +17,7 @@ from lifelong.evaluation.inputs import PolicyInput
 from lifelong.evaluation.servers.codecs import GROOT
 from lifelong.evaluation.servers.connections import API_KEY, Limits
 from lifelong.evaluation.servers.packages import need
-from lifelong.evaluation.servers.wires import EpisodeStart
+from lifelong.evaluation.servers.wires import EpisodeStart, camera_image
 
 VIDEO = {"image": "agentview", "wrist_image": "robot0_eye_in_hand"}  # key -> camera
 STATE = {
@@ -194,7 +194,9 @@ def observe(inputs: Sequence[PolicyInput], announced: Mapping[str, Any]) -> dict
     """
     keys = {modality: announced[modality]["modality_keys"] for modality in _KEYS}
     found: dict[str, Any] = {
-        f"video.{key}": np.stack([given.images[VIDEO[key]] for given in inputs])[:, None]
+        f"video.{key}": np.stack([camera_image(given, VIDEO[key], "GR00T's server") for given in inputs])[
+            :, None
+        ]
         for key in keys["video"]
     }
     states = np.stack([given.state for given in inputs]).astype(np.float32)[:, None]

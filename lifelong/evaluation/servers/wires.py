@@ -208,10 +208,11 @@ class OpenpiDialect(Dialect):
     ) -> Mapping[str, Any]:
         """Return the server's answer to an observation under openpi's names for LIBERO."""
         observation: dict[str, Any] = {
-            "observation/image": given.images["agentview"],
-            "observation/state": given.state,
+            "observation/image": camera_image(given, "agentview", connection.address),
             "prompt": given.prompt,
         }
+        if given.state.size:  # some protocols have none
+            observation["observation/state"] = given.state
         if "robot0_eye_in_hand" in given.images:
             observation["observation/wrist_image"] = given.images["robot0_eye_in_hand"]
         await connection.send(observation)
@@ -263,11 +264,11 @@ class VlaEvalDialect(Dialect):
     ) -> Mapping[str, Any]:
         """Return the server's answer to an observation with what its hello asks for."""
         wanted = announced.get("observation_params") or {}
-        images = {"agentview": given.images["agentview"]}
+        images = {"agentview": camera_image(given, "agentview", connection.address)}
         if wanted.get("send_wrist_image"):
-            images["wrist"] = given.images["robot0_eye_in_hand"]
+            images["wrist"] = camera_image(given, "robot0_eye_in_hand", connection.address)
         observation: dict[str, Any] = {"images": images, "task_description": given.prompt}
-        if wanted.get("send_state"):
+        if wanted.get("send_state") and given.state.size:
             observation |= {"states": given.state, **given.extra}
         number = await self._send(connection, "observation", observation)
         found = await self._receive(connection, "action", number)
@@ -298,6 +299,19 @@ class VlaEvalDialect(Dialect):
                 f"{connection.address} sent {message['type']} with seq {message['seq']}; expected {kind} with {number}"
             )
         return _map(message["payload"], connection, f"payload of {kind}")
+
+
+def camera_image(given: PolicyInput, camera: str, address: str) -> np.ndarray:
+    """Return the image of a camera.
+
+    Raises:
+        ServerError: The protocol does not have the camera.
+    """
+    if camera not in given.images:
+        raise ServerError(
+            f"{address} needs images of {camera}; the protocol has {', '.join(given.images)} (pixels.cameras)"
+        )
+    return given.images[camera]
 
 
 def _map(message: Any, connection: Connection, what: str) -> Mapping[str, Any]:
