@@ -33,10 +33,15 @@ def load_card(protocol: str | Path) -> Card:
         UnknownNameError: There is no such card.
         ProtocolError: The file is not a valid card; the message names the file and the keys.
     """
-    return _load(_path(str(protocol), Path.cwd()))
+    path = _path(str(protocol), Path.cwd())
+    return _packaged(path) if path.parent == _FOLDER else _load(path)
 
 
 @lru_cache(maxsize=64)
+def _packaged(path: Path) -> Card:
+    return _load(path)
+
+
 def _load(path: Path) -> Card:
     values = _read(path, ())
     return parse_card(values, path.stem, str(path))

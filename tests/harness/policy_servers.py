@@ -6,13 +6,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import zmq
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
 from lifelong.evaluation.servers.codecs import GROOT, OPENPI, VLA_EVAL
+from lifelong.evaluation.servers.groot import ACTION
 from lifelong.evaluation.servers.serving import PolicyServer
 from lifelong.evaluation.servers.sessions import ServedPolicy
+
+MODALITIES = {
+    "video": ["image", "wrist_image"],
+    "state": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
+    "action": list(ACTION),
+    "language": ["annotation.human.action.task_description"],
+}
 
 
 @contextmanager
@@ -94,6 +103,26 @@ def vla_eval(answer: Callable[[dict], Any], hello: dict, heard: list) -> Any:
                 await socket.send(VLA_EVAL.pack(reply))
 
     return web_socket(handler)
+
+
+def groot_endpoints(get_action: Callable[..., Any], **changes: list[str]) -> dict[str, Callable[..., Any]]:
+    """Return the endpoints of a GR00T server; `changes` are other keys of modalities."""
+    config = lambda keys: {"delta_indices": [0], "modality_keys": keys}  # noqa: E731
+    modalities = {
+        name: {"__ModalityConfig_class__": True, "as_json": config(keys)}
+        for name, keys in (MODALITIES | changes).items()
+    }
+    return {
+        "ping": lambda: {"status": "ok"},
+        "get_modality_config": lambda: modalities,
+        "reset": lambda options: {},
+        "get_action": get_action,
+    }
+
+
+def flat(actions: np.ndarray) -> list:
+    """GR00T's answer with actions (B, H, 7)."""
+    return [{f"action.{key}": actions[..., i : i + 1].astype(np.float32) for i, key in enumerate(ACTION)}, {}]
 
 
 @contextmanager

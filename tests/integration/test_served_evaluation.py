@@ -3,6 +3,7 @@
 import json
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 from lifelong.cli import main as cli
@@ -69,6 +70,160 @@ def test_episodes_are_repeated_after_a_broken_connection(run, tmp_path, capsys):
         found = evaluate(address, tmp_path / "broken")
     assert broken and found["tasks"] == whole["tasks"], "none is lost or counted twice"
     assert f"ConnectionLost: the connection to {address} was broken off" in capsys.readouterr().err
+
+
+OPENPI_CARD = """
+title: openpi's, small and short
+extends: openpi
+world: {drawing: fast}
+episode: {settle_steps: 1, horizon: 7}
+pixels: {render_size: [64, 64], resize_size: [56, 56]}
+action: {replan: 3}
+"""
+GROOT_CARD = """
+title: GR00T's, with what its source does not state
+extends: groot
+world: {drawing: fast, robot: libero, env_seed: 0, seeding: once, seed_per_start: 0, seed_per_task: 0, loads: 1}
+episode: {settle_steps: 0, horizon: 7, success: first_hit}
+pixels: {render_size: [64, 64], orientation: rotated, resize: none, crop: 1.0}
+proprioception: {source: observation, order: [ee_pos, ee_rotation, gripper_qpos], rotation: axis_angle, dtype: float32}
+action: {gripper: open_sign, replan: 4}
+"""
+VLA_CARD = """
+title: vla-eval's, small and short
+extends: vla-eval
+world: {drawing: fast}
+episode: {settle_steps: 1, horizon: 3}
+pixels: {render_size: [64, 64]}
+"""
+
+
+@pytest.fixture
+def card(tmp_path):
+    def write(text: str):
+        path = tmp_path / "card.yaml"
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+def on_server(address: str, out, card: str, *more: str) -> int:
+    words = ["--suite", "libero_goal/0", "--episodes", "2", "--threads", "1", "--protocol", card]
+    return cli.main(["eval", address, "--out", str(out), *words, *more])
+
+
+def lift(count: int) -> np.ndarray:
+    return np.tile([0.1, 0.0, 0.5, 0.0, 0.0, 0.1, -1.0], (count, 1))
+
+
+def test_an_openpi_server_under_a_protocol(card, tmp_path, capsys):
+    seen = []
+
+    def answer(observation):
+        seen.append(observation)
+        return {"actions": lift(4)}
+
+    with policy_servers.openpi(answer, {"action": {"replan": 3}, "model": "lift"}) as address:
+        assert on_server(address, tmp_path / "out", card(OPENPI_CARD)) == 0
+    found = json.loads((tmp_path / "out" / "eval.json").read_text())
+    assert found["tasks"][0]["lengths"] == [7, 7] and found["protocol"]["action"]["replan"] == 3
+    announced = {"action": {"replan": 3}, "model": "lift"}
+    assert found["evaluated"]["server"] == address and found["evaluated"]["announced"] == announced
+    assert len(seen) == 2 * 3, "seven steps are three chunks"
+    first = seen[0]
+    assert first["observation/image"].shape == first["observation/wrist_image"].shape == (56, 56, 3)
+    assert first["observation/image"].std() > 5 and first["observation/state"].dtype == np.float64
+    assert first["observation/state"].shape == (8,) and first["prompt"] == found["tasks"][0]["instruction"]
+    heights = sorted(o["observation/state"][2] for o in seen)
+    assert heights[-1] > heights[0] + 0.01, "the arm has moved"
+
+
+def test_an_openpi_connection_that_breaks_is_no_episode(card, tmp_path, capsys):
+    counts = []
+
+    async def handler(socket):
+        await socket.send(OPENPI.pack({}))
+        async for _ in socket:
+            counts.append(1)
+            if len(counts) == 4:
+                socket.transport.abort()
+                return
+            await socket.send(OPENPI.pack({"actions": lift(3)}))
+
+    with policy_servers.web_socket(handler) as address:
+        assert on_server(address, tmp_path / "out", card(OPENPI_CARD)) == 0
+    result = json.loads((tmp_path / "out" / "eval.json").read_text())["tasks"][0]
+    assert result["init_states"] == [0, 1] and result["lengths"] == [7, 7] and len(counts) > 6
+    assert not result.get("errors") and result["actions"][0] == result["actions"][1]
+
+
+def test_a_protocol_that_counts_errors_does_not_count_those_of_servers(card, tmp_path, capsys):
+    answers = {
+        "not finite": {"actions": np.full((3, 7), np.nan)},
+        "2 actions; the protocol executes 3": {"actions": lift(2)},
+        "its traceback": "Traceback ...\nKeyError: 'image'",
+    }
+    for number, (message, answer) in enumerate(answers.items()):
+        out = tmp_path / str(number)
+        with policy_servers.openpi(lambda _, answer=answer: answer) as address:
+            assert on_server(address, out, card(OPENPI_CARD)) == 2
+        assert message in capsys.readouterr().err and not (out / "eval.json").exists()
+
+
+def test_what_a_server_announces_is_compared_with_the_protocol(card, tmp_path, capsys):
+    with policy_servers.openpi(lambda _: {}, {"action.replan": 10, "pixels.crop": 1.0}) as address:
+        assert on_server(address, tmp_path / "out", card(OPENPI_CARD)) == 2
+        error = capsys.readouterr().err
+        assert "action.replan: protocol card has 3, the policy 10" in error and "pixels" not in error
+    with policy_servers.openpi(lambda _: {}) as address:
+        none = OPENPI_CARD.replace("replan: 3", "replan: null")
+        assert on_server(address, tmp_path / "out", card(none)) == 2
+        assert "does not state action.replan" in capsys.readouterr().err
+    spec = {"gripper": {"name": "gripper", "dims": 1, "format": "continuous_01"}}
+    for hello, message in (
+        (
+            {"action_spec": spec},
+            "gripper: LIBERO takes binary_close_positive, the server sends continuous_01",
+        ),
+        ({"observation_params": {"num_steps_wait": 50}}, "settle_steps: protocol card has 1, the policy 50"),
+        (
+            {"observation_params": {"send_state": True, "quat_no_antipodal": True}},
+            "rotation: protocol card has 'axis_angle_positive', the policy 'axis_angle'",
+        ),
+    ):
+        with policy_servers.vla_eval(lambda _: {}, hello, []) as address:
+            address = address.replace("ws:", "vla-eval:")
+            assert on_server(address, tmp_path / "out", card(VLA_CARD)) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_vla_eval_server_under_a_protocol(card, tmp_path, capsys):
+    heard, params = [], {"send_wrist_image": True, "send_state": True}
+    answer = lambda _: {"actions": lift(1)[0]}  # noqa: E731
+    with policy_servers.vla_eval(answer, {"observation_params": params}, heard) as address:
+        assert on_server(address.replace("ws:", "vla-eval:"), tmp_path / "out", card(VLA_CARD)) == 0
+    kinds = [m["type"] for m in heard]
+    assert kinds.count("observation") == 6 and kinds.count("episode_start") == kinds.count("episode_end") == 2
+    sent = next(m["payload"] for m in heard if m["type"] == "observation")
+    assert sent["images"]["wrist"].shape == (64, 64, 3) and sent["states"].shape == (8,)
+    assert json.loads((tmp_path / "out" / "eval.json").read_text())["tasks"][0]["lengths"] == [3, 3]
+
+
+def test_a_groot_server_under_a_protocol(card, tmp_path, capsys):
+    seen = []
+
+    def get_action(observation, options):
+        seen.append(observation)
+        return policy_servers.flat(np.stack([lift(16)] * len(observation["state.x"])))
+
+    with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
+        assert on_server(address.replace("tcp:", "gr00t:"), tmp_path / "out", card(GROOT_CARD)) == 0
+    assert [len(o["state.gripper"]) for o in seen] == [2, 2] and seen[0]["video.image"].shape[1:3] == (1, 64)
+    found = json.loads((tmp_path / "out" / "eval.json").read_text())
+    assert found["tasks"][0]["lengths"] == [7, 7]
+    assert found["evaluated"]["announced"]["action"]["modality_keys"][-1] == "gripper"
 
 
 def test_what_a_server_does_wrong_ends_the_evaluation(tmp_path, capsys):

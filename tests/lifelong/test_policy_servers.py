@@ -15,19 +15,13 @@ from lifelong.evaluation.rollout import run_episodes
 from lifelong.evaluation.servers.actor import RemoteActor, checked_actions
 from lifelong.evaluation.servers.codecs import GROOT, OPENPI, VLA_EVAL
 from lifelong.evaluation.servers.connections import Limits
-from lifelong.evaluation.servers.groot import ACTION, GrootWire
+from lifelong.evaluation.servers.groot import GrootWire
 from lifelong.evaluation.servers.wires import EpisodeStart, OpenpiDialect, VlaEvalDialect, WebSocketWire
 from tests.harness import policy_servers
 
 pytestmark = pytest.mark.unit
 TASK = get_suite("libero_goal").tasks[0]
 SHORT = Limits(connect=5, answer=5)
-MODALITIES = {
-    "video": ["image", "wrist_image"],
-    "state": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
-    "action": list(ACTION),
-    "language": ["annotation.human.action.task_description"],
-}
 
 
 class Plain:
@@ -393,34 +387,15 @@ def test_vla_eval_errors_and_messages_out_of_order():
         wire.close()
 
 
-def groot_endpoints(get_action, **changes):
-    config = lambda keys: {"delta_indices": [0], "modality_keys": keys}  # noqa: E731
-    modalities = {
-        name: {"__ModalityConfig_class__": True, "as_json": config(keys)}
-        for name, keys in (MODALITIES | changes).items()
-    }
-    return {
-        "ping": lambda: {"status": "ok"},
-        "get_modality_config": lambda: modalities,
-        "reset": lambda options: {},
-        "get_action": get_action,
-    }
-
-
-def flat(actions: np.ndarray) -> list:
-    """GR00T's answer with actions (B, H, 7)."""
-    return [{f"action.{key}": actions[..., i : i + 1].astype(np.float32) for i, key in enumerate(ACTION)}, {}]
-
-
 def test_groot_observations_of_many_simulations():
     seen = []
 
     def get_action(observation, options):
         seen.append(observation)
         states = np.concatenate([observation["state.x"], observation["state.y"]], -1)[:, 0]
-        return flat(np.stack([chunk(state, 8) for state in states]))
+        return policy_servers.flat(np.stack([chunk(state, 8) for state in states]))
 
-    with policy_servers.groot(groot_endpoints(get_action)) as address:
+    with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
         wire = GrootWire(address, Limits(5, 5, 2))
         assert wire.announced["video"]["modality_keys"] == ["image", "wrist_image"]
         actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=8)
@@ -439,9 +414,12 @@ def test_groot_observations_of_many_simulations():
 @pytest.mark.parametrize(
     ("get_action", "message"),
     [
-        (lambda **_: flat(np.full((1, 8, 7), np.inf)), r"not finite \(inf\)"),
-        (lambda **_: flat(np.zeros((2, 8, 7))), r"shapes \[\(2, 8, 1\)\]; expected \(1, H, 1\)"),
-        (lambda **_: flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
+        (lambda **_: policy_servers.flat(np.full((1, 8, 7), np.inf)), r"not finite \(inf\)"),
+        (
+            lambda **_: policy_servers.flat(np.zeros((2, 8, 7))),
+            r"shapes \[\(2, 8, 1\)\]; expected \(1, H, 1\)",
+        ),
+        (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
         (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
         (lambda **_: "what?", "answered str without"),
         (lambda **_: b"\xc1", "1 bytes that are no GR00T message"),
@@ -450,7 +428,7 @@ def test_groot_observations_of_many_simulations():
     ],
 )
 def test_groot_answers_that_are_not_valid_are_named(get_action, message):
-    with policy_servers.groot(groot_endpoints(get_action)) as address:
+    with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
         wire = GrootWire(address, Limits(5, 0.3))
         actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 0)], replan=2)
         actor.reset(1)
@@ -461,7 +439,7 @@ def test_groot_answers_that_are_not_valid_are_named(get_action, message):
 
 def test_groot_servers_of_other_embodiments_and_none_at_all():
     with (
-        policy_servers.groot(groot_endpoints(None, state=["left_arm"])) as address,
+        policy_servers.groot(policy_servers.groot_endpoints(None, state=["left_arm"])) as address,
         pytest.raises(ServerError, match=r"state keys \['left_arm'\]; LIBERO's are x, y"),
     ):
         GrootWire(address, SHORT)

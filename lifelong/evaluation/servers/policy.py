@@ -9,7 +9,7 @@ from pathlib import Path
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Task, get_task
 from lifelong.data.settings import CAMERAS
-from lifelong.errors import ServerError
+from lifelong.errors import ProtocolError, ServerError
 from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.adapter import CardAdapter
 from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest, make_env, run_protocol
@@ -29,6 +29,8 @@ from lifelong.evaluation.servers.wires import (
     WebSocketWire,
     Wire,
     plain,
+    same,
+    summary,
 )
 
 # scheme of an address -> scheme of the transport, and what the server's announcement says about the protocol
@@ -70,48 +72,74 @@ class ServerPolicy(PolicyUnderTest):
         self.tasks = tuple(self._tasks())
 
     def protocol(self, base: Card) -> Card:
-        """Return the protocol, after what the server announces has been compared with it; see `PolicyUnderTest`.
-
-        Of a served run it is the one that the run has in process.
+        """Return the protocol; see `PolicyUnderTest`. Of a served run it is the one that the run has in process.
 
         Raises:
-            ProtocolMismatchError: The server's policy was made for another protocol.
+            ProtocolMismatchError: The server announces something else; the message names both values.
+            ProtocolError: The protocol does not state how many actions are executed, and the server needs it.
         """
         if self.own:
-            horizon, settle_steps = self.announced["horizon"], self.announced["settle_steps"]
-            return run_protocol(base, self._image_size(), horizon, settle_steps)
-        scheme = self.args.policy.partition("://")[0]
-        base.check(SCHEMES[scheme][1](self.announced))
+            about = self.announced
+            return run_protocol(base, self._image_size(), about["horizon"], about["settle_steps"])
+        base.check(SCHEMES[self._scheme][1](self.announced))
+        if base.action.replan is None and self._scheme != "vla-eval":
+            raise ProtocolError(
+                f"protocol {base.name} does not state action.replan, the number of actions that are executed of each "
+                f"answer: write a card with `extends: {base.name}` that does, and give its path to --protocol"
+            )
         return base
 
     def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
         """Build the environment of a task; see `PolicyUnderTest`."""
-        cameras = tuple(CAMERAS[view] for view in self._views()) if self.own else None
-        drawing = None if self.own else "protocol"
         threads, assets = self.args.threads, self.args.assets
+        if self.own:
+            cameras = tuple(CAMERAS[view] for view in self._views())
+            return make_env(
+                task, count, protocol, cameras=cameras, threads=threads, assets=assets, drawing=None
+            )
+        adapter = CardAdapter(protocol, task)
         return make_env(
-            task, count, protocol, cameras=cameras, threads=threads, assets=assets, drawing=drawing
+            task,
+            count,
+            protocol,
+            cameras=adapter.cameras,
+            observations=adapter.observations,
+            threads=threads,
+            assets=assets,
         )
 
     @contextmanager
     def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
-        """Yield the actor of episodes, with connections of its own; see `PolicyUnderTest`."""
+        """Yield the actor of episodes, with connections of its own; see `PolicyUnderTest`.
+
+        Raises:
+            ServerError: The server is not there any more, or announces something else than at first.
+        """
         episodes = [EpisodeStart(task, state) for state in states]
-        if not self.own:
-            views = tuple(f"{camera.removeprefix('robot0_')}_rgb" for camera in protocol.pixels.cameras)
-            wire = self._wire()
+        if self.own:
+            seeds = [(self.args.seed, ROLLOUT, task.index, state) for state in states]
+            served = ServedActor(self.args.policy, self.announced, episodes, seeds, self.limits)
             try:
-                adapter = CardAdapter(protocol, task)
-                yield RemoteActor(wire, adapter, episodes, views=views, replan=protocol.action.replan)
+                yield served
             finally:
-                wire.close()
+                served.close()
             return
-        seeds = [(self.args.seed, ROLLOUT, task.index, state) for state in states]
-        served = ServedActor(self.args.policy, self.announced, episodes, seeds, self.limits)
+        wire = self._wire()
         try:
-            yield served
+            if not same(wire.announced, self.announced):
+                raise ServerError(
+                    f"{self.args.policy} announces {summary(wire.announced)}, but at first "
+                    f"{summary(self.announced)}: another policy is served there now; evaluate it by itself"
+                )
+            adapter = CardAdapter(protocol, task)
+            views = tuple(f"{camera.removeprefix('robot0_')}_rgb" for camera in adapter.cameras)
+            yield RemoteActor(wire, adapter, episodes, views=views, replan=protocol.action.replan)
         finally:
-            served.close()
+            wire.close()
+
+    @property
+    def _scheme(self) -> str:
+        return self.args.policy.partition("://")[0]
 
     def _wire(self) -> Wire:
         scheme, found, rest = self.args.policy.partition("://")
