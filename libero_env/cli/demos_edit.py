@@ -5,7 +5,7 @@ from pathlib import Path
 
 from libero_env.cli.arguments import Subparsers, modalities, size
 
-_ASSETS = "where models come from: builtin, or a folder with the original's"
+_ASSETS = "where models come from: builtin, original, or a folder with the original's"
 
 
 def register(commands: Subparsers) -> None:
@@ -60,6 +60,21 @@ def _register_export(commands: Subparsers) -> None:
     add("--out", type=Path, required=True, help="a new folder")
     add("--format", choices=("lerobot",), default="lerobot", help="LeRobotDataset v3.0 (default)")
     add("--labels", choices=("expert", "executed"), default="expert", help="(default: expert)")
+    add(
+        "--as",
+        dest="published",
+        metavar="SET",
+        help="write what this published set is, lerobot/libero or physical-intelligence/libero: demonstrations are run "
+        "again without no-ops, successes kept, images of 256 pixels turned as there",
+    )
+    add(
+        "--settle",
+        type=int,
+        default=10,
+        help="with --as: waiting steps before the first action (default: 10)",
+    )
+    add("--assets", help=f"with --as: {_ASSETS} (default: the original's where they are installed)")
+    add("--drawing", choices=("faithful", "fast"), default="faithful", help="with --as (default: faithful)")
     parser.set_defaults(run=run_export)
 
 
@@ -113,7 +128,19 @@ def run_filter(args: argparse.Namespace) -> None:
 def run_export(args: argparse.Namespace) -> None:
     """Write the data set and print its size."""
     from libero_env.demos.curate import find_demo_files
-    from libero_env.demos.lerobot import export_lerobot
+    from libero_env.demos.lerobot import export_lerobot, export_published
+    from libero_env.demos.regenerate import Regeneration
 
-    episodes, frames = export_lerobot(find_demo_files(args.files), args.out, labels=args.labels)
-    print(f"{args.out}: {episodes} episodes, {frames} frames")
+    files = find_demo_files(args.files)
+    if args.published is None:
+        episodes, frames = export_lerobot(files, args.out, labels=args.labels)
+        print(f"{args.out}: {episodes} episodes, {frames} frames")
+        return
+    config = Regeneration(
+        settle_steps=args.settle, labels=args.labels, assets=args.assets, drawing=args.drawing
+    )
+    written = export_published(files, args.out, args.published, config)
+    print(f"{args.out}: {written.episodes} episodes, {written.frames} frames, as {args.published}")
+    print(f"models: {config.pack().name}, drawing: {config.drawing}")
+    for where in written.failed:
+        print(f"left out, does not reach the goal when it is run again: {where}")

@@ -1,46 +1,48 @@
-"""Demonstrations as a LeRobotDataset v3.0: low-dimensional data in Parquet, images in MP4, many episodes to a file.
+"""Demonstrations as LeRobot data sets: in this package's own layout, or in that of a published set of LIBERO.
 
-Needs the extra `export` (PyArrow and PyAV). Names are those of LeRobot's own LIBERO environment: `observation.state`
-(8: grip site position, hand axis-angle, fingers), `action` (7), `observation.images.image` for agentview,
-`observation.images.image2` for the hand, `observation.images.<camera>` for others. Images are upright, and each
-action is paired with the observation on which it was chosen.
+Needs the extra `export` (PyArrow and PyAV). Both store 8 numbers of state (position of the grip site, rotation vector,
+fingers), 7 of action, images of agentview and of the hand, and the observation on which an action was chosen.
+
+The own layout is a LeRobotDataset v3.0 at 20 frames per second with upright images, as recorded. The published sets
+have images that are upright and mirrored left to right, 10 as frames per second, other names, and no no-ops; a policy
+that is trained on them has to be evaluated on mirrored images, as the clients of openpi, OpenVLA-OFT and LeRobot do.
 """
 
 import json
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
-from libero_env.demos.lerobot_files import (
-    DATA_MB,
-    DATA_PATH,
-    FILES_PER_CHUNK,
-    VIDEO_MB,
-    VIDEO_PATH,
-    CameraVideo,
-    ParquetTable,
-    import_arrow,
-)
+from libero_env.demos.lerobot_layout import OWN, PUBLISHED, ExportedEpisode, Layout
+from libero_env.demos.lerobot_v2 import ImageDatasetWriter
+from libero_env.demos.lerobot_v3 import DatasetWriter, write_json
 from libero_env.demos.read import BrokenDemoError
-from libero_env.demos.statistics import ImageStatistics, NumberStatistics
-from libero_env.demos.video import PIXEL_FORMAT, import_av
+from libero_env.demos.regenerate import Regeneration, regenerate
 from libero_env.demos.write import Episode
-from libero_env.errors import DemoError
+from libero_env.errors import DemoError, UnknownNameError
 from libero_env.storage import atomic_folder
 from libero_env.timing import CONTROL_HZ
 
-VERSION = "v3.0"
-_EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-_STATE = ("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "finger1", "finger2")
-_ACTION = ("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "gripper")
-_CAMERAS = {"agentview": "image", "eye_in_hand": "image2"}
-_INDICES = ("frame_index", "episode_index", "index", "task_index")
+ORIGIN = "meta/libero.json"  # how a data set was made
+
+
+class PublishedExport(NamedTuple):
+    """Size of an export in the layout of a published set.
+
+    Attributes:
+        episodes: Number of episodes.
+        frames: Number of frames.
+        failed: Demonstrations that did not reach the goal when they were run again, and were left out.
+    """
+
+    episodes: int
+    frames: int
+    failed: tuple[str, ...]
 
 
 def export_lerobot(
@@ -48,10 +50,10 @@ def export_lerobot(
     root: Path,
     *,
     labels: Literal["expert", "executed"] = "expert",
-    video_mb: float = VIDEO_MB,
+    video_mb: float | None = None,
     progress: bool | None = None,
 ) -> tuple[int, int]:
-    """Write demonstration files as one data set.
+    """Write demonstration files as one data set in this package's layout.
 
     Args:
         files: Files to read, in this order; all have the same cameras and image size.
@@ -67,34 +69,66 @@ def export_lerobot(
         DemoError: A file is broken or has other images than the first, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
-    if root.exists():
-        raise DemoError(f"{root} exists; choose another folder or remove it")
-    with atomic_folder(root) as folder, closing(_DatasetWriter(folder, video_mb)) as dataset:
+    _check_absent(root)
+    with atomic_folder(root) as folder, closing(DatasetWriter(folder, OWN, video_mb)) as dataset:
         for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
             language, pairing = _language(file), read_header(file).get("pairing", "libero")
             for name, episode in read_episodes(file):
                 dataset.add(_exported(f"{file}: {name}", episode, pairing, labels), language)
         dataset.close()
-        return dataset.finish()
+        size = dataset.finish()
+        _write_origin(folder, OWN, {"labels": labels, "models": _recorded_models(files)})
+        return size
 
 
-@dataclass(frozen=True)
-class _ExportedEpisode:
-    """One episode as it is exported.
+def export_published(
+    files: Sequence[Path],
+    root: Path,
+    name: str,
+    config: Regeneration | None = None,
+    *,
+    progress: bool | None = None,
+) -> PublishedExport:
+    """Run demonstrations again and write them as one data set in the layout of a published one.
 
-    Attributes:
-        state: (T, 8) float32.
-        action: (T, 7) float32.
-        success: Whether the goal was reached.
-        images: Feature to (T, H, W, 3) uint8.
-        where: File and demonstration, for error messages.
+    Args:
+        files: Files to read, in this order; their images are not used.
+        root: Folder to write; it must not exist.
+        name: Published set, one of `libero_env.demos.lerobot_layout.PUBLISHED`.
+        config: How the demonstrations are run.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
+
+    Raises:
+        UnknownNameError: No such set is known.
+        DemoError: A file is broken, no demonstration reaches its goal, or the folder exists.
+        LiberoError: PyArrow or PyAV is not installed.
     """
+    if name not in PUBLISHED:
+        raise UnknownNameError("published data set", name, PUBLISHED)
+    _check_absent(root)
+    layout, config = PUBLISHED[name], config or Regeneration()
+    writer = ImageDatasetWriter if layout.codec is None else DatasetWriter
+    kept, failed = 0, []
+    with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
+        for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
+            language = recorded_task(file).language
+            for episode in regenerate(file, config):
+                if episode.success:
+                    dataset.add(episode, language)
+                    kept += 1
+                else:
+                    failed.append(episode.where)
+        if failed and not kept:
+            raise DemoError(f"{failed[0]}: neither this demonstration nor any other reaches its goal again")
+        dataset.close()
+        episodes, frames = dataset.finish()
+        _write_origin(folder, layout, config.record() | {"as": name, "left_out": len(failed)})
+    return PublishedExport(episodes, frames, tuple(failed))
 
-    state: np.ndarray
-    action: np.ndarray
-    success: bool
-    images: dict[str, np.ndarray]
-    where: str
+
+def _check_absent(root: Path) -> None:
+    if root.exists():
+        raise DemoError(f"{root} exists; choose another folder or remove it")
 
 
 def _language(file: Path) -> str:
@@ -105,7 +139,7 @@ def _language(file: Path) -> str:
         return recorded_task(file).language
 
 
-def _exported(where: str, episode: Episode, pairing: str, labels: str) -> _ExportedEpisode:
+def _exported(where: str, episode: Episode, pairing: str, labels: str) -> ExportedEpisode:
     actions = episode.labels if labels == "expert" else episode.actions
     obs = episode.obs
     for key in ("ee_pos", "ee_ori", "gripper_states"):
@@ -116,155 +150,26 @@ def _exported(where: str, episode: Episode, pairing: str, labels: str) -> _Expor
     if not len(actions):
         raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
     state = np.concatenate([obs["ee_pos"], obs["ee_ori"], obs["gripper_states"]], axis=1).astype(np.float32)
-    images = {feature_name(key): values for key, values in obs.items() if key.endswith("_rgb")}
-    return _ExportedEpisode(state, actions.astype(np.float32), episode.success, images, where)
+    images = {key: values for key, values in obs.items() if key.endswith("_rgb")}
+    return ExportedEpisode(state, actions.astype(np.float32), episode.success, images, where)
 
 
-def feature_name(key: str) -> str:
-    """Return the data set's name of a camera's images: `eye_in_hand_rgb` -> `observation.images.image2`."""
-    camera = key.removesuffix("_rgb")
-    return f"observation.images.{_CAMERAS.get(camera, camera)}"
+def _recorded_models(files: Sequence[Path]) -> list[Any]:
+    """Return the models that the files state, each once; older files do not."""
+    found = {str(read_header(file).get("models", "")) for file in files} - {""}
+    return [json.loads(text) for text in sorted(found)]
 
 
-class _DatasetWriter:
-    """Writes a data set episode by episode."""
-
-    def __init__(self, root: Path, video_mb: float):
-        self._pa, self._pq = import_arrow()
-        import_av()
-        self.root, self._frames = root, 0
-        self._tasks: dict[str, int] = {}
-        self._episodes: list[dict[str, Any]] = []
-        self._shapes: dict[str, tuple[int, ...]] = {}
-        self._videos: dict[str, CameraVideo] = {}
-        self._video_mb = video_mb
-        self._data = ParquetTable(root)
-        self._stats: dict[str, Any] = {}  # NumberStatistics or ImageStatistics
-
-    def add(self, episode: _ExportedEpisode, language: str) -> None:
-        """Append an episode."""
-        shapes = {key: frames.shape[1:] for key, frames in episode.images.items()}
-        self._shapes = self._shapes or shapes
-        if shapes != self._shapes:
-            raise DemoError(f"{episode.where} has images {shapes}; expected {self._shapes} as in the first")
-        number, steps = len(self._episodes), len(episode.action)
-        task = self._tasks.setdefault(language, len(self._tasks))
-        first = self._frames
-        columns = {
-            "observation.state": episode.state,
-            "action": episode.action,
-            "timestamp": (np.arange(steps) / CONTROL_HZ).astype(np.float32),
-            "next.reward": np.append(np.zeros(steps - 1), float(episode.success)).astype(np.float32),
-            "next.done": np.append(np.zeros(steps - 1, bool), True),
-            "frame_index": np.arange(steps),
-            "episode_index": np.full(steps, number),
-            "index": first + np.arange(steps),
-            "task_index": np.full(steps, task),
-        }
-        entry: dict[str, Any] = {"episode_index": number, "tasks": [language], "length": steps}
-        entry |= self._data.add(columns)
-        entry |= {"dataset_from_index": first, "dataset_to_index": first + steps}
-        for key, frames in episode.images.items():
-            if key not in self._videos:
-                self._videos[key] = CameraVideo(self.root, key, self._video_mb)
-            entry |= self._videos[key].add(frames)
-        entry |= self._add_statistics(columns, episode.images)
-        self._episodes.append({**entry, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
-        self._frames += steps
-
-    def _add_statistics(
-        self, columns: dict[str, np.ndarray], images: dict[str, np.ndarray]
-    ) -> dict[str, Any]:
-        """Return the statistics of an episode, and add them to those of the data set."""
-        own: dict[str, Any] = {key: NumberStatistics.from_values(values) for key, values in columns.items()}
-        own |= {key: ImageStatistics.from_frames(frames) for key, frames in images.items()}
-        for key, stats in own.items():
-            self._stats[key] = stats if key not in self._stats else self._stats[key] + stats
-        return {f"stats/{key}/{name}": v for key, stats in own.items() for name, v in stats.summary().items()}
-
-    def close(self) -> None:
-        """Close all files."""
-        self._data.close()
-        for video in self._videos.values():
-            video.close()
-
-    def finish(self) -> tuple[int, int]:
-        """Write the metadata of the data set; return the number of episodes and the number of frames."""
-        if not self._episodes:
-            raise DemoError("no demonstrations to export")
-        pa, meta = self._pa, self.root / "meta"
-        (self.root / _EPISODES_PATH).parent.mkdir(parents=True)
-        self._pq.write_table(pa.Table.from_pylist(self._episodes), self.root / _EPISODES_PATH)
-        self._pq.write_table(self._task_table(), meta / "tasks.parquet")
-        _write_json(meta / "stats.json", {key: stats.summary() for key, stats in self._stats.items()})
-        _write_json(meta / "info.json", self._info())
-        return len(self._episodes), self._frames
-
-    def _task_table(self) -> Any:
-        """Return the table of task indices; its pandas index are the instructions, as LeRobot expects."""
-        pa, integer = self._pa, {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
-        table = pa.table(
-            {"task_index": pa.array(self._tasks.values(), pa.int64()), "task": list(self._tasks)}
-        )
-        text = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-        pandas = {
-            "index_columns": ["task"],
-            "column_indexes": [{"name": None, "field_name": None, **text}],
-            "columns": [
-                {"name": "task_index", "field_name": "task_index", **integer},
-                {"name": "task", "field_name": "task", **text},
-            ],
-            "creator": {"library": "pyarrow", "version": pa.__version__},
-            "pandas_version": "2.0.0",
-        }
-        return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-    def _info(self) -> dict[str, Any]:
-        number = {"shape": [1], "names": None}
-        features: dict[str, Any] = {key: _video_feature(*shape) for key, shape in self._shapes.items()}
-        features |= {
-            "observation.state": {"dtype": "float32", "shape": [8], "names": list(_STATE)},
-            "action": {"dtype": "float32", "shape": [7], "names": list(_ACTION)},
-            "timestamp": {"dtype": "float32", **number},
-            "next.reward": {"dtype": "float32", **number},
-            "next.done": {"dtype": "bool", **number},
-            **{key: {"dtype": "int64", **number} for key in _INDICES},
-        }
-        return {
-            "codebase_version": VERSION,
-            "robot_type": "panda",
-            "total_episodes": len(self._episodes),
-            "total_frames": self._frames,
-            "total_tasks": len(self._tasks),
-            "chunks_size": FILES_PER_CHUNK,
-            "data_files_size_in_mb": DATA_MB,
-            "video_files_size_in_mb": VIDEO_MB,
-            "fps": CONTROL_HZ,
-            "splits": {"train": f"0:{len(self._episodes)}"},
-            "data_path": DATA_PATH,
-            "video_path": VIDEO_PATH if self._shapes else None,
-            "features": features,
-        }
-
-
-def _video_feature(height: int, width: int, channels: int) -> dict[str, Any]:
-    info = {
-        "video.height": height,
-        "video.width": width,
-        "video.channels": channels,
-        "video.codec": "h264",
-        "video.pix_fmt": PIXEL_FORMAT,
-        "video.fps": CONTROL_HZ,
-        "video.is_depth_map": False,
-        "has_audio": False,
+def _write_origin(root: Path, layout: Layout, how: dict[str, Any]) -> None:
+    images = {"first_row": "top", "mirrored": layout.mirrored}
+    mirrored = "seen as through a mirror: the original's pictures after half a turn, as in the published sets"
+    images["meaning"] = mirrored if layout.mirrored else "as the camera sees the scene"
+    origin = {
+        "generator": "libero-lifelong",
+        "images": images,
+        "control_hz": CONTROL_HZ,
+        "fps_is": "a label; time between frames is 1 / control_hz"
+        if layout.fps != CONTROL_HZ
+        else "control_hz",
     }
-    return {
-        "dtype": "video",
-        "shape": [height, width, channels],
-        "names": ["height", "width", "channel"],
-        "info": info,
-    }
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=4))
+    write_json(root / ORIGIN, origin | how)

@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.demos.video import Mp4Writer
+from libero_env.demos.lerobot_layout import FILES_PER_CHUNK
+from libero_env.demos.video import H264, Codec, Mp4Writer
 from libero_env.errors import LiberoError
-from libero_env.timing import CONTROL_HZ
 
-FILES_PER_CHUNK = 1000
-DATA_MB, VIDEO_MB = 100, 200  # [MiB] size from which a file is continued in the next one
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
@@ -37,9 +35,15 @@ def chunk_and_file(file: int) -> dict[str, int]:
 
 
 class ParquetTable:
-    """Writes the Parquet files of the data, one row group per episode."""
+    """Writes the Parquet files of the data, one row group per episode.
 
-    def __init__(self, root: Path):
+    Args:
+        root: Folder of the data set.
+        limit_mb: Size from which a table is continued in another file, [MiB].
+    """
+
+    def __init__(self, root: Path, limit_mb: float):
+        self._limit_mb = limit_mb
         self._pa, self._pq = import_arrow()
         self._root = root
         self._writer: Any = None
@@ -55,7 +59,7 @@ class ParquetTable:
             for key, values in columns.items()
         }
         table = pa.table(arrays)
-        if self._bytes > DATA_MB * 2**20:
+        if self._bytes > self._limit_mb * 2**20:
             self.close()
             self._file, self._bytes = self._file + 1, 0
         place = chunk_and_file(self._file)
@@ -82,6 +86,8 @@ class CameraVideo:
         root: Folder of the data set.
         key: Feature of the camera.
         limit_mb: Size from which a video is continued in another file, [MiB].
+        fps: Frames per second.
+        codec: How frames are encoded.
         file: Number of the file that is being written.
         writer: The open file.
     """
@@ -89,6 +95,8 @@ class CameraVideo:
     root: Path
     key: str
     limit_mb: float
+    fps: int
+    codec: Codec = H264
     file: int = 0
     writer: Mp4Writer | None = field(default=None, repr=False)
 
@@ -101,10 +109,10 @@ class CameraVideo:
         if self.writer is None:
             path = self.root / VIDEO_PATH.format(video_key=self.key, **place)
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.writer = Mp4Writer(path, CONTROL_HZ)
+            self.writer = Mp4Writer(path, self.fps, self.codec)
         first = self.writer.frames
         self.writer.add(frames)
-        times = {"from_timestamp": first / CONTROL_HZ, "to_timestamp": self.writer.frames / CONTROL_HZ}
+        times = {"from_timestamp": first / self.fps, "to_timestamp": self.writer.frames / self.fps}
         return {f"videos/{self.key}/{name}": value for name, value in {**place, **times}.items()}
 
     def close(self) -> None:

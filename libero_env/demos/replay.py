@@ -75,7 +75,7 @@ def replay(
         for name, episode in read_episodes(file):
             if demos is None or name in demos:
                 found.add(name)
-                renderer.place_fixtures(_checked_fixtures(file, name, episode, renderer.scene))
+                renderer.place_fixtures(checked_fixtures(file, name, episode, renderer.scene))
                 yield _replay_episode(renderer, name, episode, by, keys)
     finally:
         renderer.close()
@@ -150,7 +150,7 @@ def rerender(
         disable = None if progress is None else not progress
         for name, episode in tqdm(read_episodes(file), unit="demo", disable=disable):
             if (index := demo_number(name)) not in recorded:
-                fixtures = _checked_fixtures(file, name, episode, renderer.scene)
+                fixtures = checked_fixtures(file, name, episode, renderer.scene)
                 obs, robot_states = renderer.render_states(episode.states, fixtures)
                 writer.write(index, replace(episode, obs=obs, robot_states=robot_states))
     finally:
@@ -175,7 +175,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     writer, world = DemoWriter(target, read_header(file)), renderer.env.world
     try:
         for name, episode in tqdm(read_episodes(file), unit="demo", disable=None):
-            renderer.place_fixtures(_checked_fixtures(file, name, episode, renderer.scene))
+            renderer.place_fixtures(checked_fixtures(file, name, episode, renderer.scene))
             renderer.env.set_state(episode.states[0])
             states = []
             for action in episode.actions:
@@ -188,7 +188,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     return writer.finish()
 
 
-def _checked_fixtures(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:
+def checked_fixtures(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:
     """Return the poses of the fixtures, after a check that the states fit the scene."""
     length = 1 + scene.model.nq + scene.model.nv
     if episode.states.shape[1] != length:

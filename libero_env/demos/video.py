@@ -1,8 +1,12 @@
 """Videos: GIF and WebP with Pillow, MP4 with PyAV (`pip install libero-lifelong[export]`)."""
 
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -10,7 +14,28 @@ from PIL import Image
 
 from libero_env.errors import LiberoError
 
-CODEC, PIXEL_FORMAT = "libx264", "yuv420p"  # every player and data set library can decode them
+PIXEL_FORMAT = "yuv420p"  # every player and data set library can decode it
+
+
+@dataclass(frozen=True)
+class Codec:
+    """How an MP4 file is encoded. Every second frame is a key frame, for random access.
+
+    Attributes:
+        name: Name of the format, such as `h264`.
+        encoder: FFmpeg's name of the encoder.
+        options: Options of the encoder; of `crf`, the quality, lower is better.
+    """
+
+    name: str
+    encoder: str
+    options: Mapping[str, str]
+
+
+# Visually lossless, and every player decodes it.
+H264 = Codec("h264", "libx264", MappingProxyType({"crf": "18", "g": "2", "bf": "0"}))
+# LeRobot's defaults (lerobot/datasets/video_utils.py: _get_codec_options).
+AV1 = Codec("av1", "libsvtav1", MappingProxyType({"crf": "30", "g": "2", "preset": "12"}))
 
 
 def import_av() -> ModuleType:
@@ -29,17 +54,17 @@ def import_av() -> ModuleType:
 class Mp4Writer:
     """Writes an MP4 file frame by frame; use it as a context manager.
 
-    Frame i is shown at exactly i / fps, and every second frame is a key frame, for random access.
+    Frame i is shown at exactly i / fps.
 
     Args:
         path: File to write.
         fps: Frames per second.
-        crf: Quality of H.264, lower is better; 18 is visually lossless.
+        codec: How frames are encoded.
     """
 
-    def __init__(self, path: Path, fps: int, crf: int = 18):
+    def __init__(self, path: Path, fps: int, codec: Codec = H264):
         self._av, self.path, self.frames = import_av(), path, 0
-        self._fps, self._crf = fps, crf
+        self._fps, self._codec = fps, codec
         self._container = self._av.open(str(path), "w")
         self._stream: Any = None
 
@@ -76,12 +101,31 @@ class Mp4Writer:
             raise LiberoError(
                 f"{self.path}: frames of {height}x{width} pixels; MP4 needs an even height and width, or write a .gif"
             )
-        stream = self._container.add_stream(CODEC, rate=self._fps)
+        try:
+            stream = self._container.add_stream(self._codec.encoder, rate=self._fps)
+        except ValueError as error:  # FFmpeg's "unknown codec"
+            raise LiberoError(
+                f"this build of PyAV has no encoder {self._codec.encoder}; its wheels have it: pip install --force av"
+            ) from error
         stream.height, stream.width, stream.pix_fmt = height, width, PIXEL_FORMAT
         stream.time_base = Fraction(1, self._fps)
-        stream.codec_context.options = {"crf": str(self._crf), "g": "2", "bf": "0"}
+        stream.codec_context.options = dict(self._codec.options)
         stream.codec_context.thread_count = 1
+        with _quiet_encoder():
+            stream.codec_context.open()
         return stream
+
+
+@contextmanager
+def _quiet_encoder() -> Iterator[None]:
+    """Keep SVT-AV1 from printing its settings; it takes the level of its messages from the environment only."""
+    before = os.environ.get("SVT_LOG")
+    os.environ.setdefault("SVT_LOG", "1")  # errors
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["SVT_LOG"]
 
 
 def write_video(path: Path, frames: np.ndarray, fps: int) -> Path:

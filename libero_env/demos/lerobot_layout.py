@@ -1,0 +1,191 @@
+"""What LeRobot data sets call things: features, their names and shapes, frames per second.
+
+`OWN` is this package's export. `LEROBOT_LIBERO` and `OPENPI_LIBERO` are the published sets of human demonstrations,
+`lerobot/libero` and `physical-intelligence/libero` on the Hugging Face Hub. Sources: the script that made the second,
+examples/libero/convert_libero_data_to_lerobot.py of Physical-Intelligence/openpi, and its data set card; the first is
+`HuggingFaceVLA/libero` (its card has the features, each with `fps`) after `convert_image_to_video_dataset` of LeRobot,
+which keeps the features and replaces those of the indices by LeRobot's default ones.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from libero_env.demos.video import AV1, H264, PIXEL_FORMAT, Codec
+from libero_env.timing import CONTROL_HZ
+
+ROBOT_TYPE = "panda"
+FILES_PER_CHUNK = 1000
+INDICES = ("frame_index", "episode_index", "index", "task_index")
+_AXES = ("height", "width", "channel")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names and numbers of a kind of data set.
+
+    Attributes:
+        version: Version of LeRobot's format.
+        fps: Frames per second in metadata, timestamps and videos; control steps are at 20 Hz whatever it says.
+        state: Feature of the state: position, rotation vector, fingers.
+        action: Feature of the action.
+        state_names: Names of the state's entries.
+        action_names: Names of the action's entries.
+        cameras: Camera -> feature of its images; others are `observation.images.<camera>`.
+        codec: How videos are encoded; None stores PNG files in the tables.
+        mirrored: Whether images are mirrored left to right.
+        outcome: Whether there are columns `next.reward` and `next.done`.
+        states_fps: Whether features state `fps`, too.
+        data_mb: Size from which a table is continued in another file, [MiB].
+        video_mb: Size from which a video is continued in another file, [MiB].
+    """
+
+    version: str
+    fps: int
+    state: str
+    action: str
+    state_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    cameras: Mapping[str, str]
+    codec: Codec | None
+    mirrored: bool
+    outcome: bool = False
+    states_fps: bool = False
+    data_mb: int = 100
+    video_mb: int = 200
+
+    def image_feature(self, key: str) -> str:
+        """Return the feature of a camera's images, such as `eye_in_hand_rgb` -> `observation.images.image2`."""
+        camera = key.removesuffix("_rgb")
+        return self.cameras.get(camera, f"observation.images.{camera}")
+
+    def features(self, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+        """Return the features as in info.json.
+
+        Args:
+            shapes: Feature of a camera -> height, width and number of channels of its images.
+        """
+        fps = {"fps": float(self.fps)} if self.states_fps else {}
+        number = {"shape": [1], "names": None}
+        found: dict[str, Any] = {}
+        for key, (height, width, channels) in shapes.items():
+            info = self._video_info(height, width, channels)
+            kind = {"dtype": "image" if self.codec is None else "video"}
+            found[key] = kind | {"shape": [height, width, channels], "names": list(_AXES)} | fps | info
+        found[self.state] = {"dtype": "float32", "shape": [8], "names": list(self.state_names)} | fps
+        found[self.action] = {"dtype": "float32", "shape": [7], "names": list(self.action_names)} | fps
+        found["timestamp"] = {"dtype": "float32", **number}
+        if self.outcome:
+            found |= {"next.reward": {"dtype": "float32", **number}, "next.done": {"dtype": "bool", **number}}
+        return found | {key: {"dtype": "int64", **number} for key in INDICES}
+
+    def _video_info(self, height: int, width: int, channels: int) -> dict[str, Any]:
+        if self.codec is None:
+            return {}
+        info = {
+            "video.height": height,
+            "video.width": width,
+            "video.channels": channels,
+            "video.codec": self.codec.name,
+            "video.pix_fmt": PIXEL_FORMAT,
+            "video.fps": self.fps,
+            "video.is_depth_map": False,
+            "has_audio": False,
+        }
+        # The published sets do not say it. Here it keeps LeRobot from merging images of different orientation.
+        orientation = {} if self.mirrored else {"image.first_row": "top", "image.mirrored": False}
+        return {"info": info | orientation}
+
+
+@dataclass(frozen=True)
+class ExportedEpisode:
+    """One episode as it is exported.
+
+    Attributes:
+        state: (T, 8) float32.
+        action: (T, 7) float32.
+        success: Whether the goal was reached.
+        images: Observation such as `agentview_rgb` -> (T, H, W, 3) uint8.
+        where: File and demonstration, for error messages.
+    """
+
+    state: np.ndarray
+    action: np.ndarray
+    success: bool
+    images: Mapping[str, np.ndarray]
+    where: str
+
+
+def episode_columns(
+    layout: Layout, episode: ExportedEpisode, number: int, first: int, task: int
+) -> dict[str, np.ndarray]:
+    """Return the columns of an episode, without images.
+
+    Args:
+        layout: Names of the columns.
+        episode: Episode of T frames.
+        number: Number of the episode in the data set.
+        first: Number of frames before it.
+        task: Index of its task.
+    """
+    steps = len(episode.action)
+    columns = {
+        layout.state: episode.state,
+        layout.action: episode.action,
+        "timestamp": (np.arange(steps) / layout.fps).astype(np.float32),
+    }
+    if layout.outcome:
+        reward = np.append(np.zeros(steps - 1), float(episode.success)).astype(np.float32)
+        columns |= {"next.reward": reward, "next.done": np.append(np.zeros(steps - 1, bool), True)}
+    return columns | {
+        "frame_index": np.arange(steps),
+        "episode_index": np.full(steps, number),
+        "index": first + np.arange(steps),
+        "task_index": np.full(steps, task),
+    }
+
+
+OWN = Layout(
+    version="v3.0",
+    fps=CONTROL_HZ,
+    state="observation.state",
+    action="action",
+    state_names=("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "finger1", "finger2"),
+    action_names=("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "gripper"),
+    cameras=MappingProxyType(
+        {"agentview": "observation.images.image", "eye_in_hand": "observation.images.image2"}
+    ),
+    codec=H264,
+    mirrored=False,
+    outcome=True,
+)
+LEROBOT_LIBERO = Layout(
+    version="v3.0",
+    fps=10,
+    state="observation.state",
+    action="action",
+    state_names=("state",),
+    action_names=("actions",),
+    cameras=OWN.cameras,
+    codec=AV1,
+    mirrored=True,
+    states_fps=True,
+    video_mb=500,
+)
+OPENPI_LIBERO = Layout(
+    version="v2.0",
+    fps=10,
+    state="state",
+    action="actions",
+    state_names=("state",),
+    action_names=("actions",),
+    cameras=MappingProxyType({"agentview": "image", "eye_in_hand": "wrist_image"}),
+    codec=None,
+    mirrored=True,
+)
+PUBLISHED: Mapping[str, Layout] = MappingProxyType(
+    {"lerobot/libero": LEROBOT_LIBERO, "physical-intelligence/libero": OPENPI_LIBERO}
+)
