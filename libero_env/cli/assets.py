@@ -54,6 +54,7 @@ def run_info(args: argparse.Namespace) -> None:
     from libero_env.assets.download import default_folder, read_manifest
     from libero_env.assets.installed import VERSION, installed_folder
     from libero_env.assets.pack import chosen_assets, facade_assets, pack_of
+    from libero_env.assets.published import ChangedAssetsError
 
     choice = chosen_assets()
     pack = pack_of(choice)
@@ -63,10 +64,13 @@ def run_info(args: argparse.Namespace) -> None:
     if root is None and choice.value != pack.name:
         print("         which does not exist")
     print(f"digest:  {pack.digest}" + (f", {_summary(root)}" if root else ""))
-    facade = facade_assets()
-    print(f"facade:  {pack_of(facade).name}" + (f": {facade.reason}" if facade != choice else ""))
-    if folder := installed_folder():
-        print(f"installed: {folder}, version {VERSION}")
+    try:
+        facade = facade_assets()
+        print(f"facade:  {pack_of(facade).name}" + (f": {facade.reason}" if facade != choice else ""))
+        if folder := installed_folder():
+            print(f"installed: {folder}, version {VERSION}")
+    except ChangedAssetsError as error:
+        print(f"facade:  {error}")
     if record := read_manifest(Path(root or default_folder())):
         print(f"downloaded: {root or default_folder()}, revision {record[0]}")
 

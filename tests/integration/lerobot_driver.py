@@ -1,8 +1,8 @@
-"""What LeRobot makes of our data sets; run by an interpreter that has LeRobot, see test_lerobot.py beside it.
+"""What LeRobot makes of our data sets; run by an interpreter that has LeRobot, see test_exported_sets.py beside it.
 
-    python lerobot_driver.py merge OURS SCRATCH    lerobot 0.4 or newer; prints JSON
-    python lerobot_driver.py read OURS             lerobot 0.3; prints JSON
-    python lerobot_driver.py openpi OURS FILE      the same, with openpi's libero_policy.py
+python lerobot_driver.py merge OURS SCRATCH    lerobot 0.4 or newer; prints JSON
+python lerobot_driver.py read OURS             lerobot 0.3; prints JSON
+python lerobot_driver.py openpi OURS FILE      the same, with openpi's libero_policy.py
 """
 
 import importlib.util
@@ -96,12 +96,19 @@ def _write(features: dict, root: Path) -> Path:
 
     rng = np.random.default_rng(0)
     dataset = LeRobotDataset.create(
-        "test/random", fps=10, features=features, robot_type="panda", root=root, use_videos=features is not CARD
+        "test/random",
+        fps=10,
+        features=features,
+        robot_type="panda",
+        root=root,
+        use_videos=features is not CARD,
     )
     for _ in range(2):
         for _ in range(5):
             frame = {key: rng.normal(size=length).astype(np.float32) for key, (length, _) in NUMBERS.items()}
-            frame |= {key: rng.integers(0, 256, (256, 256, 3), np.uint8) for key in features if "images" in key}
+            frame |= {
+                key: rng.integers(0, 256, (256, 256, 3), np.uint8) for key in features if "images" in key
+            }
             dataset.add_frame(frame | {"task": "put the bowl on the plate"})
         dataset.save_episode()
     dataset.finalize()

@@ -1,0 +1,100 @@
+"""LeRobot and openpi read what is exported in the layout of the published sets, and merge it with their metadata.
+
+They need environments of their own. `LIBERO_LEROBOT` names a Python with lerobot 0.4 or newer, by default that of
+tests/harness/peers.py; `LIBERO_LEROBOT_V2` one with lerobot 0.3, the last that reads version 2.0; `LIBERO_OPENPI` openpi's
+file src/openpi/policies/libero_policy.py. experiments/data_sets/README.md states how they are made and what came out.
+"""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero_env.demos.generate import generate
+from libero_env.demos.lerobot import export_lerobot, export_published
+from libero_env.demos.regenerate import Regeneration
+from tests.harness.peers import lerobot
+
+pytest.importorskip("av")
+parquet = pytest.importorskip("pyarrow.parquet")
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+DRIVER = Path(__file__).with_name("lerobot_driver.py")
+HOW = Regeneration(settle_steps=0, assets="builtin", drawing="fast")
+LANGUAGE = "pick up the milk and place it in the basket"
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIBERO_ASSETS", "builtin")
+        out = tmp_path_factory.mktemp("demos") / "pick_up_the_milk_and_place_it_in_the_basket_demo.hdf5"
+        return generate("libero_object/7", 1, path=out, camera_size=(16, 16), workers=1, progress=False)
+
+
+def _named(variable):
+    value = os.environ.get(variable)
+    if not value or not Path(value).exists():
+        pytest.skip(f"{variable} names nothing; see experiments/data_sets/README.md")
+    return value
+
+
+def _lerobot():
+    return _named("LIBERO_LEROBOT") if "LIBERO_LEROBOT" in os.environ else str(lerobot().python)
+
+
+def _run(python, home, *arguments):
+    env = os.environ | {"HF_HUB_OFFLINE": "1", "HF_HOME": str(home)}
+    command = [python, str(DRIVER), *map(str, arguments)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
+    result = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
+    assert done.returncode == 0 and result, done.stderr[-4000:]
+    return json.loads(result[0].removeprefix("RESULT "))
+
+
+def test_lerobot_merges_ours_with_the_published_metadata(file, tmp_path):
+    python = _lerobot()
+    ours = tmp_path / "ours"
+    written = export_published([file], ours, "lerobot/libero", HOW, progress=False)
+    found = _run(python, tmp_path / "hf", "merge", ours, tmp_path)
+    assert (found["fps"], found["robot_type"]) == (10, "panda")
+    assert (found["episodes"], found["frames"]) == (2 + 1, 2 * 5 + written.frames)
+    assert found["tasks"] == ["put the bowl on the plate", LANGUAGE]
+    features = json.loads((ours / "meta/info.json").read_text())["features"]
+    for key, feature in found["converted"].items():  # `info` is worded otherwise by newer versions
+        assert {**feature, "info": None} == {**features[key], "info": None}
+    merged = sorted(Path(found["merged"]).glob("data/*/*.parquet"))
+    rows = [row for path in merged for row in parquet.read_table(path).to_pylist()]
+    table = parquet.read_table(ours / "data/chunk-000/file-000.parquet")
+    last = [row["action"] for row in rows if row["episode_index"] == 2]
+    np.testing.assert_array_equal(last, table["action"].to_pylist())
+
+
+def test_lerobot_refuses_to_merge_the_unturned_export(file, tmp_path):
+    python = _lerobot()
+    export_lerobot([file], tmp_path / "own", progress=False)
+    with pytest.raises(AssertionError, match="ValueError: Same f"):
+        _run(python, tmp_path / "hf", "merge", tmp_path / "own", tmp_path)
+
+
+def test_lerobot_reads_the_set_of_version_2(file, tmp_path):
+    python = _named("LIBERO_LEROBOT_V2")
+    written = export_published([file], tmp_path / "ours", "physical-intelligence/libero", HOW, progress=False)
+    found = _run(python, tmp_path / "hf", "read", tmp_path / "ours")
+    assert (found["episodes"], found["frames"], found["task"]) == (1, written.frames, LANGUAGE)
+    shapes = {"image": [3, 256, 256], "wrist_image": [3, 256, 256], "state": [8], "actions": [7]}
+    assert shapes.items() <= found["shapes"].items() and 0.5 < found["largest"] <= 1.0
+    table = parquet.read_table(tmp_path / "ours/data/chunk-000/episode_000000.parquet")
+    np.testing.assert_allclose(found["actions"], table["actions"][-1].as_py(), atol=1e-6)
+
+
+def test_the_inputs_of_openpi_read_it(file, tmp_path):
+    python, policy = _named("LIBERO_LEROBOT_V2"), _named("LIBERO_OPENPI")
+    export_published([file], tmp_path / "ours", "physical-intelligence/libero", HOW, progress=False)
+    found = _run(python, tmp_path / "hf", "openpi", tmp_path / "ours", policy)
+    for camera in ("base_0_rgb", "left_wrist_0_rgb"):
+        shape, kind, largest = found["images"][camera]
+        assert (shape, kind) == ([256, 256, 3], "uint8") and largest > 100
+    assert (found["state"], found["actions"], found["prompt"]) == ([8], [7], LANGUAGE)
