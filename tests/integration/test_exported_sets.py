@@ -1,8 +1,9 @@
 """LeRobot and openpi read what is exported in the layout of the published sets, and merge it with their metadata.
 
-They need environments of their own. `LIBERO_LEROBOT` names a Python with lerobot 0.4 or newer, by default that of
-tests/harness/peers.py; `LIBERO_LEROBOT_V2` one with lerobot 0.3, the last that reads version 2.0; `LIBERO_OPENPI` openpi's
-file src/openpi/policies/libero_policy.py. experiments/data_sets/README.md states how they are made and what came out.
+They need environments of their own, which variables name. `LIBERO_LEROBOT`: a Python with lerobot 0.4 or newer, by
+default that of tests/harness/peers.py. `LIBERO_LEROBOT_V2`: one with lerobot 0.3, the last that reads version 2.0.
+`LIBERO_OPENPI`: openpi's file src/openpi/policies/libero_policy.py. experiments/data_sets/README.md states how they are
+made and what came out.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Exports in the layouts of published sets: their metadata to the letter, turned images, no no-ops, successes only.
 
 The expected metadata are those of the data set cards: `physical-intelligence/libero` as it is there, `lerobot/libero`
-as LeRobot's conversion of `HuggingFaceVLA/libero` to videos writes it (tests/integration/test_exported_sets.py runs it).
+as LeRobot's conversion of `HuggingFaceVLA/libero` to videos writes it (run by tests/integration/test_exported_sets.py).
 """
 
 import io
