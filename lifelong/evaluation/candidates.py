@@ -101,13 +101,18 @@ class RunPolicy(PolicyUnderTest):
 
 
 class UserPolicy(PolicyUnderTest):
-    """A user-defined policy; see `lifelong.evaluation.actors.CallableActor` for its interface."""
+    """A user-defined policy; see `lifelong.evaluation.actors.CallableActor` for its interface.
+
+    Its module's source is part of its identity, and so is what it names in an attribute `identity`, plain data such as
+    the digest of its weights: results of different ones are not mixed.
+    """
 
     def __init__(self, args: argparse.Namespace):
 
         self.args, self.policy = args, load_callable(args.policy)
         self.cameras = tuple(getattr(self.policy, "cameras", ("agentview", "robot0_eye_in_hand")))
-        self.identity = {"policy": args.policy}
+        own = getattr(self.policy, "identity", {})
+        self.identity = {"policy": args.policy, "source": source_digest(args.policy), **own}
         self.out = Path("eval") / args.policy.replace(":", ".")
         self.selection = SELECTION
 
@@ -237,3 +242,11 @@ def load_callable(text: str) -> Any:
             f"{text}() returns a {type(policy).__name__} without predict(observations) -> (B, 7) actions"
         )
     return policy
+
+
+def source_digest(text: str) -> str | None:
+    """Return the digest of the source of the module in `module:function`; None if it has no file of its own."""
+    source = getattr(sys.modules[text.partition(":")[0]], "__file__", None)
+    if source is None or not Path(source).is_file():
+        return None
+    return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]

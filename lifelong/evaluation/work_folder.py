@@ -267,6 +267,8 @@ def read_plan(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict) or values.get("format") != PLAN_FORMAT:
         stated = values.get("format") if isinstance(values, dict) else None
         raise ConfigError(f"{file} has the format {stated!r}; this version reads {PLAN_FORMAT}: {AGAIN}")
+    if not all(isinstance(values.get(key), dict) for key in ("units", "evaluated")):
+        raise LifelongError(f"{file} lacks `units` or `evaluated`: it is broken; {AGAIN}")
     return values
 
 

@@ -10,7 +10,7 @@ import pytest
 from lifelong.cli import main as cli
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
-from lifelong.evaluation.candidates import load_callable
+from lifelong.evaluation.candidates import UserPolicy, load_callable
 from lifelong.evaluation.protocols import PROTOCOLS, choose_init_states
 from lifelong.results.evaluation_file import EvaluationResult, overall
 from lifelong.results.metrics import wilson_interval
@@ -178,6 +178,17 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     for option, message in (("--workers", "at least 1"), ("--unit-starts", "at least 1")):
         assert cli.main([*command, option, "0"]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):
+    arguments = argparse.Namespace(policy=f"{module}:make")
+    first = UserPolicy(arguments).identity
+    assert first["policy"] == f"{module}:make" and len(first["source"]) == 16
+    file = tmp_path / f"{module}.py"
+    file.write_text(file.read_text() + "\nPolicy.identity = {'weights': '0123'}")
+    sys.modules.pop(module)
+    second = UserPolicy(arguments).identity
+    assert second["source"] != first["source"] and second["weights"] == "0123"
 
 
 def test_errors_are_reported_in_one_line(module, tmp_path, capsys):

@@ -292,6 +292,9 @@ def test_a_folder_of_an_earlier_version_or_of_something_else_is_refused(tmp_path
     (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/7"}')
     with pytest.raises(ConfigError, match="libero-evaluation-plan/7"):
         evaluate(tmp_path)
+    (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/1"}')
+    with pytest.raises(LifelongError, match="it is broken; name another folder"):
+        evaluate(tmp_path)
     with pytest.raises(LifelongError, match="holds no evaluation"):
         describe_status(tmp_path / "old")
 
