@@ -5,9 +5,11 @@ that states of the original have the same layout. The poses of fixtures belong t
 `Simulations` has them.
 """
 
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
+from threading import RLock
 
 import mujoco
 import numpy as np
@@ -132,14 +134,43 @@ def default_drawing(pack: Pack) -> str:
     return FAITHFUL if isinstance(pack, OriginalPack) and pack.lod is None else FAST
 
 
-@lru_cache(maxsize=160)
-def _build_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
+def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
     model = scene_spec(problem, pack, entities, drawing=drawing, robot=robot).compile()
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
     return Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot)
+
+
+class _SceneCache:
+    """Compiled scenes, the least recently used of which are dropped beyond a size: one of the original has 300 MB."""
+
+    def __init__(self, max_bytes: int = 1 << 30):
+        self._max_bytes, self._bytes = max_bytes, 0
+        self._scenes: OrderedDict[Hashable, Scene] = OrderedDict()
+        self._lock = RLock()
+
+    def __call__(self, problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
+        """Return the scene of these arguments; it is compiled if it is not there."""
+        key = (problem, pack, drawing, robot)
+        with self._lock:
+            if key not in self._scenes:
+                self._scenes[key] = scene = _compile_scene(*key)
+                self._bytes += mujoco.mj_sizeModel(scene.model)
+            self._scenes.move_to_end(key)
+            while self._bytes > self._max_bytes and len(self._scenes) > 1:
+                self._bytes -= mujoco.mj_sizeModel(self._scenes.popitem(last=False)[1].model)
+            return self._scenes[key]
+
+    def cache_clear(self) -> None:
+        """Drop all scenes."""
+        with self._lock:
+            self._scenes.clear()
+            self._bytes = 0
+
+
+_build_scene = _SceneCache()
 
 
 def scene_spec(

@@ -6,13 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero_env.assets.pack import BuiltinPack
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import PlacementError, RenderError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
 from libero_env.init_states.placement import lowest_point, sample_start
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.render import Renderer, open_context
-from libero_env.sim.scene import build_scene
+from libero_env.sim.scene import _SceneCache, build_scene
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import bddl, get_suite, get_task
@@ -223,3 +224,17 @@ def test_axis_angle_turns_back_into_the_rotation():
         angle, back = np.linalg.norm(vector), np.zeros(4)
         mujoco.mju_axisAngle2Quat(back, vector / max(angle, 1e-12), angle)
         assert abs(back @ quat) == pytest.approx(1)
+
+
+def test_compiled_scenes_are_kept_up_to_a_size():
+    problems = [get_task(f"libero_object/{i}").problem for i in range(3)]
+    kept = _SceneCache()
+    first, second = (kept(problem, BuiltinPack(), "fast", "libero") for problem in problems[:2])
+    assert kept(problems[0], BuiltinPack(), "fast", "libero") is first
+    small = _SceneCache(max_bytes=mujoco.mj_sizeModel(first.model) + mujoco.mj_sizeModel(second.model))
+    found = [small(problem, BuiltinPack(), "fast", "libero") for problem in problems]
+    assert small(problems[2], BuiltinPack(), "fast", "libero") is found[2]
+    assert small(problems[0], BuiltinPack(), "fast", "libero") is not found[0], "the oldest is dropped"
+    tiny = _SceneCache(max_bytes=0)
+    last = tiny(problems[0], BuiltinPack(), "fast", "libero")
+    assert tiny(problems[0], BuiltinPack(), "fast", "libero") is last, "the last one stays"
