@@ -37,6 +37,7 @@ def test_notebooks_are_small_and_sound(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_notebook(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_ASSETS", "builtin")  # whatever is installed
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "demos"))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")

@@ -1,5 +1,6 @@
 """Demonstration files as a whole: which task they are of, what is in them, and files made of parts of them."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -297,5 +298,7 @@ def describe(file: Path) -> str:
         images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no images"
         failed = data.attrs.get("num_failed_attempts", "unknown")
         pairing = data.attrs.get("pairing", "libero")
+        models = json.loads(data.attrs.get("models", "{}")).get("pack", "unknown")
     parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", images, f"failed attempts: {failed}")
-    return f"{file}: {', '.join(parts)}, pairing: {pairing}, {show_bytes(file.stat().st_size)}"
+    more = f"pairing: {pairing}, models: {models}, {show_bytes(file.stat().st_size)}"
+    return f"{file}: {', '.join(parts)}, {more}"

@@ -29,7 +29,7 @@ class EnvConfig:
         control_delta: Whether actions are relative to the current pose.
         reward: `sparse` or `staged`, see `libero_env.sim.rewards`.
         reward_scale: Reward of success.
-        assets: Asset pack of the models: a `Pack`, `builtin`, a folder, or None for the user's choice.
+        assets: Asset pack of the models: a `Pack`, `builtin`, `original`, a folder, or None for the user's choice.
         semantics: Semantics of the predicates: `original`, or `strict`, see `libero_env.sim.predicates`.
         drawing: How images are drawn: `faithful`, `fast`, or None for the pack's default, see `libero_env.sim.scene`.
         robot: Model of the arm: `libero`, or `robosuite-1.4.1`, see `libero_env.assets.robot`.

@@ -74,6 +74,7 @@ def folder(tmp_path, monkeypatch, demos) -> Path:
         write_box(tmp_path / "custom_assets" / name / f"{name}.obj", half)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path / ".libero"))
+    monkeypatch.setenv("LIBERO_ASSETS", "builtin")  # whatever is installed
     monkeypatch.setenv("LIBERO_DEMOS", str(demos))
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.delenv("DISPLAY", raising=False)
