@@ -1,11 +1,12 @@
 """`libero eval` and `libero saliency`: the success of a policy, and where it looks."""
 
 import argparse
+import io
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -186,7 +187,8 @@ def help_eval(args: argparse.Namespace) -> None:
 
     with suppress(KeyboardInterrupt), _ending_politely():
         try:
-            plan = plan_eval(args)
+            with redirect_stderr(io.StringIO()):  # the other process says the same
+                plan = plan_eval(args)
             with policy_threads(plan):
                 Worker(plan).run()
         except (LiberoError, OSError) as error:

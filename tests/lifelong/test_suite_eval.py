@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lifelong.cli import main as cli
+from lifelong.cli.evaluate import plan_eval
 from lifelong.errors import ConfigError, LifelongError, PolicyError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
 from lifelong.evaluation.candidates import UserPolicy, load_callable
@@ -178,6 +179,46 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     for option, message in (("--workers", "at least 1"), ("--unit-starts", "at least 1")):
         assert cli.main([*command, option, "0"]) == 2
         assert message in capsys.readouterr().err
+
+
+FEELING = """
+import numpy as np
+
+class Policy:
+    cameras, observations = (), ("proprioception", "ee_quat")
+
+    def predict(self, observations):
+        position = next(x for name, x in observations.items() if name in ("ee_pos", "robot0_eef_pos"))
+        return np.tanh(10 * np.concatenate([position, np.sin(1e6 * position), position[:, :1]], axis=1))
+
+def make():
+    return Policy()
+"""
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("protocol", ["libero", "openpi"])
+def test_a_unit_does_not_depend_on_those_before_it(protocol, tmp_path, monkeypatch):
+    """The actions depend on every bit of the position, and their digest is part of the result."""
+    (tmp_path / "feeling_policy.py").write_text(FEELING)
+    monkeypatch.chdir(tmp_path)
+    words = [
+        "eval",
+        "feeling_policy:make",
+        "--suite",
+        "libero_goal/0",
+        "--episodes",
+        "4",
+        "--unit-starts",
+        "2",
+    ]
+    plan = plan_eval(cli.build_parser().parse_args([*words, "--protocol", protocol, "--horizon", "5"]))
+    monkeypatch.delitem(sys.modules, "feeling_policy")
+    with plan.pool() as pool:
+        in_turn = [plan.evaluate(unit, pool).result for unit in plan.units]
+    with plan.pool() as pool:
+        alone = plan.evaluate(plan.units[1], pool).result
+    assert alone == in_turn[1] and len({*in_turn[0].actions, *in_turn[1].actions}) == 4
 
 
 def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):
