@@ -15,7 +15,7 @@ SMALL += ["--horizon", "20", "--pause", "0.5"]
 
 def test_killed_three_times_three_processes_end_with_the_result_of_one():
     done = subprocess.run(
-        [sys.executable, SCRIPT, "--kills", "3", *SMALL], capture_output=True, text=True, timeout=600
+        [sys.executable, SCRIPT, "--kills", "3", *SMALL], capture_output=True, text=True, timeout=1800
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "kills: 3" in done.stdout and "units: 8, episodes: 16" in done.stdout
