@@ -144,14 +144,15 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         actions = checked_actions(actions, self.num_envs, self.world.controller.action_dim)
         ids = np.flatnonzero(self._running)
         reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
+        state = None
         if ids.size:
-            self.world.step(ids, actions)
+            state = self.world.step_and_observe(ids, actions, self._images if self.render_images else None)
             reached[ids], rewards[ids] = self._check_goals(ids)
             self._steps[ids] += 1
         truncated = self._running & ~reached & (self._steps >= self.config.horizon)
         self._success |= reached
         self._running &= ~(reached | truncated)
-        return self._observe(ids), rewards, reached, truncated, self._info()
+        return self._observation(state), rewards, reached, truncated, self._info()
 
     def get_state(self, i: int) -> np.ndarray:
         """Return the state of simulation i, as `LiberoEnv.get_state`."""
@@ -191,7 +192,12 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         """Return the observations of all simulations, with images rendered of the given ones."""
         if self.render_images:
             self.world.render_cameras(ids, self._images)
-        return {**{k: v.copy() for k, v in self._images.items()}, **self.world.proprioception()}
+        return self._observation(None)
+
+    def _observation(self, state: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+        """Return copies of the images, with the given observations of the state or those of the present one."""
+        images = {name: values.copy() for name, values in self._images.items()}
+        return {**images, **(self.world.proprioception() if state is None else state)}
 
     def _info(self) -> dict[str, Any]:
         return {"success": self._success.copy(), "progress": self._progress.copy()}

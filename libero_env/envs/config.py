@@ -13,6 +13,7 @@ from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
 
+AFTER, SUBSTEP = OBSERVED = ("after", "substep")
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
 
@@ -33,9 +34,11 @@ class EnvConfig:
         semantics: Semantics of the predicates: `original`, or `strict`, see `libero_env.sim.predicates`.
         drawing: How images are drawn: `faithful`, `fast`, or None for the pack's default, see `libero_env.sim.scene`.
         robot: Model of the arm: `libero`, or `robosuite-1.4.1`, see `libero_env.assets.robot`.
+        observed: When a step is observed: `after` it, or in its last `substep` but one, as by the original: joints
+            2 ms, poses and images 4 ms before the end.
 
     Raises:
-        UnknownNameError: The semantics, the drawing or the robot do not exist.
+        UnknownNameError: The semantics, the drawing, the robot or the time of observation do not exist.
     """
 
     cameras: Sequence[str] = DEFAULT_CAMERAS
@@ -50,6 +53,7 @@ class EnvConfig:
     semantics: str = "original"
     drawing: str | None = None
     robot: str = DEFAULT_ROBOT
+    observed: str = AFTER
 
     def __post_init__(self) -> None:
         height, width = self.camera_size
@@ -62,6 +66,8 @@ class EnvConfig:
             raise UnknownNameError("drawing", self.drawing, DRAWINGS)
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, ROBOTS)
+        if self.observed not in OBSERVED:
+            raise UnknownNameError("time of observation", self.observed, OBSERVED)
 
     @classmethod
     def from_options(cls, config: "EnvConfig | None", options: Mapping[str, Any]) -> "EnvConfig":
@@ -96,6 +102,7 @@ class EnvOptions(TypedDict, total=False):
     semantics: str
     drawing: str | None
     robot: str
+    observed: str
 
 
 def show_options(constructor: Constructor) -> Constructor:

@@ -116,14 +116,15 @@ class LiberoEnv(gymnasium.Env):
         action = checked_actions(action, size=self.world.controller.action_dim)
         if not self._running:
             raise LiberoError("no episode is running; call reset()")
-        self.world.step([0], action[None])
+        images = self._images if self.render_images else None
+        state = self.world.step_and_observe([0], action[None], images)
         self._steps += 1
         info = self._info()
         terminated = info["success"]
         truncated = not terminated and self._steps >= self.config.horizon
         self._running = not (terminated or truncated)
         reward = self.reward(self.view, terminated, self.world.atoms, list(info["progress"].values()))
-        return self._observe(), reward, terminated, truncated, info
+        return self._observation(state), reward, terminated, truncated, info
 
     def get_state(self) -> np.ndarray:
         """Return all that the rest of the episode depends on: simulation, controller and number of steps."""
@@ -171,8 +172,12 @@ class LiberoEnv(gymnasium.Env):
     def _observe(self) -> dict[str, np.ndarray]:
         if self.render_images:
             self.world.render_cameras([0], self._images)
+        return self._observation(self.world.proprioception())
+
+    def _observation(self, state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return copies of the images, and observations of the state, (1, ...) each, without the first axis."""
         images = {key: rows[0].copy() for key, rows in self._images.items()}
-        return {**images, **{key: rows[0] for key, rows in self.world.proprioception().items()}}
+        return {**images, **{key: rows[0] for key, rows in state.items()}}
 
     def _info(self) -> dict[str, Any]:
         success, progress = self.world.check_goal(0)

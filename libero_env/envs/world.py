@@ -11,15 +11,15 @@ import numpy as np
 from gymnasium import spaces
 
 from libero_env.assets.pack import select_pack
-from libero_env.envs.config import EnvConfig, EnvOptions, show_options
+from libero_env.envs.config import AFTER, EnvConfig, EnvOptions, show_options
 from libero_env.errors import LiberoError
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
 from libero_env.sim.controller import ControllerState, get_controller
-from libero_env.sim.observations import Observer
+from libero_env.sim.observations import Observer, is_of_joints
 from libero_env.sim.predicates import atoms_of, evaluate
 from libero_env.sim.scene import build_scene
-from libero_env.sim.simulation import Indices, make_simulations
+from libero_env.sim.simulation import WATCHED, Indices, make_simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.problem import And
@@ -152,6 +152,37 @@ class World:
             actions: Action of each simulation, (num, action_dim), finite; rows of other simulations are not used.
         """
         self.simulations.step(ids, actions)
+
+    def step_and_observe(
+        self, ids: Indices, actions: np.ndarray, images: dict[str, np.ndarray] | None
+    ) -> dict[str, np.ndarray]:
+        """Advance simulations by one control period, and observe them when `config.observed` says.
+
+        Args:
+            ids: As in `step`.
+            actions: As in `step`.
+            images: Arrays of `empty_images` whose rows `ids` are rendered; None renders nothing.
+
+        Returns:
+            All observations except images, see `proprioception`.
+        """
+        if self.config.observed == AFTER:
+            self.step(ids, actions)
+            if images is not None:
+                self.render_cameras(ids, images)
+            return self.proprioception()
+        seen = self.proprioception()
+
+        def watch(done: int, rows: np.ndarray) -> None:
+            now = self.proprioception()
+            if done == WATCHED[0] and images is not None:
+                self.render_cameras(rows, images)
+            for name, values in now.items():
+                if (done == WATCHED[1]) == is_of_joints(name):
+                    seen[name][rows] = values[rows]
+
+        self.simulations.step(ids, actions, watch=watch)
+        return seen
 
     def progress(self, i: int) -> dict[str, bool]:
         """Return the truth of each atom of the goal in simulation i, by its text."""

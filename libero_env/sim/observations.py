@@ -57,6 +57,16 @@ _IMAGE_NAMES = ("rgb", "depth", *(f"segmentation_{kind}" for kind in SEGMENTATIO
 NAMES = (*_IMAGE_NAMES, "proprioception", *_ROBOT, "objects")
 
 
+def is_of_joints(name: str) -> bool:
+    """Return whether an entry is of joints, and not of poses, which the simulation computes from them."""
+    return name in (
+        "joint_states",
+        "gripper_states",
+        "joint_velocities",
+        "gripper_velocities",
+    ) or name.endswith("_joints")
+
+
 class Observer:
     """Observer of the simulations of one scene.
 

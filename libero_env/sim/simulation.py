@@ -42,8 +42,11 @@ _FIELDS = (
 # The original calls mj_forward twice in each substep. Where that moves the solver's warm start we do it, too.
 _SOLVES_BEFORE_STEP = 2 if FORWARD_WARM_STARTS else 0
 
+# Substeps after which the original observes: kinematics of the first, positions of the second
+WATCHED = (SUBSTEPS - 2, SUBSTEPS - 1)
 Indices = Sequence[int] | np.ndarray
 KinematicsHook = Callable[[mujoco.MjData], None]
+Watch = Callable[[int, np.ndarray], None]  # number of substeps done, indices of the simulations
 
 
 class Simulations(ABC):
@@ -84,6 +87,7 @@ class Simulations(ABC):
         actions: np.ndarray,
         before_last_kinematics: KinematicsHook | None,
         believed: dict[str, np.ndarray],
+        watch: Watch | None,
     ) -> None:
         """Run one control period with the goals that are set; in its first substep the controller sees `believed`."""
 
@@ -169,7 +173,11 @@ class Simulations(ABC):
         self.model.body_quat[self.fixture_bodies] = self.fixtures[i, :, 3:]
 
     def step(
-        self, ids: Indices, actions: np.ndarray, before_last_kinematics: KinematicsHook | None = None
+        self,
+        ids: Indices,
+        actions: np.ndarray,
+        before_last_kinematics: KinematicsHook | None = None,
+        watch: Watch | None = None,
     ) -> None:
         """Advance simulations by one control period.
 
@@ -178,12 +186,14 @@ class Simulations(ABC):
             actions: Action of each simulation, (num, action_dim); rows of other simulations are not used.
             before_last_kinematics: Function that is called with each MjData in the last but one substep, after its
                 integration and before its kinematics; there the original LIBERO observes. `LoopSimulations` only.
+            watch: Function that is called after each substep of `WATCHED`, with the number of substeps done
+                and the indices of the simulations whose fields are of that moment.
         """
         ids = np.asarray(ids, np.int64)
         state, believed, site = self.controller_state, self._believed(ids), self.arm.site
         pos, mat = believed["site_xpos"][:, site], believed["site_xmat"][:, site]
         state.controller.set_goals(ids, actions, believed["qpos"], pos, mat, state.goal, state.memory)
-        self._substeps(ids, actions, before_last_kinematics, believed)
+        self._substeps(ids, actions, before_last_kinematics, believed, watch)
         self._outdated[ids] = False
 
     def get_state(self, i: int) -> np.ndarray:
@@ -274,6 +284,7 @@ class LoopSimulations(Simulations):
         actions: np.ndarray,
         before_last_kinematics: KinematicsHook | None,
         believed: dict[str, np.ndarray],
+        watch: Watch | None,
     ) -> None:
         model, constants, first = self.model, self._constants(), np.zeros(1, np.int64)
         kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
@@ -293,6 +304,9 @@ class LoopSimulations(Simulations):
                 if before_last_kinematics is not None and substep == SUBSTEPS - 2:
                     before_last_kinematics(data)
                 mujoco.mj_step1(model, data)
+                if watch is not None and substep + 1 in WATCHED:
+                    self._gather(np.array([i]))
+                    watch(substep + 1, np.array([i]))
         self._gather(ids)
 
     def _warm_start(self, i: int) -> list[np.ndarray]:
@@ -344,6 +358,7 @@ class BatchSimulations(Simulations):
         actions: np.ndarray,
         before_last_kinematics: KinematicsHook | None,
         believed: dict[str, np.ndarray],
+        watch: Watch | None,
     ) -> None:
         if before_last_kinematics is not None:
             raise LiberoError("batched simulations take no before_last_kinematics hook; use LoopSimulations")
@@ -355,6 +370,8 @@ class BatchSimulations(Simulations):
                 inputs = self._inputs(self.fields)
             kernel(ids, actions, *inputs, *state, ctrl, *constants)
             self._batch.step(ids, nstep=1, stage=stage)
+            if watch is not None and substep + 1 in WATCHED:
+                watch(substep + 1, ids)
 
     def _warm_start(self, i: int) -> list[np.ndarray]:
         return [self._qacc_warmstart[i], self.fields["ctrl"][i]]

@@ -204,6 +204,11 @@ class ProtocolActor:
             self._waiting = self._predict(inputs)
         return self._waiting.pop(0)
 
+    @property
+    def sees_next(self) -> bool:
+        """Whether the next observation is given to the object."""
+        return not self._waiting
+
     def _predict(self, inputs: Sequence[PolicyInput]) -> list[np.ndarray]:
         """Return the actions (B, A) of the next steps."""
         images = {name: np.stack([one.images[name] for one in inputs]) for name in inputs[0].images}

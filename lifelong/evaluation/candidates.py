@@ -11,8 +11,6 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from libero_env.assets.robot import DEFAULT_ROBOT
-from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import LifelongError
@@ -20,12 +18,11 @@ from lifelong.evaluation.actors import Actor, CallableActor, PolicyActor, Protoc
 from lifelong.evaluation.adapter import CardAdapter
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.protocol_env import ProtocolEnv
+from lifelong.evaluation.protocol_env import OBSERVATIONS, make_env
 from lifelong.evaluation.protocols import SELECTION
 from lifelong.evaluation.restore import restore
 from lifelong.seeding import generator
 
-OBSERVATIONS = ("rgb", "proprioception", "ee_quat")
 ROLLOUT = 4  # first word of the seeds of stochastic policies; those of runs are in lifelong.sequence
 
 
@@ -172,50 +169,6 @@ def run_protocol(base: Card, image_size: tuple[int, int], horizon: int, settle_s
         own |= {"episode.horizon": horizon, "episode.settle_steps": settle_steps}
         own["episode.settle_action"] = base.settle_action if settle_steps else None
     return base.changed(own)
-
-
-def make_env(
-    task: Task,
-    count: int,
-    protocol: Card,
-    *,
-    cameras: Sequence[str] | None = None,
-    observations: Sequence[str] = OBSERVATIONS,
-    threads: int = 0,
-    assets: str | None = None,
-    drawing: str | None = "protocol",
-) -> ProtocolEnv:
-    """Build the environment of a task under a protocol.
-
-    Args:
-        task: Task.
-        count: Number of simulations.
-        protocol: Protocol.
-        cameras: Cameras that are rendered; by default the protocol's.
-        observations: Names of observations, see `libero_env.sim.observations`.
-        threads: Number of threads of the simulations; 0 is one for each core.
-        assets: Models, see `libero_env.envs.config.EnvConfig`.
-        drawing: How images are drawn; by default as the protocol says, None for the models' default.
-    """
-    world = protocol.world
-    size = protocol.pixels.render_size
-    assert size is not None, "the protocol has been checked by require()"
-    env = BatchEnv(
-        task,
-        count,
-        num_threads=threads,
-        cameras=protocol.pixels.cameras if cameras is None else tuple(cameras),
-        camera_size=size,
-        horizon=protocol.steps(task) + protocol.settle_steps,
-        observations=tuple(observations),
-        controller=world.controller,
-        control_delta=world.delta,
-        semantics=world.predicates,
-        assets=assets,
-        drawing=world.drawing if drawing == "protocol" else drawing,
-        robot=world.robot or DEFAULT_ROBOT,
-    )
-    return ProtocolEnv(env, protocol)
 
 
 def load_callable(text: str) -> Any:

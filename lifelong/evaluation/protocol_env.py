@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.assets.pack import BUILTIN, select_pack
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.config import EnvConfig
 from libero_env.envs.world import World
@@ -16,6 +17,8 @@ from libero_env.tasks import Task
 from lifelong.errors import ConfigError, ProtocolMismatchError
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.inputs import Obs
+
+OBSERVATIONS = ("rgb", "proprioception", "ee_quat")
 
 
 class ProtocolEnv:
@@ -42,6 +45,15 @@ class ProtocolEnv:
     def config(self) -> EnvConfig:
         """Configuration of the simulations."""
         return self.env.config
+
+    @property
+    def render_images(self) -> bool:
+        """Whether images are rendered, as that of the simulations; may be set."""
+        return self.env.render_images
+
+    @render_images.setter
+    def render_images(self, wanted: bool) -> None:
+        self.env.render_images = wanted
 
     @property
     def atoms(self) -> tuple[str, ...]:
@@ -89,6 +101,51 @@ class ProtocolEnv:
                 "are not here: name LIBERO's folder init_files under init_states in ~/.libero/config.yaml"
             )
         return states
+
+
+def make_env(
+    task: Task,
+    count: int,
+    protocol: Card,
+    *,
+    cameras: Sequence[str] | None = None,
+    observations: Sequence[str] = OBSERVATIONS,
+    threads: int = 0,
+    assets: str | None = None,
+    drawing: str | None = "protocol",
+) -> ProtocolEnv:
+    """Build the environment of a task under a protocol.
+
+    Args:
+        task: Task.
+        count: Number of simulations.
+        protocol: Protocol.
+        cameras: Cameras that are rendered; by default the protocol's.
+        observations: Names of observations, see `libero_env.sim.observations`.
+        threads: Number of threads of the simulations; 0 is one for each core.
+        assets: Models, see `libero_env.envs.config.EnvConfig`.
+        drawing: How images are drawn; by default as the protocol says, None for the models' default.
+    """
+    world = protocol.world
+    size = protocol.pixels.render_size
+    assert size is not None, "the protocol has been checked by require()"
+    env = BatchEnv(
+        task,
+        count,
+        num_threads=threads,
+        cameras=protocol.pixels.cameras if cameras is None else tuple(cameras),
+        camera_size=size,
+        horizon=protocol.steps(task) + protocol.settle_steps,
+        observations=tuple(observations),
+        controller=world.controller,
+        control_delta=world.delta,
+        semantics=world.predicates,
+        assets=assets,
+        drawing=world.drawing if drawing == "protocol" else drawing,
+        robot=world.robot or DEFAULT_ROBOT,
+        observed=protocol.episode.observed,
+    )
+    return ProtocolEnv(env, protocol)
 
 
 def resolve_world(card: Card, tasks: Sequence[Task], assets: str | None = None) -> tuple[Card, list[str]]:
