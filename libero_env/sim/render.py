@@ -177,6 +177,8 @@ class Renderer:
                     self._add_site(data, site)
             else:
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
+                if self._faithful:  # the headlight moves with the camera
+                    mujoco.mjv_makeLights(self._model, data, self._scene)
             if any(out is not None for out in (target.rgb, target.depth, target.depth_buffer)):
                 self._render_rgb_and_depth(target)
             if target.segmentation is not None:
