@@ -185,7 +185,7 @@ def run_episodes(
         lengths += ~tracker.over
         _tell(actor, tracker)
         actions = actor.act(obs)
-        for i in np.flatnonzero(~tracker.over):
+        for i in np.flatnonzero(~tracker.over).tolist():
             digests[i].update(np.asarray(actions[i], "<f8").tobytes())
         filmed = bool(recordings) and (step + 1) % record_every == 0
         _draw(env, filmed or getattr(actor, "sees_next", True))
