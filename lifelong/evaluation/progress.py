@@ -45,7 +45,8 @@ class Progress:
             f"{self.episodes_done} of {self.episodes} episodes",
         ]
         if math.isfinite(self.per_hour):
-            parts += [f"{self.per_hour:,.0f} an hour", f"{show_time(self.seconds_left)} left"]
+            parts += [f"{self.per_hour:,.0f} an hour"]
+            parts += [f"{show_time(self.seconds_left)} left"] if self.done < self.units else []
         parts += [f"{self.running} running"] if self.running else []
         parts += [f"{self.failed} with errors"] if self.failed else []
         return ", ".join(parts)
