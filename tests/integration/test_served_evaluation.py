@@ -1,5 +1,6 @@
 """`libero eval` of policies on servers: the episodes of an evaluation in process, also when connections break."""
 
+import hashlib
 import json
 from contextlib import contextmanager
 
@@ -8,6 +9,7 @@ import pytest
 
 from lifelong.cli import main as cli
 from lifelong.evaluation.restore import restore
+from lifelong.evaluation.servers.actor import RemoteActor
 from lifelong.evaluation.servers.codecs import OPENPI
 from lifelong.evaluation.servers.sessions import ServedPolicy
 from tests.harness import policy_servers
@@ -137,6 +139,23 @@ def test_an_openpi_server_under_a_protocol(card, tmp_path, capsys):
     assert first["observation/state"].shape == (8,) and first["prompt"] == found["tasks"][0]["instruction"]
     heights = sorted(o["observation/state"][2] for o in seen)
     assert heights[-1] > heights[0] + 0.01, "the arm has moved"
+
+
+def test_leaving_out_images_changes_none_that_are_sent(card, tmp_path, capsys, monkeypatch):
+    def answer(observation):  # actions that depend on every pixel
+        draws = np.random.default_rng(
+            list(hashlib.sha256(observation["observation/image"].tobytes()).digest())
+        )
+        return {"actions": draws.uniform(-0.5, 0.5, (3, 7))}
+
+    found = []
+    for name in ("seen", "all"):
+        if name == "all":
+            monkeypatch.setattr(RemoteActor, "sees_next", True)
+        with policy_servers.openpi(answer) as address:
+            assert on_server(address, tmp_path / name, card(OPENPI_CARD)) == 0
+        found.append(json.loads((tmp_path / name / "eval.json").read_text())["tasks"])
+    assert found[0] == found[1] and len(set(found[0][0]["actions"])) == 2
 
 
 def test_an_openpi_connection_that_breaks_is_no_episode(card, tmp_path, capsys):
