@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import signal
 import sys
 
 import numpy as np
@@ -219,6 +220,27 @@ def test_a_unit_does_not_depend_on_those_before_it(protocol, tmp_path, monkeypat
     with plan.pool() as pool:
         alone = plan.evaluate(plan.units[1], pool).result
     assert alone == in_turn[1] and len({*in_turn[0].actions, *in_turn[1].actions}) == 4
+
+
+@pytest.mark.sim
+def test_at_sigterm_a_unit_is_given_back_and_the_same_command_goes_on(module, tmp_path, capsys, monkeypatch):
+    command = ["eval", f"{module}:make", "--suite", "libero_object/3", "--episodes", "2", "--horizon", "2"]
+    command += ["--protocol", "openpi", "--out", "found", "--unit-starts", "1"]
+    policy = load_callable(f"{module}:make")
+    asked = []
+
+    def predict(self, observations):
+        asked.append(1)
+        if len(asked) == 3:  # in the second unit
+            signal.raise_signal(signal.SIGTERM)
+        return np.zeros((1, 7))
+
+    monkeypatch.setattr(type(policy), "predict", predict)
+    assert cli.main(command) == 130
+    assert "found keeps what is done; the same command goes on" in capsys.readouterr().err
+    assert not list((tmp_path / "found" / "claims").iterdir())
+    assert len(list((tmp_path / "found" / "units").iterdir())) == 1
+    assert cli.main(command) == 0 and len(asked) == 5
 
 
 def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):

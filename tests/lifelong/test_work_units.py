@@ -110,6 +110,21 @@ def test_an_open_environment_is_used_for_all_units_of_its_task(tmp_path):
     assert built == [(task.id, 1) for task in TASKS]
 
 
+def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
+    plan, begun = evaluation(tmp_path, **TWO), []
+    plan.folder.join(plan.units)
+    plan.folder.claims.take(plan.units[0].name)
+
+    def env(task, count):
+        begun.append(task.id)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(tmp_path, env=env, **TWO)
+    assert begun == [TASKS[1].id]
+    assert list(plan.folder.held()) == [plan.units[0].name], "the other unit was given back"
+
+
 def test_tasks_are_announced_once_each_and_progress_is_that_of_all(tmp_path):
     rows, lines = [], []
     evaluate(tmp_path, tasks=TASKS[:1], **TWO)
