@@ -83,13 +83,12 @@ pixels: {render_size: [64, 64], resize_size: [56, 56]}
 action: {replan: 3}
 """
 GROOT_CARD = """
-title: GR00T's, with what its source does not state
+title: GR00T's, with the seed that its source does not state
 extends: groot
-world: {drawing: fast, robot: libero, env_seed: 0, seeding: once, seed_per_start: 0, seed_per_task: 0, loads: 1}
-episode: {settle_steps: 0, horizon: 7, success: first_hit}
-pixels: {render_size: [64, 64], orientation: rotated, resize: none, crop: 1.0}
-proprioception: {source: observation, order: [ee_pos, ee_rotation, gripper_qpos], rotation: axis_angle, dtype: float32}
-action: {gripper: open_sign, replan: 4}
+world: {drawing: fast, robot: libero, env_seed: 0, seeding: once, loads: 1}
+episode: {horizon: 7}
+pixels: {render_size: [64, 64]}
+action: {replan: 4}
 """
 VLA_CARD = """
 title: vla-eval's, small and short

@@ -60,7 +60,7 @@ def test_cards_that_state_enough_can_be_run(name):
 
 
 def test_what_a_source_does_not_state_is_not_guessed(tmp_path):
-    with pytest.raises(ProtocolError, match=r"groot cannot be run.*pixels\.render_size.*extends: groot"):
+    with pytest.raises(ProtocolError, match=r"groot cannot be run.*world\.env_seed.*extends: groot"):
         load_card("groot").require()
     with pytest.raises(ProtocolError, match=r"rlinf.*episode\.horizon"):
         load_card("rlinf").require()
