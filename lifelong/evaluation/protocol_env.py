@@ -60,15 +60,6 @@ class ProtocolEnv:
         """Atoms of the goal, in the order of `progress` in infos."""
         return self.env.atoms
 
-    @property
-    def render_images(self) -> bool:
-        """Whether images are rendered in each step, see `BatchEnv`."""
-        return self.env.render_images
-
-    @render_images.setter
-    def render_images(self, wanted: bool) -> None:
-        self.env.render_images = wanted
-
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict]:
         """Start episodes in the initial states of the option `init_state`, (num_envs,) indices.
 
