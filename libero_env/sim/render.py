@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import RenderError, UnknownNameError
+from libero_env.sim.culling import Culling
 
 BACKENDS = ("egl", "osmesa", "glfw")
 REMEDY = (
@@ -120,19 +121,23 @@ class Renderer:
         model: Model to render.
         height: Height of the images, pixels.
         width: Width of the images, pixels.
-        faithful: Whether reflections and sites are drawn, as the original does. Multisampling is the model's.
+        faithful: Whether reflections are drawn, and sites as the original does. Multisampling is the model's.
+        cull: Whether what the camera cannot show is left out; images do not depend on it.
 
     Raises:
         RenderError: The images are larger than the model's offscreen buffer.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int, *, faithful: bool = False):
+    def __init__(
+        self, model: mujoco.MjModel, height: int, width: int, *, faithful: bool = False, cull: bool = True
+    ):
         largest = min(model.vis.global_.offheight, model.vis.global_.offwidth)
         if not (0 < height <= largest and 0 < width <= largest):
             raise RenderError(
                 f"an image of {height}x{width} pixels is not valid; height and width must be between 1 and {largest}"
             )
         self._model, self._height, self._width, self._faithful = model, height, width, faithful
+        self._culling = Culling(model) if cull else None
         self._gl: GLContext | None = None
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
@@ -169,20 +174,28 @@ class Renderer:
         all_categories = mujoco.mjtCatBit.mjCAT_ALL
         for k, target in enumerate(targets):
             self._camera.fixedcamid = target.camera
-            if k == 0:
+            if k == 0 or self._faithful:
                 mujoco.mjv_updateScene(
                     self._model, data, self._options, None, self._camera, all_categories, self._scene
                 )
                 for site in glowing_sites:
                     self._add_site(data, site)
-            else:
+            else:  # without the headlight, which stays at the first camera
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
-                if self._faithful:  # the headlight moves with the camera
-                    mujoco.mjv_makeLights(self._model, data, self._scene)
+            left_out = self._leave_out(data, target.camera)
             if any(out is not None for out in (target.rgb, target.depth, target.depth_buffer)):
                 self._render_rgb_and_depth(target)
             if target.segmentation is not None:
                 self._render_segmentation(target.segmentation)
+            for geom, kind in left_out:
+                geom.type = kind
+
+    def _leave_out(self, data: mujoco.MjData, camera: int) -> list[tuple[mujoco.MjvGeom, int]]:
+        """Remove from the scene what the camera cannot show; return it with its types."""
+        if self._culling is None:
+            return []
+        aspect, geoms = self._width / self._height, self._geoms[: self._scene.ngeom]
+        return self._culling.apply(data, camera, aspect, geoms, self._faithful)
 
     def _render_rgb_and_depth(self, target: RenderTarget) -> None:
         mujoco.mjr_render(self._viewport, self._scene, self._context)
@@ -264,6 +277,7 @@ class Renderer:
         self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + 100)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = int(self._faithful)
+        self._geoms = self._scene.geoms
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 0
         self._options.geomgroup[1] = 1

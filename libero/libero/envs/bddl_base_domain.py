@@ -284,7 +284,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         """Do nothing; a subclass may change the simulation before each control step."""
 
     def _post_action(self, action: Any) -> tuple[float, bool, dict[str, Any]]:
-        result = self.reward(action), self.timestep >= self.horizon and not self.ignore_done, {}
+        over = self.timestep >= self.horizon and not self.ignore_done
+        result: tuple[float, bool, dict[str, Any]] = self.reward(action), over, {}
         self._post_process()
         return result
 
