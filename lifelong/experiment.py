@@ -1,5 +1,6 @@
 """A run: build everything from the configuration, learn the task sequence, write the results."""
 
+import copy
 import sys
 import time
 from collections.abc import Mapping
@@ -11,7 +12,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from libero_env.assets.pack import select_pack
 from libero_env.envs.batch import BatchEnv
+from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
@@ -55,6 +58,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     Raises:
         LiberoError: The configuration, the data or the directory is invalid.
     """
+    config = _with_drawing(config)
     settings = RunSettings(**{str(k): v for k, v in config.items() if k not in GROUPS})
     if settings.threads:
         torch.set_num_threads(settings.threads)
@@ -116,7 +120,7 @@ def _build_contexts(
         augment=build(config.augmentation),
         stream=stream,
         group_size=benchmark.group_size,
-        envs=EnvPool(partial(_make_env, tasks, spec, evaluation), evaluation.open_environments),
+        envs=EnvPool(partial(_make_env, tasks, spec, evaluation, data.drawing), evaluation.open_environments),
         directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
         tracker=build(config.wandb),
         seed=settings.seed,
@@ -140,11 +144,22 @@ def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
     return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
 
 
+def _with_drawing(config: DictConfig) -> DictConfig:
+    """Return a configuration that names how images are drawn, so that the saved one does."""
+    if OmegaConf.select(config, "data.drawing") is not None:
+        return config
+    config = copy.deepcopy(config)
+    OmegaConf.update(config, "data.drawing", default_drawing(select_pack()), force_add=True)
+    return config
+
+
 def _pretraining_config(plain: Any) -> dict[str, Any]:
     return {key: plain[key] for key in PRETRAIN_KEYS}
 
 
-def _make_env(tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings, key: Any) -> BatchEnv:
+def _make_env(
+    tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings, drawing: str | None, key: Any
+) -> BatchEnv:
     task, simulations = key
     return BatchEnv(
         tasks[task],
@@ -153,6 +168,7 @@ def _make_env(tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings,
         cameras=tuple(CAMERAS[view] for view in spec.views),
         camera_size=spec.image_size,
         horizon=settings.horizon + settings.settle_steps,
+        drawing=drawing,
     )
 
 

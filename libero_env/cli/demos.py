@@ -53,6 +53,7 @@ def _register_generate(commands: Subparsers) -> None:
         action="store_true",
         help="record states, proprioception and actions only; `rerender` can add images later",
     )
+    add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
     add("--seed", type=int, default=0, help="seed of starts, motion styles and action noise (default: 0)")
@@ -136,6 +137,7 @@ def demo_configs(args: argparse.Namespace) -> "list[DemoConfig]":
             variation=variation(args),
             cameras=() if args.no_images else tuple(args.cameras),
             modalities=modalities(args),
+            drawing=args.drawing,
         )
         for task in tasks
     ]

@@ -36,6 +36,7 @@ def _register_rerender(commands: Subparsers) -> None:
     add("out", type=Path, help="the new file")
     add("--size", type=size, default=(128, 128), help="128 or 120x160 (default: 128)")
     add("--cameras", nargs="+", default=("agentview", "robot0_eye_in_hand"))
+    add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
     add("--depth", action="store_true", help="render depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="render a segmentation too")
     add("--assets", help=_ASSETS)
@@ -110,7 +111,7 @@ def run_rerender(args: argparse.Namespace) -> None:
     from libero_env.demos.observe import RenderConfig
     from libero_env.demos.replay import rerender
 
-    config = RenderConfig(tuple(args.cameras), args.size, modalities(args))
+    config = RenderConfig(tuple(args.cameras), args.size, modalities(args), args.drawing)
     print(describe(rerender(args.file, args.out, config, assets=args.assets)))
 
 

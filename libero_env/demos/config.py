@@ -18,7 +18,7 @@ from libero_env.demos.read import Pairing
 from libero_env.demos.write import DemoWriter, make_header
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
-from libero_env.sim.scene import build_scene
+from libero_env.sim.scene import FAST, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
 
@@ -61,6 +61,7 @@ class DemoConfig:
         variation: How the demonstrations differ from each other.
         cameras: Names of the cameras in the model.
         modalities: Kinds of image, see `RenderConfig`.
+        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
     """
 
     source: Task | str
@@ -71,6 +72,12 @@ class DemoConfig:
     variation: Variation = Variation()
     cameras: tuple[str, ...] = DEFAULT_CAMERAS
     modalities: tuple[str, ...] = ("rgb",)
+    drawing: str | None = None
+
+    @cached_property
+    def drawn(self) -> str:
+        """How images are drawn, one of `DRAWINGS`."""
+        return self.drawing or default_drawing(select_pack())
 
     @cached_property
     def task(self) -> Task:
@@ -82,7 +89,7 @@ class DemoConfig:
     @property
     def render_config(self) -> RenderConfig:
         """What is rendered of each state."""
-        return RenderConfig(self.cameras, self.camera_size, self.modalities)
+        return RenderConfig(self.cameras, self.camera_size, self.modalities, self.drawn)
 
     def header(self) -> dict[str, Any]:
         """Return the attributes of the file. This compiles the scene, for its digest."""
@@ -102,7 +109,7 @@ class DemoConfig:
             seed=self.seed,
             generator=GENERATOR,
             disturbed=self.disturb,
-            model_digest=model_digest(task),
+            model_digest=model_digest(task, self.drawn),
             models=json.dumps({"pack": (pack := select_pack()).name, "digest": pack.digest}),
             versions=json.dumps(versions),
             **self.render_config.header(),
@@ -123,7 +130,7 @@ class DemoConfig:
         return (
             f"Recipe(source='', camera_size={self.camera_size!r}, seed={self.seed!r}, pairing={self.pairing!r}, "
             f"disturb={self.disturb!r}, variation={variation}, cameras={self.cameras!r}, "
-            f"pictures={self.modalities!r})"
+            f"pictures={self.modalities!r}{'' if self.drawn == FAST else f', drawing={self.drawn!r}'})"
         )
 
 
@@ -150,9 +157,9 @@ class RecordingJob:
 
 
 @lru_cache(maxsize=16)
-def model_digest(task: Task) -> str:
+def model_digest(task: Task, drawing: str | None = None) -> str:
     """Return 16 hex digits that change with anything in the task's compiled scene, its appearance included."""
-    model = build_scene(task.problem).model
+    model = build_scene(task.problem, drawing=drawing).model
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return hashlib.sha256(buffer.tobytes()).hexdigest()[:16]

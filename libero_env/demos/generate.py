@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace as changed
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -27,6 +28,7 @@ from libero_env.demos.record import (
 from libero_env.errors import DemoError
 from libero_env.parallel import cpu_count, spawn_pool
 from libero_env.paths import demos_dir
+from libero_env.sim.scene import FAST
 from libero_env.tasks import Task, get_suite
 
 # A chunk is the position of a job, and the demonstrations of it to record together; a report on it begins likewise.
@@ -77,21 +79,23 @@ def ensure_demos(
     *,
     camera_size: tuple[int, int] = (128, 128),
     seed: int = 0,
+    drawing: str | None = None,
     root: str | Path | None = None,
     workers: int = 0,
     progress: bool | None = None,
 ) -> list[Path]:
     """Return demonstration files with at least `n` demonstrations of each task; what is missing is recorded.
 
-    The path of a file contains all that its demonstrations depend on (suite, camera size, seed, generator), so each
-    is recorded once. A file that was recorded with another version of the scene is recorded again. Several processes
-    may call this at the same time.
+    The path of a file contains all that its demonstrations depend on (suite, camera size, seed, generator, drawing), so
+    each is recorded once. A file that was recorded with another version of the scene is recorded again. Several
+    processes may call this at the same time.
 
     Args:
         tasks: Name of a suite, or tasks.
         n: Demonstrations of each task. The first `n` are the same however many there are.
         camera_size: As for `generate`.
         seed: As for `generate`.
+        drawing: How images are drawn, see `DemoConfig`.
         root: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         workers: As for `generate`.
         progress: As for `generate`.
@@ -104,7 +108,8 @@ def ensure_demos(
     """
     tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
     root = demos_dir() if root is None else Path(root)
-    configs = [DemoConfig(task, (camera_size[0], camera_size[1]), seed) for task in tasks]
+    size = (camera_size[0], camera_size[1])
+    configs = [DemoConfig(task, size, seed, drawing=drawing) for task in tasks]
     jobs = [RecordingJob(config, demo_path(root, config)) for config in configs]
     _raise_errors(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
     return [job.path for job in jobs]
@@ -153,7 +158,8 @@ def make_demos(
 def demo_path(root: Path, config: DemoConfig) -> Path:
     """Return where `ensure_demos` keeps the demonstrations of a configuration; the path contains all that matters."""
     (height, width), task = config.camera_size, config.task
-    plain = config == DemoConfig(config.source, config.camera_size, config.seed)
+    default = DemoConfig(config.source, config.camera_size, config.seed)
+    plain = changed(config, drawing=None) == default and config.drawn == FAST
     suffix = "" if plain else f"-{zlib.crc32(config.key().encode()):08x}"
     folder = f"{height}x{width}-seed{config.seed}-{GENERATOR}{suffix}"
     return root / task.suite / folder / f"{task.name}_demo.hdf5"

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.observations import DEFAULT_CAMERAS
-from libero_env.sim.scene import Scene
+from libero_env.sim.scene import FAST, Scene
 from libero_env.tasks import Task
 
 
@@ -28,17 +29,21 @@ class RenderConfig:
         size: (height, width) of the images, pixels.
         modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
             and `segmentation_element`.
+        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
     """
 
     cameras: tuple[str, ...] = DEFAULT_CAMERAS
     size: tuple[int, int] = (128, 128)
     modalities: tuple[str, ...] = ("rgb",)
+    drawing: str | None = None
 
-    def header(self) -> dict[str, list]:
-        """Return the attributes of a file; the default cameras and modalities are left out."""
+    def header(self) -> dict[str, Any]:
+        """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
         values = {"cameras": list(self.cameras), "pictures": list(self.modalities)}
         defaults = {"cameras": list(DEFAULT_CAMERAS), "pictures": ["rgb"]}
-        return {"camera_size": list(self.size)} | {k: v for k, v in values.items() if v != defaults[k]}
+        drawing = {} if self.drawing in (None, FAST) else {"drawing": self.drawing}
+        changed = {k: v for k, v in values.items() if v != defaults[k]}
+        return {"camera_size": list(self.size), **changed, **drawing}
 
 
 class StateRenderer:
@@ -57,6 +62,7 @@ class StateRenderer:
             cameras=config.cameras,
             camera_size=config.size,
             assets=assets,
+            drawing=config.drawing,
             observations=(*config.modalities, "proprioception", "ee_quat"),
         )
 

@@ -48,7 +48,9 @@ class DemoRecorder:
 
     def __init__(self, config: DemoConfig):
         self.config, self.task = config, config.task
-        self.env = BatchEnv(self.task, BATCH, num_threads=1, cameras=(), horizon=MAX_STEPS)
+        self.env = BatchEnv(
+            self.task, BATCH, num_threads=1, cameras=(), horizon=MAX_STEPS, drawing=config.drawn
+        )
         self.renderer = StateRenderer(self.task, config.render_config)
         self.shapes = Shapes(self.env.world.scene)
 

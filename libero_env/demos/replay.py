@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 from tqdm import tqdm
 
-from libero_env.assets.pack import Pack
+from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import BrokenDemoError, demo_number
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
 from libero_env.sim.observations import image_name
-from libero_env.sim.scene import Scene
+from libero_env.sim.scene import Scene, default_drawing
 
 REPLAY_MODES = ("state", "action")
 
@@ -68,7 +68,8 @@ def replay(
     """
     if by not in REPLAY_MODES:
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
-    renderer = StateRenderer(recorded_task(file), RenderConfig(tuple(cameras), size), assets)
+    config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
+    renderer = StateRenderer(recorded_task(file), config, assets)
     keys = [image_name(camera, "rgb") for camera in cameras]
     found = set()
     try:
@@ -142,7 +143,9 @@ def rerender(
     """
     if target.exists() and target.samefile(file):
         raise DemoError(f"{target} is the file to read; choose another name")
-    header = {k: v for k, v in read_header(file).items() if k not in ("cameras", "pictures")}
+    header = {k: v for k, v in read_header(file).items() if k not in ("cameras", "pictures", "drawing")}
+    pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
+    config = replace(config, drawing=config.drawing or default_drawing(pack))
     writer = DemoWriter(target, {**header, **config.header(), "pairing": "aligned"})
     recorded = writer.recorded()
     renderer = StateRenderer(recorded_task(file), config, assets)

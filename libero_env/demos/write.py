@@ -39,6 +39,7 @@ _CONFIG_KEYS = (
     "camera_size",
     "cameras",
     "pictures",
+    "drawing",
     "pairing",
     "generator",
     "disturbed",

@@ -1,7 +1,8 @@
 """Which geoms a picture cannot show, so that they need not be drawn. Leaving them out changes no bit of it.
 
-A geom is left out if its bounding box is outside the camera's view, and outside what a mirror shows of the scene. MuJoCo
-draws at most one mirror: the first opaque plane or box of the scene that is reflective, and of a box only the face z+.
+A geom is left out if its bounding box is outside the camera's view, and outside what a mirror shows of the scene.
+MuJoCo draws at most one mirror (`mjr_render`): the first opaque plane or box of the scene that is reflective, and of a
+box only the face z+.
 """
 
 from collections.abc import Sequence
@@ -56,20 +57,21 @@ class Culling:
         boxes = _Boxes(self._model, data, ids, self._is_mesh[ids])
         eye = data.cam_xpos[camera]
         kept = ~self._can_cull[ids] | boxes.inside(eye, normals)
-        mirror = next((k for k, i in enumerate(places) if _is_mirror(geoms[i])), None) if mirrors else None
+        mirror = next((k for k, i in enumerate(places) if _is_mirror(geoms[i], eye)), None)
         if mirror is not None:
-            if kept[mirror]:
+            for i in places[
+                mirror + 1 :
+            ]:  # otherwise the next one becomes the mirror where this one is left out
+                geoms[i].reflectance = 0.0
+            if mirrors and kept[mirror]:
                 kept |= self._in_mirror(data, eye, normals, boxes, int(ids[mirror]))
-            else:  # otherwise the next one would become the mirror
-                for i in places:
-                    geoms[i].reflectance = 0.0
         left_out = [(geoms[i], int(geoms[i].type)) for i in places[~kept]]
         for geom, _ in left_out:
             geom.type = _NONE
         return left_out
 
     def _frustum(self, data: mujoco.MjData, camera: int, aspect: float) -> np.ndarray | None:
-        """Return the inward normals (5, 3) of the planes through the camera that bound its view; None if it has others."""
+        """Return the inward normals (5, 3) of the planes through the camera that bound its view, None for others."""
         model = self._model
         projection = getattr(model, "cam_projection", getattr(model, "cam_orthographic", None))
         if (projection is not None and projection[camera]) or model.cam_sensorsize[camera].any():
@@ -117,11 +119,13 @@ class _Boxes:
         self.axes = rotations * half[:, None, :]
 
     def inside(self, apex: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which boxes (n,) are not wholly outside one of the planes through `apex` (3,) with inward `normals` (k, 3)."""
+        """Return which boxes (n,) reach inside all planes through `apex` (3,) with inward `normals` (k, 3)."""
         distance = (self.centres - apex) @ normals.T  # (n, k)
         reach = np.abs(np.einsum("kj,nji->nki", normals, self.axes)).sum(axis=2)
         return (distance + reach >= -_MARGIN).all(axis=1)
 
 
-def _is_mirror(geom: mujoco.MjvGeom) -> bool:
-    return geom.reflectance > 0 and geom.type in (_PLANE, _BOX) and geom.rgba[3] >= _OPAQUE
+def _is_mirror(geom: mujoco.MjvGeom, eye: np.ndarray) -> bool:
+    if geom.type not in (_PLANE, _BOX) or not geom.reflectance > 0 or geom.rgba[3] < _OPAQUE:
+        return False
+    return geom.type == _BOX or (eye - geom.pos) @ np.reshape(geom.mat, (3, 3))[:, 2] >= 0

@@ -41,7 +41,9 @@ def find_demos(
         if not missing:
             continue
         size = (data.image_size, data.image_size)
-        paths = ensure_demos(missing, count, camera_size=size, root=data.folder, progress=progress)
+        paths = ensure_demos(
+            missing, count, camera_size=size, drawing=data.drawing, root=data.folder, progress=progress
+        )
         found |= zip([task.id for task in missing], paths, strict=True)
     return [found[task.id] for task in tasks]
 

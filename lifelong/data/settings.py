@@ -6,6 +6,7 @@ from typing import Literal
 
 from libero_env.demos.read import LOW_DIM_KEYS
 from libero_env.errors import UnknownNameError
+from libero_env.sim.scene import DRAWINGS
 from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.types import PolicySpec
 
@@ -30,6 +31,8 @@ class DataSettings:
         folder: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         memory: Where frames are held, see `lifelong.data.loading`; batches do not depend on it.
         backend: What reads the windows, see `lifelong.data.loading`; batches do not depend on it.
+        drawing: How images are drawn, in the demonstrations and in evaluations of the policy: `fast`, `faithful`, or
+            None for the default of the models. The saved configuration of a run has the one that was used.
     """
 
     demos: int
@@ -42,6 +45,7 @@ class DataSettings:
     folder: str | None = None
     memory: str = "auto"
     backend: str = "native"
+    drawing: Literal["fast", "faithful"] | None = None
 
     def __post_init__(self) -> None:
         valid = {
@@ -51,10 +55,11 @@ class DataSettings:
             "backend": BACKENDS,
             "views": CAMERAS,
             "proprio": LOW_DIM_KEYS,
+            "drawing": (None, *DRAWINGS),
         }
         for key, names in valid.items():
             value = getattr(self, key)
-            for name in [value] if isinstance(value, str) else value:
+            for name in [value] if value is None or isinstance(value, str) else value:
                 if name not in names:
                     raise UnknownNameError(f"data.{key}", name, names)
 

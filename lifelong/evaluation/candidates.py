@@ -57,7 +57,7 @@ class PolicyUnderTest(ABC):
 
 
 class RunPolicy(PolicyUnderTest):
-    """The policy of a run, evaluated with the image size it was trained on."""
+    """The policy of a run, evaluated with the images it was trained on: their size and drawing."""
 
     def __init__(self, args: argparse.Namespace):
 
@@ -85,7 +85,7 @@ class RunPolicy(PolicyUnderTest):
             cameras=cameras,
             threads=self.args.threads,
             assets=self.args.assets,
-            drawing=None,
+            drawing=self.run.drawing,
         )
 
     @contextmanager

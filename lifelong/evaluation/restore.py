@@ -42,6 +42,7 @@ class LoadedRun:
         language: Encoder of instructions; see `embed`.
         instructions: Instructions that are embedded together: those of the pretraining, then those of the run.
         group_size: Number of tasks learned together.
+        drawing: How the images that it learned from were drawn.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class LoadedRun:
     language: Any
     instructions: tuple[str, ...]
     group_size: int = 1
+    drawing: str | None = None
 
     def embed(self, task: Task) -> torch.Tensor:
         """Return the (L,) embedding of a task's instruction, as in training.
@@ -126,6 +128,7 @@ def restore(source: Path, *, after: int | None = None, device: str = "auto") -> 
         language=language,
         instructions=instructions,
         group_size=benchmark.group_size,
+        drawing=data.drawing,
     )
 
 

@@ -108,6 +108,7 @@ def _run_episode(
         cameras=tuple(CAMERAS[view] for view in spec.views),
         camera_size=spec.image_size,
         horizon=horizon + run.eval.settle_steps,
+        drawing=run.drawing,
     )
     try:
         with run.acting(run.tasks[task]) as policy:

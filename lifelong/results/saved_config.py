@@ -79,6 +79,7 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
     upgrades: dict[str, Callable[[Mapping[str, Any]], Node]] = {
         "policy": upgrade_policy,
         "algo": upgrade_algorithm,
+        "data": lambda node: {"drawing": "fast", **node},  # runs that do not name it were drawn so
     }
     return {
         key: upgrades[key](node) if key in upgrades else node

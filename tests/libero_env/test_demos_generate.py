@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from libero_env.demos.config import DemoConfig, RecordingJob, Variation
-from libero_env.demos.curate import read_episodes
-from libero_env.demos.generate import demo_path, ensure_demos, generate
+from libero_env.demos.curate import read_episodes, read_header
+from libero_env.demos.generate import demo_path, ensure_demos, generate, make_demos
 from libero_env.demos.read import demo_number, read_demos
 from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
@@ -137,8 +137,19 @@ def test_files_are_recorded_once_and_found_again(whole, tmp_path):
         DemoConfig(TASK, SIZE, seed=1),
         DemoConfig(TASK, (32, 32)),
         DemoConfig(TASK, SIZE, disturb=False),
+        DemoConfig(TASK, SIZE, drawing="faithful"),
     )
     assert kept not in [demo_path(tmp_path, other) for other in others]
+
+
+def test_a_faithful_drawing_is_recorded(whole, tmp_path):
+    file = tmp_path / "faithful.hdf5"
+    config = DemoConfig(TASK, SIZE, drawing="faithful")
+    make_demos([RecordingJob(config, file)], 1, workers=1, progress=False)
+    fast, faithful = read_demos(whole)[0], read_demos(file)[0]
+    assert np.array_equal(fast.actions, faithful.actions)
+    assert (fast.obs["agentview_rgb"] != faithful.obs["agentview_rgb"]).any()
+    assert read_header(file)["drawing"] == "faithful" and "drawing" not in read_header(whole)
 
 
 @pytest.mark.unit
@@ -146,6 +157,7 @@ def test_files_are_recorded_once_and_found_again(whole, tmp_path):
     ("config", "folder"),
     [
         (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-9"),
+        (DemoConfig("libero_object/0", (64, 64), drawing="fast"), "64x64-seed0-scripted-expert-9"),
         (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-9-d9a2a37b"),
         (
             DemoConfig(

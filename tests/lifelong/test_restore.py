@@ -1,12 +1,17 @@
 """Loading of a run's policy, and its saliency."""
 
+from argparse import Namespace
+
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 from libero_env.tasks import get_task
 from lifelong.errors import ConfigError, LifelongError
+from lifelong.evaluation.candidates import RunPolicy
+from lifelong.evaluation.card_files import load_card
 from lifelong.evaluation.restore import restore
 from lifelong.evaluation.saliency import SaliencySettings
 from lifelong.evaluation.saliency_sheet import draw_saliency
@@ -69,3 +74,20 @@ def test_saliency_sheet_of_a_run(tmp_path):
     assert "failure, after learning 2 tasks; steps 0, 2, 3" in path.with_suffix(".txt").read_text()
     with pytest.raises(ConfigError, match="tasks 0 to 1"):
         draw_saliency(tmp_path / "run", task=2)
+
+
+@pytest.mark.parametrize(("saved", "drawing"), [({"drawing": "faithful"}, "faithful"), ({}, "fast")])
+def test_a_run_is_evaluated_with_the_drawing_that_it_was_trained_with(tmp_path, saved, drawing):
+    make_run(tmp_path / "run")
+    file = tmp_path / "run" / "config.yaml"
+    config = yaml.safe_load(file.read_text())
+    del config["data"]["drawing"]  # as in runs of earlier versions
+    config["data"] |= saved
+    file.write_text(yaml.safe_dump(config))
+    args = Namespace(policy=str(tmp_path / "run"), after=None, device="cpu", threads=1, assets="builtin")
+    policy = RunPolicy(args)
+    env = policy.env(policy.run.tasks[0], 1, policy.protocol(load_card("libero")))
+    try:
+        assert env.env.world.scene.drawing == drawing
+    finally:
+        env.close()

@@ -95,8 +95,9 @@ class ServerPolicy(PolicyUnderTest):
         threads, assets = self.args.threads, self.args.assets
         if self.own:
             cameras = tuple(CAMERAS[view] for view in self._views())
+            drawing = self.announced.get("drawing")
             return make_env(
-                task, count, protocol, cameras=cameras, threads=threads, assets=assets, drawing=None
+                task, count, protocol, cameras=cameras, threads=threads, assets=assets, drawing=drawing
             )
         adapter = CardAdapter(protocol, task)
         return make_env(

@@ -80,6 +80,7 @@ class ServedPolicy:
             "protocol": "libero",
             "horizon": run.eval.horizon,
             "settle_steps": run.eval.settle_steps,
+            "drawing": run.drawing,
             "selection": list(run.eval.init_states("curve")),
             "observation": {PREFIX + name: about for name, about in (images | readings).items()},
             "images": "upright: first row on top, not mirrored",
