@@ -18,7 +18,7 @@ from lifelong.evaluation.actors import Actor, CallableActor, PolicyActor, Protoc
 from lifelong.evaluation.adapter import CardAdapter
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.protocol_env import OBSERVATIONS, make_env
+from lifelong.evaluation.protocol_env import OBSERVATIONS, make_env, run_protocol
 from lifelong.evaluation.protocols import SELECTION
 from lifelong.evaluation.restore import restore
 from lifelong.seeding import generator
@@ -141,34 +141,6 @@ class UserPolicy(PolicyUnderTest):
             yield ProtocolActor(self.policy, CardAdapter(protocol, task), protocol.action.replan, views)
         else:
             yield CallableActor(self.policy, protocol.prompt(task), views, names == "original")
-
-
-def run_protocol(base: Card, image_size: tuple[int, int], horizon: int, settle_steps: int) -> Card:
-    """Return a protocol as it is run with a policy of this package.
-
-    The policy sees upright images of the size that it was trained on, and predicts an action for each step. Under
-    `libero`, episodes have the run's own length and settling.
-
-    Args:
-        base: Protocol.
-        image_size: Height and width of the policy's images, [pixels].
-        horizon: Maximum number of control steps of an episode of the run.
-        settle_steps: Number of steps before the policy acts in the run.
-    """
-    own: dict[str, Any] = {
-        "pixels.render_size": tuple(image_size),
-        "pixels.orientation": "upright",
-        "pixels.resize": "none",
-        "pixels.resize_size": None,
-        "pixels.crop": 1.0,
-        "action.gripper": "as_predicted",
-        "action.chunk": 1,
-        "action.replan": 1,
-    }
-    if base.name == "libero":
-        own |= {"episode.horizon": horizon, "episode.settle_steps": settle_steps}
-        own["episode.settle_action"] = base.settle_action if settle_steps else None
-    return base.changed(own)
 
 
 def load_callable(text: str) -> Any:

@@ -203,3 +203,31 @@ def fixture_poses(task: Task, scene: Scene, card: Card, starts: Sequence[int]) -
         drawn = list(drawn_fixtures(scene, card.env_seed(task, 0) or 0, max(starts) + 1, loads))
         return {i: drawn[i] for i in starts}
     return {i: OriginalResets(scene, card.env_seed(task, i) or 0, loads).reset() for i in set(starts)}
+
+
+def run_protocol(base: Card, image_size: tuple[int, int], horizon: int, settle_steps: int) -> Card:
+    """Return a protocol as it is run with a policy of this package.
+
+    The policy sees upright images of the size that it was trained on, and predicts an action for each step. Under
+    `libero`, episodes have the run's own length and settling.
+
+    Args:
+        base: Protocol.
+        image_size: Height and width of the policy's images, [pixels].
+        horizon: Maximum number of control steps of an episode of the run.
+        settle_steps: Number of steps before the policy acts in the run.
+    """
+    own: dict[str, Any] = {
+        "pixels.render_size": tuple(image_size),
+        "pixels.orientation": "upright",
+        "pixels.resize": "none",
+        "pixels.resize_size": None,
+        "pixels.crop": 1.0,
+        "action.gripper": "as_predicted",
+        "action.chunk": 1,
+        "action.replan": 1,
+    }
+    if base.name == "libero":
+        own |= {"episode.horizon": horizon, "episode.settle_steps": settle_steps}
+        own["episode.settle_action"] = base.settle_action if settle_steps else None
+    return base.changed(own)

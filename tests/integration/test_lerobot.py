@@ -20,7 +20,13 @@ def test_lerobot_finds_the_plugin_and_its_rollout_succeeds(tmp_path):
     assert found["success"][0] and found["steps"][0] == len(np.load(file)["actions"])
     assert found["task"] == ["pick up the alphabet soup and place it in the basket"] * 2
     assert found["frames"] == [2, SIZE, SIZE, 3]
-    env = LiberoEnv("libero_object/0", camera_size=(SIZE, SIZE), assets="builtin", drawing="faithful")
+    options = {"assets": "builtin", "drawing": "faithful", "observed": "substep"}
+    env = LiberoEnv(
+        "libero_object/0",
+        camera_size=(SIZE, SIZE),
+        observations=("rgb", "proprioception", "ee_quat"),
+        **options,
+    )
     obs, _ = env.reset(options={"init_state": 0})
     for _ in range(10):
         obs, *_ = env.step(OPEN)

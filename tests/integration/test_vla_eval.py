@@ -1,16 +1,19 @@
-"""vla-eval's harness, in an environment of its own, on the facade; `vla_eval.evaluate(docker=False)` each time."""
+"""vla-eval's harness, in an environment of its own, on the facade and on our benchmark; without Docker each time."""
 
 import json
 
 import numpy as np
 import pytest
 
+from lifelong.cli import main as cli
 from tests.harness.peers import vla_eval
 from tests.harness.recorded import write_actions
+from tests.harness.runs import make_run
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 THEIRS = "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark"
+OURS = "lifelong.evaluation.vla_eval:LiberoBenchmark"
 TASK = "libero_object/0"
 
 
@@ -31,17 +34,47 @@ def evaluate(recorded, folder, *benchmarks: dict) -> tuple[dict, dict]:
         return found, dict(seen)
 
 
-def test_their_benchmark_runs_on_the_facade(recorded, tmp_path):
+def test_both_benchmarks_give_the_same_episodes(recorded, tmp_path):
+    """vla-eval's own on the facade, and ours: the same actions have the same outcome."""
     theirs = {"benchmark": THEIRS, "params": {"suite": "libero_object", "seed": 7}}
-    found, seen = evaluate(recorded, tmp_path, theirs)
-    assert found["errors"] == [0] and found["recordings"] == 1
+    ours = {"benchmark": OURS, "params": {"suite": "libero_object", "seed": 7}}
+    found, seen = evaluate(recorded, tmp_path, theirs, ours)
+    assert found["errors"] == [0, 0] and found["recordings"] == 1
+    assert found["specs"] == ["Spec validation passed (server↔benchmark compatible)"] * 2
+    assert found["prompts"] == ["pick up the alphabet soup and place it in the basket"] * 4
     assert found["success"][0] and found["steps"][0] == len(np.load(recorded)["actions"])
-    assert found["specs"] == ["Spec validation passed (server↔benchmark compatible)"]
-    assert found["prompts"] == ["pick up the alphabet soup and place it in the basket"] * 2
-    shapes = {name: value.shape for name, value in seen.items() if name.startswith("0/")}
-    assert shapes == {
-        "0/agentview": (256, 256, 3),
-        "0/wrist": (256, 256, 3),
-        "0/states": (8,),
-        "0/controller_states": (8,),
+    assert found["success"][:2] == found["success"][2:] and found["steps"][:2] == found["steps"][2:]
+    shapes = {"agentview": (256, 256, 3), "wrist": (256, 256, 3), "states": (8,), "controller_states": (8,)}
+    for episode in range(2):
+        for name, shape in shapes.items():
+            a, b = seen[f"{episode}/{name}"], seen[f"{episode + 2}/{name}"]
+            assert a.shape == b.shape == shape and a.dtype == b.dtype
+    told = found["started"][2]
+    assert told["protocol"] == "vla-eval" and told["models"] == "builtin" and told["drawing"] == "faithful"
+    assert {"models_digest", "mujoco", "protocol_digest"} <= set(told)
+
+
+def test_a_run_acts_as_in_process(tmp_path, capsys):
+    """The third way of a checkpoint, after `libero eval RUN` and `libero eval ws://...`: actions to the bit."""
+    make_run(tmp_path / "run", "algo=packnet", "policy/head=gmm_small", "policy.stochastic=true")
+    out = tmp_path / "local"
+    options = ["--episodes", "2", "--unit-starts", "1", "--horizon", "8", "--threads", "1"]
+    assert cli.main(["eval", str(tmp_path / "run"), "--out", str(out), *options]) == 0
+    tasks = json.loads((out / "eval.json").read_text())["tasks"][:1]
+    entry = {
+        "benchmark": OURS,
+        "params": {"suite": "libero_object", "task_ids": [int(tasks[0]["task"].partition("/")[2])]},
+        "episodes_per_task": 2,
+        "max_steps": 8,
     }
+    found = vla_eval().run("vla_eval_served_run.py", tmp_path / "run", json.dumps([entry]), cwd=tmp_path)
+    assert found["errors"] == [0]
+    assert found["steps"] == tasks[0]["lengths"] and found["success"] == tasks[0]["successes"]
+    assert found["actions"] == tasks[0]["actions"]
+
+
+def test_a_server_for_another_protocol_is_refused(recorded, tmp_path):
+    entry = {"benchmark": OURS, "params": {"suite": "libero_object", "card": "openpi", "env_seed": 0}}
+    with pytest.raises(AssertionError) as refused:
+        evaluate(recorded, tmp_path, entry)
+    assert "world.env_seed: protocol openpi has 7, the policy 0" in str(refused.value)

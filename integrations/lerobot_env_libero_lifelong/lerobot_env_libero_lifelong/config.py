@@ -32,6 +32,8 @@ class LiberoLifelongEnv(EnvConfig):
         observation_height: Height of images, [pixels].
         observation_width: Width of images, [pixels].
         control_mode: `relative` or `absolute` actions.
+        original_starts: Whether these states are those that LIBERO publishes, with fixtures placed by the episode's
+            seed, as in LeRobot's own type; needs the original's models and states.
         num_steps_wait: Number of steps before the policy acts, with the gripper opened.
         drawing: `faithful` as the original, or `fast`; None for the default of the models.
         robot: Model of the arm: `libero`, or `robosuite-1.4.1`.
@@ -50,6 +52,7 @@ class LiberoLifelongEnv(EnvConfig):
     observation_height: int = 360
     observation_width: int = 360
     control_mode: str = "relative"
+    original_starts: bool = False
     num_steps_wait: int = 10
     drawing: str | None = "faithful"
     robot: str = "libero"
@@ -88,7 +91,7 @@ class LiberoLifelongEnv(EnvConfig):
             with_state=self.obs_type == "pixels_agent_pos",
             max_steps=self.episode_length,
             wait_steps=self.num_steps_wait,
-            stored_starts=self.init_states,
+            starts=("original" if self.original_starts else "stored") if self.init_states else "new",
             control_mode=self.control_mode,
             fps=self.fps,
             drawing=self.drawing,

@@ -10,6 +10,7 @@ from libero_env.timing import CONTROL_HZ
 
 OBS_TYPES = ("pixels_agent_pos", "pixels")
 CONTROL_MODES = ("relative", "absolute")
+STARTS = ("stored", "original", "new")
 # LeRobot's `lerobot/envs/libero.py`, TASK_SUITE_MAX_STEPS; other suites have 500 there
 MAX_STEPS = {
     "libero_spatial": 280,
@@ -49,13 +50,15 @@ class Settings:
         with_state: Whether observations have the state of the robot.
         max_steps: Maximum number of steps of the policy; None for LeRobot's of the suite.
         wait_steps: Number of steps before the policy acts.
-        stored_starts: Whether episodes start in the stored states.
+        starts: Where episodes start. `stored`: in the 50 states of this package, fixtures included. `original`: as in
+            LeRobot's own environments, in the states that LIBERO publishes, with fixtures placed by the episode's seed.
+            `new`: in new placements, by seed.
         control_mode: `relative` or `absolute`.
         fps: Rate of control, [Hz].
         drawing: As in `libero_env.envs.config.EnvConfig`; so are `robot` and `assets`.
 
     Raises:
-        UnknownNameError: The control mode does not exist.
+        UnknownNameError: The control mode or the starts do not exist.
         LiberoError: The rate of control, a camera's name, or a number of steps is not valid.
     """
 
@@ -64,7 +67,7 @@ class Settings:
     with_state: bool = True
     max_steps: int | None = None
     wait_steps: int = 10
-    stored_starts: bool = True
+    starts: str = "stored"
     control_mode: str = "relative"
     fps: int = CONTROL_HZ
     drawing: str | None = None
@@ -74,6 +77,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.control_mode not in CONTROL_MODES:
             raise UnknownNameError("control_mode", self.control_mode, CONTROL_MODES)
+        if self.starts not in STARTS:
+            raise UnknownNameError("starts", self.starts, STARTS)
         if self.fps != CONTROL_HZ:
             raise LiberoError(
                 f"fps is {self.fps}; LIBERO is controlled at {CONTROL_HZ} Hz, and data that are labelled with "
@@ -112,6 +117,7 @@ class Settings:
             drawing=self.drawing,
             robot=self.robot,
             assets=self.assets,
+            observed="substep",
         )
 
 

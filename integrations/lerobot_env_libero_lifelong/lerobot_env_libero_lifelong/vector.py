@@ -15,7 +15,8 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.envs.subproc import SubprocEnv
 from libero_env.errors import LiberoError
 from libero_env.geometry import quat_to_mat
-from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.init_states.original_resets import OriginalResets
+from libero_env.init_states.store import NUM_INIT_STATES, load_original_states
 from libero_env.sim.controller import get_controller
 from libero_env.tasks import Task
 
@@ -37,7 +38,7 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         num_envs: Number of simulations.
         settings: Options.
         processes: Whether each simulation gets a process of its own, so that images are rendered in parallel; the
-            results are the same. Not used with absolute actions.
+            results are the same. Not used with absolute actions or the original's starts.
 
     Attributes:
         task: Name of the task.
@@ -56,7 +57,7 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         self._task, self.settings, self.num_envs = task, settings, num_envs
         self.task, self.task_description, self.task_id = task.name, task.language, task.index
         self.render_mode = "rgb_array"
-        self._processes = processes and settings.control_delta
+        self._processes = processes and settings.control_delta and settings.starts != "original"
         self._max_episode_steps = settings.steps(task)
         self.single_observation_space = _observation_space(settings)
         self.single_action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
@@ -72,11 +73,20 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         """Start an episode in every simulation, and let the objects settle.
 
         Args:
-            seed: One seed for each simulation, or one number from which they count up; used for new placements only.
+            seed: One seed for each simulation, or one number from which they count up; not used with stored starts.
             options: Ignored; LeRobot passes a mark of its own.
+
+        Raises:
+            LiberoError: The starts of the original are asked for without its models or states, or without seeds.
         """
         envs = self._open()
-        start = {"init_state": self._starts % NUM_INIT_STATES} if self.settings.stored_starts else {}
+        if isinstance(seed, int):
+            seed = [seed + i for i in range(self.num_envs)]
+        start: dict[str, Any] = {}
+        if self.settings.starts == "stored":
+            start = {"init_state": self._starts % NUM_INIT_STATES}
+        elif self.settings.starts == "original":
+            start = {"start": self._original_starts(seed), "outdated_controller": True}
         self._starts = self._starts + self.num_envs
         with _waiting(envs):
             obs, info = envs.reset(seed=seed, options=start)
@@ -132,6 +142,30 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
             else:
                 self._envs = BatchEnv(self._task, self.num_envs, config=config)
         return self._envs
+
+    def _original_starts(self, seeds: Sequence[int | None] | None) -> np.ndarray:
+        """Return the states in which LeRobot's own environments start, [time, qpos, qvel, poses of the fixtures].
+
+        Each of them has loaded its model when it was made, at a first reset, and at each reset since.
+        """
+        assert isinstance(self._envs, BatchEnv), "there are no processes with these starts"
+        scene, states = self._envs.world.scene, load_original_states(self._task)
+        size = 1 + scene.model.nq + scene.model.nv
+        if states is None or len(states[0]) < size:
+            raise LiberoError(
+                f"{self._task.id}: original_starts needs the states that LIBERO publishes: name its folder init_files "
+                "under init_states in ~/.libero/config.yaml, and install the original's models"
+            )
+        if seeds is None or any(seed is None for seed in seeds):
+            raise LiberoError("original_starts places fixtures by the episodes' seeds, and there are none")
+        rows = []
+        for i, seed in zip(self._starts.tolist(), seeds, strict=True):
+            loads = 2 + i // self.num_envs
+            poses = (
+                OriginalResets(scene, int(seed or 0), loads).reset() if scene.fixtures else np.zeros((0, 7))
+            )
+            rows.append(np.concatenate([states[i % len(states)][:size], poses.ravel()]))
+        return np.array(rows)
 
     def _observation(self, obs: dict[str, np.ndarray]) -> dict[str, Any]:
         """Return an observation as LeRobot's `LiberoEnv` gives it: lowest row first, quaternions xyzw."""

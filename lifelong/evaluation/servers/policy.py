@@ -12,10 +12,10 @@ from lifelong.data.settings import CAMERAS
 from lifelong.errors import ProtocolError, ServerError
 from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.adapter import CardAdapter
-from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest, run_protocol
+from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.protocol_env import make_env
+from lifelong.evaluation.protocol_env import make_env, run_protocol
 from lifelong.evaluation.protocols import SELECTION
 from lifelong.evaluation.servers.actor import RemoteActor
 from lifelong.evaluation.servers.announcements import groot_fields, openpi_fields, vla_eval_fields
