@@ -1,6 +1,7 @@
 """Clients of policy servers: formats, chunks, and servers that fail, are late or send what is not valid."""
 
 import asyncio
+import sys
 import threading
 import time
 
@@ -8,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from libero_env.errors import MissingPackageError
 from libero_env.tasks import get_suite
 from lifelong.errors import ConnectionLost, ServerError, WireError
 from lifelong.evaluation.inputs import PolicyInput
@@ -16,6 +18,7 @@ from lifelong.evaluation.servers.actor import RemoteActor, checked_actions
 from lifelong.evaluation.servers.codecs import GROOT, OPENPI, VLA_EVAL
 from lifelong.evaluation.servers.connections import Limits
 from lifelong.evaluation.servers.groot import GrootWire
+from lifelong.evaluation.servers.packages import need
 from lifelong.evaluation.servers.wires import EpisodeStart, OpenpiDialect, VlaEvalDialect, WebSocketWire
 from tests.harness import policy_servers
 
@@ -103,6 +106,14 @@ def test_values_and_bytes_that_are_refused(codec):
     for data in (b"", b"\xc1garbage", codec.pack(1) + b"more"):
         with pytest.raises(WireError, match=f"no {codec.name} message"):
             codec.unpack(data)
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    for module, package in (("msgpack", "msgpack"), ("zmq", "pyzmq"), ("websockets", "websockets")):
+        monkeypatch.setitem(sys.modules, module, None)
+        message = rf"package {package}, which.*pip install 'libero-lifelong\[servers\]'"
+        with pytest.raises(MissingPackageError, match=message):
+            need(module)
 
 
 def test_an_array_that_does_not_fit_its_bytes_is_refused():
