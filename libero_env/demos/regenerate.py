@@ -5,17 +5,20 @@ recorded state the robot waits ten steps with its gripper open; the recorded act
 nothing; what is observed before an action is stored with it; an episode counts if the goal holds at its end. Images
 have 256 pixels and are turned by half a turn when they are converted: the original's first row is the bottom one, so
 they come out upright and mirrored left to right.
+
+Human demonstrations go on for a while when the goal has been reached; those of this package's expert end there. Run
+again they may be a step short, so the expert's last action is repeated a few times until the goal holds.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
-from libero_env.demos.curate import read_episodes, recorded_task
+from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.lerobot_layout import ExportedEpisode
 from libero_env.demos.replay import checked_fixtures
 from libero_env.demos.write import Episode
@@ -33,6 +36,7 @@ class Regeneration:
     Attributes:
         size: Height and width of the images, pixels.
         settle_steps: Number of waiting steps before the first action.
+        extra_steps: Largest number of repetitions of the last action, in recordings of the expert only.
         labels: Actions to store: those that were executed, or the expert's own where the file has them.
         assets: Where models come from, as for `LiberoEnv`; None is the original's models where they are installed, as
             in the facade.
@@ -42,6 +46,7 @@ class Regeneration:
 
     size: tuple[int, int] = (256, 256)
     settle_steps: int = 10
+    extra_steps: int = 10
     labels: Literal["expert", "executed"] = "expert"
     assets: Pack | str | Path | None = None
     drawing: str = "faithful"
@@ -65,6 +70,7 @@ class Regeneration:
             "drawing": self.drawing,
             "robot": self.robot,
             "settle_steps": self.settle_steps,
+            "extra_steps": f"at most {self.extra_steps}, of the expert's recordings",
             "labels": self.labels,
             "no_op": f"norm(action[:6]) < {NOOP_NORM} and the gripper as in the last kept action",
         }
@@ -80,6 +86,8 @@ def regenerate(file: Path, config: Regeneration) -> Iterator[ExportedEpisode]:
     Raises:
         DemoError: The file is broken or does not fit its task's scene.
     """
+    if "generator" not in read_header(file):  # not of this package's expert
+        config = replace(config, extra_steps=0)
     world = World(recorded_task(file), config=config.env_config())
     try:
         for name, episode in read_episodes(file):
@@ -108,20 +116,24 @@ def _run(world: World, episode: Episode, config: Regeneration, where: str) -> Ex
         world.step([0], _OPEN)
     images = world.empty_images()
     stored: dict[str, list[np.ndarray]] = {key: [] for key in images}
-    states = []
-    for t in kept:
+    states, actions, success = [], [], False
+    recorded = list(zip(episode.actions[kept], labels[kept], strict=True))
+    extra = [(episode.labels[-1], episode.labels[-1])] * config.extra_steps
+    for i, (executed, label) in enumerate([*recorded, *extra]):
+        if success and i >= len(recorded):
+            break
         world.render_cameras([0], images)
         for key, rows in images.items():
-            stored[key].append(
-                rows[0, :, ::-1].copy()
-            )  # upright in this package: a mirror image is half a turn
+            stored[key].append(rows[0, :, ::-1].copy())  # here images are upright: mirrored is half a turn
         obs = world.proprioception()
         states.append(np.concatenate([obs[key][0] for key in ("ee_pos", "ee_ori", "gripper_states")]))
-        world.step([0], episode.actions[t : t + 1])
+        actions.append(label)
+        world.step([0], executed[None])
+        success = i + 1 >= len(recorded) and world.check_goal(0)[0]
     return ExportedEpisode(
         state=np.array(states, np.float32).reshape(-1, 8),
-        action=labels[kept].astype(np.float32),
-        success=bool(len(kept)) and world.check_goal(0)[0],
+        action=np.array(actions, np.float32).reshape(-1, 7),
+        success=success,
         images={key: np.array(frames) for key, frames in stored.items()},
         where=where,
     )

@@ -16,7 +16,7 @@ from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.generate import generate
 from libero_env.demos.lerobot import ORIGIN, export_lerobot, export_published
 from libero_env.demos.observe import RenderConfig, StateRenderer
-from libero_env.demos.regenerate import Regeneration, noop_mask
+from libero_env.demos.regenerate import Regeneration, noop_mask, regenerate
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, UnknownNameError
 
@@ -237,6 +237,30 @@ def test_each_set_says_which_way_round_its_images_are(file, exported, tmp_path):
     origin = json.loads((exported["lerobot/libero"] / ORIGIN).read_text())
     assert origin["images"]["mirrored"] is True and origin["control_hz"] == 20
     assert origin["models"]["pack"] == "builtin" and origin["drawing"] == "fast"
+
+
+def test_a_recording_that_ends_too_early_is_continued(file, episode, tmp_path):
+    """The expert's last action, letting go, is repeated until the goal holds; in other files nothing is added."""
+    expected_frames = len(episode)
+
+    def cut(one):
+        steps = expected_frames - 3
+        obs = {key: values[:steps] for key, values in one.obs.items()}
+        robot_states, labels = one.robot_states[:steps], one.labels[:steps]
+        arrays = {"actions": one.actions[:steps], "states": one.states[:steps], "expert_actions": labels}
+        return replace(one, obs=obs, robot_states=robot_states, **arrays)
+
+    short, small = _rewrite(file, tmp_path / "short.hdf5", cut), replace(HOW, size=(16, 16))
+    (continued,) = regenerate(short, small)
+    assert continued.success and expected_frames - 3 < len(continued.action) <= expected_frames + 7
+    (stopped,) = regenerate(short, replace(small, extra_steps=0))
+    assert not stopped.success and len(stopped.action) == expected_frames - 3
+    human = DemoWriter(
+        tmp_path / "human.hdf5", {k: v for k, v in read_header(short).items() if k != "generator"}
+    )
+    human.write(0, next(read_episodes(short))[1])
+    (left,) = regenerate(human.finish(), small)
+    assert not left.success and len(left.action) == expected_frames - 3
 
 
 def test_an_unknown_set_is_named(file, tmp_path):
