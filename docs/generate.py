@@ -207,4 +207,45 @@ def _cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
-PARTS = {"commands": command_reference, "configuration": configuration_reference}
+PROTOCOL_ROWS = {
+    "fixtures": ("world.fixture_poses", "world.env_seed", "world.seeding"),
+    "waiting": ("episode.settle_steps",),
+    "horizon": ("episode.horizon",),
+    "success": ("episode.success",),
+    "errors": ("episode.errors",),
+    "images drawn": ("pixels.render_size", "pixels.orientation"),
+    "resized": ("pixels.resize", "pixels.resize_size", "pixels.crop"),
+    "state": ("proprioception.rotation", "proprioception.dtype"),
+    "gripper": ("action.gripper",),
+    "replan": ("action.replan",),
+    "episodes of a task": ("counting.trials",),
+    "arm": ("world.robot",),
+}
+
+
+def protocol_table() -> str:
+    """A row for each protocol, with the values in which they differ most."""
+    from lifelong.cli.protocols import shown_values
+    from lifelong.evaluation.card_files import card_names, load_card
+
+    lines = [
+        "| protocol |" + "".join(f" {title} |" for title in PROTOCOL_ROWS),
+        "|---" * (len(PROTOCOL_ROWS) + 1) + "|",
+    ]
+    for name in card_names():
+        values = shown_values(load_card(name))
+        cells = []
+        for keys in PROTOCOL_ROWS.values():
+            told = dict.fromkeys(values[key] for key in keys)
+            cells.append(
+                ", ".join(t for t in told if t not in ("-", "1.0", "not stated")) or next(iter(told))
+            )
+        lines.append(f"| `{name}` |" + "".join(f" {cell} |" for cell in cells))
+    return "\n".join(lines)
+
+
+PARTS = {
+    "commands": command_reference,
+    "configuration": configuration_reference,
+    "protocols": protocol_table,
+}

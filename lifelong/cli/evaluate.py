@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 POLICY_HELP = (
     "a run's directory, one of its checkpoints, module:function that returns an object with predict, or the "
-    "address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://..."
+    "address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://...; or a result, "
+    "eval.json, which is run again"
 )
 
 
@@ -112,6 +113,13 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         help="requests that a policy server gets before it has answered (default: one for each episode of a batch)",
     )
     parser.add_argument("--again", action="store_true", help="repeat what is done already")
+    parser.add_argument(
+        "--despite",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="of a result that is run again: what may differ from then, such as mujoco (default: nothing)",
+    )
     parser.add_argument(
         "--status", type=Path, metavar="OUT", help="only say how far the evaluation in this folder is"
     )
@@ -225,11 +233,18 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     from lifelong.evaluation.card_files import load_card
     from lifelong.evaluation.protocol_env import resolve_world
     from lifelong.evaluation.protocols import choose_init_states
+    from lifelong.evaluation.repeat import check_same, is_result, repeated, repeated_card
     from lifelong.evaluation.suite import SuiteEvaluation
     from lifelong.evaluation.units import UNIT_STARTS
+    from lifelong.results.evaluation_file import EvaluationResult
     from lifelong.results.records import installed_versions
 
-    card = load_card(args.protocol)
+    earlier = None
+    if is_result(args.policy):
+        earlier, where = EvaluationResult.read(args.policy), args.policy
+        args, card = repeated(args, earlier), repeated_card(earlier, where)
+    else:
+        card = load_card(args.protocol)
     policy: PolicyUnderTest
     if "://" in args.policy:
         from lifelong.evaluation.servers.policy import ServerPolicy
@@ -246,9 +261,14 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     protocol.require()
     for note in notes:
         print(f"note: {note}", file=sys.stderr, flush=True)
-    init_states = choose_init_states(args.starts, args.episodes, policy.selection)
+    identity, versions = {**policy.identity, "seed": args.seed}, installed_versions(args.assets)
+    if earlier is None:
+        init_states = choose_init_states(args.starts, args.episodes, policy.selection)
+    else:
+        init_states = earlier.init_states
+        check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=args.despite)
     return SuiteEvaluation(
-        identity={**policy.identity, "seed": args.seed},
+        identity=identity,
         tasks=tuple(dict.fromkeys(tasks)),
         init_states=init_states,
         protocol=protocol,
@@ -260,7 +280,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
         errors_are_failures=protocol.episode.errors == "failure",
         videos=args.videos,
         progress=sys.stderr.isatty() and args.workers == 1,
-        versions=installed_versions(args.assets),
+        versions=versions,
         policy_threads=args.policy_threads or (1 if policy.on_cpu else None),
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from libero_env.cli import assets, demos, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import LiberoError
-from lifelong.cli import compare, evaluate, serve
+from lifelong.cli import compare, evaluate, protocols, serve
 from lifelong.errors import LifelongError
 
 TRAIN_HELP = """\
@@ -134,6 +134,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     objects.register,
     teleop.register,
     evaluate.register,
+    protocols.register,
     serve.register,
     compare.register,
     register_report,

@@ -110,6 +110,8 @@ class UserPolicy(PolicyUnderTest):
         self.cameras = tuple(getattr(self.policy, "cameras", ("agentview", "robot0_eye_in_hand")))
         own = getattr(self.policy, "identity", {})
         self.identity = {"policy": args.policy, "source": source_digest(args.policy), **own}
+        if args.names is not None:
+            self.identity |= {"names": args.names}
         self.out = Path("eval") / args.policy.replace(":", ".")
         self.selection = SELECTION
 

@@ -11,8 +11,9 @@ from typing import Any
 import yaml
 
 from libero_env.errors import UnknownNameError
-from lifelong.errors import ProtocolError
+from lifelong.errors import EvaluationFileError, ProtocolError
 from lifelong.evaluation.card import SECTIONS, Card
+from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult
 
 _FOLDER = Path(str(resources.files("lifelong"))) / "evaluation" / "cards"
 _TOP = ("title", "extends", "sources")
@@ -27,7 +28,7 @@ def load_card(protocol: str | Path) -> Card:
     """Return a card.
 
     Args:
-        protocol: Name of one of the package's cards, or path of a YAML file.
+        protocol: Name of one of the package's cards, or path of a YAML file, or of a result, `eval.json`.
 
     Raises:
         UnknownNameError: There is no such card.
@@ -43,8 +44,18 @@ def _packaged(path: Path) -> Card:
 
 
 def _load(path: Path) -> Card:
-    values = _read(path, ())
-    return parse_card(values, path.stem, str(path))
+    if path.suffix == ".json":
+        return _of_result(path)
+    return parse_card(_read(path, ()), path.stem, str(path))
+
+
+def _of_result(path: Path) -> Card:
+    """Return the card that a result was made with."""
+    try:
+        values = EvaluationResult.read(path).protocol
+    except EvaluationFileError as error:
+        raise ProtocolError(str(error)) from error
+    return parse_card(values, str(values.get("name", path.parent.name)), str(path))
 
 
 def parse_card(values: Mapping[str, Any], name: str, where: str) -> Card:
@@ -75,7 +86,9 @@ def _path(protocol: str, folder: Path) -> Path:
     if packaged.is_file() and "/" not in protocol:
         return packaged
     path = (folder / Path(protocol).expanduser()).resolve()
-    if path.suffix in (".yaml", ".yml"):
+    if path.is_dir() and (path / FILE_NAME).is_file():
+        path = path / FILE_NAME
+    if path.suffix in (".yaml", ".yml", ".json"):
         if path.is_file():
             return path
         raise ProtocolError(f"{path} does not exist; protocols of the package: {', '.join(card_names())}")
@@ -100,6 +113,11 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         base = _read(_path(own["extends"], path.parent), (*seen, path))
     except UnknownNameError as error:
         raise ProtocolError(f"{path}: extends: {error}") from error
+    base["sources"] = {
+        key: text
+        for key, text in (base.get("sources") or {}).items()
+        if not ("." in key and key.partition(".")[2] in (own.get(key.partition(".")[0]) or {}))
+    }
     merged = dict(base)
     for key, value in own.items():
         inner = base.get(key)

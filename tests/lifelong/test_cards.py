@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from libero_env.tasks import get_task
+from lifelong.cli import main as cli
 from lifelong.errors import MissingObservationError, PolicyError, ProtocolError, ProtocolMismatchError
 from lifelong.evaluation.actors import CallableActor, ProtocolActor
 from lifelong.evaluation.adapter import CardAdapter, axis_angle, axis_angle_float32, axis_angle_positive
@@ -317,3 +318,18 @@ def _plain(value):
 
 def test_cards_are_values():
     assert load_card("openpi") == load_card("openpi") and isinstance(load_card("openpi"), Card)
+
+
+def test_protocols_from_the_command_line(tmp_path, capsys):
+    assert cli.main(["protocols", "list"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(card_names())
+    assert cli.main(["protocols", "show", "groot"]) == 0
+    shown = capsys.readouterr().out
+    assert "render_size        not stated" in shown and "20  # default of libero" in shown
+    assert "robosuite 1.4.1\n" not in shown, "the source of a value that was replaced is not that of the new one"
+    mine = write(tmp_path, "extends: openpi\naction: {replan: 10}")
+    assert cli.main(["protocols", "diff", "openpi", str(mine)]) == 1
+    assert capsys.readouterr().out.splitlines()[1].split() == ["action.replan", "5", "10"]
+    assert cli.main(["protocols", "diff", "openpi", "openpi"]) == 0
+    assert cli.main(["protocols", "show", "opennpi"]) == 2
+    assert "Did you mean 'openpi'" in capsys.readouterr().err

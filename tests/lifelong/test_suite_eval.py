@@ -4,6 +4,7 @@ import argparse
 import json
 import signal
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -147,6 +148,28 @@ def test_a_policy_from_a_module_of_the_working_directory(module):
 
 
 @pytest.mark.sim
+def test_a_result_is_run_again_from_its_file(module, tmp_path, capsys):
+    command = ["eval", f"{module}:make", "--suite", "libero_goal/3", "--episodes", "2", "--horizon", "3"]
+    command += ["--protocol", "openpi", "--seed", "4", "--names", "original", "--threads", "1"]
+    assert cli.main([*command, "--out", "found"]) == 0
+    assert cli.main(["eval", "found/eval.json", "--threads", "1"]) == 0
+    first, again = EvaluationResult.read("found"), EvaluationResult.read("found/again")
+    assert (first.outcomes, first.actions) == (again.outcomes, again.actions)
+    assert (first.evaluated, first.protocol, first.init_states) == (
+        again.evaluated,
+        again.protocol,
+        again.init_states,
+    )
+    other = replace(first, versions={**first.versions, "mujoco": "3.0.0"})
+    other.write(tmp_path / "other" / "eval.json")
+    capsys.readouterr()
+    assert cli.main(["eval", "other/eval.json"]) == 2
+    assert "mujoco: 3.0.0 in the result" in (err := capsys.readouterr().err) and "--despite mujoco" in err
+    assert cli.main(["eval", "other", "--threads", "1", "--despite", "mujoco"]) == 0
+    assert EvaluationResult.read("other/again").actions == first.actions
+
+
+@pytest.mark.sim
 def test_a_user_defined_policy_from_the_command_line(module, tmp_path, capsys):
     command = ["eval", f"{module}:make", "--suite", "libero_object/3", "--episodes", "2", "--horizon", "3"]
     command += ["--protocol", "openpi", "--out", "found", "--threads", "1"]
@@ -244,7 +267,7 @@ def test_at_sigterm_a_unit_is_given_back_and_the_same_command_goes_on(module, tm
 
 
 def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):
-    arguments = argparse.Namespace(policy=f"{module}:make")
+    arguments = argparse.Namespace(policy=f"{module}:make", names=None)
     first = UserPolicy(arguments).identity
     assert first["policy"] == f"{module}:make" and len(first["source"]) == 16
     file = tmp_path / f"{module}.py"

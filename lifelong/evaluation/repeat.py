@@ -1,0 +1,100 @@
+"""A result is run again from its file alone: the same policy, protocol, tasks, initial states and seed."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lifelong.errors import ConfigError, ResultsError
+from lifelong.evaluation.card import Card
+from lifelong.evaluation.card_files import parse_card
+from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult
+
+POLICIES = ("run", "policy", "server")  # keys of `evaluated` that name a policy, one for each kind
+
+
+def is_result(text: str) -> bool:
+    """Return whether a word of the command line is a result: `eval.json`, or a folder that has one and is no run."""
+    path = Path(text)
+    if path.is_dir():
+        return (path / FILE_NAME).is_file() and not (path / "config.yaml").is_file()
+    return path.suffix == ".json" and path.is_file()
+
+
+def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Namespace:
+    """Return the arguments of `libero eval` that repeat a result.
+
+    Args:
+        args: Arguments with the result's file as the policy; processes, folder and device are taken from them.
+        result: The result.
+
+    Raises:
+        ResultsError: The result does not say which policy it is of.
+    """
+    evaluated = result.evaluated
+    kind = next((name for name in POLICIES if evaluated.get(name)), None)
+    if kind is None:
+        raise ResultsError(f"{args.policy} does not say which policy it is of: {dict(evaluated)}")
+    path = Path(args.policy)
+    folder = path if path.is_dir() else path.parent
+    changes = {
+        "policy": str(evaluated[kind]),
+        "after": evaluated.get("after"),
+        "names": evaluated.get("names"),
+        "seed": int(evaluated.get("seed", 0)),
+        "suite": [task.task for task in result.tasks],
+        "unit_starts": result.unit_starts,
+        "policy_threads": args.policy_threads or _threads(result),
+        "horizon": None,
+        "size": None,
+        "out": args.out or folder / "again",
+    }
+    return argparse.Namespace(**(vars(args) | changes))
+
+
+def repeated_card(result: EvaluationResult, where: str) -> Card:
+    """Return the protocol of a result.
+
+    Raises:
+        ProtocolError: The result is of the first version, which did not store the whole protocol, or was edited.
+    """
+    return parse_card(result.protocol, str(result.protocol.get("name", "result")), where)
+
+
+def check_same(
+    result: EvaluationResult,
+    *,
+    evaluated: Mapping[str, Any],
+    protocol: Card,
+    versions: Mapping[str, str],
+    despite: Sequence[str],
+) -> None:
+    """Check that an evaluation is the one of a result.
+
+    Args:
+        result: The result.
+        evaluated: What identifies the policy now.
+        protocol: Protocol now.
+        versions: Versions now.
+        despite: Names of differences that the user accepts.
+
+    Raises:
+        ConfigError: Something differs; the message names both values of each.
+    """
+    then = {**result.evaluated, **result.versions, "protocol": result.protocol.get("digest")}
+    now = {**evaluated, **versions, "protocol": protocol.digest}
+    wrong = [
+        f"{name}: {then[name]} in the result, {now[name]} here"
+        for name in then
+        if name in now and then[name] != now[name] and name not in despite
+    ]
+    if wrong:
+        names = " ".join(text.partition(":")[0] for text in wrong)
+        raise ConfigError(
+            f"the result cannot be repeated as it was; {'; '.join(wrong)}. To run it all the same: --despite {names}"
+        )
+
+
+def _threads(result: EvaluationResult) -> int | None:
+    found = result.environment.get("policy_threads") if result.evaluated.get("run") else None
+    return found if isinstance(found, int) else None
