@@ -84,7 +84,7 @@ class OriginalResets:
         for item in self._plan.on_objects:
             self._draw(item, (0.0, 0.0, 0.0, 0.0))
             self._turn(item)
-        return np.array([placed[name].pose for name in self.scene.fixtures]).reshape(-1, 7)
+        return np.array([placed[name].pose for name in self.scene.fixtures], float).reshape(-1, 7)
 
     def _place(self, item: "_Item", placed: dict[str, "_Placed"]) -> "_Placed":
         """Draw the place of an entity on the workspace."""
@@ -100,6 +100,7 @@ class OriginalResets:
     def _place_on_site(self, item: "_Item", placed: dict[str, "_Placed"], site: "_Site") -> "_Placed":
         """Draw the place of an object on or in a site of an entity that has been placed."""
         carrier = placed[site.carrier]
+        assert carrier.pose is not None, "sites that objects are placed on belong to fixtures"
         dx, dy, dz = quat_to_mat(carrier.pose[3:]) @ site.pos
         half_x, half_y = site.size / 2
         top = 0.0 if site.inside else carrier.model.top_offset[2]
@@ -197,12 +198,12 @@ class _Plan:
     on_sites: tuple[_Item, ...]
     on_objects: tuple[_Item, ...]
     inside: frozenset[str]
-    default_sites: dict[str, _Site] | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> "_Plan":
         """Return the plan of a scene."""
-        joints, items, on, within, on_objects = [], [], [], [], []
+        joints: list[Atom] = []
+        items, on, within, on_objects = list[_Item](), list[_Item](), list[_Item](), list[_Item]()
         for atom in scene.problem.init:
             if atom.predicate in _JOINT_STATES:
                 joints.append(atom)
@@ -214,7 +215,7 @@ class _Plan:
                     (on if atom.predicate == "On" else within).append(item)
                 elif item.region.ranges:
                     items.append(item)
-        ranges = tuple(tuple(map(float, _joint_range(scene, atom))) for atom in joints)
+        ranges = tuple(_joint_range(scene, atom) for atom in joints)
         names = tuple(atom.args[0] for atom in joints)
         inside = frozenset(item.site for item in within)
         return cls(ranges, names, tuple(items), (*on, *within), tuple(on_objects), inside)

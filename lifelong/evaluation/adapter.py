@@ -55,7 +55,7 @@ class CardAdapter:
         return actions
 
     def _images(self, obs: Obs, i: int) -> dict[str, np.ndarray]:
-        pixels, found = self.card.pixels, {}
+        pixels, found = self.card.pixels, dict[str, np.ndarray]()
         for camera in pixels.cameras:
             image = np.asarray(obs[f"{camera.removeprefix('robot0_')}_rgb"][i])
             if pixels.orientation == "bottom_up":

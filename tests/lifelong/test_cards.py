@@ -326,7 +326,9 @@ def test_protocols_from_the_command_line(tmp_path, capsys):
     assert cli.main(["protocols", "show", "groot"]) == 0
     shown = capsys.readouterr().out
     assert "render_size        not stated" in shown and "20  # default of libero" in shown
-    assert "robosuite 1.4.1\n" not in shown, "the source of a value that was replaced is not that of the new one"
+    assert "robosuite 1.4.1\n" not in shown, (
+        "the source of a value that was replaced is not that of the new one"
+    )
     mine = write(tmp_path, "extends: openpi\naction: {replan: 10}")
     assert cli.main(["protocols", "diff", "openpi", str(mine)]) == 1
     assert capsys.readouterr().out.splitlines()[1].split() == ["action.replan", "5", "10"]
