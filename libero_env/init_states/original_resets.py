@@ -11,14 +11,14 @@ environments/base.py.
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_to_mat
-from libero_env.objects.model import ObjectModel
+from libero_env.objects.model import ObjectModel, rest_quat
 from libero_env.sim.scene import Scene
 from libero_env.tasks.problem import Atom, Region
 
@@ -93,14 +93,13 @@ class OriginalResets:
             x, y = self._draw(item, *item.region.ranges)
             found = _Placed(item.model, x + ox, y + oy, item.height + oz - item.model.bottom_offset[2])
             if item.fixture or not any(found.overlaps(other) for other in placed.values()):
-                yaw = self._turn(item)
-                return found if not item.fixture else found.turned(yaw, self.scene, item.name)
+                return found.turned(self._turn(item), item.fixture)
         raise PlacementError(f"{item.name} does not fit")
 
     def _place_on_site(self, item: "_Item", placed: dict[str, "_Placed"], site: "_Site") -> "_Placed":
         """Draw the place of an object on or in a site of an entity that has been placed."""
         carrier = placed[site.carrier]
-        assert carrier.pose is not None, "sites that objects are placed on belong to fixtures"
+        assert carrier.pose is not None, "it has been turned"
         dx, dy, dz = quat_to_mat(carrier.pose[3:]) @ site.pos
         half_x, half_y = site.size / 2
         top = 0.0 if site.inside else carrier.model.top_offset[2]
@@ -109,8 +108,7 @@ class OriginalResets:
             height = carrier.z + top + dz - item.model.bottom_offset[2]
             found = _Placed(item.model, x + carrier.x + dx, y + carrier.y + dy, height)
             if not any(found.overlaps(other) for other in placed.values()):
-                self._turn(item)
-                return found
+                return found.turned(self._turn(item), item.fixture)
         raise PlacementError(f"{item.name} does not fit")
 
     def _draw(
@@ -122,17 +120,14 @@ class OriginalResets:
         x = self._rng.uniform(low=x0 + edge, high=x1 - edge)
         return x, self._rng.uniform(low=y0 + edge, high=y1 - edge)
 
-    def _turn(self, item: "_Item") -> float:
-        """Draw the rotation of an entity: one angle for each axis; return the last."""
-        angle = 0.0
-        for low, high in item.angles:
-            angle = self._rng.uniform(low=low, high=high)
-        return angle
+    def _turn(self, item: "_Item") -> list[float]:
+        """Draw the rotation of an entity: one angle for each axis."""
+        return [self._rng.uniform(low=low, high=high) for low, high in item.angles]
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """An entity where it has been placed; of movable objects the orientation is not needed."""
+    """An entity where it has been placed; its pose is position and quaternion wxyz, (7,)."""
 
     model: ObjectModel
     x: float
@@ -147,10 +142,13 @@ class _Placed:
         )
         return bool(near and self.z - other.z <= other.model.top_offset[2] - self.model.bottom_offset[2])
 
-    def turned(self, yaw: float, scene: Scene, name: str) -> "_Placed":
-        """Return the fixture with its pose."""
-        pose = np.array([self.x, self.y, self.z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-        return _Placed(self.model, self.x, self.y, self.z, pose)
+    def turned(self, angles: Sequence[float], fixture: bool) -> "_Placed":
+        """Return the entity with its pose: a fixture turned about the vertical, an object about its own axes."""
+        if fixture:
+            quat = np.array([np.cos(angles[0] / 2), 0.0, 0.0, np.sin(angles[0] / 2)])
+        else:
+            quat = rest_quat({axis: (a, a) for axis, a in zip(self.model.rotation, angles, strict=False)})
+        return replace(self, pose=np.array([self.x, self.y, self.z, *quat]))
 
 
 @dataclass(frozen=True)
@@ -257,7 +255,7 @@ def _item(scene: Scene, atom: Atom) -> _Item:
         return _Item(name, model, region, True, False, ((min(yaw), max(yaw)),), height)
     within = scene.problem.name.lower().startswith(_WITHIN_BOUNDS)
     angles = tuple((min(r), max(r)) for r in model.rotation.values()) or ((0.0, 2 * np.pi),)
-    site = target if own and target not in scene.objects else ""
+    site = target if own and target not in scene.entities else ""
     return _Item(name, model, region, False, within, angles, 0.0 if site else _LIFT, site)
 
 

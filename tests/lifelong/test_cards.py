@@ -323,12 +323,13 @@ def test_cards_are_values():
 def test_protocols_from_the_command_line(tmp_path, capsys):
     assert cli.main(["protocols", "list"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(card_names())
-    assert cli.main(["protocols", "show", "groot"]) == 0
+    assert cli.main(["protocols", "show", "rlinf"]) == 0
     shown = capsys.readouterr().out
-    assert "render_size        not stated" in shown and "20  # default of libero" in shown
-    assert "robosuite 1.4.1\n" not in shown, (
-        "the source of a value that was replaced is not that of the new one"
+    assert (
+        "horizon            not stated  # not stated for the" in shown and "20  # default of libero" in shown
     )
+    replaced = load_card(write(tmp_path, "extends: openpi\nworld: {loads: 3}"))
+    assert "world.loads" not in replaced.sources and "world.robot" in replaced.sources
     mine = write(tmp_path, "extends: openpi\naction: {replan: 10}")
     assert cli.main(["protocols", "diff", "openpi", str(mine)]) == 1
     assert capsys.readouterr().out.splitlines()[1].split() == ["action.replan", "5", "10"]
