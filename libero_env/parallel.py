@@ -1,11 +1,17 @@
-"""Worker processes."""
+"""Worker processes, and the progress of long work."""
 
 import multiprocessing
 import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import connection
+from typing import Any
+
+from tqdm import tqdm
+
+LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
 
 
 def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -> ProcessPoolExecutor:
@@ -43,3 +49,40 @@ def end_with_parent() -> None:
 def cpu_count() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def progress_bar(*iterable: Any, progress: bool | None = None, **options: Any) -> tqdm:
+    """Return a progress bar on stderr; where that is no terminal, it is a line every fifteen seconds.
+
+    Args:
+        iterable: Iterable to go through, if any.
+        progress: True shows the bar anywhere, False shows nothing, None shows what fits stderr.
+        options: Further arguments of `tqdm.tqdm`.
+    """
+    if progress is None and not sys.stderr.isatty():
+        return _ProgressLines(*iterable, **options)
+    return tqdm(*iterable, disable=progress is False, **options)
+
+
+class _ProgressLines(tqdm):
+    """Progress as lines for a file; work that is done sooner than the first line is not told."""
+
+    def __init__(self, *iterable: Any, **options: Any):
+        self._lines = False  # tqdm shows the bar when it is made
+        form = "{desc}: {n_fmt} of {total_fmt}, {elapsed} passed, {remaining} left{postfix}"
+        intervals = {"mininterval": LINE_SECONDS, "miniters": 1, "leave": False}
+        super().__init__(*iterable, **{**options, **intervals}, bar_format=form)
+        self._lines = True
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+        """Write a line, but not when the bar is removed."""
+        if self._lines and msg is None:
+            self.fp.write(f"{self}\n")
+            self.fp.flush()
+        return True
+
+    def close(self) -> None:
+        """End without a line; tqdm would move the cursor."""
+        if not self.disable:
+            self.disable = True
+            self._decr_instances(self)

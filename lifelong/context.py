@@ -40,7 +40,7 @@ class RunContext:
         tracker: Mirror of the metrics to Weights & Biases.
         seed: Seed from which all randomness of the run is derived.
         device: Device of the policy.
-        progress: Whether to show progress bars.
+        progress: Whether to show progress bars; None prints lines where demonstrations are recorded.
         ranks: Rank of this process among those that train together.
     """
 
@@ -60,5 +60,5 @@ class RunContext:
     tracker: Tracker
     seed: int
     device: torch.device
-    progress: bool
+    progress: bool | None
     ranks: Ranks = Ranks()

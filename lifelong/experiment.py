@@ -18,7 +18,7 @@ from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
-from lifelong.data.demonstrations import DemoDatasets, find_demos
+from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
@@ -29,7 +29,7 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
-from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings, build
+from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings, build, check_values
 from lifelong.streams import StreamSettings
 from lifelong.training.distributed import Ranks
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
@@ -59,7 +59,9 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
         LiberoError: The configuration, the data or the directory is invalid.
     """
     config = _with_drawing(config)
-    settings = RunSettings(**{str(k): v for k, v in config.items() if k not in GROUPS})
+    top = OmegaConf.masked_copy(config, [k for k in config if k not in GROUPS])
+    check_values(top, RunSettings)
+    settings = RunSettings(**{str(k): v for k, v in top.items()})
     if settings.threads:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
@@ -95,6 +97,7 @@ def _build_contexts(
     pretrain: PretrainSettings = build(config.pretrain)
     first = pretrain.sequence()
     data: DataSettings = build(config.data)
+    check_folder(data)
     fit: FitSettings = build(config.train)
     if fit.compile != "off":
         check_compiler(device)
@@ -107,7 +110,7 @@ def _build_contexts(
         load_weights(policy, weights, file)
     demos, algorithm = stream.demos(data.demos, len(tasks), benchmark.group_size), build(config.algo)
     evaluation: EvalSettings = build(config.eval)
-    progress = sys.stderr.isatty() if settings.progress is None else settings.progress
+    progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
     context = RunContext(
         tasks=tasks,
         languages=languages[len(first) :],
@@ -125,7 +128,7 @@ def _build_contexts(
         tracker=build(config.wandb),
         seed=settings.seed,
         device=device,
-        progress=progress and ranks.first,
+        progress=progress if ranks.first else False,
         ranks=ranks,
     )
     if not first:

@@ -1,5 +1,8 @@
 """From the command line to a run: the configuration is composed, errors take one line, sweeps get a report."""
 
+import difflib
+import os
+import re
 import sys
 from collections.abc import Sequence
 from importlib import resources
@@ -7,14 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.errors import LiberoError, UnknownNameError
 from lifelong import experiment
+from lifelong.errors import ConfigError
 from lifelong.report.page import write_report
 from lifelong.training.distributed import Ranks, process_group, rank
 
@@ -54,6 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _compose_and_run(words, folder, ranks)
     except LiberoError as error:
         _print_error(error)
+        return 1
+    except (HydraException, OmegaConfBaseException) as error:  # the configuration cannot be composed
+        _print_error(_with_suggestion(error, words) or error)
         return 1
     except KeyboardInterrupt:
         print("interrupted; the same command resumes the run", file=sys.stderr)
@@ -118,8 +127,44 @@ def _compose_and_run(words: list[str], folder: Path, ranks: Ranks) -> int:
             return None
 
     sys.argv[1:] = words  # where Hydra reads them
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
     hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(job)()
     return int(failed)
+
+
+def _with_suggestion(error: Exception, words: Sequence[str]) -> LiberoError | None:
+    """Return an error that names the keys there are, if an override names one that there is not."""
+    found = re.search(r"Could not override '([\w.]+)'", str(error))
+    if found is None:
+        return None
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        node: Any = compose("config", [w for w in words if re.match(r"\w+=\w+$", w) and _is_choice(w)])
+    *parents, _ = found[1].split(".")
+    path = []
+    for name in parents:
+        if not OmegaConf.is_dict(node) or name not in node:
+            break
+        node = node[name]
+        path.append(name)
+    valid = (
+        [".".join([*path, str(key)]) for key in node if key != "_target_"]
+        if OmegaConf.is_dict(node)
+        else path
+    )
+    wanted = ".".join(found[1].split(".")[: len(path) + 1])
+    close = difflib.get_close_matches(wanted, valid, n=1)
+    hint = f" Did you mean {close[0]}?" if close else ""
+    return ConfigError(
+        f"unknown key {wanted} of the configuration.{hint} Valid: {', '.join(valid)}; "
+        f"+{found[1]}=... adds a key that the chosen files lack"
+    )
+
+
+def _is_choice(word: str) -> bool:
+    """Return whether an override chooses a file of the package's configuration."""
+    group, _, name = word.partition("=")
+    return (config_folder() / group / f"{name}.yaml").is_file()
 
 
 def _print_error(error: Exception) -> None:

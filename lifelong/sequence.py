@@ -155,7 +155,7 @@ class TaskSequence:
             on_epoch=lambda end: context.ranks.broadcast(self._after_epoch, phase, end),
             resume=resume,
             label=f"task {phase.task + 1} {phase.kind.name}",
-            progress=context.progress,
+            progress=bool(context.progress),
             ranks=context.ranks,
         )
         if self._selects_best(phase):
@@ -286,7 +286,7 @@ class TaskSequence:
                 precision=settings.precision,
                 record_every=settings.record_every if recorded else 0,
                 label=f"rollouts on task {task + 1}",
-                progress=context.progress,
+                progress=bool(context.progress),
             )
         if rollouts.frames:
             self._save_video(learned, task, rollouts.frames, rollouts.episodes[0].success)

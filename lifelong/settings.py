@@ -1,11 +1,14 @@
 """Settings of the run, the task sequence and pretraining."""
 
-from collections.abc import Sequence
+import difflib
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from hydra.utils import instantiate
-from omegaconf import DictConfig
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf
 
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
@@ -22,8 +25,57 @@ def build(node: DictConfig, **arguments: Any) -> Any:
     Args:
         node: Node with `_target_`, the dotted path of a class or function.
         arguments: Further keyword arguments of the target.
+
+    Raises:
+        ConfigError: The target has no parameter of a key's name, or takes no value of this kind.
     """
+    check_values(node, get_object(node._target_))
     return instantiate(node, _convert_="all", _partial_=True)(**arguments)
+
+
+def check_values(node: DictConfig, target: Callable[..., Any]) -> None:
+    """Check the keys of a node, and values that should be numbers or truths, against the signature of its target.
+
+    Args:
+        node: Node of the configuration.
+        target: Class or function that takes its keys as arguments.
+
+    Raises:
+        ConfigError: A key is unknown, or a value is of the wrong kind.
+    """
+    parameters = inspect.signature(target).parameters
+    any_key = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    try:
+        hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    except (NameError, TypeError):  # of a user's class: names that exist for type checkers only
+        hints = {}
+    for key in map(str, node):
+        if key.startswith("_") or OmegaConf.is_missing(node, key):
+            continue
+        name = node._get_full_key(key)
+        if key not in parameters and not any_key:
+            close = difflib.get_close_matches(key, parameters, n=1)
+            hint = f" Did you mean {close[0]}?" if close else ""
+            raise ConfigError(f"unknown key {name}.{hint} Valid: {', '.join(parameters)}")
+        if key in hints and not _is_of(node[key], hints[key]):
+            kinds = " or ".join(KINDS.get(kind, str(kind)) for kind in get_args(hints[key]) or (hints[key],))
+            raise ConfigError(f"{name} is {node[key]!r}; expected {kinds}")
+
+
+KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
+
+
+def _is_of(value: Any, hint: Any) -> bool:
+    """Return whether a value is of a kind; kinds other than numbers, truths and null are not checked."""
+    if isinstance(hint, UnionType) or get_origin(hint) is Union:
+        return any(_is_of(value, one) for one in get_args(hint))
+    if hint is NoneType:
+        return value is None
+    if hint is bool:
+        return isinstance(value, bool) or value in (0, 1)
+    if hint in (int, float):
+        return isinstance(value, int if hint is int else (int, float)) and not isinstance(value, bool)
+    return True
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from urllib.parse import urlparse
 from tqdm import tqdm
 
 from libero_env.assets.hub import DownloadError
+from libero_env.parallel import progress_bar
 
 TRIES = 5  # consecutive attempts that receive no byte
 TIMEOUT = 60.0  # [s] without a byte
@@ -43,8 +44,7 @@ def fetch(
         raise DownloadError(f"{url}: not an http or https address")
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f"{target.name}.partial")
-    hidden = None if progress is None else not progress
-    with tqdm(total=size, unit="B", unit_scale=True, desc=target.name[:40], disable=hidden) as bar:
+    with progress_bar(total=size, unit="B", unit_scale=True, desc=target.name[:40], progress=progress) as bar:
         _fetch_all(url, partial, size, bar, pause)
     if is_valid is not None and not is_valid(partial):
         partial.unlink()

@@ -5,6 +5,7 @@ recorded before, or on how often the recording was interrupted.
 """
 
 import shutil
+import sys
 import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
@@ -26,7 +27,7 @@ from libero_env.demos.record import (
     record_chunk_in_worker,
 )
 from libero_env.errors import DemoError
-from libero_env.parallel import cpu_count, spawn_pool
+from libero_env.parallel import cpu_count, progress_bar, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.sim.scene import FAST
 from libero_env.tasks import Task, get_suite
@@ -61,7 +62,7 @@ def generate(
         workers: Number of processes. 0 means one per core; 1 records in this process.
         pairing: Which observation is stored with an action, see `libero_env.demos.read`.
         disturb: Whether noise is added to the executed actions; the file then also holds the expert's own actions.
-        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal, and lines otherwise.
 
     Raises:
         DemoError: The existing file was recorded with another configuration, the file cannot be written, or the
@@ -184,13 +185,17 @@ def _record(
         for j, numbers in enumerate(missing)
         for i in range(0, len(numbers), BATCH)
     ]
-    bar = tqdm(
+    if progress is not False:
+        count = n * len(jobs) - sum(report.recorded for report in reports)
+        folders = ", ".join(sorted({str(job.path.parent.parent) for job in jobs}))
+        tqdm.write(f"recording {count} demonstrations of {len(jobs)} tasks in {folders}", file=sys.stderr)
+    bar = progress_bar(
         total=n * len(jobs),
         initial=sum(report.recorded for report in reports),
         desc="demonstrations",
         unit="demo",
         smoothing=0.1,
-        disable=None if progress is None else not progress,
+        progress=progress,
     )
     for writer, numbers in zip(writers, missing, strict=True):
         if not numbers:  # a process was killed after the last part

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
 from libero_env.demos.lerobot_layout import OWN, PUBLISHED, ExportedEpisode, Layout
@@ -25,6 +24,7 @@ from libero_env.demos.read import BrokenDemoError
 from libero_env.demos.regenerate import Regeneration, regenerate
 from libero_env.demos.write import Episode
 from libero_env.errors import DemoError, UnknownNameError
+from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
 from libero_env.timing import CONTROL_HZ
 
@@ -71,7 +71,7 @@ def export_lerobot(
     """
     _check_absent(root)
     with atomic_folder(root) as folder, closing(DatasetWriter(folder, OWN, video_mb)) as dataset:
-        for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
+        for file in progress_bar(files, desc="export", unit="file", progress=progress):
             language, pairing = _language(file), read_header(file).get("pairing", "libero")
             for name, episode in read_episodes(file):
                 dataset.add(_exported(f"{file}: {name}", episode, pairing, labels), language)
@@ -110,7 +110,7 @@ def export_published(
     writer = ImageDatasetWriter if layout.codec is None else DatasetWriter
     kept, failed = 0, []
     with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
-        for file in tqdm(files, unit="file", disable=None if progress is None else not progress):
+        for file in progress_bar(files, desc="export", unit="file", progress=progress):
             language = recorded_task(file).language
             for episode in regenerate(file, config):
                 if episode.success:

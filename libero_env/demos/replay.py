@@ -6,7 +6,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from tqdm import tqdm
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.curate import read_episodes, read_header, recorded_task
@@ -14,6 +13,7 @@ from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import BrokenDemoError, demo_number
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
+from libero_env.parallel import progress_bar
 from libero_env.sim.observations import image_name
 from libero_env.sim.scene import Scene, default_drawing
 
@@ -150,8 +150,7 @@ def rerender(
     recorded = writer.recorded()
     renderer = StateRenderer(recorded_task(file), config, assets)
     try:
-        disable = None if progress is None else not progress
-        for name, episode in tqdm(read_episodes(file), unit="demo", disable=disable):
+        for name, episode in progress_bar(read_episodes(file), desc="render", unit="demo", progress=progress):
             if (index := demo_number(name)) not in recorded:
                 fixtures = checked_fixtures(file, name, episode, renderer.scene)
                 obs, robot_states = renderer.render_states(episode.states, fixtures)
@@ -177,7 +176,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     renderer = StateRenderer(recorded_task(file), RenderConfig(()))
     writer, world = DemoWriter(target, read_header(file)), renderer.env.world
     try:
-        for name, episode in tqdm(read_episodes(file), unit="demo", disable=None):
+        for name, episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
             renderer.place_fixtures(checked_fixtures(file, name, episode, renderer.scene))
             renderer.env.set_state(episode.states[0])
             states = []

@@ -16,7 +16,6 @@ from statistics import median
 
 import mujoco
 import numpy as np
-from tqdm import tqdm
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.config import GENERATOR
@@ -25,7 +24,7 @@ from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.init_states.store import scene_digest
-from libero_env.parallel import spawn_pool
+from libero_env.parallel import progress_bar, spawn_pool
 from libero_env.sim.scene import build_scene
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
@@ -141,8 +140,9 @@ def certify(
         found = [_stored(path, empty) if path else empty for path, empty in zip(paths, found, strict=True)]
     chunks = [(k, chunk) for k, known in enumerate(found) for chunk in _missing(known, states)]
     total, left = states * len(tasks), sum(len(chunk) for _, chunk in chunks)
-    off = None if progress is None else not progress
-    with tqdm(total=total, initial=total - left, desc="certify", unit="start", disable=off) as bar:
+    with progress_bar(
+        total=total, initial=total - left, desc="certify", unit="start", progress=progress
+    ) as bar:
         for k, outcomes in _run(chunks, tasks, jobs, pack, disturb):
             merged = {o.state: o for o in (*found[k].outcomes, *outcomes)}
             found[k] = replace(found[k], outcomes=tuple(merged[i] for i in sorted(merged)))

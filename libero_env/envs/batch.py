@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from libero_env.envs.checks import ResetRequest, check_options, checked_actions
 from libero_env.envs.config import EnvConfig, EnvOptions, show_options
 from libero_env.envs.world import World
+from libero_env.errors import LiberoError
 from libero_env.sim.rewards import Reward
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
@@ -105,6 +106,7 @@ class BatchEnv(gymnasium.vector.VectorEnv):
             LiberoError: An initial state does not exist, or seeds or mask have the wrong length.
             PlacementError: The objects do not fit.
         """
+        self._check_open()
         options = options or {}
         check_options(options, valid=("init_state", "start", "outdated_controller", "reset_mask"))
         request = ResetRequest.from_arguments(self.num_envs, seed, options)
@@ -141,6 +143,7 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         Raises:
             ActionError: The shape is wrong, or a value is not finite; no state has changed.
         """
+        self._check_open()
         actions = checked_actions(actions, self.num_envs, self.world.controller.action_dim)
         ids = np.flatnonzero(self._running)
         reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
@@ -176,6 +179,10 @@ class BatchEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulations and the OpenGL context."""
         self.world.close()
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise LiberoError(f"these simulations of {self.task.id} are closed; make others")
 
     def _check_goals(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in each of the simulations, and its reward; note the truth of atoms."""

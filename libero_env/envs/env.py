@@ -72,7 +72,7 @@ class LiberoEnv(gymnasium.Env):
         self.observation_space, self.action_space = self.world.observation_space(), self.world.action_space()
         self.render_images = True
         self._images = self.world.empty_images()
-        self._steps, self._running = 0, False
+        self._steps, self._running, self._closed = 0, False, False
 
     @property
     def view(self) -> StateView:
@@ -93,6 +93,7 @@ class LiberoEnv(gymnasium.Env):
             LiberoError: The initial state does not exist.
             PlacementError: The objects do not fit.
         """
+        self._check_open()
         super().reset(seed=seed)
         options = options or {}
         check_options(options, valid=("init_state",))
@@ -113,6 +114,7 @@ class LiberoEnv(gymnasium.Env):
             ActionError: The shape is wrong, or a value is not finite; the state has not changed.
             LiberoError: No episode is running.
         """
+        self._check_open()
         action = checked_actions(action, size=self.world.controller.action_dim)
         if not self._running:
             raise LiberoError("no episode is running; call reset()")
@@ -128,6 +130,7 @@ class LiberoEnv(gymnasium.Env):
 
     def get_state(self) -> np.ndarray:
         """Return all that the rest of the episode depends on: simulation, controller and number of steps."""
+        self._check_open()
         return np.append(self.world.simulations.get_state(0), float(self._steps))
 
     def set_state(self, state: np.ndarray) -> dict[str, np.ndarray]:
@@ -140,6 +143,7 @@ class LiberoEnv(gymnasium.Env):
         Raises:
             LiberoError: The vector has another length, or is not finite.
         """
+        self._check_open()
         state = np.asarray(state, np.float64)
         model, size = self.world.scene.model, self.world.simulations.state_size + 1
         if state.shape not in ((size,), (1 + model.nq + model.nv,)) or not np.isfinite(state).all():
@@ -158,6 +162,7 @@ class LiberoEnv(gymnasium.Env):
 
     def render_cameras(self) -> dict[str, np.ndarray]:
         """Render the observed images of the current state: name -> (H, W, ...)."""
+        self._check_open()
         self.world.render_cameras([0], self._images)
         return {key: rows[0].copy() for key, rows in self._images.items()}
 
@@ -167,7 +172,12 @@ class LiberoEnv(gymnasium.Env):
 
     def close(self) -> None:
         """Free the simulation and the OpenGL context."""
+        self._closed = True
         self.world.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise LiberoError(f"this environment of {self.task.id} is closed; make another")
 
     def _observe(self) -> dict[str, np.ndarray]:
         if self.render_images:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from tqdm import tqdm
 
 from libero_env.assets.pack import BUILTIN
 from libero_env.errors import LiberoError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import sample_settled
-from libero_env.parallel import spawn_pool
+from libero_env.parallel import progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
@@ -121,7 +120,9 @@ def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)  # fails now, not after the work
     with spawn_pool(jobs) as pool:
         generated = zip(tasks, pool.map(_generate, tasks), strict=True)
-        for task, (states, digest) in tqdm(generated, unit="task", desc="initial states", total=len(tasks)):
+        for task, (states, digest) in progress_bar(
+            generated, unit="task", desc="initial states", total=len(tasks)
+        ):
             arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
     atomic_write_npz(path, arrays)
 

@@ -91,10 +91,16 @@ def get_task(key: str) -> Task:
 
     Raises:
         UnknownNameError: The suite, index or task does not exist; the message lists the valid ones.
-        LiberoError: The file is not a valid task.
+        LiberoError: The file is not a valid task, or the name is that of a suite.
     """
     if key.endswith(ENDINGS):
         return read_task(key)
+    if key in suite_names():
+        last = len(get_suite(key)) - 1
+        raise LiberoError(
+            f"{key} is a suite of {last + 1} tasks, not a task; write {key}/0 to {key}/{last}, or the name of a task "
+            f"(`libero tasks list {key}`)"
+        )
     for mark in "/-":
         suite_name, found, index = key.rpartition(mark)
         if found:

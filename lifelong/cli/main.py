@@ -1,9 +1,11 @@
 """The `libero` command. Each subcommand is a small function that imports what it needs when it runs."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from libero_env.cli import assets, demos, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
@@ -34,12 +36,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0, 1 where the command found a fault, 2 after an error, which is printed in one line.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        status = _run(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to be flushed
+        return 141  # as of a process that SIGPIPE ends
+    return status
+
+
+def _run(words: list[str]) -> int:
     if words[:1] == ["train"] and not {"-h", "--help"} & set(words):
         return run_train(words[1:])  # Hydra reads the rest: options in any place, overrides
     args = build_parser().parse_args(words)
     try:
         return args.run(args) or 0
+    except BrokenPipeError:
+        raise
     except (LiberoError, LifelongError, OSError) as error:
         print(f"libero: error: {error}", file=sys.stderr)
         return 2
@@ -48,9 +61,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that prints its help where a command is missing."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print what is wrong, or the commands there are, and exit."""
+        if message.endswith((": COMMAND", ": ACTION")):
+            self.print_help(sys.stderr)
+            self.exit(2)
+        super().error(message)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser with every subcommand; each stores its function as `run`."""
-    parser = argparse.ArgumentParser(prog="libero", description="Lifelong robot learning on LIBERO.")
+    parser = _Parser(prog="libero", description="Lifelong robot learning on LIBERO.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     for register in COMMANDS:
         register(subparsers)

@@ -1,5 +1,6 @@
 """Demonstrations of a run's tasks: recorded if there are none, read when they are needed."""
 
+import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ from lifelong.types import PolicySpec
 
 
 def find_demos(
-    tasks: Sequence[Task], counts: Sequence[int], data: DataSettings, progress: bool
+    tasks: Sequence[Task], counts: Sequence[int], data: DataSettings, progress: bool | None
 ) -> list[Path]:
     """Return the demonstration file of each task; missing demonstrations are recorded.
 
@@ -29,12 +30,14 @@ def find_demos(
         tasks: Tasks in learning order.
         counts: Number of demonstrations required of each task.
         data: Image size, and the folder of the files.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar; None shows one in a terminal, and lines otherwise.
 
     Raises:
-        DataError: A file in the original's layout has fewer demonstrations than required.
+        DataError: `data.folder` does not exist, or a file in the original's layout has fewer demonstrations than
+            required.
         DemoError: A file is broken, or demonstrations cannot be recorded.
     """
+    folder = check_folder(data)
     found = dict(_existing_files(tasks, counts, data))
     for count in sorted(set(counts), reverse=True):
         missing = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in found]
@@ -42,10 +45,29 @@ def find_demos(
             continue
         size = (data.image_size, data.image_size)
         paths = ensure_demos(
-            missing, count, camera_size=size, drawing=data.drawing, root=data.folder, progress=progress
+            missing, count, camera_size=size, drawing=data.drawing, root=folder, progress=progress
         )
         found |= zip([task.id for task in missing], paths, strict=True)
     return [found[task.id] for task in tasks]
+
+
+def check_folder(data: DataSettings) -> Path | None:
+    """Return the folder of the demonstrations, None for the default one.
+
+    Raises:
+        DataError: It does not exist; the message names a similar folder beside it.
+    """
+    if data.folder is None:
+        return None
+    folder = Path(data.folder).expanduser()
+    if folder.is_dir():
+        return folder
+    beside = [p.name for p in folder.parent.iterdir() if p.is_dir()] if folder.parent.is_dir() else []
+    close = difflib.get_close_matches(folder.name, beside, n=1)
+    hint = f" Did you mean {folder.parent / close[0]}?" if close else ""
+    raise DataError(
+        f"data.folder={data.folder} does not exist.{hint} To record demonstrations into a new folder, make it first"
+    )
 
 
 def _existing_files(
