@@ -123,7 +123,7 @@ def _build_contexts(
         augment=build(config.augmentation),
         stream=stream,
         group_size=benchmark.group_size,
-        envs=EnvPool(partial(_make_env, tasks, spec, evaluation, data.drawing), evaluation.open_environments),
+        envs=EnvPool(partial(_make_env, tasks, spec, evaluation, data), evaluation.open_environments),
         directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
         tracker=build(config.wandb),
         seed=settings.seed,
@@ -161,7 +161,7 @@ def _pretraining_config(plain: Any) -> dict[str, Any]:
 
 
 def _make_env(
-    tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings, drawing: str | None, key: Any
+    tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings, data: DataSettings, key: Any
 ) -> BatchEnv:
     task, simulations = key
     return BatchEnv(
@@ -171,7 +171,8 @@ def _make_env(
         cameras=tuple(CAMERAS[view] for view in spec.views),
         camera_size=spec.image_size,
         horizon=settings.horizon + settings.settle_steps,
-        drawing=drawing,
+        drawing=data.drawing,
+        robot=data.robot,
     )
 
 

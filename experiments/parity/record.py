@@ -24,7 +24,7 @@ from libero.libero.envs.env_wrapper import ControlEnv
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_90", "libero_10")
 MOTIONS = ("reach", "fold", "press", "spin", "wander")
 TOUCHES = ("self", "link7", "table", "objects")  # bits of `touches`
-STRIDE = 10  # control steps between two complete states of a file
+STRIDE = 10  # control steps between two moments of a file
 
 
 def make_env(suite: str, task_id: int, seed: int) -> ControlEnv:
@@ -62,6 +62,19 @@ def start_afresh(env: ControlEnv, state: np.ndarray) -> None:
     robot.controller.reset_goal()
     robot.gripper.current_action = np.zeros(2)
     env.sim.data._data.qacc_warmstart[:] = 0.0
+
+
+def moment(env: ControlEnv) -> np.ndarray:
+    """Return all that the rest of an episode depends on.
+
+    It consists of time, qpos, qvel, the solver's warm start, controls, goal position and orientation, gripper command.
+    """
+    data, robot = env.sim.data._data, env.env.robots[0]
+    state = [[data.time], data.qpos, data.qvel, data.qacc_warmstart, data.ctrl]
+    controller = robot.controller
+    return np.concatenate(
+        [*state, controller.goal_pos, np.ravel(controller.goal_ori), robot.gripper.current_action]
+    )
 
 
 class TouchCounter:
@@ -154,21 +167,20 @@ def record(suite: str, task_id: int, kind: str, steps: int, seed: int) -> dict[s
     """Return the arrays of one recording."""
     env = make_env(suite, task_id, seed)
     sim, rng = env.sim, np.random.default_rng(seed)
-    nq = sim.model.nq
     start = np.array(sim.get_state().flatten())
     start_afresh(env, start)
     touches = TouchCounter(env)
     hand = sim.model.site_name2id("gripper0_grip_site")
     motion = Motion(kind, np.array(sim.data.get_body_xpos("robot0_base")), rng)
-    actions, robot, full, touched = [], [], [], []
+    actions, robot, moments, touched = [], [], [], []
     for t in range(steps):
+        if t % STRIDE == 0:
+            moments.append(moment(env))
         actions.append(motion.action(np.array(sim.data.site_xpos[hand])))
         env.step(actions[-1])
         state = np.array(sim.get_state().flatten())
         robot.append(state[1:10])
         touched.append(touches.take())
-        if (t + 1) % STRIDE == 0:
-            full.append(state[1 : 1 + nq])
     poses = fixture_poses(env)
     env.close()
     return {
@@ -178,10 +190,9 @@ def record(suite: str, task_id: int, kind: str, steps: int, seed: int) -> dict[s
         "robosuite": np.array(robosuite.__version__),
         "mujoco": np.array(mujoco.__version__),
         "fixtures": np.array(json.dumps(poses)),
-        "start": start,
         "actions": np.round(np.array(actions) * 64).astype(np.int8),
         "robot_qpos": np.array(robot),
-        "qpos": np.array(full),
+        "moments": np.array(moments),
         "touches": np.array(touched, np.uint8),
     }
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from libero_env.assets.robot import ROBOTS
 from libero_env.cli import demos_edit
 from libero_env.cli.arguments import Subparsers, modalities, positive, size
 from libero_env.demos.curate import describe, find_demo_files
@@ -56,6 +57,7 @@ def _register_generate(commands: Subparsers) -> None:
     add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
+    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="model of the arm (default: libero)")
     add("--seed", type=int, default=0, help="seed of starts, motion styles and action noise (default: 0)")
     add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
     add(
@@ -138,6 +140,7 @@ def demo_configs(args: argparse.Namespace) -> "list[DemoConfig]":
             cameras=() if args.no_images else tuple(args.cameras),
             modalities=modalities(args),
             drawing=args.drawing,
+            robot=args.robot,
         )
         for task in tasks
     ]

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import select_pack
-from libero_env.assets.robot import robosuite_version
+from libero_env.assets.robot import DEFAULT_ROBOT, robosuite_version
 from libero_env.demos.observe import RenderConfig
 from libero_env.demos.read import Pairing
 from libero_env.demos.write import DemoWriter, make_header
@@ -62,6 +62,7 @@ class DemoConfig:
         cameras: Names of the cameras in the model.
         modalities: Kinds of image, see `RenderConfig`.
         drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
+        robot: Model of the arm, see `libero_env.assets.robot`.
     """
 
     source: Task | str
@@ -73,6 +74,7 @@ class DemoConfig:
     cameras: tuple[str, ...] = DEFAULT_CAMERAS
     modalities: tuple[str, ...] = ("rgb",)
     drawing: str | None = None
+    robot: str = DEFAULT_ROBOT
 
     @cached_property
     def drawn(self) -> str:
@@ -109,7 +111,8 @@ class DemoConfig:
             seed=self.seed,
             generator=GENERATOR,
             disturbed=self.disturb,
-            model_digest=model_digest(task, self.drawn),
+            robot=self.robot,
+            model_digest=model_digest(task, self.drawn, self.robot),
             models=json.dumps({"pack": (pack := select_pack()).name, "digest": pack.digest}),
             versions=json.dumps(versions),
             **self.render_config.header(),
@@ -127,10 +130,11 @@ class DemoConfig:
             f"Variation(style={v.style!r}, noise={v.noise!r}, push_rate={v.push_rate!r}, "
             f"reserved={v.reserved!r})"
         )
+        robot = "" if self.robot == DEFAULT_ROBOT else f", robot={self.robot!r}"
         return (
             f"Recipe(source='', camera_size={self.camera_size!r}, seed={self.seed!r}, pairing={self.pairing!r}, "
             f"disturb={self.disturb!r}, variation={variation}, cameras={self.cameras!r}, "
-            f"pictures={self.modalities!r}{'' if self.drawn == FAST else f', drawing={self.drawn!r}'})"
+            f"pictures={self.modalities!r}{'' if self.drawn == FAST else f', drawing={self.drawn!r}'}{robot})"
         )
 
 
@@ -157,9 +161,9 @@ class RecordingJob:
 
 
 @lru_cache(maxsize=16)
-def model_digest(task: Task, drawing: str | None = None) -> str:
+def model_digest(task: Task, drawing: str | None = None, robot: str = DEFAULT_ROBOT) -> str:
     """Return 16 hex digits that change with anything in the task's compiled scene, its appearance included."""
-    model = build_scene(task.problem, drawing=drawing).model
+    model = build_scene(task.problem, drawing=drawing, robot=robot).model
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return hashlib.sha256(buffer.tobytes()).hexdigest()[:16]

@@ -9,6 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.read import (
     LOW_DIM_KEYS,
     BrokenDemoError,
@@ -66,6 +67,18 @@ def read_header(file: Path) -> dict[str, Any]:
     with open_demo_file(file) as handle:
         demo_names(handle, file)
         return {key: value for key, value in handle["data"].attrs.items() if key not in _COUNTS}
+
+
+def recorded_robot(file: Path) -> str:
+    """Return the model of the arm that was recorded, one of `libero_env.assets.robot.ROBOTS`.
+
+    This package's files name it; those before it had a name have robosuite 1.4.1's. The original's have 1.4.0's.
+
+    Raises:
+        DemoError: It is not a demonstration file.
+    """
+    header = read_header(file)
+    return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else DEFAULT_ROBOT))
 
 
 def recorded_task(file: Path) -> Task:

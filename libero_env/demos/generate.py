@@ -16,6 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import GENERATOR, DemoConfig, RecordingJob
 from libero_env.demos.read import Pairing
 from libero_env.demos.record import (
@@ -82,6 +83,7 @@ def ensure_demos(
     seed: int = 0,
     drawing: str | None = None,
     root: str | Path | None = None,
+    robot: str = DEFAULT_ROBOT,
     workers: int = 0,
     progress: bool | None = None,
 ) -> list[Path]:
@@ -98,6 +100,7 @@ def ensure_demos(
         seed: As for `generate`.
         drawing: How images are drawn, see `DemoConfig`.
         root: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
+        robot: Model of the arm, see `libero_env.assets.robot`.
         workers: As for `generate`.
         progress: As for `generate`.
 
@@ -110,7 +113,7 @@ def ensure_demos(
     tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
     root = demos_dir() if root is None else Path(root)
     size = (camera_size[0], camera_size[1])
-    configs = [DemoConfig(task, size, seed, drawing=drawing) for task in tasks]
+    configs = [DemoConfig(task, size, seed, drawing=drawing, robot=robot) for task in tasks]
     jobs = [RecordingJob(config, demo_path(root, config)) for config in configs]
     _raise_errors(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
     return [job.path for job in jobs]

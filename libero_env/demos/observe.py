@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.demos.write import Episode
 from libero_env.envs.env import LiberoEnv
@@ -53,9 +54,17 @@ class StateRenderer:
         task: Task whose scene is simulated.
         config: What is rendered.
         assets: Where models come from, as for `LiberoEnv`.
+        robot: Model of the arm, see `libero_env.assets.robot`.
     """
 
-    def __init__(self, task: Task, config: RenderConfig, assets: Pack | str | Path | None = None):
+    def __init__(
+        self,
+        task: Task,
+        config: RenderConfig,
+        assets: Pack | str | Path | None = None,
+        *,
+        robot: str = DEFAULT_ROBOT,
+    ):
         self.task = task
         self.env = LiberoEnv(
             task,
@@ -63,6 +72,7 @@ class StateRenderer:
             camera_size=config.size,
             assets=assets,
             drawing=config.drawing,
+            robot=robot,
             observations=(*config.modalities, "proprioception", "ee_quat"),
         )
 
@@ -104,7 +114,7 @@ class StateRenderer:
 
     @cached_property
     def _spec(self) -> mujoco.MjSpec:
-        return spec_without_textures(self.task.problem)
+        return spec_without_textures(self.task.problem, robot=self.scene.robot)
 
     def close(self) -> None:
         """Free the simulation and the OpenGL context."""

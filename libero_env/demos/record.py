@@ -49,9 +49,15 @@ class DemoRecorder:
     def __init__(self, config: DemoConfig):
         self.config, self.task = config, config.task
         self.env = BatchEnv(
-            self.task, BATCH, num_threads=1, cameras=(), horizon=MAX_STEPS, drawing=config.drawn
+            self.task,
+            BATCH,
+            num_threads=1,
+            cameras=(),
+            horizon=MAX_STEPS,
+            drawing=config.drawn,
+            robot=config.robot,
         )
-        self.renderer = StateRenderer(self.task, config.render_config)
+        self.renderer = StateRenderer(self.task, config.render_config, robot=config.robot)
         self.shapes = Shapes(self.env.world.scene)
 
     def attempt(self, numbers: list[tuple[int, int]]) -> list[tuple[int, Attempt]]:

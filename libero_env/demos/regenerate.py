@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
-from libero_env.demos.curate import read_episodes, read_header, recorded_task
+from libero_env.demos.curate import read_episodes, read_header, recorded_robot, recorded_task
 from libero_env.demos.lerobot_layout import ExportedEpisode
 from libero_env.demos.replay import checked_fixtures
 from libero_env.demos.write import Episode
@@ -88,7 +88,7 @@ def regenerate(file: Path, config: Regeneration) -> Iterator[ExportedEpisode]:
     """
     if "generator" not in read_header(file):  # not of this package's expert
         config = replace(config, extra_steps=0)
-    world = World(recorded_task(file), config=config.env_config())
+    world = World(recorded_task(file), config=config.env_config(), robot=recorded_robot(file))
     try:
         for name, episode in read_episodes(file):
             world.simulations.fixtures[0] = checked_fixtures(file, name, episode, world.scene)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.curate import read_episodes, read_header, recorded_task
+from libero_env.demos.curate import read_episodes, read_header, recorded_robot, recorded_task
 from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.read import BrokenDemoError, demo_number
 from libero_env.demos.write import DemoWriter, Episode
@@ -69,7 +69,7 @@ def replay(
     if by not in REPLAY_MODES:
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
     config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
-    renderer = StateRenderer(recorded_task(file), config, assets)
+    renderer = _renderer(file, config, assets)
     keys = [image_name(camera, "rgb") for camera in cameras]
     found = set()
     try:
@@ -148,7 +148,7 @@ def rerender(
     config = replace(config, drawing=config.drawing or default_drawing(pack))
     writer = DemoWriter(target, {**header, **config.header(), "pairing": "aligned"})
     recorded = writer.recorded()
-    renderer = StateRenderer(recorded_task(file), config, assets)
+    renderer = _renderer(file, config, assets)
     try:
         for name, episode in progress_bar(read_episodes(file), desc="render", unit="demo", progress=progress):
             if (index := demo_number(name)) not in recorded:
@@ -173,7 +173,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     Raises:
         DemoError: The file is broken or does not fit its task's scene.
     """
-    renderer = StateRenderer(recorded_task(file), RenderConfig(()))
+    renderer = _renderer(file, RenderConfig(()))
     writer, world = DemoWriter(target, read_header(file)), renderer.env.world
     try:
         for name, episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
@@ -188,6 +188,10 @@ def rerun_actions(file: Path, target: Path) -> Path:
     finally:
         renderer.close()
     return writer.finish()
+
+
+def _renderer(file: Path, config: RenderConfig, assets: Pack | str | Path | None = None) -> StateRenderer:
+    return StateRenderer(recorded_task(file), config, assets, robot=recorded_robot(file))
 
 
 def checked_fixtures(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.errors import DemoError
 from libero_env.mujoco_compat import delete
 from libero_env.objects.model import ROOT_BODY
@@ -33,10 +34,10 @@ _TEXTURE_FIELDS = (
 
 
 def spec_without_textures(
-    problem: Problem, pack: Pack | None = None, drawing: str | None = None
+    problem: Problem, pack: Pack | None = None, drawing: str | None = None, robot: str = DEFAULT_ROBOT
 ) -> mujoco.MjSpec:
     """Return the scene of a problem as an editable model without textures; arguments as of `scene_spec`."""
-    spec = scene_spec(problem, pack, drawing=drawing)
+    spec = scene_spec(problem, pack, drawing=drawing, robot=robot)
     for material in spec.materials:
         material.textures = [""] * len(list(material.textures))
     for texture in list(spec.textures):

@@ -29,7 +29,7 @@ def find_demos(
     Args:
         tasks: Tasks in learning order.
         counts: Number of demonstrations required of each task.
-        data: Image size, and the folder of the files.
+        data: Image size, robot, and the folder of the files.
         progress: Whether to show a progress bar; None shows one in a terminal, and lines otherwise.
 
     Raises:
@@ -45,7 +45,13 @@ def find_demos(
             continue
         size = (data.image_size, data.image_size)
         paths = ensure_demos(
-            missing, count, camera_size=size, drawing=data.drawing, root=folder, progress=progress
+            missing,
+            count,
+            camera_size=size,
+            drawing=data.drawing,
+            root=folder,
+            robot=data.robot,
+            progress=progress,
         )
         found |= zip([task.id for task in missing], paths, strict=True)
     return [found[task.id] for task in tasks]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.demos.read import LOW_DIM_KEYS
 from libero_env.errors import UnknownNameError
 from libero_env.sim.scene import DRAWINGS
@@ -28,6 +29,7 @@ class DataSettings:
         proprio: Names of the proprioceptive readings that the policy sees, keys of `LOW_DIM_KEYS`.
         pairing: `aligned` pairs each action with the observation before it; `stored` reads files as they are.
         labels: `expert` learns the actions that the expert chose, `executed` those with noise that were executed.
+        robot: Model of the arm in demonstrations and evaluation, see `libero_env.assets.robot`.
         folder: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         memory: Where frames are held, see `lifelong.data.loading`; batches do not depend on it.
         backend: What reads the windows, see `lifelong.data.loading`; batches do not depend on it.
@@ -42,6 +44,7 @@ class DataSettings:
     proprio: Sequence[str]
     pairing: Literal["aligned", "stored"] = "aligned"
     labels: Literal["expert", "executed"] = "expert"
+    robot: str = DEFAULT_ROBOT
     folder: str | None = None
     memory: str = "auto"
     backend: str = "native"
@@ -51,6 +54,7 @@ class DataSettings:
         valid = {
             "pairing": ("aligned", "stored"),
             "labels": ("expert", "executed"),
+            "robot": ROBOTS,
             "memory": MEMORY,
             "backend": BACKENDS,
             "views": CAMERAS,

@@ -73,7 +73,7 @@ class RunPolicy(PolicyUnderTest):
     def protocol(self, base: Card) -> Card:
         """Return the protocol with the run's images and one prediction for each step; see `PolicyUnderTest`."""
         settings, size = self.run.eval, self.run.policy.spec.image_size
-        return run_protocol(base, size, settings.horizon, settings.settle_steps)
+        return run_protocol(base, size, settings.horizon, settings.settle_steps, self.run.robot)
 
     def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
 

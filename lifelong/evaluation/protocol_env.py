@@ -205,17 +205,20 @@ def fixture_poses(task: Task, scene: Scene, card: Card, starts: Sequence[int]) -
     return {i: OriginalResets(scene, card.env_seed(task, i) or 0, loads).reset() for i in set(starts)}
 
 
-def run_protocol(base: Card, image_size: tuple[int, int], horizon: int, settle_steps: int) -> Card:
+def run_protocol(
+    base: Card, image_size: tuple[int, int], horizon: int, settle_steps: int, robot: str = DEFAULT_ROBOT
+) -> Card:
     """Return a protocol as it is run with a policy of this package.
 
     The policy sees upright images of the size that it was trained on, and predicts an action for each step. Under
-    `libero`, episodes have the run's own length and settling.
+    `libero`, episodes have the run's own length, settling and robot.
 
     Args:
         base: Protocol.
         image_size: Height and width of the policy's images, [pixels].
         horizon: Maximum number of control steps of an episode of the run.
         settle_steps: Number of steps before the policy acts in the run.
+        robot: Model of the arm in the run.
     """
     own: dict[str, Any] = {
         "pixels.render_size": tuple(image_size),
@@ -229,5 +232,6 @@ def run_protocol(base: Card, image_size: tuple[int, int], horizon: int, settle_s
     }
     if base.name == "libero":
         own |= {"episode.horizon": horizon, "episode.settle_steps": settle_steps}
+        own["world.robot"] = robot
         own["episode.settle_action"] = base.settle_action if settle_steps else None
     return base.changed(own)

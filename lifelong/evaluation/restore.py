@@ -41,6 +41,7 @@ class LoadedRun:
         device: Device of the policy.
         language: Encoder of instructions; see `embed`.
         instructions: Instructions that are embedded together: those of the pretraining, then those of the run.
+        robot: Model of the arm that the run was trained with.
         group_size: Number of tasks learned together.
         drawing: How the images that it learned from were drawn.
     """
@@ -56,6 +57,7 @@ class LoadedRun:
     device: torch.device
     language: Any
     instructions: tuple[str, ...]
+    robot: str
     group_size: int = 1
     drawing: str | None = None
 
@@ -127,6 +129,7 @@ def restore(source: Path, *, after: int | None = None, device: str = "auto") -> 
         device=where,
         language=language,
         instructions=instructions,
+        robot=data.robot,
         group_size=benchmark.group_size,
         drawing=data.drawing,
     )

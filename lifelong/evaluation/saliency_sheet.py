@@ -109,6 +109,7 @@ def _run_episode(
         camera_size=spec.image_size,
         horizon=horizon + run.eval.settle_steps,
         drawing=run.drawing,
+        robot=run.robot,
     )
     try:
         with run.acting(run.tasks[task]) as policy:

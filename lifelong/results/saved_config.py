@@ -77,15 +77,24 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
         config: A run's config.yaml, or the part of it that a pretraining keeps, as plain data; it is not modified.
     """
     upgrades: dict[str, Callable[[Mapping[str, Any]], Node]] = {
+        "data": upgrade_data,
         "policy": upgrade_policy,
         "algo": upgrade_algorithm,
-        "data": lambda node: {"drawing": "fast", **node},  # runs that do not name it were drawn so
     }
     return {
         key: upgrades[key](node) if key in upgrades else node
         for key, node in config.items()
         if key != "compat"
     }
+
+
+def upgrade_data(node: Mapping[str, Any]) -> Node:
+    """Return the node of the data with the drawing and the robot that were the only ones before they had names.
+
+    Args:
+        node: The `data` node; one of today comes back unchanged.
+    """
+    return {"drawing": "fast", "robot": "robosuite-1.4.1", **node}
 
 
 def upgrade_policy(node: Mapping[str, Any]) -> Node:

@@ -38,6 +38,7 @@ SHORT = (
     *("train.epochs=2", "train.steps_per_epoch=4", "train.batch_size=8"),
     *("eval.episodes=2", "eval.curve_episodes=1", "eval.every=1", "eval.horizon=20", "eval.record_every=0"),
     "eval.select=last",
+    *("data.robot=robosuite-1.4.1", "data.drawing=fast"),  # of earlier versions, which had no names for them
 )
 ENCODER = (
     *("policy.encoder.width=8", "policy.encoder.stage_blocks=[1]", "policy.encoder.stem_stride=8"),

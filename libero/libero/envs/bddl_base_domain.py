@@ -25,7 +25,7 @@ from libero.libero.envs.predicates import eval_predicate_fn
 from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero.libero.utils.utils import postprocess_model_xml
-from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS
+from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, ROBOTS
 from libero_env.demos.stored_model import (
     compile_stored,
     model_xml,
@@ -35,6 +35,7 @@ from libero_env.demos.stored_model import (
 from libero_env.errors import DemoError, LiberoError, UnknownNameError
 from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
+from libero_env.paths import read_config
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
@@ -84,11 +85,13 @@ class BDDLBaseDomain(RobosuiteMethods):
             of the task file are sampled.
         drawing: How images are drawn: `faithful`, to the bit of the original's with its models and MuJoCo 3.3.2, or
             `fast`; an addition.
+        robot: Model of the arm, `libero` (that of robosuite 1.4.0) or `robosuite-1.4.1`; by default the key `robot` of
+            the configuration file, or else `libero`; an addition.
         kwargs: Arguments of the original's classes in `WITHOUT_EFFECT` are accepted and have no effect.
 
     Raises:
         BDDLError: The file is not a task file.
-        UnknownNameError: An argument, controller or camera does not exist.
+        UnknownNameError: An argument, controller, camera or robot does not exist.
     """
 
     def __init__(
@@ -113,6 +116,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         camera_depths: bool | Sequence[bool] = False,
         camera_segmentations: Any = None,
         drawing: str = FAITHFUL,
+        robot: str | None = None,
         **kwargs: Any,
     ):
         if unknown := [key for key in kwargs if key not in WITHOUT_EFFECT]:
@@ -122,6 +126,9 @@ class BDDLBaseDomain(RobosuiteMethods):
             raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
         if drawing not in DRAWINGS:
             raise UnknownNameError("drawing", drawing, DRAWINGS)
+        self.robot = robot or str(read_config().get("robot") or DEFAULT_ROBOT)
+        if self.robot not in ROBOTS:
+            raise UnknownNameError("robot", self.robot, ROBOTS)
         self.drawing = drawing
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
         self.problem = BDDLUtils.read_problem(bddl_file_name)
@@ -163,13 +170,13 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _load_model(self) -> None:
         pack = facade_pack()
-        self.scene = build_scene(self.problem, pack, drawing=self.drawing)
+        self.scene = build_scene(self.problem, pack, drawing=self.drawing, robot=self.robot)
         hooks = ("_load_fixtures_in_arena", "_load_objects_in_arena", "_load_sites_in_arena", "_setup_camera")
         model = self.scene.model
         if any(getattr(type(self), hook) is not getattr(BDDLBaseDomain, hook) for hook in hooks):
             from libero.libero.envs.arenas import Arena
 
-            arena = Arena(scene_spec(self.problem, pack, drawing=self.drawing))
+            arena = Arena(scene_spec(self.problem, pack, drawing=self.drawing, robot=self.robot))
             for hook in hooks:
                 getattr(self, hook)(arena)
             model = arena.spec.compile()
@@ -355,7 +362,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         spec = (
             mujoco.MjSpec.from_string(self._xml)
             if self._xml
-            else spec_without_textures(self.problem, self.scene.pack, self.drawing)
+            else spec_without_textures(self.problem, self.scene.pack, self.drawing, self.robot)
         )
         return model_xml(spec, poses)
 
@@ -371,9 +378,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         """
         poses = read_fixture_poses(xml_string, self.scene)
         try:
-            model = compile_stored(
-                xml_string, scene_spec(self.problem, self.scene.pack, drawing=self.drawing)
-            )
+            spec = scene_spec(self.problem, self.scene.pack, drawing=self.drawing, robot=self.robot)
+            model = compile_stored(xml_string, spec)
         except DemoError as error:
             warnings.warn(f"{error}; only the poses of the fixtures are taken from it", stacklevel=2)
             for name, pose in poses.items():

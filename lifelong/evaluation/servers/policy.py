@@ -81,7 +81,8 @@ class ServerPolicy(PolicyUnderTest):
         """
         if self.own:
             about = self.announced
-            return run_protocol(base, self._image_size(), about["horizon"], about["settle_steps"])
+            own = (about["horizon"], about["settle_steps"], about["robot"])
+            return run_protocol(base, self._image_size(), *own)
         base.check(SCHEMES[self._scheme][1](self.announced))
         if base.action.replan is None and self._scheme != "vla-eval":
             raise ProtocolError(

@@ -81,6 +81,7 @@ class ServedPolicy:
             "horizon": run.eval.horizon,
             "settle_steps": run.eval.settle_steps,
             "drawing": run.drawing,
+            "robot": run.robot,
             "selection": list(run.eval.init_states("curve")),
             "observation": {PREFIX + name: about for name, about in (images | readings).items()},
             "images": "upright: first row on top, not mirrored",
