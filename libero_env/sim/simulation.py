@@ -148,6 +148,10 @@ class Simulations(ABC):
         pos, mat = (np.repeat(rest[name][:, site], len(ids), 0) for name in ("site_xpos", "site_xmat"))
         self.controller_state.restart(ids, pos, mat)
 
+    def update_controller(self, ids: Indices) -> None:
+        """Let the controller see the arm as it is, which ends `outdate_controller`; its goal stays."""
+        self._outdated[np.asarray(ids, np.int64)] = False
+
     @cached_property
     def _rest_fields(self) -> dict[str, np.ndarray]:
         """Fields of a simulation whose arm is in its rest pose, (1, ...)."""

@@ -279,10 +279,35 @@ def test_observations_match_the_recordings(shared, make_env):
     env = make_env(**BLIND)
     env.reset()
     env.set_init_state(states[0])
+    env.robots[0].controller.update(force=True)  # as when it was recorded; the controller is of the reset
+    env.robots[0].controller.reset_goal()
     for action, expected in zip(actions[:25], seen, strict=False):
         obs = env.step(action)[0]
         found = np.concatenate([np.ravel(obs[key]) for key in json.loads(str(keys))])
         assert np.abs(found - expected)[[*range(7), *range(14, 23)]].max() < 1e-6
+
+
+def test_the_controller_is_of_the_reset_until_the_first_step(make_env):
+    """As in the original: after `set_init_state` the first goal is relative to the pose that the reset left."""
+    env = make_env(**BLIND)
+    env.seed(0)
+    env.reset()
+    moved = env.get_sim_state()
+    moved[1:8] += 0.05  # the arm's joints
+    ends = []
+    for measured in (False, True, None):
+        env.reset()
+        if measured is None:
+            env.step([0.0] * 7)
+        env.set_init_state(moved)
+        if measured:
+            env.robots[0].controller.update(force=True)
+            env.robots[0].controller.reset_goal()
+        for _ in range(10):
+            obs = env.step([0.0] * 6 + [-1.0])[0]
+        ends.append(obs["robot0_joint_pos"] - moved[1:8])
+    kept, updated, stepped = (np.abs(end).max() for end in ends)
+    assert kept > 0.03 and updated < 0.02 and stepped < 0.03
 
 
 def test_contacts_and_grasps_have_robosuites_methods(make_env):

@@ -100,8 +100,14 @@ class ControlEnv:
         return self.env.sim.get_state().flatten()
 
     def set_state(self, mujoco_state: np.ndarray) -> None:
-        """Set the state, as `get_sim_state` returns it; see `set_init_state`."""
+        """Set the state, as `get_sim_state` returns it; see `set_init_state`.
+
+        Between a reset and the first step, the controller takes the arm to be where the reset has left it, as in the
+        original, see `libero_env.sim.simulation.Simulations.outdate_controller`.
+        """
         self.env.restart(mujoco_state)
+        if self.env.cur_time == 0.0:
+            self.env.simulations.outdate_controller([0])
 
     def set_init_state(self, init_state: np.ndarray) -> Mapping[str, np.ndarray]:
         """Set the state, see `BDDLBaseDomain.restart`, and observe it; the horizon counts from here."""

@@ -108,10 +108,9 @@ class LiberoBenchmark(StepBenchmark):
         if self.observations is None:
             chosen = _agreed(chosen, {k: v for k, v in asked.items() if v is not None})
         else:
-            size = tuple(camera_size or chosen.pixels.render_size or ())
-            chosen = run_protocol(
-                chosen, size, max_steps or 600, 5 if num_steps_wait is None else num_steps_wait
-            )
+            height, width = camera_size or chosen.pixels.render_size or (128, 128)
+            settling = chosen.settle_steps if num_steps_wait is None else num_steps_wait
+            chosen = run_protocol(chosen, (height, width), max_steps or 600, settling)
         self.card, notes = resolve_world(chosen, self.tasks, assets)
         self.card.require()
         for note in notes:
@@ -131,7 +130,8 @@ class LiberoBenchmark(StepBenchmark):
             "models_digest": versions["models_digest"],
             "drawing": self.card.world.drawing,
             "robot": self.card.world.robot,
-            **{key: versions[key] for key in ("libero-lifelong", "mujoco") if key in versions},
+            "mujoco": versions["mujoco"],
+            "libero_lifelong": versions.get("libero-lifelong", "source"),
         }
         languages = [task.language for task in get_suite(self.suite).tasks]
         return [

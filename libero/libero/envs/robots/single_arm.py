@@ -80,7 +80,9 @@ class Controller:
         return self._state.controller.action_dim - 1
 
     def update(self, force: bool = False) -> None:
-        """Do nothing: kinematics are read when they are needed."""
+        """Measure the arm, if forced; otherwise do nothing: kinematics are read when they are needed."""
+        if force:
+            self._env.simulations.update_controller([0])
 
     def update_base_pose(self, base_pos: Any = None, base_ori: Any = None) -> None:
         """Do nothing: goals are in the world frame."""
