@@ -73,7 +73,9 @@ class RunPolicy(PolicyUnderTest):
     def protocol(self, base: Card) -> Card:
         """Return the protocol with the run's images and one prediction for each step; see `PolicyUnderTest`."""
         settings, size = self.run.eval, self.run.policy.spec.image_size
-        return run_protocol(base, size, settings.horizon, settings.settle_steps, self.run.robot)
+        run, assets = self.run, self.args.assets
+        own = (settings.horizon, settings.settle_steps, run.robot)
+        return run_protocol(base, size, *own, drawing=run.drawing, assets=assets)
 
     def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
 
@@ -85,7 +87,6 @@ class RunPolicy(PolicyUnderTest):
             cameras=cameras,
             threads=self.args.threads,
             assets=self.args.assets,
-            drawing=self.run.drawing,
         )
 
     @contextmanager

@@ -12,7 +12,7 @@ from libero_env.envs.config import EnvConfig
 from libero_env.envs.world import World
 from libero_env.init_states.original_resets import OriginalResets, drawn_fixtures
 from libero_env.init_states.store import load_original_states
-from libero_env.sim.scene import Scene
+from libero_env.sim.scene import Scene, default_drawing
 from libero_env.tasks import Task
 from lifelong.errors import ConfigError, ProtocolMismatchError
 from lifelong.evaluation.card import Card
@@ -206,7 +206,14 @@ def fixture_poses(task: Task, scene: Scene, card: Card, starts: Sequence[int]) -
 
 
 def run_protocol(
-    base: Card, image_size: tuple[int, int], horizon: int, settle_steps: int, robot: str = DEFAULT_ROBOT
+    base: Card,
+    image_size: tuple[int, ...],
+    horizon: int,
+    settle_steps: int,
+    robot: str = DEFAULT_ROBOT,
+    *,
+    drawing: str | None = None,
+    assets: str | None = None,
 ) -> Card:
     """Return a protocol as it is run with a policy of this package.
 
@@ -219,8 +226,11 @@ def run_protocol(
         horizon: Maximum number of control steps of an episode of the run.
         settle_steps: Number of steps before the policy acts in the run.
         robot: Model of the arm in the run.
+        drawing: How the images were drawn that it was trained on; None for the models' default.
+        assets: Models that are evaluated with, see `libero_env.assets.pack.select_pack`.
     """
     own: dict[str, Any] = {
+        "world.drawing": drawing or default_drawing(select_pack(assets)),
         "pixels.render_size": tuple(image_size),
         "pixels.orientation": "upright",
         "pixels.resize": "none",

@@ -82,7 +82,8 @@ class ServerPolicy(PolicyUnderTest):
         if self.own:
             about = self.announced
             own = (about["horizon"], about["settle_steps"], about["robot"])
-            return run_protocol(base, self._image_size(), *own)
+            drawing, assets = about.get("drawing"), self.args.assets
+            return run_protocol(base, self._image_size(), *own, drawing=drawing, assets=assets)
         base.check(SCHEMES[self._scheme][1](self.announced))
         if base.action.replan is None and self._scheme != "vla-eval":
             raise ProtocolError(
@@ -96,10 +97,7 @@ class ServerPolicy(PolicyUnderTest):
         threads, assets = self.args.threads, self.args.assets
         if self.own:
             cameras = tuple(CAMERAS[view] for view in self._views())
-            drawing = self.announced.get("drawing")
-            return make_env(
-                task, count, protocol, cameras=cameras, threads=threads, assets=assets, drawing=drawing
-            )
+            return make_env(task, count, protocol, cameras=cameras, threads=threads, assets=assets)
         adapter = CardAdapter(protocol, task)
         return make_env(
             task,
