@@ -15,7 +15,10 @@ from lifelong.settings import build
 from lifelong.types import PolicySpec
 from tests.harness.configs import CONFIGS
 
-TINY = ("preset=smoke", "device=cpu", "data.image_size=32", "policy.encoder.width=8", "policy.head.hidden=16")
+TINY = (
+    *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "device=cpu", "data.image_size=32"),
+    *("policy.encoder.width=8", "policy.head.hidden=16"),
+)
 
 
 def make_windows(task: int, spec: PolicySpec) -> SequenceVLDataset:

@@ -19,6 +19,8 @@ ROOT = Path(__file__).parents[2]
 ALGORITHMS = sorted(file.stem for file in (ROOT / "configs" / "algo").glob("*.yaml"))
 TINY = (
     "preset=smoke",
+    "benchmark=libero_object",
+    "benchmark.tasks=2",
     "algo=packnet",
     "threads=1",
     "data.demos=2",
@@ -64,11 +66,12 @@ def records(path: Path) -> list[dict]:
 def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
     output = finish(start(home, tmp_path, "preset=smoke", "algo=er"))
     path = run_dir(tmp_path)
-    assert path == tmp_path / "libero_object" / "er" / "bc_transformer_small_seed1"
+    assert path == tmp_path / "first_steps" / "er" / "bc_transformer_small_seed1"
     assert "2 tasks learned" in output
     summary = json.loads((path / "results.json").read_text())
     assert summary["finished"] and summary["tasks_learned"] == 2
     assert summary["metrics"].keys() >= {"fwt", "nbt", "auc"}
+    assert summary["success_matrix"]["rates"][0][0] > 0, "a first report shows some success"
     page = (path / "report.html").read_text()
     assert "<svg" in page and "data:image/webp" in page
     kept = {p.name for p in (path / "checkpoints").iterdir()}
@@ -157,7 +160,7 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
     ],
 )
 def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, message):
-    process = start(home, tmp_path, "preset=smoke", override)
+    process = start(home, tmp_path, "preset=smoke", "benchmark=libero_object", override)
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 1
     assert message in output and "Traceback" not in output

@@ -34,7 +34,16 @@ RUNS = Path(__file__).parent / "data" / "saved_runs"
 EVERY = 5  # of the weights' numbers one is stored
 
 SHORT = (
-    *("preset=smoke", "data.demos=2", "data.image_size=32", "device=cpu", "threads=1", "progress=false"),
+    *(
+        "preset=smoke",
+        "benchmark=libero_object",
+        "benchmark.tasks=2",
+        "data.demos=2",
+        "data.image_size=32",
+        "device=cpu",
+        "threads=1",
+        "progress=false",
+    ),
     *("train.epochs=2", "train.steps_per_epoch=4", "train.batch_size=8"),
     *("eval.episodes=2", "eval.curve_episodes=1", "eval.every=1", "eval.horizon=20", "eval.record_every=0"),
     "eval.select=last",
