@@ -68,6 +68,7 @@ class _ProgressLines(tqdm):
     """Progress as lines for a file; work that is done sooner than the first line is not told."""
 
     def __init__(self, *iterable: Any, **options: Any):
+        self.disable = False
         self._lines = False  # tqdm shows the bar when it is made
         form = "{desc}: {n_fmt} of {total_fmt}, {elapsed} passed, {remaining} left{postfix}"
         intervals = {"mininterval": LINE_SECONDS, "miniters": 1, "leave": False}

@@ -59,7 +59,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
         LiberoError: The configuration, the data or the directory is invalid.
     """
     config = _with_drawing(config)
-    top = OmegaConf.masked_copy(config, [k for k in config if k not in GROUPS])
+    top = OmegaConf.masked_copy(config, [str(k) for k in config if k not in GROUPS])
     check_values(top, RunSettings)
     settings = RunSettings(**{str(k): v for k, v in top.items()})
     if settings.threads:

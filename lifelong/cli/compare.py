@@ -107,7 +107,10 @@ def run_compare(args: argparse.Namespace) -> None:
     if not 0 < args.alpha < 1:
         raise ConfigError(f"--alpha is a probability between 0 and 1, not {args.alpha:g}")
     sides = [*_single_sides(args.results), *(_group(words) for words in args.group)]
-    control = tuple(_single_sides(args.control)) if args.control else None
+    control = None
+    if args.control:
+        first, second = _single_sides(args.control)
+        control = (first, second)
     found = judge(sides, control=control, allow=args.allow, alpha=args.alpha)
     print(render(found, tasks=args.tasks))
     if args.out:

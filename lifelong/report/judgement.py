@@ -142,7 +142,8 @@ def judge(
     if twice := sorted({name for name in labels if labels.count(name) > 1}):
         raise ConfigError(f"two policies are called {', '.join(twice)}; write NAME=RESULT to name them")
     notes = check_comparable([*sides, *(control or ())], allow)
-    rivals, controls = [], [control] if control else []
+    rivals: list[tuple[Side, Side]] = []
+    controls = [control] if control else []
     for a, b in combinations(sides, 2):
         (controls if _is_control(a, b) else rivals).append((a, b))
     notes += [note for a, b in controls for note in _control_notes(a, b)]

@@ -191,7 +191,9 @@ def sequential_stopping(
         draw = rng.random((len(part), limit))
         wins = np.cumsum(draw < won, axis=1)
         losses = np.cumsum((draw >= won) & (draw < question.differing), axis=1)
-        reached = log_evidence(wins, losses) >= -np.log(question.level)
+        reached = log_evidence(np.asarray(wins, np.int64), np.asarray(losses, np.int64)) >= -np.log(
+            question.level
+        )
         decided = reached.any(axis=1)
         at = reached.argmax(axis=1)
         rows = np.arange(len(part))
