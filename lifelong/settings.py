@@ -43,7 +43,10 @@ def check_values(node: DictConfig, target: Callable[..., Any]) -> None:
     Raises:
         ConfigError: A key is unknown, or a value is of the wrong kind.
     """
-    parameters = inspect.signature(target).parameters
+    try:
+        parameters = inspect.signature(target).parameters
+    except ValueError:  # of some builtins, such as dict, which take anything
+        return
     any_key = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     try:
         hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)

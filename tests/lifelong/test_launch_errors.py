@@ -56,6 +56,7 @@ def test_a_mistyped_override_is_one_line(word, message, here, capsys):
 @pytest.mark.unit
 def test_values_fit_the_parameters_of_their_target():
     assert build(OmegaConf.create({**FIT, "lr": 1, "steps_per_epoch": None})).lr == 1
+    assert build(OmegaConf.create({"_target_": "builtins.dict", "any": "key"})) == {"any": "key"}
     for changes, message in [
         ({"steps_per_epoch": "x"}, "steps_per_epoch is 'x'; expected a whole number or null"),
         ({"epochs": True}, "epochs is True; expected a whole number"),
