@@ -34,7 +34,7 @@ class Start:
     fixtures: np.ndarray
 
 
-def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
+def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | None = None) -> Start:
     """Sample a start: entities in the regions of their init atoms, joints as in the atoms, no contact.
 
     Objects hover by a millimetre and are not at rest; see `libero_env.init_states.settle`.
@@ -42,6 +42,7 @@ def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
     Args:
         scene: Scene to sample.
         rng: Random generator.
+        fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
 
     Raises:
         PlacementError: No placement without contact was found in 500 tries, or an init atom cannot be placed.
@@ -51,7 +52,7 @@ def sample_start(scene: Scene, rng: np.random.Generator) -> Start:
     data = mujoco.MjData(model)
     data.qpos[:] = initial_qpos(scene)
     data.qpos[:7] += ARM_NOISE * rng.standard_normal(7)
-    fixtures = _sample_fixtures(scene, rng)
+    fixtures = _sample_fixtures(scene, rng) if fixtures is None else fixtures
     if scene.fixtures:
         model.body_pos[scene.fixture_bodies] = fixtures[:, :3]
         model.body_quat[scene.fixture_bodies] = fixtures[:, 3:]

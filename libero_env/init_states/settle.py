@@ -54,7 +54,13 @@ def settle(
     )
 
 
-def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.random.Generator) -> Start:
+def sample_settled(
+    scene: Scene,
+    simulations: Simulations,
+    i: int,
+    rng: np.random.Generator,
+    fixtures: np.ndarray | None = None,
+) -> Start:
     """Sample a start that is at rest, where the init atoms are true and the goal is false.
 
     Args:
@@ -62,13 +68,14 @@ def sample_settled(scene: Scene, simulations: Simulations, i: int, rng: np.rando
         simulations: Simulations of the scene.
         i: Index of the simulation to settle the objects in.
         rng: Random generator.
+        fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
 
     Raises:
         PlacementError: As `sample_start`; or no sample of 20 comes to rest where it should.
     """
     view, reason = StateView(scene, simulations, i), ""
     for _ in range(_MAX_SAMPLES):
-        start = sample_start(scene, rng)
+        start = sample_start(scene, rng, fixtures)
         try:
             qpos = settle(simulations, i, start.qpos, scene.nq_robot, start.fixtures)
         except PlacementError as error:

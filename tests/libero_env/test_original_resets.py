@@ -37,6 +37,25 @@ def test_resets_draw_what_the_original_draws(task):
             assert digest == row["rng"], "rejected placements have drawn as many numbers"
 
 
+def test_fixtures_of_the_facade_stand_where_the_original_draws_them(monkeypatch, tmp_path):
+    from libero.libero import benchmark
+    from libero.libero.envs.env_wrapper import ControlEnv
+
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    task = next(name for name in RECORDED if name.startswith("libero_goal/"))
+    suite = benchmark.get_benchmark("libero_goal")()
+    path = suite.get_task_bddl_file_path(int(task.partition("/")[2]))
+    env = ControlEnv(bddl_file_name=path, use_camera_obs=False)
+    env.seed(7)
+    for row in RECORDED[task]["7"][:3]:
+        env.reset()
+        for name, pose in row["fixtures"].items():
+            body = env.sim.model.body_name2id(env.env.fixtures_dict[name].root_body)
+            found = np.concatenate([env.sim.model.body_pos[body], env.sim.model.body_quat[body]])
+            np.testing.assert_allclose(found, pose, rtol=0, atol=1e-15)
+    env.close()
+
+
 def test_an_environment_that_was_loaded_more_often_draws_more_joints():
     scene = build_scene(get_task("libero_10/3").problem)  # a drawer is open at the start
     first, second = (next(iter(drawn_fixtures(scene, 7, 1, loads))) for loads in (1, 2))

@@ -33,6 +33,7 @@ from libero_env.demos.stored_model import (
     spec_without_textures,
 )
 from libero_env.errors import DemoError, LiberoError, UnknownNameError
+from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
 from libero_env.paths import read_config
@@ -145,6 +146,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.camera_list = cameras(camera_names, *sizes, camera_depths, camera_segmentations)
         self.camera_names = [camera.name for camera in self.camera_list]
         self.rng = np.random.default_rng()
+        self._resets: OriginalResets | None = None
         self.timestep, self.cur_time, self.done = 0, 0.0, False
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
         self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
@@ -214,9 +216,10 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     # Episodes -----------------------------------------------------------------------------------------------
 
-    def seed(self, seed: int) -> None:
-        """Seed the placements from now on."""
+    def seed(self, seed: int | None) -> None:
+        """Seed the placements from now on; fixtures stand where the original's resets with this seed have them."""
         self.rng = np.random.default_rng(seed)
+        self._resets = None if seed is None else OriginalResets(self.scene, seed)
 
     def reset(self) -> "OrderedDict[str, np.ndarray]":
         """Sample an initial state and observe it; raise a PlacementError if the objects do not fit."""
@@ -241,7 +244,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
         own, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
         try:
-            return sample_settled(self.scene, self.simulations, 0, self.rng)
+            fixtures = None if self._resets is None else self._resets.reset()
+            return sample_settled(self.scene, self.simulations, 0, self.rng, fixtures)
         finally:
             self.simulations.controller_state = own
 
