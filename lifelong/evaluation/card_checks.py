@@ -142,8 +142,6 @@ def _action(v: Mapping[str, Any]) -> Iterator[str]:
 def _world(v: Mapping[str, Any]) -> Iterator[str]:
     if v["world.fixture_poses"] == "stored" and v["world.env_seed"] is not None:
         yield f"world.env_seed is {v['world.env_seed']}, but world.fixture_poses are stored: nothing is drawn"
-    if v["world.fixture_poses"] == "stored" and "reset" in v["episode.reset_order"]:
-        yield "episode.reset_order has reset, but world.fixture_poses are stored"
     if v["world.fixture_poses"] == "drawn" and "reset" not in v["episode.reset_order"]:
         yield "world.fixture_poses are drawn, but episode.reset_order has no reset, which draws them"
     if v["world.seeding"] == "once":

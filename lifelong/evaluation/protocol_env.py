@@ -67,11 +67,14 @@ class ProtocolEnv:
             ConfigError: An initial state does not exist.
         """
         options = dict(options or {})
-        if self.card.world.fixture_poses == "stored" or "init_state" not in options:
+        if "init_state" not in options:
+            return self.env.reset(seed=seed, options=options)
+        options["outdated_controller"] = "reset" in self.card.episode.reset_order
+        if self.card.world.fixture_poses == "stored":
             return self.env.reset(seed=seed, options=options)
         starts = np.broadcast_to(options.pop("init_state"), (self.num_envs,)).tolist()
         rows = start_rows(self.env.task, self.env.world.scene, self.card, starts, self._stored())
-        return self.env.reset(seed=seed, options={**options, "start": rows, "outdated_controller": True})
+        return self.env.reset(seed=seed, options={**options, "start": rows})
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Apply actions, see `BatchEnv.step`."""
@@ -163,10 +166,10 @@ def resolve_world(card: Card, tasks: Sequence[Task], assets: str | None = None) 
         changes["world.models"] = here
         notes.append(f"models: {here}, where protocol {card.name} has {card.world.models} (see --assets)")
     if card.world.init_states == "original" and any(load_original_states(t) is None for t in tasks):
-        changes["world.init_states"] = "builtin"
+        changes |= {"world.init_states": "builtin", "world.fixture_poses": "stored", "world.env_seed": None}
         notes.append(
-            f"initial states: this package's, where protocol {card.name} has those that LIBERO publishes "
-            "(init_states in ~/.libero/config.yaml)"
+            f"initial states: this package's, with their fixtures, where protocol {card.name} has those that LIBERO "
+            "publishes (init_states in ~/.libero/config.yaml)"
         )
     return card.changed(changes), notes
 
