@@ -210,6 +210,8 @@ def test_seeds_of_earlier_versions_are_grouped_with_those_of_today(tmp_path):
         )
         plain = OmegaConf.to_container(config, resolve=True) | {"seed": 2}
         (tmp_path / name / "config.yaml").write_text(yaml.safe_dump(plain))
+        results = tmp_path / name / "results.jsonl"
+        results.write_text(results.read_text().replace('"seed": 1', '"seed": 2'))
         runs.append(tmp_path / name)
     groups = group_runs([load_run(run) for run in runs])
     assert [(group.label, len(group.runs)) for group in groups] == [
