@@ -69,6 +69,9 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of stochastic policies (default: 0)")
     parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
     parser.add_argument(
+        "--robot", help="arm: libero, or robosuite-1.4.1 (default: the protocol's, or that of the run)"
+    )
+    parser.add_argument(
         "--unit-starts",
         type=int,
         metavar="N",
@@ -258,6 +261,8 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     protocol, notes = resolve_world(policy.protocol(card), tasks, args.assets)
     if args.horizon:
         protocol = protocol.changed({"episode.horizon": args.horizon})
+    if args.robot:
+        protocol = protocol.changed({"world.robot": args.robot})
     protocol.require()
     for note in notes:
         print(f"note: {note}", file=sys.stderr, flush=True)

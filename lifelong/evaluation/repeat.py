@@ -46,6 +46,7 @@ def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Nam
         "unit_starts": result.unit_starts,
         "policy_threads": args.policy_threads or _threads(result),
         "horizon": None,
+        "robot": None,
         "size": None,
         "out": args.out or folder / "again",
     }

@@ -11,7 +11,7 @@ import pytest
 
 from lifelong.cli import main as cli
 from lifelong.cli.evaluate import plan_eval
-from lifelong.errors import ConfigError, LifelongError, PolicyError
+from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
 from lifelong.evaluation.candidates import UserPolicy, load_callable
 from lifelong.evaluation.protocols import PROTOCOLS, choose_init_states
@@ -243,6 +243,14 @@ def test_a_unit_does_not_depend_on_those_before_it(protocol, tmp_path, monkeypat
     with plan.pool() as pool:
         alone = plan.evaluate(plan.units[1], pool).result
     assert alone == in_turn[1] and len({*in_turn[0].actions, *in_turn[1].actions}) == 4
+
+
+def test_the_robot_of_an_evaluation_can_be_chosen(module):
+    words = ["eval", f"{module}:make", "--suite", "libero_object/3", "--robot"]
+    plan = plan_eval(cli.build_parser().parse_args([*words, "robosuite-1.4.1"]))
+    assert plan.protocol.world.robot == "robosuite-1.4.1"
+    with pytest.raises(ProtocolError, match="expected one of libero, robosuite-1.4.1"):
+        plan_eval(cli.build_parser().parse_args([*words, "panda"]))
 
 
 @pytest.mark.sim
