@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.assets.robot import ROBOTS
 from libero_env.cli import demos_edit
 from libero_env.cli.arguments import Subparsers, modalities, positive, size
 from libero_env.demos.curate import describe, find_demo_files
@@ -57,7 +56,7 @@ def _register_generate(commands: Subparsers) -> None:
     add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
-    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="model of the arm (default: libero)")
+    add("--robot", default="libero", help="model of the arm: libero, or robosuite-1.4.1 (default: libero)")
     add("--seed", type=int, default=0, help="seed of starts, motion styles and action noise (default: 0)")
     add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
     add(

@@ -9,7 +9,6 @@ from typing import Any
 import h5py
 import numpy as np
 
-from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.read import (
     LOW_DIM_KEYS,
     BrokenDemoError,
@@ -78,7 +77,7 @@ def recorded_robot(file: Path) -> str:
         DemoError: It is not a demonstration file.
     """
     header = read_header(file)
-    return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else DEFAULT_ROBOT))
+    return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else "libero"))
 
 
 def recorded_task(file: Path) -> Task:

@@ -243,9 +243,8 @@ def test_observations_of_the_environment_are_those_of_rollouts(acting):
         metric.rollouts(cfg, algo, suite.get_task(0), suite.get_task_emb(0), 0, [4])
     finally:
         del algo.policy.get_action
-    env = OffScreenRenderEnv(
-        bddl_file_name=suite.get_task_bddl_file_path(0), camera_heights=SIZE, camera_widths=SIZE
-    )
+    size = {"camera_heights": SIZE, "camera_widths": SIZE}
+    env = OffScreenRenderEnv(bddl_file_name=suite.get_task_bddl_file_path(0), drawing="fast", **size)
     env.reset()
     env.set_init_state(states[4])
     for _ in range(metric.SETTLE_STEPS):
