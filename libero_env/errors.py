@@ -43,6 +43,10 @@ class MissingPackageError(LiberoError):
         return type(self), (self.reason, self.remedy)
 
 
+class InvalidInputError(LiberoError, ValueError):
+    """A file or value from outside that is not valid; the message names file and line, or key, and what is valid."""
+
+
 class BDDLError(LiberoError, ValueError):
     """A task file that cannot be read; the message starts with file:line."""
 

@@ -4,7 +4,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -35,8 +35,8 @@ def atomic_path(target: Path, *, fsync: bool = False) -> Iterator[Path]:
 
     Args:
         target: File to write; its folder is created.
-        fsync: Whether the content must have reached the disk before the file gets its name, so that it
-            survives a power failure.
+        fsync: Whether the content must have reached the disk before the file gets its name, and the name before
+            the block ends, so that it survives a power failure.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
@@ -46,8 +46,20 @@ def atomic_path(target: Path, *, fsync: bool = False) -> Iterator[Path]:
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
         os.replace(temporary, target)
+        if fsync:
+            sync_folder(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names of a folder's files have reached the disk, where the file system can."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some network file systems sync no folders
+            os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:
