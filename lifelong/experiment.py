@@ -20,11 +20,14 @@ from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
+from lifelong.evaluation.environment_record import renderer_name_or_none
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.pretraining import load_initial_weights, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
-from lifelong.results.records import PhaseRecord, RunEndRecord, start_record, utc_now
+from lifelong.results.conditions import changed_conditions, present_conditions, recorded_threads
+from lifelong.results.log import ResultLog
+from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord, start_record, utc_now
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
@@ -62,8 +65,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     top = OmegaConf.masked_copy(config, [str(k) for k in config if k not in GROUPS])
     check_values(top, RunSettings)
     settings = RunSettings(**{str(k): v for k, v in top.items()})
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
+    _set_threads(settings, Path(settings.runs_dir) / _run_name(names, settings))
     keep_freed_memory()
     with deterministic(settings.deterministic):
         # before anything is written: an invalid configuration leaves no trace
@@ -85,6 +87,18 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                 context.tracker.finish()
                 _write_results(directory, plain)
     return directory.path
+
+
+def _set_threads(settings: RunSettings, directory: Path) -> None:
+    """Give PyTorch its threads; a resumed run has those that it was started with, on which its bits depend."""
+    threads = settings.threads
+    if not threads and settings.resume:
+        results = ResultLog(directory / "results.jsonl").read()
+        threads = 0 if results.finished else recorded_threads(results) or 0
+        if threads not in (0, torch.get_num_threads()):
+            print(f"threads={threads}, as when this run was started: its bits depend on their number")
+    if threads:
+        torch.set_num_threads(threads)
 
 
 def _build_contexts(
@@ -182,6 +196,7 @@ def _opened(context: RunContext, plain: Mapping[str, Any], resume: bool) -> Abst
 
 
 def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> None:
+    """Record the start; say where it is a resume under conditions that give other bits."""
     context.directory.log.append(
         start_record(
             algo=names["algo"],
@@ -193,8 +208,18 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             instructions=[t.language for t in context.tasks],
             config=OmegaConf.to_yaml(OmegaConf.create(plain)),
             group_size=context.group_size,
+            conditions=present_conditions(
+                context.device, processes=context.ranks.size, renderer=renderer_name_or_none()
+            ),
         )
     )
+    starts = context.directory.log.read().of(RunRecord)
+    if len(starts) > 1 and (changes := changed_conditions(starts[-2], starts[-1])):
+        print(
+            f"resumed under other conditions ({', '.join(changes)}): from here on, bits differ from those of an "
+            "uninterrupted run",
+            file=sys.stderr,
+        )
 
 
 def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Mapping[str, Any]) -> None:

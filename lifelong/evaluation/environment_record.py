@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from libero_env.errors import RenderError
 from libero_env.sim.render import renderer_name
 from lifelong.evaluation.environments import VectorEnv
 
@@ -31,6 +32,14 @@ def describe_environment(env: VectorEnv) -> dict[str, Any]:
         "instruction_set": torch.backends.cpu.get_cpu_capability(),
         "policy_threads": torch.get_num_threads(),
     }
+
+
+def renderer_name_or_none() -> str | None:
+    """Return the name of the OpenGL renderer, such as `llvmpipe (LLVM 15.0.6)`; None where nothing can be drawn."""
+    try:
+        return renderer_name()[1]
+    except RenderError:  # said where something is drawn
+        return None
 
 
 def common_environment(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

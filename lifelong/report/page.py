@@ -112,7 +112,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "media": _media(run.path / "videos"),
         "saliency": _media(run.path / "saliency"),
         "config_text": run.config_text,
-        "versions": dict(record.versions),
+        "versions": {**record.versions, **{k.replace("_", " "): v for k, v in record.conditions.items()}},
         "run_dir": run.path.resolve().name,
     }
 

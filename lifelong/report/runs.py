@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from lifelong.errors import LifelongError, ResultsError
+from lifelong.results.conditions import resume_notes
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import RunRecord
@@ -94,7 +95,8 @@ def load_run(path: Path) -> Run:
     if not results.finished:
         so_far = f"{learned} of {len(record.tasks)} tasks are learned"
         notes.insert(0, f"This run is not finished: {so_far}, and the metrics are over these.")
-    return Run(path, results, record, config, text, (*notes, *results.problems), learned, metrics)
+    remarks = (*notes, *resume_notes(results), *results.problems)
+    return Run(path, results, record, config, text, remarks, learned, metrics)
 
 
 def short_labels(instructions: Sequence[str]) -> list[str]:

@@ -43,6 +43,7 @@ class RunRecord:
     cpu_count: int
     started: str  # ISO 8601, UTC
     group_size: int = 1  # tasks learned together as one step of the sequence
+    conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.conditions`
 
     def __post_init__(self) -> None:
         if len(self.tasks) != len(self.instructions):
@@ -167,6 +168,7 @@ def start_record(
     instructions: Sequence[str],
     config: str,
     group_size: int = 1,
+    conditions: Mapping[str, str] | None = None,
 ) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
@@ -180,6 +182,7 @@ def start_record(
         instructions: Instructions of the tasks, in the same order.
         config: Resolved configuration as text, of which the SHA-256 is recorded.
         group_size: Number of tasks learned together.
+        conditions: What decides the bits of its results, see `lifelong.results.conditions`.
     """
     return RunRecord(
         algo=algo,
@@ -195,6 +198,7 @@ def start_record(
         cpu_count=os.cpu_count() or 1,
         started=utc_now(),
         group_size=group_size,
+        conditions=conditions or {},
     )
 
 
@@ -257,7 +261,9 @@ def from_line(line: bytes) -> Record:
         raise ValueError(f"unknown kind of record {kind!r}; valid: {', '.join(RECORD_TYPES)}")
     known = [f for f in fields(RECORD_TYPES[kind]) if f.init]
     expected = {f.name: f.type for f in known}
-    optional = {f.name for f in known if f.default is not MISSING}  # of records that older versions wrote
+    optional = {
+        f.name for f in known if (f.default, f.default_factory) != (MISSING, MISSING)
+    }  # of records that older versions wrote
     if odd := sorted((expected.keys() ^ values.keys()) - (optional - values.keys())):
         raise ValueError(f"a {kind!r} record has the keys {', '.join(expected)}; missing or unknown: {odd}")
     return RECORD_TYPES[kind](**{k: _checked(kind, k, v, expected[k]) for k, v in values.items()})

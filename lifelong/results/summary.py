@@ -11,6 +11,7 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.errors import ResultsError
+from lifelong.results.conditions import resume_notes
 from lifelong.results.metrics import METRIC_NAMES, lifelong_metrics, wilson_interval
 from lifelong.results.records import TaskEndRecord
 from lifelong.results.results import Results
@@ -51,6 +52,7 @@ def summarize(results: Results) -> dict[str, Any]:
     ends = {r.task: r.best_epoch for r in results.of(TaskEndRecord)}
     return {
         "run": {k: v for k, v in asdict(run).items() if k != "kind"},
+        "resumed_under_other_conditions": resume_notes(results),
         "finished": results.finished,
         "tasks_learned": size,
         "metrics": _metrics(results, "matrix") if size else None,
