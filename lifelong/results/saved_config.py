@@ -1,7 +1,16 @@
-"""Configurations of runs made by earlier versions, brought to the keys of today."""
+"""Saved configurations: read as plain data, and brought from the keys of earlier versions to those of today.
+
+A run directory may be somebody else's, so nothing in its config.yaml is executed or resolved: a text with `${...}` is a
+text.
+"""
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
+
+from libero_env.errors import InvalidInputError
+from libero_env.validation import read_yaml_file
+from lifelong.errors import ConfigError
 
 Node = dict[str, Any]
 
@@ -66,6 +75,24 @@ _POLICIES = {
 _ER, _AGEM = "lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM"
 _EWC, _PACKNET = "lifelong.algorithms.ewc.EWC", "lifelong.algorithms.packnet.PackNet"
 _REPLAY = {_ER, _AGEM}
+
+
+def read_saved_config(path: str | Path) -> Node:
+    """Return the content of a run's or pretraining's config.yaml as it was saved; see `upgrade_config` for old keys.
+
+    Args:
+        path: File config.yaml.
+
+    Raises:
+        ConfigError: The file is missing, is not valid YAML, or holds no keys with values.
+    """
+    try:
+        config = read_yaml_file(path).data
+    except InvalidInputError as error:
+        raise ConfigError(f"{error}; expected the configuration that a run has saved") from error
+    if not isinstance(config, dict) or not config or not all(isinstance(key, str) for key in config):
+        raise ConfigError(f"{path} is no configuration of a run: expected keys with values, such as seed: 1")
+    return config
 
 
 def upgrade_config(config: Mapping[str, Any]) -> Node:
