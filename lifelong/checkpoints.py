@@ -1,27 +1,40 @@
-"""Checkpoints: nested dictionaries of tensors and plain values, in one safetensors file.
+"""Checkpoints: nested dictionaries of tensors and plain values, in one safetensors file with a checksum.
 
-Tensors are stored under their path in the tree; everything else is JSON in the file's header. Nothing is executed on
-load, and a file is either complete or does not exist.
+Tensors are stored under their path in the tree; everything else is JSON in the file's header, with a SHA-256 over all
+of it. Equal trees give equal files. Nothing is executed on load, a file is either complete or does not exist, and one
+that was damaged later is refused.
 """
 
+import hashlib
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from libero_env.storage import atomic_path
+from libero_env.storage import atomic_path, show_bytes
 from lifelong.errors import CheckpointError
 
-_FORMAT = "lifelong-1"
+FORMAT = "lifelong-2"
+FIRST_FORMAT = "lifelong-1"  # without a checksum
+MAX_DEPTH = 64  # dictionaries within dictionaries
+MAX_TREE = 64 << 20  # [bytes] of everything but the tensors
+
+_ENTRY = "lifelong"  # the only one in the header: the library writes several in random order
+_DTYPES = (
+    *(torch.float32, torch.float64, torch.float16, torch.bfloat16),
+    *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
+)
 
 
 def save(path: Path, tree: dict[str, Any]) -> None:
-    """Write a tree to a file, which replaces an older one in one step.
+    """Write a tree to a file, which replaces an older one in one step. It is on disk when this returns.
 
     Args:
         path: File to write; its folder is created.
@@ -31,13 +44,17 @@ def save(path: Path, tree: dict[str, Any]) -> None:
     Raises:
         CheckpointError: A leaf is of another type, or the file cannot be written.
     """
-    tensors: dict[str, Tensor] = {}
-    plain = _encode(tree, "", tensors)
-    tensors.setdefault("", torch.zeros(0))
+    tensors: dict[str, Tensor] = {"": torch.zeros(0)}
+    plain = _encode(tree, "", tensors, 0)
+    text = json.dumps(plain, separators=(",", ":"))
+    if len(text) > MAX_TREE:
+        raise CheckpointError(f"cannot store {show_bytes(len(text))} besides tensors in {path}")
+    head = {"format": FORMAT, "sha256": _digest(text, tensors), "tree": plain}
+    content = safetensors.torch.save(tensors, {_ENTRY: json.dumps(head, separators=(",", ":"))})
     try:
-        with atomic_path(path) as temporary:
-            save_file(tensors, temporary, metadata={"format": _FORMAT, "tree": json.dumps(plain)})
-    except (OSError, SafetensorError) as error:
+        with atomic_path(path, fsync=True) as temporary:
+            temporary.write_bytes(content)
+    except OSError as error:
         message = f"cannot write {path}: {error}. Free some space; an older file is intact"
         raise CheckpointError(message) from error
 
@@ -50,24 +67,62 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         device: Device of the tensors.
 
     Raises:
-        CheckpointError: The file is missing, truncated, or was not written by `save`.
+        CheckpointError: The file is missing, damaged, or was not written by `save`.
     """
+    return read(path, device)[0]
+
+
+def read(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Any], bool]:
+    """Return the tree in a file, and whether a checksum confirms it (earlier versions wrote none); see `load`."""
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
     try:
-        with safe_open(path, framework="pt", device=str(device)) as file:
+        _check_size(path)
+        with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
-            if metadata.get("format") != _FORMAT:
-                raise CheckpointError(
-                    f"{path} is a safetensors file of another program (format {metadata.get('format')!r}, "
-                    f"expected {_FORMAT!r})"
-                )
+            head = _head(metadata)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        return _decode(json.loads(metadata["tree"]), tensors)
-    except (OSError, SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise CheckpointError(
-            f"{path} is broken ({error}). Delete it: the run resumes from the checkpoint before it"
-        ) from error
+        if head["format"] == FORMAT:
+            text = json.dumps(head["tree"], separators=(",", ":"))
+            if _digest(text, tensors) != head["sha256"]:
+                raise ValueError("its content does not have the checksum that it was written with")
+        placed = {name: tensor.to(device) for name, tensor in tensors.items()}
+        tree = _decode(head["tree"], placed, 0)
+        if not isinstance(tree, dict):
+            raise ValueError("it holds no dictionary")
+        return tree, head["format"] == FORMAT
+    except (OSError, SafetensorError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path} is broken, or is no checkpoint ({error})") from error
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Form of tensors by the name of a weight of the policy, each of that weight's shape; see `check`.
+
+    Attributes:
+        complete: Whether every weight of the policy, buffers included, must be there.
+    """
+
+    complete: bool = False
+
+
+def check(tree: Any, form: Any, source: Path | str, policy: torch.nn.Module | None = None) -> None:
+    """Check that a tree from a file has the form that the code which uses it relies on.
+
+    Args:
+        tree: Tree, or a part of one.
+        form: Type of the value; `{type: form}` for a dictionary of any keys of the type; `{name: form}` for one with
+            exactly these keys; a tuple of forms for alternatives, of which the last one is reported; None for None;
+            `Weights` for weights of the policy. Numbers in tensors must be finite, except where the policy's are not.
+        source: Where it comes from, for error messages.
+        policy: Policy that `Weights` refer to.
+
+    Raises:
+        CheckpointError: It has another form; the message names the first difference.
+    """
+    own = {} if policy is None else policy.state_dict()
+    if (problem := _difference(tree, form, own)) is not None:
+        raise CheckpointError(f"{source} does not fit this run: {problem}")
 
 
 def load_weights(module: torch.nn.Module, state: dict[str, Tensor], source: Path | str) -> None:
@@ -79,9 +134,12 @@ def load_weights(module: torch.nn.Module, state: dict[str, Tensor], source: Path
         source: Where they come from, for error messages.
 
     Raises:
-        CheckpointError: Names or shapes differ; the message names the first difference. The module is unchanged.
+        CheckpointError: Names, shapes or kinds of numbers differ, or weights are not finite; the message names the
+            first difference. The module is unchanged.
     """
     own = module.state_dict()
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(f"{source} holds no weights of a policy by name")
     for name, tensor in own.items():
         if name not in state:
             raise CheckpointError(f"{source} has no {name}: it was written with another policy configuration")
@@ -89,35 +147,153 @@ def load_weights(module: torch.nn.Module, state: dict[str, Tensor], source: Path
             raise CheckpointError(
                 f"{source}: {name} has shape {tuple(state[name].shape)}; the policy expects {tuple(tensor.shape)}"
             )
+        if state[name].is_floating_point() != tensor.is_floating_point():
+            raise CheckpointError(
+                f"{source}: {name} is of {state[name].dtype}; the policy's is {tensor.dtype}"
+            )
+        if not _is_finite(state[name]) and _is_finite(tensor):
+            raise CheckpointError(f"{source}: {name} has values that are not finite; training had diverged")
     extra = sorted(set(state) - set(own))
     if extra:
         raise CheckpointError(f"{source} has {extra[0]}, which the policy does not have")
     module.load_state_dict(state)
 
 
-def _encode(node: Any, path: str, tensors: dict[str, Tensor]) -> Any:
+def _encode(node: Any, path: str, tensors: dict[str, Tensor], depth: int) -> Any:
+    if depth > MAX_DEPTH:
+        raise CheckpointError(f"cannot store what is nested deeper than {MAX_DEPTH}, at {path[:80]}")
     if isinstance(node, Tensor):
+        if node.dtype not in _DTYPES or node.layout != torch.strided:
+            raise CheckpointError(f"cannot store a tensor of {node.dtype}, {node.layout}, at {path}")
+        while path in tensors:  # the keys 1 and "1"
+            path += "'"
         tensors[path] = node.detach().cpu().clone(memory_format=torch.contiguous_format)
         return {"tensor": path}
     if isinstance(node, dict):
-        items = [[k, _encode(v, f"{path}/{k}", tensors)] for k, v in node.items()]
-        if not all(isinstance(k, str | int) for k, _ in items):
+        if not all(isinstance(k, str | int) and not isinstance(k, bool) for k in node):
             raise CheckpointError(f"keys at {path or '/'} are not all str or int: {list(node)[:3]}")
-        return {"dict": items}
+        return {"dict": [[k, _encode(v, f"{path}/{k}", tensors, depth + 1)] for k, v in node.items()]}
     if isinstance(node, list | tuple):
-        return {type(node).__name__: [_encode(v, f"{path}/{i}", tensors) for i, v in enumerate(node)]}
+        kind = "list" if isinstance(node, list) else "tuple"
+        return {kind: [_encode(v, f"{path}/{i}", tensors, depth + 1) for i, v in enumerate(node)]}
     if node is None or isinstance(node, str | int | float | bool):
         return {"value": node}
     raise CheckpointError(f"cannot store a {type(node).__name__} at {path}")
 
 
-def _decode(node: dict[str, Any], tensors: dict[str, Tensor]) -> Any:
+def _decode(node: Any, tensors: Mapping[str, Tensor], depth: int) -> Any:
+    """Return the tree that `_encode` described; raise ValueError where the description is not one of its."""
+    if depth > MAX_DEPTH or not isinstance(node, dict) or len(node) != 1:
+        raise ValueError("its tree is not valid")
     ((kind, content),) = node.items()
-    if kind == "tensor":
+    if kind == "value" and (content is None or isinstance(content, str | int | float | bool)):
+        return content
+    if kind == "tensor" and isinstance(content, str) and content in tensors:
         return tensors[content]
-    if kind == "dict":
-        return {k: _decode(v, tensors) for k, v in content}
-    if kind in ("list", "tuple"):
-        values: Iterator[Any] = (_decode(v, tensors) for v in content)
-        return list(values) if kind == "list" else tuple(values)
-    return content
+    if kind in ("list", "tuple") and isinstance(content, list):
+        values = [_decode(v, tensors, depth + 1) for v in content]
+        return values if kind == "list" else tuple(values)
+    if kind == "dict" and isinstance(content, list):
+        return _decode_dict(content, tensors, depth)
+    raise ValueError(f"its tree is not valid: {kind!r}")
+
+
+def _decode_dict(items: list[Any], tensors: Mapping[str, Tensor], depth: int) -> dict[str | int, Any]:
+    found: dict[str | int, Any] = {}
+    for item in items:
+        if not isinstance(item, list) or len(item) != 2 or type(item[0]) not in (str, int):
+            raise ValueError("its tree is not valid: a key is missing")
+        if item[0] in found:
+            raise ValueError(f"its tree is not valid: {item[0]!r} occurs twice")
+        found[item[0]] = _decode(item[1], tensors, depth + 1)
+    return found
+
+
+def _head(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Return the entry of the header with the tree; raise ValueError where there is none."""
+    if metadata.get("format") == FIRST_FORMAT:
+        return {"format": FIRST_FORMAT, "tree": json.loads(metadata.get("tree", ""))}
+    if _ENTRY not in metadata:
+        raise ValueError("a safetensors file of another program")
+    head = json.loads(metadata[_ENTRY])
+    if not isinstance(head, dict) or head.get("format") != FORMAT or not {"sha256", "tree"} <= head.keys():
+        stated = head.get("format") if isinstance(head, dict) else None
+        raise ValueError(f"the format is {stated!r}; this version reads {FIRST_FORMAT!r} and {FORMAT!r}")
+    return head
+
+
+def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of a tree: of its description, and of each tensor's name, type, shape and bytes."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
+        digest.update(memoryview(tensor.reshape(-1).view(torch.uint8).numpy()))
+    return digest.hexdigest()
+
+
+def _check_size(path: Path) -> None:
+    """Raise ValueError where a header or a file is larger than anything that `save` writes here."""
+    size = path.stat().st_size
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > memory:
+        raise ValueError(f"it has {show_bytes(size)}, and this machine a memory of {show_bytes(memory)}")
+    with open(path, "rb") as file:
+        header = int.from_bytes(file.read(8), "little")
+    if not 2 <= header <= size - 8:
+        raise ValueError("it is truncated, or of another kind")
+
+
+def _difference(value: Any, form: Any, own: Mapping[str, Tensor], path: str = "") -> str | None:
+    """Return the first difference between a tree and its form; None where there is none."""
+    if isinstance(form, tuple):
+        found = [_difference(value, one, own, path) for one in form]
+        return None if None in found else found[-1]
+    if isinstance(form, Weights):
+        return _weights_difference(value, form, own, path)
+    if isinstance(form, dict):
+        return _dict_difference(value, form, own, path)
+    kind = type(None) if form is None else form
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        return f"{path or 'it'} is of type {type(value).__name__}; expected {kind.__name__}"
+    if isinstance(value, Tensor) and not _is_finite(value):
+        return f"{path} has values that are not finite"
+    return None
+
+
+def _dict_difference(value: Any, form: Any, own: Mapping[str, Tensor], path: str) -> str | None:
+    if not isinstance(value, dict):
+        return f"{path or 'it'} is of type {type(value).__name__}; expected dict"
+    first = next(iter(form), None)
+    if isinstance(first, type):
+        parts = dict.fromkeys(value, form[first])
+        if odd := [key for key in value if type(key) is not first]:
+            return f"{path or 'it'} has the key {odd[0]!r}; expected {first.__name__}"
+    else:
+        parts = form
+        if odd := sorted(map(repr, form.keys() ^ value.keys())):
+            return f"{path or 'it'} has the keys {', '.join(map(str, value))}; missing or unknown: {odd[0]}"
+    for key, part in parts.items():
+        problem = _difference(value[key], part, own, f"{path}/{key}")
+        if problem is not None:
+            return problem
+    return None
+
+
+def _weights_difference(value: Any, form: Weights, own: Mapping[str, Tensor], path: str) -> str | None:
+    if not isinstance(value, dict):
+        return f"{path or 'it'} is of type {type(value).__name__}; expected dict"
+    for name, tensor in value.items():
+        if name not in own:
+            return f"{path}/{name} is no weight of the policy"
+        if not isinstance(tensor, Tensor) or (not _is_finite(tensor) and _is_finite(own[name])):
+            return f"{path}/{name} is no tensor of finite values"
+        if tensor.shape != own[name].shape:
+            return f"{path}/{name} has shape {tuple(tensor.shape)}; the policy's has {tuple(own[name].shape)}"
+    if form.complete and (missing := sorted(own.keys() - value.keys())):
+        return f"{path or 'it'} lacks {missing[0]}"
+    return None
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    return not tensor.is_floating_point() or bool(torch.isfinite(tensor).all())

@@ -1,9 +1,14 @@
 """Checkpoints: complete or absent, exact, and nothing is executed on load."""
 
+import hashlib
+import json
+import os
 import pickle
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError
@@ -72,3 +77,136 @@ def test_weights_of_another_shape_are_refused(tmp_path):
         with pytest.raises(CheckpointError, match=message):
             checkpoints.load_weights(net, state, tmp_path)
     assert torch.equal(net.weight, before)
+
+
+TREE = {
+    "task": 3,
+    "policy": {"a": torch.arange(12.0).reshape(3, 4), "b": torch.ones(5, dtype=torch.uint8)},
+    "odd": {1: torch.zeros(2), "1": torch.ones(2), "nan": float("nan")},
+    "half": torch.ones(3, dtype=torch.bfloat16),
+    "scalar": torch.tensor(2),
+}
+
+
+def test_equal_trees_give_equal_files_that_others_may_read(tmp_path):
+    names = [tmp_path / f"{i}.safetensors" for i in range(8)]
+    for name in names:
+        checkpoints.save(name, TREE)
+    assert len({hashlib.sha256(name.read_bytes()).digest() for name in names}) == 1
+    os.umask(mask := os.umask(0))
+    assert names[0].stat().st_mode & 0o777 == 0o666 & ~mask, "as every other file"
+    with safe_open(names[0], framework="pt") as file:
+        assert torch.equal(file.get_tensor("/policy/a"), TREE["policy"]["a"])
+    back = checkpoints.load(names[0])
+    assert back["odd"][1].tolist() == [0, 0] and back["odd"]["1"].tolist() == [1, 1]
+    assert back["half"].dtype == torch.bfloat16 and back["scalar"].shape == ()
+
+
+def test_any_flipped_byte_is_found(tmp_path):
+    path = tmp_path / "x.safetensors"
+    checkpoints.save(path, TREE)
+    whole, silent = path.read_bytes(), []
+    for i in range(len(whole)):
+        path.write_bytes(whole[:i] + bytes([whole[i] ^ 0x10]) + whole[i + 1 :])
+        try:
+            checkpoints.load(path)
+            silent.append(i)
+        except CheckpointError:
+            pass
+    assert not silent
+
+
+def test_files_of_earlier_versions_are_read_without_a_checksum(tmp_path):
+    path = tmp_path / "x.safetensors"
+    tree = {"dict": [["task", {"value": 1}], ["w", {"tensor": "/w"}]]}
+    entries = {"format": "lifelong-1", "tree": json.dumps(tree)}
+    save_file({"": torch.zeros(0), "/w": torch.ones(2)}, path, entries)
+    found, checked = checkpoints.read(path)
+    assert found["task"] == 1 and found["w"].tolist() == [1, 1] and not checked
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        "[]",
+        '{"value": []}',
+        '{"tensor": "/gone"}',
+        '{"tensor": 3}',
+        '{"dict": [["a"]]}',
+        '{"dict": [[null, {"value": 1}]]}',
+        '{"dict": [["a", {"value": 1}], ["a", {"value": 2}]]}',
+        '{"list": {"value": 1}}',
+        '{"dict": [], "list": []}',
+        '{"list": [' * 200 + '{"value": 1}' + "]}" * 200,
+        "[" * 100_000,
+        "{",
+    ],
+)
+def test_a_tree_that_was_not_written_here_is_refused(tmp_path, tree):
+    path = tmp_path / "x.safetensors"
+    save_file({"": torch.zeros(0)}, path, {"format": "lifelong-1", "tree": tree})
+    with pytest.raises(CheckpointError, match=r"x\.safetensors is broken, or is no checkpoint"):
+        checkpoints.load(path)
+
+
+def test_what_cannot_be_read_again_is_not_written(tmp_path):
+    deep: dict = {}
+    for _ in range(100):
+        deep = {"a": deep}
+    for tree, message in [
+        (deep, "nested deeper"),
+        ({"a": torch.ones(1, dtype=torch.complex128)}, "complex128"),
+        ({"a": torch.ones(2, 2).to_sparse()}, "sparse"),
+        ({(1, 2): 3}, "not all str or int"),
+    ]:
+        with pytest.raises(CheckpointError, match=message):
+            checkpoints.save(tmp_path / "x.safetensors", tree)
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_of_other_programs_are_refused_and_never_to_be_deleted(tmp_path):
+    save_file({"w": torch.ones(2)}, tmp_path / "other.safetensors", {"format": "pt"})
+    sparse = tmp_path / "sparse.safetensors"
+    with open(sparse, "wb") as file:
+        file.truncate(1 << 42)
+    for path in (tmp_path / "other.safetensors", "/etc/passwd", sparse):
+        with pytest.raises(CheckpointError, match="no checkpoint") as caught:
+            checkpoints.load(checkpoints.Path(path))
+        assert "elete" not in str(caught.value)
+
+
+def test_weights_that_are_not_finite_or_of_another_kind_are_refused(tmp_path):
+    net = torch.nn.Linear(3, 2)
+    net.register_buffer("mask", torch.tensor([0.0, -torch.inf]))
+    state = {k: v.clone() for k, v in net.state_dict().items()}
+    checkpoints.load_weights(net, state, tmp_path)
+    with pytest.raises(CheckpointError, match="weight has values that are not finite"):
+        checkpoints.load_weights(net, state | {"weight": state["weight"] * torch.nan}, tmp_path)
+    with pytest.raises(CheckpointError, match="int64"):
+        checkpoints.load_weights(net, state | {"bias": torch.ones(2, dtype=torch.int64)}, tmp_path)
+    for odd in (None, [], {"weight": 1}, {1: torch.ones(2)}):
+        with pytest.raises(CheckpointError):
+            checkpoints.load_weights(net, odd, tmp_path)
+
+
+def test_a_form_names_the_first_difference():
+    net = torch.nn.Linear(3, 2)
+    form = {"n": int, "w": (None, checkpoints.Weights()), "by_task": {int: {"a": torch.Tensor}}}
+    good = {"n": 1, "w": {"bias": torch.ones(2)}, "by_task": {0: {"a": torch.ones(1)}}}
+    checkpoints.check(good, form, "x", net)
+    checkpoints.check(good | {"w": None, "by_task": {}}, form, "x", net)
+    for changed, message in [
+        ({"n": True}, "/n is of type bool; expected int"),
+        ({"n": "1"}, "/n is of type str"),
+        ({"z": 1}, "missing or unknown: 'z'"),
+        ({"w": {"bias": torch.ones(3)}}, r"/w/bias has shape \(3,\)"),
+        ({"w": {"other": torch.ones(2)}}, "/w/other is no weight of the policy"),
+        ({"w": {"bias": torch.ones(2) * torch.inf}}, "/w/bias is no tensor of finite values"),
+        ({"by_task": {"0": {"a": torch.ones(1)}}}, "has the key '0'; expected int"),
+        ({"by_task": {0: {"a": 1.0}}}, "/by_task/0/a is of type float; expected Tensor"),
+        ({"by_task": [1]}, "/by_task is of type list; expected dict"),
+    ]:
+        with pytest.raises(CheckpointError, match=message):
+            checkpoints.check(good | changed, form, "x", net)
+    with pytest.raises(CheckpointError, match="lacks weight"):
+        checkpoints.check({"bias": torch.ones(2)}, checkpoints.Weights(complete=True), "x", net)
