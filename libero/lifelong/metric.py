@@ -23,7 +23,7 @@ from libero._adapters.lifelong.observations import image_tensor
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.pickles import read_states
-from libero_env.init_states.store import NUM_INIT_STATES, split_row
+from libero_env.init_states.store import NUM_INIT_STATES, check_width, split_row
 from libero_env.tasks import Task, get_suite, read_task, suite_names
 from lifelong.evaluation.actors import Obs
 from lifelong.evaluation.rollout import Episode, run_episodes
@@ -228,6 +228,8 @@ class _EvalEnv(BatchEnv):
         path = Path(folder or "", task.problem_folder, task.init_states_file)
         is_users = folder and folder != generated_paths()["init_states"] and path.is_file()
         self.rows = read_states(path) if is_users else None
+        if self.rows is not None:
+            check_width(self.world.scene.model, self.rows, path)
         self.sim_states, self.on_step = sim_states, on_step
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:

@@ -1,26 +1,43 @@
-"""Initial states in the original's files: pickled arrays in a zip, read without executing anything.
+"""Initial states in the original's files: one array in a pickle, which is in a zip; nothing is executed.
 
-`torch.load` would call every function that a pickle names. Here each name that is allowed in a pickle is replaced by a
-small class of this module that only stores its arguments, and any other name is an error.
+What is read, and no more: a zip as `torch.save` writes it, or a bare pickle; in it one array of NumPy or one tensor of
+torch, of two dimensions, with finite numbers of 4 or 8 bytes, at most 10,000 states of at most 10,000 numbers and 16
+million numbers in all. Sizes are compared with the file before memory is asked for.
 """
 
 import io
+import os
 import pickle
+import stat
+import struct
 import zipfile
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
 
-from libero_env.errors import LiberoError
+from libero_env.init_states.pickle_reader import Call, External, Name, StateFileError, read_pickle, shown
 from libero_env.storage import atomic_path
 
-_MAX_BYTES = 1 << 28  # largest part of a file
+_MAX_BYTES = 1 << 28  # of a file, and of a part of it
+_MAX_PARTS = 1000  # of a zip
+_MAX_EDGE = 10_000  # states, and numbers of a state
+_MAX_NUMBERS = 1 << 24
+_ZIP_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+    *(EOFError, NotImplementedError, OverflowError, ValueError),
+)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # date of all parts, so that equal states give equal files
-
-
-class StateFileError(LiberoError, ValueError):
-    """A file of initial states that is broken or has other content than arrays; the message names the file."""
+_CODES = ("f8", "f4", "i8", "i4")
+_STORAGES = {"torch.DoubleStorage": np.dtype("<f8"), "torch.FloatStorage": np.dtype("<f4")}
+_RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
+_FROM_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
+_TENSOR = "torch._utils._rebuild_tensor_v2"
+_NAMES = frozenset(
+    (*_RECONSTRUCT, *_FROM_BUFFER, *_STORAGES, _TENSOR)
+    + ("numpy.ndarray", "numpy.dtype", "_codecs.encode", "collections.OrderedDict")
+)
 
 
 def read_states(path: str | Path) -> np.ndarray:
@@ -33,26 +50,23 @@ def read_states(path: str | Path) -> np.ndarray:
         Rows [time, qpos, qvel], (n, size) float64.
 
     Raises:
-        StateFileError: The file does not exist, has no array of two dimensions, or its pickle calls other functions.
+        StateFileError: The file does not exist, is broken, or has something else than one array of the kind that the
+            module describes.
     """
     try:
-        with open(path, "rb") as file:
-            zipped = zipfile.is_zipfile(file)
-            file.seek(0)
-            found = _read_zip(file) if zipped else _Reader(file).load()
+        content = _read_file(Path(path))
+        if content.startswith(b"PK"):
+            array = _read_zip(content)
+        else:
+            array = _to_array(read_pickle(content, _NAMES), None)
+        if not np.isfinite(array).all():
+            raise StateFileError("a state has numbers that are not finite")
     except StateFileError as error:
         raise StateFileError(f"{path}: {error}") from None
     except OSError as error:
         raise StateFileError(
             f"{path}: {error.strerror or error}; see `init_states` in the config file"
         ) from error
-    except Exception as error:  # noqa: BLE001 - a broken pickle may raise any error
-        raise StateFileError(
-            f"{path} is not a file of initial states ({type(error).__name__}: {error})"
-        ) from error
-    array = found.array() if isinstance(found, _Array) else found
-    if not isinstance(array, np.ndarray) or array.ndim != 2 or not np.isfinite(array).all():
-        raise StateFileError(f"{path}: expected an array (states, size) of finite numbers")
     return np.ascontiguousarray(array, np.float64)
 
 
@@ -67,105 +81,145 @@ def write_states(path: str | Path, rows: np.ndarray) -> None:
             archive.writestr(zipfile.ZipInfo(f"{path.stem}/{name}", _EPOCH), data)
 
 
-def _read_zip(file: Any) -> object:
-    with zipfile.ZipFile(file) as archive:
-        root = next((n.removesuffix("data.pkl") for n in archive.namelist() if n.endswith("data.pkl")), None)
-        if root is None:
-            raise StateFileError("a zip without data.pkl; expected what torch.save writes")
-        return _Reader(io.BytesIO(_part(archive, f"{root}data.pkl")), archive, root).load()
+def _read_file(path: Path) -> bytes:
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise StateFileError("not a file")
+    if found.st_size > _MAX_BYTES:
+        raise StateFileError(f"larger than {_MAX_BYTES >> 20} MiB")
+    with open(path, "rb") as file:
+        return file.read(found.st_size)
 
 
-def _part(archive: zipfile.ZipFile, name: str) -> bytes:
-    if archive.getinfo(name).file_size > _MAX_BYTES:
-        raise StateFileError(f"{name} is larger than {_MAX_BYTES >> 20} MiB")
-    return archive.read(name)
+@dataclass(frozen=True)
+class _Parts:
+    """The parts of a zip; `root` is the beginning of their names."""
+
+    archive: zipfile.ZipFile
+    root: str
+
+    def size(self, name: str) -> int:
+        """Return the size of a part in bytes, after a check that it can be read."""
+        try:
+            info = self.archive.getinfo(self.root + name)
+        except KeyError:
+            raise StateFileError(f"the part {shown(name)} is missing") from None
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+            raise StateFileError(f"{shown(name)} is encrypted or compressed in an unusual way")
+        if info.file_size > _MAX_BYTES:
+            raise StateFileError(f"{shown(name)} is larger than {_MAX_BYTES >> 20} MiB")
+        return info.file_size
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a part."""
+        size = self.size(name)
+        content = self.archive.read(self.root + name)
+        if len(content) != size:
+            raise StateFileError(f"{shown(name)} is incomplete")
+        return content
 
 
-class _Dtype:
-    """Replacement of `numpy.dtype`."""
-
-    def __init__(self, code: str, *_: object):
-        if code not in ("f8", "f4", "i8", "i4"):
-            raise StateFileError(f"an array of {code!r}; expected numbers of 4 or 8 bytes")
-        self.dtype = np.dtype(code)
-
-    def __setstate__(self, state: tuple) -> None:
-        if state[1] == ">":
-            self.dtype = self.dtype.newbyteorder(">")
-
-
-class _Array:
-    """Replacement of `numpy.ndarray`."""
-
-    def __init__(self, *_: object):
-        self._state: tuple[object, ...] = ()
-
-    def __setstate__(self, state: tuple) -> None:
-        self._state = state
-
-    def array(self) -> np.ndarray:
-        """Return the described array."""
-        _, shape, dtype, fortran, raw = self._state
-        if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes) and isinstance(shape, tuple)):
-            raise StateFileError("an array of other values than numbers")
-        return np.frombuffer(raw, dtype.dtype).reshape(shape, order="F" if fortran else "C")
+def _read_zip(content: bytes) -> np.ndarray:
+    if content.count(b"PK\x01\x02") > _MAX_PARTS:
+        raise StateFileError(f"a zip of more than {_MAX_PARTS} parts; expected what torch.save writes")
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = archive.namelist()
+            pickles = [name for name in names if name.rpartition("/")[2] == "data.pkl"]
+            if len(pickles) != 1 or len(set(names)) < len(names):
+                raise StateFileError("a zip without one data.pkl; expected what torch.save writes")
+            parts = _Parts(archive, pickles[0].removesuffix("data.pkl"))
+            return _to_array(read_pickle(parts.read("data.pkl"), _NAMES), parts)
+    except StateFileError:
+        raise
+    except _ZIP_ERRORS as error:
+        raise StateFileError(f"the zip is broken ({shown(error)})") from None
 
 
-class _Storage:
-    """Replacement of a storage class of torch: the type of the numbers."""
+def _to_array(found: object, parts: _Parts | None) -> np.ndarray:
+    """Return the array that a pickle describes."""
+    match found:
+        case Call(name, _, (_, shape, dtype, order, raw)) if name in _RECONSTRUCT:
+            return _from_bytes(shape, dtype, raw, fortran=order is True)
+        case Call(name, (raw, dtype, shape, ("C" | "F") as order), None) if name in _FROM_BUFFER:
+            return _from_bytes(shape, dtype, raw, fortran=order == "F")
+        case Call(name, (External(key), int(offset), shape, strides, *_), None) if name == _TENSOR:
+            if parts is None:
+                raise StateFileError("a tensor without the zip that has its numbers")
+            return _from_storage(_storage(key, parts), offset, _pair(shape), _pair(strides, "steps"))
+    raise StateFileError("expected an array (states, size) of numbers")
 
-    def __init__(self, code: str):
-        self.dtype = np.dtype(code)
+
+def _pair(found: object, what: str = "(states, size)") -> tuple[int, int]:
+    match found:
+        case (int(rows), int(columns)):
+            return rows, columns
+    raise StateFileError(f"expected an array (states, size) of numbers; {what} are no two numbers")
 
 
-def _bytes(text: str, encoding: str) -> bytes:
-    """Return the bytes that pickles of the second protocol write as text."""
-    if encoding != "latin1":
-        raise StateFileError(f"bytes in the encoding {encoding!r}; expected latin1")
-    return text.encode("latin1")
+def _check_shape(shape: tuple[int, int]) -> None:
+    if min(shape) < 1:
+        raise StateFileError("an array without numbers")
+    if max(shape) > _MAX_EDGE or shape[0] * shape[1] > _MAX_NUMBERS:
+        raise StateFileError(
+            f"an array with an edge over {_MAX_EDGE:,}, or of more than {_MAX_NUMBERS:,} numbers in all"
+        )
 
 
-def _tensor(storage: np.ndarray, offset: int, shape: tuple, stride: tuple, *_: object) -> np.ndarray:
+def _from_bytes(shape: object, dtype: object, raw: object, *, fortran: bool) -> np.ndarray:
+    rows, columns = _pair(shape)
+    _check_shape((rows, columns))
+    kind = _dtype(dtype)
+    content = _bytes(raw)
+    if len(content) != rows * columns * kind.itemsize:
+        raise StateFileError(f"{len(content)} bytes for {rows} x {columns} numbers")
+    return np.frombuffer(content, kind).reshape((rows, columns), order="F" if fortran else "C")
+
+
+def _dtype(found: object) -> np.dtype:
+    match found:
+        case Call("numpy.dtype", (str(code), *_), (_, ("<" | ">") as order, None, None, None, *_)):
+            if code in _CODES:
+                return np.dtype(order + code)
+            raise StateFileError(f"an array of {shown(code)!r}; expected numbers of 4 or 8 bytes")
+    raise StateFileError("an array of other values than numbers")
+
+
+def _bytes(found: object) -> bytes | bytearray:
+    """Return bytes; pickles of the second protocol write them as text."""
+    match found:
+        case bytes() | bytearray():
+            return found
+        case Call("_codecs.encode", (str(text), "latin1"), None):
+            try:
+                return text.encode("latin1")
+            except UnicodeEncodeError:
+                raise StateFileError("numbers that are no bytes") from None
+    raise StateFileError("an array of other values than numbers")
+
+
+def _storage(key: object, parts: _Parts) -> np.ndarray:
+    """Return the numbers that a tensor refers to, from another part of the zip."""
+    match key:
+        case ("storage", Name(kind), str(part), *_) if kind in _STORAGES and part.isdecimal():
+            if f"{parts.root}byteorder" in parts.archive.namelist() and parts.read("byteorder") != b"little":
+                raise StateFileError("a tensor of a big-endian machine; save it again as a NumPy array")
+            content = parts.read(f"data/{part}")
+            if len(content) % _STORAGES[kind].itemsize:
+                raise StateFileError(f"{len(content)} bytes are no numbers of {kind}")
+            return np.frombuffer(content, _STORAGES[kind])
+    raise StateFileError("a tensor of other values than numbers, or outside of the file")
+
+
+def _from_storage(
+    storage: np.ndarray, offset: int, shape: tuple[int, int], strides: tuple[int, int]
+) -> np.ndarray:
     """Return a tensor of a storage as an array, after a check of its bounds."""
-    last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
-    if offset < 0 or min(stride, default=0) < 0 or min(shape, default=1) < 1 or last >= storage.size:
+    _check_shape(shape)
+    if offset < 0 or min(strides) < 0:
+        raise StateFileError("a tensor with negative steps")
+    last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
+    if last >= storage.size:
         raise StateFileError("a tensor that is larger than its storage")
-    steps = [s * storage.itemsize for s in stride]
-    return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps, writeable=False).copy()
-
-
-_KNOWN: dict[tuple[str, str], object] = {
-    ("numpy", "ndarray"): _Array,
-    ("numpy", "dtype"): _Dtype,
-    ("numpy.core.multiarray", "_reconstruct"): _Array,
-    ("numpy._core.multiarray", "_reconstruct"): _Array,
-    ("_codecs", "encode"): _bytes,
-    ("collections", "OrderedDict"): dict,
-    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-    ("torch", "DoubleStorage"): _Storage("f8"),
-    ("torch", "FloatStorage"): _Storage("f4"),
-}
-
-
-class _Reader(pickle.Unpickler):
-    """An unpickler that accepts the names above and no others."""
-
-    def __init__(self, file: Any, archive: zipfile.ZipFile | None = None, root: str = ""):
-        super().__init__(file)
-        self._archive, self._root = archive, root
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return the replacement of a name in the pickle."""
-        if (module, name) not in _KNOWN:
-            self._refuse(f"{module}.{name}")
-        return _KNOWN[module, name]
-
-    def persistent_load(self, pid: Any) -> np.ndarray:
-        """Return the numbers of a tensor, from another part of the zip."""
-        kind, storage, key, *_ = pid
-        if kind != "storage" or not isinstance(storage, _Storage) or self._archive is None:
-            self._refuse(f"a {kind!r} outside the pickle")
-        return np.frombuffer(_part(self._archive, f"{self._root}data/{key}"), storage.dtype)
-
-    def _refuse(self, what: str) -> NoReturn:
-        raise StateFileError(f"the pickle names {what}; only arrays of numbers are read, nothing is executed")
+    rows, columns = (np.arange(n) * (step if n > 1 else 0) for n, step in zip(shape, strides, strict=True))
+    return storage[offset + rows[:, None] + columns]

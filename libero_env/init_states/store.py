@@ -46,9 +46,36 @@ def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -
 
 
 def split_row(model: mujoco.MjModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split rows (k, n) of initial states into qpos (k, nq), qvel (k, nv) and fixtures (k, nfixtures, 7)."""
+    """Split rows (k, n) of initial states into qpos (k, nq), qvel (k, nv) and fixtures (k, nfixtures, 7).
+
+    Raises:
+        LiberoError: The rows have another length.
+    """
+    check_width(model, rows)
+    if (rows.shape[1] - 1 - model.nq - model.nv) % 7:
+        raise LiberoError(f"a state of {rows.shape[1]} numbers; the poses at its end have 7 each")
     _, qpos, qvel, fixtures = np.split(rows, np.cumsum([1, model.nq, model.nv]), axis=1)
     return qpos, qvel, fixtures.reshape(len(rows), -1, 7)
+
+
+def check_width(model: mujoco.MjModel, rows: np.ndarray, source: object = "") -> None:
+    """Check that rows (k, n) can begin with [time, qpos, qvel] of a model.
+
+    Args:
+        model: Model of the task.
+        rows: States.
+        source: Where they come from, for the message.
+
+    Raises:
+        LiberoError: The rows are too short.
+    """
+    size = 1 + model.nq + model.nv
+    if rows.ndim != 2 or rows.shape[1] < size:
+        where = f"{source}: " if source else ""
+        raise LiberoError(
+            f"{where}states of {rows.shape[-1]} numbers; this task's begin with {size} of [time, qpos, qvel]. "
+            "Are they of another task, or of other models?"
+        )
 
 
 def load_init_states(task: Task, scene: Scene) -> np.ndarray:
@@ -82,17 +109,27 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
     return states
 
 
-def load_original_states(task: Task) -> np.ndarray | None:
+def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray | None:
     """Return the initial states that LIBERO publishes for a task, rows [time, qpos, qvel]; None without them.
 
     They are in the folder `init_states` of the configuration file, laid out as LIBERO's `init_files`.
 
+    Args:
+        task: Task.
+        scene: Compiled scene that is to start in them, whose size is compared; None compares nothing.
+
     Raises:
         StateFileError: The task's file is broken.
+        LiberoError: The states are of another model than the scene's.
     """
     folder = read_config().get("init_states")
     path = Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init" if folder else None
-    return read_states(path) if path is not None and path.is_file() else None
+    if path is None or not path.is_file():
+        return None
+    states = read_states(path)
+    if scene is not None:
+        check_width(scene.model, states, path)
+    return states
 
 
 def cache_init_states(task: Task) -> Path:

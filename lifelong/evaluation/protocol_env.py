@@ -88,7 +88,7 @@ class ProtocolEnv:
         """Return the initial states of the task that the protocol names, rows that begin with [time, qpos, qvel]."""
         if self.card.world.init_states == "builtin":
             return self.env.world.init_states
-        states = load_original_states(self.env.task)
+        states = load_original_states(self.env.task, self.env.world.scene)
         if states is None:
             raise ConfigError(
                 f"{self.env.task.id}: protocol {self.card.name} starts from the states that LIBERO publishes, which "

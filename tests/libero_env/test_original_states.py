@@ -2,12 +2,16 @@
 
 import os
 import pickle
+import tracemalloc
 import zipfile
 
+import mujoco
 import numpy as np
 import pytest
 
+from libero_env.errors import LiberoError
 from libero_env.init_states.pickles import StateFileError, read_states, write_states
+from libero_env.init_states.store import check_width, split_row
 
 pytestmark = pytest.mark.unit
 
@@ -64,6 +68,68 @@ def test_pickles_that_call_functions_are_errors(tmp_path, zipped):
     with pytest.raises(StateFileError, match=r"evil: the pickle names posix.mkdir"):
         read_states(file)
     assert not (tmp_path / "pwned").exists()
+
+
+def test_a_rejected_file_changes_nothing_for_the_next(tmp_path):
+    torch = pytest.importorskip("torch")
+    torch.save(torch.arange(12, dtype=torch.float64).reshape(3, 4), tmp_path / "good")
+    expected = read_states(tmp_path / "good")
+    # sets an attribute of what the name stands for
+    evil = b"\x80\x02ctorch\nDoubleStorage\n}X\x05\x00\x00\x00dtypeK\x01sb."
+    (tmp_path / "evil").write_bytes(evil)
+    with pytest.raises(StateFileError, match="evil"):
+        read_states(tmp_path / "evil")
+    assert (read_states(tmp_path / "good") == expected).all()
+
+
+def memory_peak(path) -> int:
+    """Return the memory that Python asks for while it refuses a file, in bytes."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(StateFileError, match=path.name):
+            read_states(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_small_files_do_not_ask_for_much_memory(tmp_path):
+    torch = pytest.importorskip("torch")
+    torch.save(torch.zeros(1, 1).expand(32768, 32768), tmp_path / "steps of zero")
+    # a length of 32 GB; an entry of the memory that would need a table of 4 GB
+    (tmp_path / "length").write_bytes(b"\x80\x04\x8e" + (1 << 35).to_bytes(8, "little") + b"x")
+    (tmp_path / "entry").write_bytes(b"\x80\x02K\x01r\xff\xff\xff\x0f.")
+    (tmp_path / "many").write_bytes(b"\x80\x02" + b"(" * 1_000_000 + b".")
+    with zipfile.ZipFile(tmp_path / "packed", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("x/data.pkl", bytes((1 << 28) + 1))
+    for name in ("steps of zero", "length", "entry", "many", "packed"):
+        assert memory_peak(tmp_path / name) < 20e6, name
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_states_are_finite_numbers(tmp_path, value):
+    write_states(tmp_path / "file", np.full((2, 3), value))
+    with pytest.raises(StateFileError, match="file: .* not finite"):
+        read_states(tmp_path / "file")
+
+
+def test_states_of_another_model_are_one_line(tmp_path):
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    check_width(model, np.zeros((2, 14)))
+    with pytest.raises(LiberoError, match=r"^file: states of 13 numbers; .* begin with 14 "):
+        check_width(model, np.zeros((2, 13)), "file")
+    with pytest.raises(LiberoError, match="15 numbers"):
+        split_row(model, np.zeros((2, 15)))
+    assert [part.shape for part in split_row(model, np.zeros((2, 21)))] == [(2, 7), (2, 6), (2, 1, 7)]
+
+
+def test_what_is_no_file_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")  # reading it would wait for ever
+    for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
+        with pytest.raises(StateFileError, match="not a file"):
+            read_states(path)
 
 
 def test_errors_name_the_broken_file(tmp_path):
