@@ -1,6 +1,7 @@
 # make train   set everything up, then train and evaluate (ARGS="algo=er seed=2" are Hydra overrides)
 # make test    set everything up, then the checks that CI runs
 # make assets  set everything up, and the original's models (340 MB), with which tests compare pictures
+# make fuzz    the property tests with tens of thousands of hostile inputs, see experiments/fuzz
 # make docs    set everything up, then the documentation: build/site/index.html
 PYTHON ?= python3
 ARGS ?=
@@ -14,7 +15,7 @@ EXTRAS := train,assets,export,judge,language,notebooks,robosuite,servers,wandb,d
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl assets train test lint docs clean
+.PHONY: help setup gl assets train test lint audit fuzz docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -61,6 +62,13 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check --quiet .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+
+fuzz: setup
+	$(BIN)/python experiments/fuzz/run.py --workers $(WORKERS) $(ARGS)
+
+# known vulnerabilities of the pinned packages; it needs the network, and says so where there is none
+audit: $(STAMP)
+	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
