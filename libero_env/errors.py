@@ -47,6 +47,10 @@ class InvalidInputError(LiberoError, ValueError):
     """A file or value from outside that is not valid; the message names file and line, or key, and what is valid."""
 
 
+class ClosedEnvironmentError(LiberoError):
+    """An environment is used after `close`; make another."""
+
+
 class BDDLError(LiberoError, ValueError):
     """A task file that cannot be read; the message starts with file:line."""
 

@@ -2,15 +2,19 @@
 
 import contextlib
 import os
+import signal
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from multiprocessing.shared_memory import SharedMemory
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+
+from libero_env.parallel import end_with_parent
 
 
 class Shared:
@@ -86,19 +90,25 @@ def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
 def serve(
     pipe: Connection, make: Callable[[], Any], variables: Mapping[str, str], host_class: type[Host]
 ) -> None:
-    """Run commands in a worker until `close`, or until the other end of the pipe is gone."""
+    """Run commands in a worker until `close`, or until the other end of the pipe is gone.
+
+    The wait for the next command has no limit; the process ends with its parent.
+    """
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks; it decides
     os.environ.update(variables)
     host = host_class(make)
     try:
         while True:
-            command, *args = pipe.recv()
+            number, command, args = pipe.recv()
             try:
-                pipe.send((True, getattr(host, command)(*args)))
+                answer = ForkingPickler.dumps((number, True, getattr(host, command)(*args)))
             except Exception:  # noqa: BLE001 - the other end raises it
-                pipe.send((False, traceback.format_exc()))
+                answer = ForkingPickler.dumps((number, False, traceback.format_exc()))
+            pipe.send_bytes(answer)
             if command == "close":
                 return
-    except (EOFError, BrokenPipeError, KeyboardInterrupt):
+    except (EOFError, BrokenPipeError, ConnectionResetError):
         host.close()
 
 

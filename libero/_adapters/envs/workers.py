@@ -3,23 +3,41 @@
 A worker answers requests in order: `send` starts one and `recv` waits for its answer, so several workers run at once.
 """
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import connection
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import utils
 
 from libero_env.envs.worker import Worker, shut_down, wait_for
 from libero_env.envs.worker_host import CallHost, Shared
-from libero_env.errors import LiberoError
+from libero_env.errors import ClosedEnvironmentError, LiberoError
+
+CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes
 
 
 class WorkerError(LiberoError, RuntimeError):
-    """A worker failed, died or took too long; the message states which one and why."""
+    """Workers failed, died or took too long; the message states which, why, and how to go on.
+
+    Attributes:
+        failed: Reason by index of the environment; empty in the error of a single worker.
+        results: What the call returned for the other environments, by index.
+    """
+
+    def __init__(
+        self, message: str, failed: Mapping[int, str] | None = None, results: Mapping[int, Any] | None = None
+    ):
+        super().__init__(message)
+        self.failed, self.results = dict(failed or {}), dict(results or {})
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        """Keep the attributes in a copy."""
+        return type(self), (*self.args, self.failed, self.results)
 
 
 class CloudpickleWrapper(utils.CloudpickleWrapper):
@@ -136,6 +154,10 @@ class EnvWorker(ABC):
             self.is_closed = True
             self.close_env()
 
+    def why_lost(self) -> str:
+        """Return why no call can succeed any more, such as the end of its process; empty while it works."""
+        return ""
+
     @staticmethod
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
         """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
@@ -189,6 +211,8 @@ class DummyEnvWorker(_HostWorker):
         self.env = self._host.env
 
     def _send(self, command: str, *args: Any) -> None:
+        if self.is_closed:
+            raise ClosedEnvironmentError("this environment is closed; make another")
         self.result = getattr(self._host, command)(*args)
 
     def recv(self) -> Any:
@@ -206,37 +230,67 @@ class SubprocEnvWorker(_HostWorker):
     Args:
         env_fn: Factory of the environment, called in the process; a lambda is allowed.
         share_memory: Whether the arrays of observations come back through shared memory.
-        timeout: Seconds that a call may take; None for no limit.
+        timeout: Seconds that a call may take, and at first the start of the process; None for 600.
     """
 
     def __init__(self, env_fn: Callable[[], Any], share_memory: bool = False, timeout: float | None = None):
         super().__init__(env_fn)
-        self.share_memory, self._timeout, self._request = share_memory, timeout, ""
+        self.share_memory, self._timeout = share_memory, CALL_TIMEOUT if timeout is None else timeout
         self._worker = Worker("", env_fn, host=VectorHost, run_main=False)
+        self._opening: int | None = self._worker.requests  # until its answer has come
+        self._request, self._since, self._lost = "open", time.monotonic(), ""
         self.process, self.parent_remote = self._worker.process, self._worker.pipe
 
     def _send(self, command: str, *args: Any) -> None:
-        self._request = args[0]
+        self._check(self.why_lost())
         self._worker.send(command, *args)
+        self._request, self._since = args[0], time.monotonic()
 
     def recv(self) -> Any:
         """Return the result of the call that was started; see `EnvWorker.recv`."""
-        if not self._worker.opened:
-            self._answer("making the environment")
-            self._worker.opened = True
-        result = self._answer(self._request)
+        self._check(self._lost)
+        request = self._worker.requests
+        if self._opening is not None:
+            self._answer("making the environment", self._opening)
+            self._opening, self._worker.opened, self._since = None, True, time.monotonic()
+        result = self._answer(self._request, request)
         if self.share_memory and (observation := _observation(result)):
             self._unshare(observation)
         return result
 
-    def _answer(self, request: str) -> Any:
+    def why_lost(self) -> str:
+        """Return why no call can succeed any more; see `EnvWorker.why_lost`."""
+        if not self._lost and not self.process.is_alive():
+            self._lost = self._worker.end_reason()
+        return self._lost
+
+    def _check(self, lost: str) -> None:
+        if self.is_closed:
+            raise ClosedEnvironmentError("this environment is closed; make another")
+        if lost:
+            raise WorkerError(f"worker {self.process.pid}: {lost}")
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until the call that was started has taken too long."""
+        return max(0.0, self._since + self._timeout - time.monotonic())
+
+    def _answer(self, name: str, request: int) -> Any:
         """Return the answer to a request; a worker that does not answer, or has no environment, is killed."""
-        answers, failures = wait_for({0: self._worker}, self._timeout)
+        answers, failures = wait_for({0: self._worker}, self.seconds_left, {0: request})
         if not failures:
             return answers[0]
-        if failures[0].lost or not self._worker.opened:
+        reason = failures[0].reason
+        if failures[0].late:
+            began = time.strftime("%H:%M:%S", time.localtime(time.time() - (time.monotonic() - self._since)))
+            reason = (
+                f"no answer within {self._timeout:g} s, since {began}; it was ended. If it is only slow, "
+                "raise call_timeout="
+            )
+        if failures[0].lost or self._opening is not None:
             self.process.kill()
-        raise WorkerError(f"worker {self.process.pid}, in {request}: {failures[0].reason}")
+            self._lost = f"in {name}: {reason}"
+        raise WorkerError(f"worker {self.process.pid}, in {name}: {reason}")
 
     def _unshare(self, observation: dict[str, Any]) -> None:
         """Fill in the arrays that came through shared memory, which the first observation sets up."""
@@ -245,9 +299,9 @@ class SubprocEnvWorker(_HostWorker):
             absent = [key for key in shared.views if observation.get(key, 0) is None]
             observation.update({key: shared.views[key].copy() for key in absent})
         elif arrays := _arrays(observation):
-            self._worker.shared = Shared(arrays)
-            self._worker.send("attach", self._worker.shared.name)
-            self._answer("attach")
+            layout = {key: _Layout(array.shape, array.dtype) for key, array in arrays.items()}
+            self._worker.shared = shared = Shared(layout)
+            self._answer("attach", self._worker.send("attach", shared.name, layout))
 
     def close_env(self) -> None:
         """End the process, by force where it does not answer."""
@@ -256,21 +310,29 @@ class SubprocEnvWorker(_HostWorker):
     @staticmethod
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
         """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
-        remotes: dict[Any, EnvWorker] = {getattr(worker, "parent_remote"): worker for worker in workers}  # noqa: B009 - only here
-        end = None if timeout is None else time.monotonic() + timeout
+        own = [worker for worker in workers if isinstance(worker, SubprocEnvWorker)]
+        remotes: dict[Any, SubprocEnvWorker] = {worker.parent_remote: worker for worker in own}
+        end = time.monotonic() + (math.inf if timeout is None else timeout)
         ready: list[EnvWorker] = []
         while remotes and len(ready) < wait_num:
-            found = connection.wait(list(remotes), None if end is None else max(0.0, end - time.monotonic()))
+            late = [remote for remote, worker in remotes.items() if not worker.seconds_left]
+            left = min(end - time.monotonic(), *(worker.seconds_left for worker in remotes.values()))
+            found = late or connection.wait(list(remotes), max(0.0, left))
             ready += [remotes.pop(remote) for remote in found]
-            if not found:
+            if not found and time.monotonic() >= end:
                 break
         return ready
 
 
+class _Layout(NamedTuple):
+    """Shape and type of an array in shared memory."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
 class VectorHost(CallHost):
     """The commands of a worker, with observations in shared memory."""
-
-    layout: Mapping[str, np.ndarray] = {}  # arrays of the first observation
 
     def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Call a method; None stands for arrays of an observation that are in shared memory."""
@@ -282,9 +344,8 @@ class VectorHost(CallHost):
         result = super().call(method, args, kwargs)
         if observation := _observation(result):
             arrays = _arrays(observation)
-            self.layout = self.layout or arrays
             for key, view in self.shared.views.items() if self.shared else ():
-                if key in arrays and arrays[key].shape == view.shape:
+                if key in arrays and (arrays[key].shape, arrays[key].dtype) == (view.shape, view.dtype):
                     view[...] = arrays[key]
                     observation[key] = None
         return result
@@ -300,9 +361,9 @@ class VectorHost(CallHost):
         else:
             super().set(key, value)
 
-    def attach(self, name: str) -> None:
-        """Write observations to shared memory, laid out as the first observation was."""
-        self.shared = Shared(self.layout, name)
+    def attach(self, name: str, layout: Mapping[str, _Layout]) -> None:
+        """Write observations to shared memory, where they fit its layout."""
+        self.shared = Shared(layout, name)
 
 
 def _observation(result: Any) -> dict[str, Any] | None:
@@ -312,4 +373,8 @@ def _observation(result: Any) -> dict[str, Any] | None:
 
 
 def _arrays(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    return {key: value for key, value in observation.items() if isinstance(value, np.ndarray)}
+    return {
+        key: value
+        for key, value in observation.items()
+        if isinstance(value, np.ndarray) and not value.dtype.hasobject
+    }

@@ -4,12 +4,13 @@ They may be of the original's interface, whose `reset` returns an observation an
 of Gymnasium's, with (observation, info) and five. Results are stacked: dictionaries as an object array of them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from gymnasium import spaces
+from pydantic import Field
 
 from libero._adapters.envs.workers import (  # noqa: F401 - names of the original
     CloudpickleWrapper,
@@ -19,13 +20,16 @@ from libero._adapters.envs.workers import (  # noqa: F401 - names of the origina
     SubprocEnvWorker,
     WorkerError,
 )
-from libero_env.errors import LiberoError
+from libero_env.errors import ClosedEnvironmentError, InvalidInputError, LiberoError
+from libero_env.validation import validate
 
 # Attributes of a vector that are those of its environments, in a list.
 GYM_RESERVED_KEYS = ["metadata", "reward_range", "spec", "action_space", "observation_space"]
 
 gym_old_venv_step_type = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 gym_new_venv_step_type = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+_Count = Annotated[int, Field(ge=1)]
+_Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Ids = int | Sequence[int] | np.ndarray | None
 
 
@@ -42,7 +46,7 @@ class BaseVectorEnv:
         timeout: Seconds that `step` waits for them; None for no limit.
 
     Raises:
-        LiberoError: `wait_num` or `timeout` is out of range.
+        InvalidInputError: There are no factories, or `wait_num` or `timeout` is out of range.
     """
 
     def __init__(
@@ -52,13 +56,16 @@ class BaseVectorEnv:
         wait_num: int | None = None,
         timeout: float | None = None,
     ):
+        env_fns = list(env_fns)
+        if not env_fns or not all(map(callable, env_fns)):
+            raise InvalidInputError(
+                f"env_fns={env_fns!r}: expected at least one function that makes an environment"
+            )
         self.env_num = len(env_fns)
-        self.wait_num = wait_num or self.env_num
-        if not 1 <= self.wait_num <= self.env_num:
-            raise LiberoError(f"wait_num={wait_num}: expected 1 to {self.env_num} environments")
-        if timeout is not None and timeout <= 0:
-            raise LiberoError(f"timeout={timeout}: expected a positive number of seconds")
-        self.timeout = timeout
+        self.wait_num = validate(_Count | None, wait_num, prefix=("wait_num",)) or self.env_num
+        if self.wait_num > self.env_num:
+            raise InvalidInputError(f"wait_num={wait_num}: expected 1 to {self.env_num} environments")
+        self.timeout = validate(_Seconds | None, timeout, prefix=("timeout",))
         self.is_async = self.wait_num != self.env_num or timeout is not None
         self.is_closed = False
         self.workers = [worker_fn(env_fn) for env_fn in env_fns]
@@ -79,12 +86,11 @@ class BaseVectorEnv:
 
     def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:
         """Return an attribute of each environment."""
-        return [self.workers[i].get_env_attr(key) for i in self._ids(id)]
+        return self._each(self._ids(id), lambda worker: worker.get_env_attr(key))
 
     def set_env_attr(self, key: str, value: Any, id: Ids = None) -> None:
         """Set an attribute of each environment."""
-        for i in self._ids(id):
-            self.workers[i].set_env_attr(key, value)
+        self._each(self._ids(id), lambda worker: worker.set_env_attr(key, value))
 
     def reset(self, id: Ids = None, **kwargs: Any) -> Any:
         """Reset the environments; return their observations (k,), or these and a list of their infos."""
@@ -100,22 +106,26 @@ class BaseVectorEnv:
             Observations, rewards, successes and infos, each (k,); of environments of Gymnasium's interface
             observations, rewards, terminated, truncated and infos.
         """
-        ids = self._ids(id) if action is not None else []
-        if action is not None and len(action) != len(ids):
-            raise LiberoError(f"step: {len(action)} actions for {len(ids)} environments")
-        for i, row in zip(ids, () if action is None else action, strict=True):
-            self.workers[i].start("step", row)
+        ids = self._ids(id if action is not None else [])
+        failed = self._start("step", ids, [] if action is None else action)
+        ids = [i for i in ids if i not in failed]
         if self.is_async:
             self.waiting_id += ids
             self.ready_id = [i for i in self.ready_id if i not in ids]
-            ids = self._wait()
-        results = self._receive("step", ids)
+            ids = self._wait() if self.waiting_id or not failed else []
+        elif action is None:
+            raise InvalidInputError(
+                "step(None) waits for environments that act; it needs wait_num or timeout"
+            )
+        results = self._each(ids, lambda worker: worker.finish("step"), failed)
         for i, result in zip(ids, results, strict=True):
             result[-1]["env_id"] = i
         return tuple(map(_stack, zip(*results, strict=True)))
 
     def _wait(self) -> list[int]:
         """Wait for some environments, and move them from waiting to ready."""
+        if not self.waiting_id:
+            raise InvalidInputError("no environment is at a step; give some an action first")
         found: list[EnvWorker] = []
         while not found:
             waiting = [self.workers[i] for i in self.waiting_id]
@@ -160,30 +170,66 @@ class BaseVectorEnv:
 
     def _call(self, method: str, ids: Sequence[int], arguments: Any = None, **kwargs: Any) -> list[Any]:
         """Call a method of these environments at once, each with its own argument."""
-        if arguments is not None and len(arguments) != len(ids):
-            raise LiberoError(f"{method}: {len(arguments)} values for {len(ids)} environments")
-        for k, i in enumerate(ids):
-            self.workers[i].start(method, *(() if arguments is None else (arguments[k],)), **kwargs)
-        return self._receive(method, ids)
+        failed = self._start(method, ids, arguments, **kwargs)
+        return self._each([i for i in ids if i not in failed], lambda worker: worker.finish(method), failed)
 
-    def _receive(self, method: str, ids: Sequence[int]) -> list[Any]:
-        """Return all answers; a failure is raised once no answer is left for the next call."""
-        results, failures = [], []
+    def _start(self, method: str, ids: Sequence[int], arguments: Any, **kwargs: Any) -> dict[int, str]:
+        """Start a call of a method of these environments, each with its own argument; return failures by index."""
+        if arguments is not None and (not hasattr(arguments, "__len__") or len(arguments) != len(ids)):
+            count = len(arguments) if hasattr(arguments, "__len__") else type(arguments).__name__
+            values = "actions" if method == "step" else "values"
+            raise InvalidInputError(f"{method}: {count} {values} for {len(ids)} environments")
+        failed = {}
+        for k, i in enumerate(ids):
+            try:
+                self.workers[i].start(method, *(() if arguments is None else (arguments[k],)), **kwargs)
+            except WorkerError as error:
+                failed[i] = str(error)
+        return failed
+
+    def _each(
+        self, ids: Sequence[int], ask: Callable[[EnvWorker], Any], failed: Mapping[int, str] | None = None
+    ) -> list[Any]:
+        """Return the answer of each worker; failures are raised when all others have come, with their results."""
+        results: dict[int, Any] = {}
+        failed = dict(failed or {})
         for i in ids:
             try:
-                results.append(self.workers[i].finish(method))
+                results[i] = ask(self.workers[i])
             except WorkerError as error:
-                failures.append(error)
-        if failures:
-            raise failures[0]
-        return results
+                failed[i] = str(error)
+        if failed:
+            done = (
+                f"The others, {list(results)}, have done it: see `results` of this error. " if results else ""
+            )
+            raise WorkerError(f"{_named(failed)}\n{done}{self._remedy()}", failed, results)
+        return list(results.values())
+
+    def _remedy(self) -> str:
+        """Return how to go on after a failure."""
+        lost = [i for i, worker in enumerate(self.workers) if worker.why_lost()]
+        if not lost:
+            return "All environments can still be used"
+        rest = [i for i in range(self.env_num) if i not in lost]
+        return (
+            f"Go on with id={rest}, or close this vector and make a new one" if rest else "Make a new vector"
+        )
 
     def _assert_is_not_closed(self) -> None:
         if self.is_closed:
-            raise LiberoError("this vector of environments is closed; make a new one")
+            raise ClosedEnvironmentError("this vector of environments is closed; make a new one")
 
     def _wrap_id(self, id: Ids = None) -> list[int]:
-        return list(range(self.env_num)) if id is None else [int(i) for i in np.atleast_1d(id)]
+        if id is None:
+            return list(range(self.env_num))
+        ids = np.atleast_1d(id)
+        whole = ids.ndim == 1 and (not ids.size or ids.dtype.kind in "iu")
+        if not whole or any(not -self.env_num <= i < self.env_num for i in ids):
+            raise InvalidInputError(f"id={id!r}: expected indices from 0 to {self.env_num - 1}")
+        chosen = [int(i) % self.env_num for i in ids]
+        if len(set(chosen)) < len(chosen):
+            raise InvalidInputError(f"id={id!r}: an environment occurs twice")
+        return chosen
 
     def _assert_id(self, id: Sequence[int]) -> None:
         if busy := [i for i in id if i in self.waiting_id]:
@@ -193,6 +239,8 @@ class BaseVectorEnv:
         self._assert_is_not_closed()
         ids = self._wrap_id(id)
         self._assert_id(ids)
+        if lost := {i: reason for i in ids if (reason := self.workers[i].why_lost())}:
+            raise WorkerError(f"{_named(lost)}\nNothing was done. {self._remedy()}", lost)
         return ids
 
 
@@ -209,7 +257,8 @@ class SubprocVectorEnv(BaseVectorEnv):
     Args:
         env_fns: One factory for each environment; a lambda is allowed.
         share_memory: Whether the arrays of observations come back through shared memory.
-        call_timeout: Seconds after which a worker that does not answer is killed; None for no limit.
+        call_timeout: Seconds after which a worker that does not answer is ended, the start of the processes included;
+            None for 600. The environments of other workers go on.
         kwargs: Further arguments of `BaseVectorEnv`.
     """
 
@@ -220,8 +269,13 @@ class SubprocVectorEnv(BaseVectorEnv):
         call_timeout: float | None = None,
         **kwargs: Any,
     ):
-        worker_fn = partial(SubprocEnvWorker, share_memory=share_memory, timeout=call_timeout)
+        limit = validate(_Seconds | None, call_timeout, prefix=("call_timeout",))
+        worker_fn = partial(SubprocEnvWorker, share_memory=share_memory, timeout=limit)
         super().__init__(env_fns, worker_fn, **kwargs)
+
+
+def _named(reasons: Mapping[int, str]) -> str:
+    return "\n".join(f"environment {i}: {reason.rstrip()}" for i, reason in sorted(reasons.items()))
 
 
 def _stack(items: Sequence[Any]) -> np.ndarray:
