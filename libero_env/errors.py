@@ -1,7 +1,10 @@
 """Errors of the package; all derive from `LiberoError`."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+RAISED_BY = "raised by "  # a note on an error from code of the user begins so; then follows whose code it is
 
 
 class LiberoError(Exception):
@@ -69,3 +72,24 @@ class RenderError(LiberoError):
 
 class DemoError(LiberoError, ValueError):
     """A demonstration file that is broken; the message names file, demonstration, key, and what was expected."""
+
+
+def printable(text: str) -> str:
+    """Return a text as a terminal may be given it: control characters that came from a file or a user are escaped."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+
+
+@contextmanager
+def code_of(who: str) -> Iterator[None]:
+    """Add to errors that leave the context a note of whose code raised them, but not to those of this package.
+
+    Args:
+        who: Code of the user that is called in the context, such as `the policy my_policy:make`.
+    """
+    try:
+        yield
+    except LiberoError:
+        raise
+    except Exception as error:
+        error.add_note(RAISED_BY + who)
+        raise

@@ -2,14 +2,18 @@
 
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import connection
+from types import TracebackType
 from typing import Any
 
 from tqdm import tqdm
+
+from libero_env.errors import LiberoError
 
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
 
@@ -17,17 +21,36 @@ LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
 def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -> ProcessPoolExecutor:
     """Return a pool of processes that start with a new interpreter and end when this process ends.
 
-    They are spawned, not forked: an OpenGL context that a fork inherits hangs.
+    They are spawned, not forked: an OpenGL context that a fork inherits hangs. As a context manager, the pool is waited
+    for after an error, and killed where the work is interrupted.
 
     Args:
         workers: Number of processes.
         initializer: Function of a module that each process calls when it starts.
     """
     spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker, initargs=(initializer,))
+    return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=(initializer,))
+
+
+class _Pool(ProcessPoolExecutor):
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
+            for process in list((self._processes or {}).values()):  # Python 3.14 has kill_workers
+                process.kill()
+        self.shutdown(wait=True, cancel_futures=kind is not None)
+        if kind is not None and issubclass(kind, BrokenExecutor):
+            raise LiberoError(
+                "a worker process was killed, by the system if memory was short; what is finished is kept. The same "
+                "command goes on; fewer workers need less memory"
+            ) from error
 
 
 def _start_worker(initializer: Callable[[], None] | None) -> None:
+    for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all its processes; the parent ends this one
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     end_with_parent()
     if initializer is not None:
         initializer()

@@ -18,6 +18,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from libero_env.cli import ending
 from libero_env.errors import LiberoError, UnknownNameError
 from lifelong import experiment
 from lifelong.errors import ConfigError
@@ -50,23 +51,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Hydra's overrides and options, such as `algo=ewc` and `-m`. None: those of this process.
 
     Returns:
-        The exit status: 0, or 1 after an error, which is printed in one line.
+        The exit status, see `libero_env.cli.ending`.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    try:
-        with process_group() as ranks:
-            folder = config_folder()
-            check_choices(words, (folder, *_user_folders(words)))
-            return _compose_and_run(words, folder, ranks)
-    except LiberoError as error:
-        _print_error(error)
-        return 1
-    except (HydraException, OmegaConfBaseException) as error:  # the configuration cannot be composed
-        _print_error(_with_suggestion(error, words) or error)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; the same command resumes the run", file=sys.stderr)
-        return 130
+    with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+        try:
+            with ending.interruptible(), process_group() as ranks:
+                folder = config_folder()
+                check_choices(words, (folder, *_user_folders(words)))
+                return _compose_and_run(words, folder, ranks)
+        except (HydraException, OmegaConfBaseException) as error:  # the configuration cannot be composed
+            return _report(_with_suggestion(error, words) or error)
+        except KeyboardInterrupt as error:
+            error.add_note("the same command resumes the run")
+            return _report(error)
+        except Exception as error:  # noqa: BLE001 - told by kind
+            return _report(error)
 
 
 def config_folder() -> Path:
@@ -112,24 +111,23 @@ def _user_folders(words: Sequence[str]) -> list[Path]:
 
 
 def _compose_and_run(words: list[str], folder: Path, ranks: Ranks) -> int:
-    """Run the jobs of the command line, several after `-m`; return the exit status."""
-    failed = False
+    """Run the jobs of the command line, several after `-m`; return the worst exit status."""
+    status = 0
 
     def job(config: DictConfig) -> Path | None:
-        nonlocal failed
+        nonlocal status
         try:
             return experiment.run(config, HydraConfig.get().runtime.choices, ranks)
-        except (LiberoError, HydraException, OmegaConfBaseException, OSError) as error:
-            failed = True
-            _print_error(error)
+        except Exception as error:  # noqa: BLE001 - told by kind; the other jobs of a sweep go on
+            status = max(status, _report(error))
             if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
-                raise SystemExit(1) from error
+                raise SystemExit(status) from error
             return None
 
     sys.argv[1:] = words  # where Hydra reads them
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
     hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(job)()
-    return int(failed)
+    return status
 
 
 def _with_suggestion(error: Exception, words: Sequence[str]) -> LiberoError | None:
@@ -167,14 +165,10 @@ def _is_choice(word: str) -> bool:
     return (config_folder() / group / f"{name}.yaml").is_file()
 
 
-def _print_error(error: Exception) -> None:
-    who = f"rank {rank()}: " if rank() else ""
-    print(f"error: {who}{_one_line(error)}", file=sys.stderr)
-
-
-def _one_line(error: Exception) -> str:
-    """Return the message in one line; where Hydra wraps an error of ours, the message of ours."""
+def _report(error: BaseException) -> int:
+    """Print an error in one line; where Hydra wraps an error of ours, the message of ours."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LiberoError):
         cause = cause.__cause__
-    return " ".join(str(cause or error).split())
+    who = f"rank {rank()}: " if rank() else ""
+    return ending.report(cause or error, who=who, mistakes=(HydraException, OmegaConfBaseException))

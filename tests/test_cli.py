@@ -63,7 +63,7 @@ def test_a_task_is_shown_as_bddl(capsys):
 def test_errors_are_one_line_and_a_status(argv, hint, capsys):
     assert cli.main(argv) == 2
     err = capsys.readouterr().err
-    assert err.startswith("libero: error: ") and hint in err and err.count("\n") == 1
+    assert err.startswith("error: ") and hint in err and err.count("\n") == 1
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def test_runs_as_a_process():
     command = [sys.executable, "-m", "lifelong.cli", "tasks", "show", "nope"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
-    assert done.stderr.startswith("libero: error: unknown task 'nope'") and "Traceback" not in done.stderr
+    assert done.stderr.startswith("error: unknown task 'nope'") and "Traceback" not in done.stderr
 
 
 def test_doctor_reports_what_is_broken_and_how_to_fix_it(monkeypatch, capsys):

@@ -115,7 +115,7 @@ def test_invalid_input_gives_one_line_and_a_status(argv, hint, tmp_path, monkeyp
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))
     assert cli.main(["demos", *argv]) == 2
     err = capsys.readouterr().err
-    lines = [line for line in err.splitlines() if line.startswith("libero: error:")]
+    lines = [line for line in err.splitlines() if line.startswith("error:")]
     assert len(lines) == 1 and hint in lines[0]
 
 

@@ -22,7 +22,7 @@ def register(subparsers: Subparsers) -> None:
     download.add_argument(
         "--revision", help="commit, tag or branch of the data set (default: a pinned commit)"
     )
-    download.set_defaults(run=run_download)
+    download.set_defaults(run=run_download, go_on="what is downloaded is kept; the same command goes on")
     info = commands.add_parser("info", help="print which models scenes are built from, and why")
     info.set_defaults(run=run_info)
     check = commands.add_parser("check", help="check that all files of the models exist and are unchanged")

@@ -75,7 +75,7 @@ def _register_generate(commands: Subparsers) -> None:
     )
     add("--workers", type=int, default=0, help="number of processes (default: one per core)")
     add("--folder", type=Path, help="where to keep the files (default: LIBERO_DEMOS, or in the cache)")
-    generate.set_defaults(run=run_generate)
+    generate.set_defaults(run=run_generate, go_on="what is recorded is kept; the same command goes on")
 
 
 def _register_download(commands: Subparsers) -> None:
@@ -88,7 +88,7 @@ def _register_download(commands: Subparsers) -> None:
     add("--dest", type=Path, help="folder to write (default: where demonstrations are kept)")
     add("--revision", help="commit, tag or branch of the data set (default: a pinned commit)")
     add("--overwrite", action="store_true", help="replace existing files of other contents")
-    download.set_defaults(run=run_download)
+    download.set_defaults(run=run_download, go_on="what is downloaded is kept; the same command goes on")
 
 
 def run_download(args: argparse.Namespace) -> None:

@@ -64,7 +64,7 @@ def _register_checks(commands: Subparsers) -> None:
         "--disturb", action="store_true", help="add noise to the actions, as demonstrations do"
     )
     certify.add_argument("--again", action="store_true", help="run again what is in the folder")
-    certify.set_defaults(run=run_certify)
+    certify.set_defaults(run=run_certify, go_on="what is measured is kept; the same command goes on")
     lint = commands.add_parser("lint", help="report what is wrong or doubtful in tasks, and how to fix it")
     _add_tasks(lint)
     lint.add_argument(

@@ -24,7 +24,7 @@ def register(subparsers: Subparsers) -> None:
     add("--camera", default="agentview", help="camera shown while recording (default: agentview)")
     add("--screen", default="auto", choices=("auto", "window", "terminal"), help="where it is shown")
     add_device_options(parser)
-    parser.set_defaults(run=run_teleop)
+    parser.set_defaults(run=run_teleop, go_on="what is recorded is kept; the same command goes on")
 
 
 def add_device_options(parser: argparse.ArgumentParser) -> None:

@@ -229,8 +229,7 @@ def _here(jobs: Sequence[RecordingJob], chunks: list[_Chunk]) -> _ChunkReports:
 
 def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: int) -> _ChunkReports:
     """Record as `_here` does, in a pool of processes; chunks that have begun are finished after an error."""
-    pool = spawn_pool(workers, initializer=initialize_worker)
-    try:
+    with spawn_pool(workers, initializer=initialize_worker) as pool:
         owners: dict[Future[RecordingReport], int] = {
             pool.submit(record_chunk_in_worker, jobs[j], numbers): j for j, numbers in chunks
         }
@@ -243,8 +242,6 @@ def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: i
                     if owner == j:
                         other.cancel()
             yield j, report
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _is_complete(job: RecordingJob, n: int) -> bool:

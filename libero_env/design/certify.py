@@ -200,15 +200,12 @@ def _run(
         for k, states in chunks:
             yield k, attempt(tasks[k], states, pack, disturb)
         return
-    pool = spawn_pool(jobs)
-    try:
+    with spawn_pool(jobs) as pool:
         futures: dict[Future[list[Outcome]], int] = {
             pool.submit(attempt, tasks[k], states, pack, disturb): k for k, states in chunks
         }
         for future in as_completed(futures):
             yield futures[future], future.result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> list[Outcome]:

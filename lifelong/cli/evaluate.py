@@ -2,15 +2,13 @@
 
 import argparse
 import io
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.errors import LiberoError
+from libero_env.cli import ending
 from libero_env.parallel import cpu_count
 from lifelong.errors import ConfigError
 
@@ -169,15 +167,15 @@ def run_eval(args: argparse.Namespace) -> None:
     print(HEADER, flush=True)
     helpers = argparse.Namespace(**(vars(args) | {"again": False}))
     try:
-        with _ending_politely(), policy_threads(plan), Crew(args.workers - 1, help_eval, helpers) as crew:
+        with policy_threads(plan), Crew(args.workers - 1, help_eval, helpers) as crew:
             result = Worker(
                 plan,
                 on_result=lambda row: print(table_row(row), flush=True),
                 on_progress=_print_progress,
                 on_wait=crew.tend,
             ).run()
-    except KeyboardInterrupt:
-        print(f"{plan.out} keeps what is done; the same command goes on", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        error.add_note(f"{plan.out} keeps what is done; the same command goes on")
         raise
     for row in total_rows(result.tasks):
         print(row)
@@ -196,14 +194,14 @@ def help_eval(args: argparse.Namespace) -> None:
     """Work on the evaluation that another process of this command prints; errors go to the standard error."""
     from lifelong.evaluation.worker import Worker
 
-    with suppress(KeyboardInterrupt), _ending_politely():
+    with suppress(KeyboardInterrupt), ending.interruptible():
         try:
             with redirect_stderr(io.StringIO()):  # the other process says the same
                 plan = plan_eval(args)
             with policy_threads(plan):
                 Worker(plan).run()
-        except (LiberoError, OSError) as error:
-            sys.exit(f"libero: a worker ended: {error}")
+        except Exception as error:  # noqa: BLE001 - told by kind
+            sys.exit(ending.report(error, who="a worker ended: "))
 
 
 def check_eval(args: argparse.Namespace) -> None:
@@ -301,23 +299,6 @@ def policy_threads(plan: "SuiteEvaluation") -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def _ending_politely() -> Iterator[None]:
-    """End at SIGTERM, which batch systems send, as at Ctrl-C: what was claimed is given back."""
-
-    def end(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _print_progress(progress: object) -> None:

@@ -1,17 +1,15 @@
 """The `libero` command. Each subcommand is a small function that imports what it needs when it runs."""
 
 import argparse
-import os
+import io
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from libero_env.cli import assets, demos, objects, tasks, teleop
+from libero_env.cli import assets, demos, ending, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
-from libero_env.errors import LiberoError
 from lifelong.cli import compare, evaluate, protocols, serve
-from lifelong.errors import LifelongError
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -34,14 +32,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: The words after `libero`. None: those of this process.
 
     Returns:
-        The exit status: 0, 1 where the command found a fault, 2 after an error, which is printed in one line.
+        The exit status, see `libero_env.cli.ending`.
     """
-    try:
-        status = _run(list(sys.argv[1:] if argv is None else argv))
-        sys.stdout.flush()
-    except BrokenPipeError:  # the reader, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to be flushed
-        return 141  # as of a process that SIGPIPE ends
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names of files need not be text
+            stream.reconfigure(errors="backslashreplace")
+    with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+        try:
+            status = _run(words)
+            sys.stdout.flush()
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - told by kind
+            return ending.report(error)
     return status
 
 
@@ -49,27 +50,29 @@ def _run(words: list[str]) -> int:
     if words[:1] == ["train"] and not {"-h", "--help"} & set(words):
         return run_train(words[1:])  # Hydra reads the rest: options in any place, overrides
     args = build_parser().parse_args(words)
-    try:
-        return args.run(args) or 0
-    except BrokenPipeError:
-        raise
-    except (LiberoError, LifelongError, OSError) as error:
-        print(f"libero: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("libero: interrupted", file=sys.stderr)
-        return 130
+    with ending.interruptible():
+        try:
+            return args.run(args) or 0
+        except KeyboardInterrupt as error:
+            if hint := getattr(args, "go_on", ""):
+                error.add_note(hint)
+            raise
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that prints its help where a command is missing."""
+    """A parser that tells an error in one line, and prints its help where a command is missing."""
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        # read before the words come here: it may stand anywhere
+        self.add_argument(ending.DEBUG, action="store_true", help="show the traceback of every error")
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong, or the commands there are, and exit."""
         if message.endswith((": COMMAND", ": ACTION")):
             self.print_help(sys.stderr)
-            self.exit(2)
-        super().error(message)
+            self.exit(ending.MISTAKE)
+        self.exit(ending.MISTAKE, f"error: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -105,7 +108,7 @@ def run_train(words: Sequence[str]) -> int:
         if error.name not in ("hydra", "jinja2", "matplotlib", "omegaconf", "safetensors", "torch"):
             raise
         print(f"error: {error.name} is not installed: pip install 'libero-lifelong[train]'", file=sys.stderr)
-        return 1
+        return ending.MISTAKE
     return launch(words)
 
 

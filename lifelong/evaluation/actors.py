@@ -1,5 +1,6 @@
 """Actors of rollouts: a policy of this package, or any object that answers observations with actions."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -8,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from libero_env.errors import code_of
 from lifelong.errors import MissingObservationError, PolicyError
 from lifelong.evaluation.inputs import Adapter, Obs, PolicyInput
 from lifelong.policies.base import Policy
@@ -142,7 +144,8 @@ class CallableActor:
     def reset(self, num_envs: int) -> None:
         """Call the object's `reset`, if it has one; see `Actor`."""
         if hasattr(self.policy, "reset"):
-            self.policy.reset(self.instruction, num_envs)
+            with code_of(f"the policy's {_name(self.policy, 'reset')}"):
+                self.policy.reset(self.instruction, num_envs)
 
     def act(self, obs: Obs) -> np.ndarray:
         """Return the object's actions; see `Actor`.
@@ -151,10 +154,11 @@ class CallableActor:
             PolicyError: The actions have the wrong shape, or are not finite.
         """
         given = as_original(obs) if self.original else obs
-        answer = self.policy.predict(Observations(given, instruction=self.instruction))
-        actions = _as_array(answer)
+        name = _name(self.policy, "predict")
+        with code_of(f"the policy's {name}"):
+            answer = self.policy.predict(Observations(given, instruction=self.instruction))
+        actions = _as_array(answer, name)
         expected = (len(next(iter(obs.values()))), self.action_dim)
-        name = f"{type(self.policy).__name__}.predict"
         if actions.shape != expected:
             raise PolicyError(f"{name} returned actions of shape {actions.shape}; expected {expected}")
         if not np.isfinite(actions).all():
@@ -199,7 +203,8 @@ class ProtocolActor:
         if not self._waiting:
             inputs = self.adapter.inputs(obs)
             if self._reset_policy and hasattr(self.policy, "reset"):
-                self.policy.reset(inputs[0].prompt, self._num_envs)
+                with code_of(f"the policy's {_name(self.policy, 'reset')}"):
+                    self.policy.reset(inputs[0].prompt, self._num_envs)
             self._reset_policy = False
             self._waiting = self._predict(inputs)
         return self._waiting.pop(0)
@@ -215,7 +220,10 @@ class ProtocolActor:
         given = Observations(
             images, state=np.stack([one.state for one in inputs]), instruction=inputs[0].prompt
         )
-        found, name = _as_array(self.policy.predict(given)), f"{type(self.policy).__name__}.predict"
+        name = _name(self.policy, "predict")
+        with code_of(f"the policy's {name}"):
+            answer = self.policy.predict(given)
+        found = _as_array(answer, name)
         chunks = found[:, None] if found.ndim == 2 else found
         if chunks.ndim != 3 or chunks.shape[::2] != (len(inputs), self.action_dim):
             raise PolicyError(
@@ -230,8 +238,19 @@ class ProtocolActor:
         return list(self.adapter.actions(chunks[:, :count]).swapaxes(0, 1))
 
 
-def _as_array(answer: Any) -> np.ndarray:
-    return np.asarray(answer.detach().cpu() if isinstance(answer, Tensor) else answer, np.float64)
+def _name(policy: Any, method: str) -> str:
+    return f"{type(policy).__name__}.{method}"
+
+
+def _as_array(answer: Any, name: str) -> np.ndarray:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", np.exceptions.ComplexWarning)
+            return np.asarray(answer.detach().cpu() if isinstance(answer, Tensor) else answer, np.float64)
+    except (TypeError, ValueError, np.exceptions.ComplexWarning) as error:
+        raise PolicyError(
+            f"{name} returned a {type(answer).__name__} that is no array of numbers ({error})"
+        ) from None
 
 
 def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) -> Observation:

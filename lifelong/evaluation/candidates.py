@@ -9,11 +9,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Annotated, Any
 
+from pydantic import Field
+
+from libero_env.errors import code_of
 from libero_env.tasks import Task
+from libero_env.validation import validate
 from lifelong.data.settings import CAMERAS
-from lifelong.errors import LifelongError
+from lifelong.errors import LifelongError, PolicyError
 from lifelong.evaluation.actors import Actor, CallableActor, PolicyActor, ProtocolActor
 from lifelong.evaluation.adapter import CardAdapter
 from lifelong.evaluation.card import Card
@@ -23,7 +28,10 @@ from lifelong.evaluation.protocols import SELECTION
 from lifelong.evaluation.restore import restore
 from lifelong.seeding import generator
 
+_WRITE = "write module:function, such as my_policy:make"
 ROLLOUT = 4  # first word of the seeds of stochastic policies; those of runs are in lifelong.sequence
+
+_Side = Annotated[int, Field(ge=1, le=4096)]  # pixels
 
 
 class PolicyUnderTest(ABC):
@@ -108,8 +116,8 @@ class UserPolicy(PolicyUnderTest):
     def __init__(self, args: argparse.Namespace):
 
         self.args, self.policy = args, load_callable(args.policy)
-        self.cameras = tuple(getattr(self.policy, "cameras", ("agentview", "robot0_eye_in_hand")))
-        own = getattr(self.policy, "identity", {})
+        self.cameras = self._own("cameras", tuple[str, ...], ("agentview", "robot0_eye_in_hand"))
+        own = self._own("identity", dict[str, Any], {})
         self.identity = {"policy": args.policy, "source": source_digest(args.policy), **own}
         if args.names is not None:
             self.identity |= {"names": args.names}
@@ -118,7 +126,7 @@ class UserPolicy(PolicyUnderTest):
 
     def protocol(self, base: Card) -> Card:
         """Return the protocol with the policy's own image size, if it has one; see `PolicyUnderTest`."""
-        size = getattr(self.policy, "camera_size", None)
+        size = self._own("camera_size", tuple[_Side, _Side] | None, None)
         if self.args.size:
             size = (self.args.size, self.args.size)
         return base if size is None else base.changed({"pixels.render_size": tuple(size)})
@@ -130,10 +138,19 @@ class UserPolicy(PolicyUnderTest):
             count,
             protocol,
             cameras=self.cameras,
-            observations=tuple(getattr(self.policy, "observations", OBSERVATIONS)),
+            observations=self._own("observations", tuple[str, ...], OBSERVATIONS),
             threads=self.args.threads,
             assets=self.args.assets,
         )
+
+    def _own(self, name: str, kind: Any, default: Any) -> Any:
+        """Return an attribute of the policy, or the default where it has none.
+
+        Raises:
+            PolicyError: It is of another kind.
+        """
+        value = getattr(self.policy, name, default)
+        return validate(kind, value, prefix=(f"the policy's {name}",), error=PolicyError)
 
     @contextmanager
     def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
@@ -158,18 +175,34 @@ def load_callable(text: str) -> Any:
     if added:
         sys.path.insert(0, folder)
     try:
-        make = getattr(importlib.import_module(module), name)
-    except (ModuleNotFoundError, AttributeError) as error:
-        raise LifelongError(f"{text}: {error}; write module:function, such as my_policy:make") from error
+        with code_of(f"the module {module}"):
+            make = getattr(_imported(module, text), name, None)
+        if not callable(make):
+            what = "has no function" if make is None else f"has a {type(make).__name__}, not a function,"
+            raise LifelongError(f"{text}: module {module} {what} {name}; {_WRITE}")
+        with code_of(f"{text}()"):
+            policy = make()
     finally:
         if added:
             sys.path.remove(folder)
-    policy = make()
     if not callable(getattr(policy, "predict", None)):
         raise LifelongError(
             f"{text}() returns a {type(policy).__name__} without predict(observations) -> (B, 7) actions"
         )
     return policy
+
+
+def _imported(module: str, text: str) -> ModuleType:
+    """Return a module; one that it imports itself and that does not exist is an error of its own."""
+    parts = module.split(".")
+    if not all(part.isidentifier() for part in parts):
+        raise LifelongError(f"{text}: {module!r} is no name of a module; {_WRITE}")
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in {".".join(parts[: i + 1]) for i in range(len(parts))}:
+            raise
+        raise LifelongError(f"{text}: {error}; {_WRITE}") from error
 
 
 def source_digest(text: str) -> str | None:

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import sys
+import time
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -62,6 +63,10 @@ class Crew:
             if kind is None:
                 process.join(PATIENCE)
             process.terminate()
+        end = time.monotonic() + PATIENCE
+        for process in self._processes:
+            process.join(max(0.0, end - time.monotonic()))
+            process.kill()
             process.join()
 
     def _start(self) -> BaseProcess:

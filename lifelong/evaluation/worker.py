@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, printable
 from lifelong.errors import ConnectionLost, EvaluationIncompleteError
 from lifelong.evaluation.claims import Claim
 from lifelong.evaluation.progress import Progress, measure_progress
@@ -37,7 +37,7 @@ class Worker:
         *,
         on_result: Callable[[TaskResult], None] = lambda _: None,
         on_progress: Callable[[Progress], None] = lambda _: None,
-        on_error: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
+        on_error: Callable[[str], None] = lambda text: print(printable(text), file=sys.stderr, flush=True),
         on_wait: Callable[[int], None] = lambda _: None,
     ):
         self._evaluation, self._folder = evaluation, evaluation.folder

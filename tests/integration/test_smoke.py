@@ -122,7 +122,7 @@ def test_another_configuration_in_the_same_directory_is_refused(home, tmp_path):
     finish(start(home, tmp_path, *TINY, "benchmark.tasks=1"))
     process = start(home, tmp_path, *TINY, "benchmark.tasks=1", "train.lr=0.5")
     output, _ = process.communicate(timeout=300)
-    assert process.returncode == 1
+    assert process.returncode == 2
     assert "train.lr 0.003 -> 0.5" in output and "run_id=" in output and "Traceback" not in output
 
 
@@ -162,7 +162,7 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
 def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, message):
     process = start(home, tmp_path, "preset=smoke", "benchmark=libero_object", override)
     output, _ = process.communicate(timeout=300)
-    assert process.returncode == 1
+    assert process.returncode == 2
     assert message in output and "Traceback" not in output
     assert len(output.strip().splitlines()) == 1, output
     assert not list(tmp_path.rglob("config.yaml")), "nothing stands in the way of the mended command"

@@ -64,7 +64,7 @@ def test_streams_from_the_command_line(tmp_path):
     assert all(torch.equal(weights[name], kept[name]) for name in weights)
 
     status, output = train(tmp_path, "algo=sequential", "init_from=nowhere", "run_id=none")
-    assert status == 1 and "no checkpoint at nowhere" in output
+    assert status == 2 and "no checkpoint at nowhere" in output
     assert not (
         tmp_path / "runs" / "libero_object" / "sequential" / "bc_transformer_small_seed1_none"
     ).exists()

@@ -47,7 +47,7 @@ def here(tmp_path, monkeypatch) -> Path:
 )
 def test_a_mistyped_override_is_one_line(word, message, here, capsys):
     (here / "demos").mkdir()
-    assert main(["train", "preset=smoke", word]) == 1
+    assert main(["train", "preset=smoke", word]) == 2
     found = capsys.readouterr().err
     assert found.startswith(message) and found.count("\n") == 1
     assert not list(here.rglob("results.jsonl")), "no run has begun"

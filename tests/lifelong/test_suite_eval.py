@@ -267,7 +267,7 @@ def test_at_sigterm_a_unit_is_given_back_and_the_same_command_goes_on(module, tm
         return np.zeros((1, 7))
 
     monkeypatch.setattr(type(policy), "predict", predict)
-    assert cli.main(command) == 130
+    assert cli.main(command) == 143
     assert "found keeps what is done; the same command goes on" in capsys.readouterr().err
     assert not list((tmp_path / "found" / "claims").iterdir())
     assert len(list((tmp_path / "found" / "units").iterdir())) == 1

@@ -1,0 +1,202 @@
+"""How a command ends: one line for what its user did wrong, a traceback for a fault of this package, and a status.
+
+| status | meaning |
+|---|---|
+| 0 | it did what was asked |
+| 1 | it found something broken or missing, which is its result |
+| 2 | it was asked for something that is not valid, or a policy or another part of the user's raised an error |
+| 70 | this package has a fault: a traceback, and a request to report it |
+| 128 + n | signal n ended it: 129 SIGHUP, 130 SIGINT (Ctrl-C), 141 SIGPIPE, 143 SIGTERM |
+
+`--debug`, or the environment variable `LIBERO_DEBUG=1`, which worker processes inherit, shows every traceback.
+"""
+
+import errno
+import os
+import shlex
+import signal
+import sys
+import sysconfig
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from libero_env.errors import RAISED_BY, LiberoError, printable
+
+MISTAKE, DEFECT, SIGNALLED = 2, 70, 128
+DEBUG, VARIABLE = "--debug", "LIBERO_DEBUG"
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+_MAX_FRAMES = 12  # of the user's code in a message
+_ROOTS = [str(Path(__file__).parents[2] / name) + os.sep for name in ("libero_env", "lifelong", "libero")]
+_INSTALLED = [sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+# what a machine refuses; other errors of the operating system are unexpected
+_REFUSALS = {
+    getattr(errno, name)
+    for name in (
+        *("EACCES", "EADDRINUSE", "EADDRNOTAVAIL", "EBUSY", "ECONNREFUSED", "ECONNRESET", "EDQUOT", "EEXIST"),
+        *("EFBIG", "EHOSTUNREACH", "EIO", "EISDIR", "ELOOP", "EMFILE", "ENAMETOOLONG", "ENETUNREACH"),
+        *("ENFILE", "ENODEV", "ENOENT", "ENOLCK", "ENOMEM", "ENOSPC", "ENOTDIR", "ENOTEMPTY", "ENXIO"),
+        *("EPERM", "EROFS", "ESTALE", "ETIMEDOUT", "ETXTBSY"),
+    )
+    if hasattr(errno, name)
+}
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that asks this process to end; its notes say how to go on.
+
+    Args:
+        number: Number of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise `Interrupted` at the first of SIGINT, SIGTERM and SIGHUP; the second one ends the process at once.
+
+    A signal that is ignored, as SIGHUP under `nohup`, stays so. In other threads than the main one nothing changes.
+    """
+    before: dict[int, Callable[[int, FrameType | None], object] | int] = {}
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for one in before:
+            signal.signal(one, signal.SIG_DFL)
+        raise Interrupted(number)
+
+    if threading.current_thread() is threading.main_thread():
+        for number in (getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)):
+            handler = signal.getsignal(number)
+            if handler is not None and handler is not signal.SIG_IGN:
+                before[number] = handler
+                signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def debugging(words: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the words of a command line without `--debug`, which counts for this command and its processes."""
+    rest = [word for word in words if word != DEBUG]
+    before = os.environ.get(VARIABLE)
+    if len(rest) < len(words):
+        os.environ[VARIABLE] = "1"
+    try:
+        yield rest
+    finally:
+        if before is None:
+            os.environ.pop(VARIABLE, None)
+        else:
+            os.environ[VARIABLE] = before
+
+
+def is_debugging() -> bool:
+    """Return whether every traceback is shown."""
+    return os.environ.get(VARIABLE, "0") not in ("", "0")
+
+
+def report(error: BaseException, *, who: str = "", mistakes: tuple[type[BaseException], ...] = ()) -> int:
+    """Print on the standard error why a command ends, and return its exit status.
+
+    Args:
+        error: What ended it.
+        who: Which of several processes this is, before the message; empty for the only one.
+        mistakes: Errors of other packages that tell what their user did wrong.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        number = getattr(error, "number", signal.SIGINT)
+        by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"
+        _say("; ".join([f"{who}interrupted{by}", *getattr(error, "__notes__", ())]))
+        return SIGNALLED + number
+    if isinstance(error, BrokenPipeError):  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to be flushed
+        return SIGNALLED + signal.SIGPIPE
+    if is_debugging():
+        traceback.print_exception(error)
+    if isinstance(error, LiberoError):
+        _say(f"error: {who}{str(error).strip()}")
+    elif (told := _raised_by_user(error)) is not None:
+        _say(f"error: {who}{told}")
+    elif isinstance(error, mistakes):
+        _say(f"error: {who}{' '.join(str(error).split())}")
+    elif (lack := _lack(error)) is not None:
+        _say(f"error: {who}{lack}")
+    else:
+        if not is_debugging():
+            traceback.print_exception(error)
+        _say(f"error: {who}{_request()}")
+        return DEFECT
+    return MISTAKE
+
+
+def _say(text: str) -> None:
+    print(printable(text), file=sys.stderr, flush=True)
+
+
+def _lack(error: BaseException) -> str | None:
+    """Return what the machine refused or lacks; None if it is not that."""
+    if isinstance(error, OSError) and error.errno in _REFUSALS:
+        names = [str(name) for name in (error.filename, error.filename2) if name is not None]
+        return ": ".join([" and ".join(names), error.strerror or str(error)] if names else [str(error)])
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):  # the latter is PyTorch's
+        return f"not enough memory ({str(error).strip() or type(error).__name__}); ask for less at a time"
+    if type(error).__name__ == "OutOfMemoryError":
+        return f"not enough memory of the GPU ({str(error).partition('. ')[0]}); ask for less at a time"
+    return None
+
+
+def _raised_by_user(error: BaseException) -> str | None:
+    """Return where code of the user raised an error; None where no such code had a part in it."""
+    link: BaseException | None = error
+    while link is not None:
+        frames = traceback.extract_tb(link.__traceback__)
+        ours = [i for i, frame in enumerate(frames) if _is_below(frame.filename, _ROOTS)]
+        called = frames[ours[0] + 1 :] if ours else []
+        own = [frame for frame in called if _is_user_file(frame.filename)]
+        notes = [n for n in getattr(link, "__notes__", ()) if n.startswith(RAISED_BY)]
+        syntax = isinstance(link, SyntaxError) and _is_user_file(link.filename or "<>")
+        if own or notes or syntax:
+            shown = own or (frames[ours[-1] + 1 :] if ours else [])
+            lines = "".join(traceback.format_list(shown[-_MAX_FRAMES:])).rstrip()
+            text = "".join(traceback.format_exception_only(_without_notes(link))).strip()
+            culprit = notes[0].removeprefix(RAISED_BY) if notes else "code of yours"
+            more = "" if is_debugging() else "(--debug shows the whole traceback)"
+            return "\n".join(part for part in (f"{culprit} raised {text}", lines, more) if part)
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+    return None
+
+
+def _without_notes(error: BaseException) -> BaseException:
+    notes = getattr(error, "__notes__", None)
+    if notes:
+        notes[:] = [note for note in notes if not note.startswith(RAISED_BY)]
+    return error
+
+
+def _is_user_file(name: str) -> bool:
+    """Return whether a file belongs to neither this package, nor Python, nor an installed package."""
+    if name.startswith("<") or {"site-packages", "dist-packages"} & set(Path(name).parts):
+        return False
+    return not _is_below(name, [*_ROOTS, *_INSTALLED])
+
+
+def _is_below(name: str, folders: Sequence[str]) -> bool:
+    return os.path.abspath(name).startswith(tuple(folders))
+
+
+def _request() -> str:
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return (
+        "this is a fault of libero-lifelong, not of its user. Please report it to those you have the package\n"
+        f"from, with the traceback above, the command ({command}) and what `libero doctor` prints.\n"
+        "What was finished before is kept."
+    )

@@ -1,0 +1,327 @@
+"""How commands end: whose fault an error is, which status it gives, and what signals leave behind."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from libero_env.cli import ending
+from libero_env.errors import LiberoError, code_of
+from libero_env.parallel import spawn_pool
+from lifelong import launch
+from lifelong.cli import main as cli
+
+ROOT = Path(__file__).parents[1]
+PATIENCE = 60.0  # s; for a process to start or to end
+
+POLICY = """
+import time
+import numpy as np
+
+class Policy:
+    cameras, camera_size = ("agentview",), (16, 16)
+
+    def __init__(self, act):
+        self.act = act
+
+    def predict(self, observations):
+        return self.act(observations)
+
+def zeros(observations):
+    return np.zeros((len(observations["agentview_rgb"]), 7))
+
+def fails(observations):
+    raise ValueError("no such weights\\x1b[2J")
+
+def slow(observations):
+    open("started", "a").close()
+    time.sleep(0.2)
+    return zeros(observations)
+
+def make():
+    return Policy(zeros)
+
+def failing():
+    return Policy(fails)
+
+def waiting():
+    return Policy(slow)
+
+def texts():
+    return Policy(lambda observations: [["a"] * 7])
+
+def nothing():
+    return None
+
+def without_weights():
+    raise FileNotFoundError(2, "No such file or directory", "weights.bin")
+
+def misshapen():
+    policy = Policy(zeros)
+    policy.cameras = 5
+    return policy
+
+number = 5
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv(ending.VARIABLE, raising=False)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    Path("ending_policy.py").write_text(POLICY)
+    Path("ending_broken.py").write_text("def make(:\n")
+    Path("ending_lacking.py").write_text("import a_package_that_is_not_there\n")
+    yield tmp_path
+    for name in [name for name in sys.modules if name.startswith("ending_")]:
+        del sys.modules[name]
+
+
+@pytest.mark.unit
+def test_a_fault_of_ours_is_a_traceback_and_a_request(monkeypatch, capsys):
+    monkeypatch.setattr("libero_env.cli.tasks.run_tasks_show", int)  # TypeError, of none of the user's code
+    assert cli.main(["tasks", "show", "libero_goal/0"]) == ending.DEFECT
+    found = capsys.readouterr().err
+    assert found.startswith("Traceback") and "TypeError" in found
+    assert "fault of libero-lifelong" in found and "libero doctor" in found
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC, errno.EROFS, errno.EMFILE])
+def test_what_the_system_refuses_is_one_line(number, monkeypatch, capsys):
+    error = OSError(number, os.strerror(number), "some/file")
+    assert ending.report(error) == ending.MISTAKE
+    assert capsys.readouterr().err == f"error: some/file: {os.strerror(number)}\n"
+
+
+@pytest.mark.unit
+def test_errors_by_kind(capsys):
+    assert ending.report(MemoryError("Unable to allocate 7.45 TiB")) == ending.MISTAKE
+    assert "not enough memory (Unable to allocate 7.45 TiB)" in capsys.readouterr().err
+    assert ending.report(OSError("no number")) == ending.DEFECT
+    assert ending.report(RecursionError("deep")) == ending.DEFECT
+    capsys.readouterr()
+    assert (
+        ending.report(LiberoError("bad name '\x1b]0;title\x07\u202eabc'"), who="rank 1: ") == ending.MISTAKE
+    )
+    found = capsys.readouterr().err
+    assert found == "error: rank 1: bad name '\\x1b]0;title\\x07\\u202eabc'\n", (
+        "a terminal obeys nothing of it"
+    )
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("ending_nowhere:make", "No module named 'ending_nowhere'; write module:function"),
+        ("ending_policy:missing", "module ending_policy has no function missing"),
+        ("ending_policy:number", "module ending_policy has a int, not a function, number"),
+        ("ending_policy:nothing", "returns a NoneType without predict"),
+        ("ending_policy:misshapen", "the policy's cameras is 5; expected a list"),
+        (
+            "ending_policy:without_weights",
+            "ending_policy:without_weights() raised FileNotFoundError: [Errno 2]",
+        ),
+        ("ending_broken:make", "the module ending_broken raised File"),
+        (
+            "ending_lacking:make",
+            "the module ending_lacking raised ModuleNotFoundError: No module named 'a_package",
+        ),
+        (":", "'' is no name of a module"),
+        ("a\0b:c", "is no name of a module"),
+    ],
+)
+def test_a_policy_that_cannot_be_made_is_the_users(policy, message, here, capsys):
+    assert cli.main(["eval", policy, "--suite", "libero_object/0"]) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert found.startswith("error: ") and message in found and "lifelong/" not in found, found
+
+
+@pytest.mark.sim
+def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
+    command = [
+        "eval",
+        "ending_policy:failing",
+        "--suite",
+        "libero_object/0",
+        "--episodes",
+        "1",
+        "--horizon",
+        "2",
+    ]
+    assert cli.main(command) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert "error: the policy's Policy.predict raised ValueError: no such weights\\x1b[2J\n" in found
+    assert f'File "{here}/ending_policy.py", line 18, in fails\n    raise ValueError(' in found
+    assert "lifelong/" not in found and "fault of libero-lifelong" not in found and "\x1b" not in found
+    assert cli.main(["--debug", *command, "--again"]) == ending.MISTAKE
+    assert "lifelong/evaluation/actors.py" in capsys.readouterr().err
+    assert ending.VARIABLE not in os.environ
+    command[1] = "ending_policy:texts"
+    assert cli.main(command) == ending.MISTAKE
+    assert "error: Policy.predict returned a list that is no array of numbers" in capsys.readouterr().err
+
+
+@pytest.mark.unit
+def test_an_error_keeps_its_type_where_it_is_caught():
+    with pytest.raises(ValueError, match="mine") as found, code_of("the policy"):
+        raise ValueError("mine")
+    assert found.value.__notes__ == ["raised by the policy"]
+    with pytest.raises(LiberoError) as ours, code_of("the policy"):
+        raise LiberoError("ours")
+    assert not hasattr(ours.value, "__notes__")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    "words", [["--debug", "tasks", "show", "nope"], ["tasks", "show", "nope", "--debug"]]
+)
+def test_debug_shows_the_traceback_of_a_mistake(words, here, capsys):
+    assert cli.main(words) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert found.startswith("Traceback") and "\nerror: unknown task 'nope'" in found
+
+
+@pytest.mark.unit
+def test_debug_reaches_train(here, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    assert launch.main(["preset=smoke", "--debug", "algo=evc"]) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert found.startswith("Traceback") and "\nerror: unknown algo 'evc'" in found
+    monkeypatch.setenv(ending.VARIABLE, "1")
+    assert launch.main(["preset=smoke", "algo=evc"]) == ending.MISTAKE
+    assert capsys.readouterr().err.startswith("Traceback")
+
+
+@pytest.mark.unit
+def test_mistyped_options_are_one_line(capsys):
+    for words in (["eval", "--sise", "3"], ["tasks", "list", "--order", "x"], ["nope"]):
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(words)
+        found = capsys.readouterr().err
+        assert found.startswith("error: ") and found.count("\n") == 1 and "--help" in found
+
+
+@pytest.mark.unit
+def test_signals_interrupt_once_and_keep_what_is_ignored():
+    def handlers() -> list[object]:
+        return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+
+    before = handlers()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        with pytest.raises(KeyboardInterrupt) as found, ending.interruptible():
+            try:
+                signal.raise_signal(number)
+            finally:
+                assert handlers() == [signal.SIG_DFL] * 3, "a second signal ends the process"
+        assert ending.report(found.value) == 128 + number
+    assert handlers() == before
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ending.interruptible():
+            signal.raise_signal(signal.SIGHUP)  # as under nohup
+    finally:
+        signal.signal(signal.SIGHUP, before[2])
+
+
+@pytest.mark.unit
+def test_a_killed_worker_is_told():
+    with (
+        pytest.raises(LiberoError, match="a worker process was killed.*The same command goes on"),
+        spawn_pool(1) as pool,
+    ):
+        pool.submit(os._exit, 1).result()
+
+
+def started(words: list[str], folder: Path, ready: Callable[[int], bool]) -> subprocess.Popen:
+    """A process of `libero`, as soon as it is ready, by its number."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "lifelong.cli", *words]
+    process = subprocess.Popen(command, cwd=folder, env=env, stderr=subprocess.PIPE, text=True)
+    assert within(lambda: ready(process.pid) or process.poll() is not None) and process.poll() is None
+    return process
+
+
+def within(true: Callable[[], bool]) -> bool:
+    """Whether something is true soon."""
+    end = time.monotonic() + PATIENCE
+    while not true() and time.monotonic() < end:
+        time.sleep(0.02)
+    return true()
+
+
+def descendants(pid: int) -> set[int]:
+    """Numbers of the processes that a process has started."""
+    children = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), set()).add(
+                int(stat.parent.name)
+            )
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    found, new = set(), {pid}
+    while new:
+        new = {child for parent in new for child in children.get(parent, ())}
+        found |= new
+    return found
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+EVALUATION = [
+    "eval",
+    "ending_policy:waiting",
+    "--suite",
+    "libero_object/0",
+    "--unit-starts",
+    "1",
+    "--workers",
+    "2",
+]
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
+def test_a_signal_ends_an_evaluation_and_its_workers(name, here):
+    process = started(EVALUATION, here, lambda _: (here / "started").exists())
+    workers = descendants(process.pid)
+    assert workers
+    process.send_signal(number := getattr(signal, name))
+    _, told = process.communicate(timeout=PATIENCE)
+    assert within(lambda: not any(map(is_running, workers))), "no process is left"
+    if name == "SIGKILL":
+        return
+    assert process.returncode == 128 + number
+    assert (
+        f"interrupted by {name}; eval/ending_policy.waiting keeps what is done; the same command goes on"
+        in told
+    )
+    assert "Traceback" not in told and not list(here.rglob("claims/*.json"))
+
+
+@pytest.mark.sim
+def test_sighup_ends_a_recording_and_its_workers(here):
+    words = ["demos", "generate", "--task", "libero_goal/7", "--n", "40", "--workers", "2", "--size", "16"]
+    process = started([*words, "--folder", "kept"], here, lambda pid: len(descendants(pid)) > 2)
+    workers = descendants(process.pid)
+    process.send_signal(signal.SIGHUP)
+    _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 129
+    assert "interrupted by SIGHUP; what is recorded is kept; the same command goes on" in told
+    assert "Traceback" not in told
+    assert within(lambda: not any(map(is_running, workers)))
