@@ -54,6 +54,10 @@ class ClosedEnvironmentError(LiberoError):
     """An environment is used after `close`; make another."""
 
 
+class BrokenFileError(LiberoError, ValueError):
+    """A file of the package or of its cache that is damaged; the message names it."""
+
+
 class BDDLError(LiberoError, ValueError):
     """A task file that cannot be read; the message starts with file:line."""
 

@@ -2,24 +2,33 @@
 
 import os
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from libero_env.errors import LiberoError
+from libero_env.validation import read_yaml_file, validate
+
+_KEYS = ("benchmark_root", "bddl_files", "init_states", "datasets", "assets", "objects", "robot")
 
 
 def cache_dir() -> Path:
-    """Return `$LIBERO_CACHE`, or by default `libero` in the user's cache folder."""
+    """Return `$LIBERO_CACHE`, or by default `libero` in the user's cache folder; an absolute path.
+
+    Raises:
+        LiberoError: The user has no home folder.
+    """
     if path := os.environ.get("LIBERO_CACHE"):
-        return Path(path).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "libero"
+        return _absolute(path, "LIBERO_CACHE")
+    found = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(found) if os.path.isabs(found) else _absolute("~/.cache", "LIBERO_CACHE")) / "libero"
 
 
 def demos_dir() -> Path:
-    """Return `$LIBERO_DEMOS`, or by default `demos` in the cache folder."""
+    """Return `$LIBERO_DEMOS`, or by default `demos` in the cache folder; an absolute path.
+
+    Raises:
+        LiberoError: As `cache_dir`.
+    """
     if path := os.environ.get("LIBERO_DEMOS"):
-        return Path(path).expanduser()
+        return _absolute(path, "LIBERO_DEMOS")
     return cache_dir() / "demos"
 
 
@@ -32,28 +41,41 @@ def objects_dir() -> Path:
         LiberoError: As `read_config`.
     """
     path = os.environ.get("LIBERO_OBJECTS") or read_config().get("objects")
-    return Path(str(path)).expanduser() if path else config_file().parent / "objects"
+    return _absolute(str(path), "LIBERO_OBJECTS") if path else config_file().parent / "objects"
 
 
 def config_file() -> Path:
-    """Return `config.yaml` in `$LIBERO_CONFIG_PATH` or by default in `~/.libero`; the file need not exist."""
-    folder = os.environ.get("LIBERO_CONFIG_PATH")
-    return (Path(folder).expanduser() if folder else Path.home() / ".libero") / "config.yaml"
-
-
-def read_config() -> dict[str, Any]:
-    """Return the content of the configuration file, empty if there is none.
+    """Return `config.yaml` in `$LIBERO_CONFIG_PATH` or by default in `~/.libero`; the file need not exist.
 
     Raises:
-        LiberoError: The file is not valid YAML, or is no mapping.
+        LiberoError: The user has no home folder.
+    """
+    folder = os.environ.get("LIBERO_CONFIG_PATH") or "~/.libero"
+    return _absolute(folder, "LIBERO_CONFIG_PATH") / "config.yaml"
+
+
+def read_config() -> dict[str, str]:
+    """Return the paths in the configuration file, empty if there is none; keys without a value are left out.
+
+    Keys that this package does not use may have any value.
+
+    Raises:
+        LiberoError: The file is not valid YAML, has no keys, or a value that is no text.
     """
     path = config_file()
     if not path.is_file():
         return {}
+    found = read_yaml_file(path)
+    data = {} if found.data is None else found.data
+    if isinstance(data, dict):
+        data = {key: value for key, value in data.items() if key in _KEYS}
+    paths = validate(dict[str, str | None], data, source=found.source, line_of=found.line_of)
+    return {key: value for key, value in paths.items() if value}
+
+
+def _absolute(path: str, variable: str) -> Path:
+    """Return a path with the home folder in place of `~`, relative to the working directory."""
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        raise LiberoError(f"{path} is not valid YAML ({error}); fix or remove it") from error
-    if not isinstance(found, dict):
-        raise LiberoError(f"{path}: expected keys with values such as `assets: PATH`; fix or remove it")
-    return found
+        return Path(path).expanduser().absolute()
+    except RuntimeError as error:
+        raise LiberoError(f"{path}: {error}; set {variable} to a folder") from None

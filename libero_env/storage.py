@@ -1,10 +1,20 @@
-"""Reading and writing of files: YAML, and files that are replaced in one step."""
+"""Reading and writing of files: YAML, files that are replaced in one step, arrays and caches of them with checksums."""
 
+import hashlib
+import io
+import json
+import logging
+import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,6 +22,19 @@ from typing import Any
 import numpy as np
 import yaml
 
+from libero_env.errors import BrokenFileError, LiberoError
+
+Arrays = dict[str, np.ndarray]
+
+MAX_ARRAYS_BYTES = 1 << 30  # of a file of arrays, and of its arrays in memory
+_MAX_RECORD_BYTES = 64 << 20
+_SEAL = b"sha256:"  # 64 hexadecimal digits follow: the comment of the zip, which is the end of the file
+_SEAL_BYTES = len(_SEAL) + 64
+_ARRAY_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+    *(EOFError, KeyError, NotImplementedError, OverflowError, RuntimeError, ValueError, UserWarning),
+)
+_log = logging.getLogger(__name__)
 PART_SUFFIX = ".part"  # of files and folders that are not yet complete
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
 
@@ -101,10 +124,214 @@ def create_text(target: Path, text: str) -> bool:
         temporary.unlink(missing_ok=True)
 
 
-def atomic_write_npz(target: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays to a compressed npz file in one step; see `atomic_path`."""
-    with atomic_path(target) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
+def atomic_write_npz(target: Path, arrays: Mapping[str, Any], *, fsync: bool = False) -> None:
+    """Write arrays to a compressed npz file in one step; see `atomic_path`.
+
+    The file ends with the SHA-256 of all before it, as the comment of the zip, which `np.load` ignores. It is never
+    writable by others than its owner.
+    """
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    content = bytearray(stream.getvalue())
+    content[-2:] = _SEAL_BYTES.to_bytes(2, "little")  # length of the comment
+    seal = _SEAL + hashlib.sha256(content).hexdigest().encode()
+    with (
+        atomic_path(target, fsync=fsync) as temporary,
+        open(temporary, "wb", opener=_open_for_owner) as file,
+    ):
+        file.write(content)
+        file.write(seal)
+
+
+def _open_for_owner(path: str, flags: int) -> int:
+    """Open a new file that others may read at most, whatever the user's mask is."""
+    return os.open(path, flags, 0o644)
+
+
+def read_npz(path: Path) -> Arrays:
+    """Read the arrays of a file of `atomic_write_npz`, or of one without the checksum at its end.
+
+    Raises:
+        BrokenFileError: The checksums do not fit, or the file has something else than arrays of numbers and texts.
+        OSError: The file cannot be read.
+    """
+    return _read_npz(path)[0]
+
+
+def _read_npz(path: Path) -> tuple[Arrays, bool]:
+    """Return the arrays of a file and whether it has the checksum at its end."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_ARRAYS_BYTES:
+        raise BrokenFileError(f"{path} is no file of at most {show_bytes(MAX_ARRAYS_BYTES)}")
+    content = path.read_bytes()
+    seal = content[-_SEAL_BYTES:]
+    sealed = seal.startswith(_SEAL)
+    if (
+        sealed
+        and hashlib.sha256(memoryview(content)[:-_SEAL_BYTES]).hexdigest().encode() != seal[len(_SEAL) :]
+    ):
+        raise BrokenFileError(f"{path} has another checksum than when it was written")
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(info.file_size for info in archive.infolist()) > MAX_ARRAYS_BYTES:
+                raise ValueError(f"more than {show_bytes(MAX_ARRAYS_BYTES)} of arrays")
+            if {info.compress_type for info in archive.infolist()} - {
+                zipfile.ZIP_STORED,
+                zipfile.ZIP_DEFLATED,
+            }:
+                raise ValueError("an unusual compression")
+            names = archive.namelist()
+            return {name.removesuffix(".npy"): _parse_npy(archive.read(name)) for name in names}, sealed
+    except _ARRAY_ERRORS as error:
+        raise BrokenFileError(f"{path} is no file of arrays ({' '.join(str(error).split())})") from None
+
+
+def _parse_npy(content: bytes) -> np.ndarray:
+    """Return the array of an npy file, whose size must be that of its content."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, fortran, dtype = read_header[version](stream)
+    if dtype.kind not in "biufU" or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
+        raise ValueError("an array of another size or kind")
+    array = np.frombuffer(content, dtype, offset=stream.tell())
+    return array.reshape(shape, order="F" if fortran else "C").copy(order="K")
+
+
+def cached_arrays(path: Path, make: Callable[[], Arrays], fits: Callable[[Arrays], bool]) -> Arrays:
+    """Return the arrays of a cache file; where there is none that is intact, make them and write it.
+
+    Args:
+        path: File, in a folder of the cache folder.
+        make: Function that makes the arrays.
+        fits: Function that returns whether arrays are of the names, shapes and types that are expected. That they are
+            finite is checked besides.
+
+    Returns:
+        The same arrays with a cache or without: what is wrong with it is one line of the log, never an error.
+    """
+    if (found := read_cache(path, fits)) is None:
+        found = make()
+        write_cache(path, found)
+    return found
+
+
+def read_cache(path: Path, fits: Callable[[Arrays], bool]) -> Arrays | None:
+    """Return the arrays of a cache file; None where it does not exist, is broken, or is not to be trusted.
+
+    Files of earlier versions, without the checksum at their end, are checked by those of their parts, and get one.
+
+    Args:
+        path: File, in a folder of the cache folder.
+        fits: As for `cached_arrays`.
+    """
+    if not _is_trusted(path.parent):
+        return None
+    try:
+        arrays, sealed = _read_npz(path)
+    except BrokenFileError as error:
+        _log.warning("%s; it is made again", error)
+        return None
+    except OSError:
+        return None
+    if not fits(arrays) or not all(np.isfinite(a).all() for a in arrays.values() if a.dtype.kind == "f"):
+        _log.warning("%s has other arrays than expected; it is made again", path)
+        return None
+    if not sealed:
+        write_cache(path, arrays)
+    return arrays
+
+
+def write_cache(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a cache file; where that is not possible, one line of the log says so."""
+    _write_cached(path, lambda: atomic_write_npz(path, arrays, fsync=True))
+
+
+def read_cached_record(path: Path) -> dict[str, Any] | None:
+    """Return the data of a cache file of `write_cached_record`; None where there is none that is intact and trusted."""
+    return read_record(path) if _is_trusted(path.parent) else None
+
+
+def write_cached_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write plain data to a cache file; where that is not possible, one line of the log says so."""
+    _write_cached(path, lambda: write_record(path, record))
+
+
+def _write_cached(path: Path, write: Callable[[], None]) -> None:
+    try:
+        make_cache_folder(path.parent)
+        if _is_trusted(path.parent):
+            write()
+    except OSError as error:
+        _warn_once(path.parent, error.strerror or str(error))
+
+
+def make_cache_folder(folder: Path) -> None:
+    """Make a folder and those above it, as the user's mask says, but never such that others may write there."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    for one in reversed(missing):
+        one.mkdir(mode=0o755, exist_ok=True)
+
+
+def check_trusted(folder: Path) -> None:
+    """Check that no other user can have written the files of a folder of the cache.
+
+    A folder that does not exist is fine. In a cache folder where everybody may write, as `/tmp`, it must belong to this
+    user; elsewhere also to the owner of the cache folder.
+
+    Raises:
+        LiberoError: Another user can.
+    """
+    try:
+        found, root = folder.stat(), folder.parent.stat()
+    except OSError:
+        return
+    remedy = "set LIBERO_CACHE to a folder of your own"
+    if found.st_mode & stat.S_IWOTH:
+        raise LiberoError(f"{folder} is writable by every user: chmod -R o-w {folder.parent}, or {remedy}")
+    owners = {0, os.geteuid(), *(() if root.st_mode & stat.S_IWOTH else (root.st_uid,))}
+    if found.st_uid not in owners:
+        raise LiberoError(f"{folder} belongs to another user, who may have put anything there: {remedy}")
+
+
+def _is_trusted(folder: Path) -> bool:
+    try:
+        check_trusted(folder)
+    except LiberoError as error:
+        _warn_once(folder, str(error))
+        return False
+    return True
+
+
+@lru_cache(maxsize=64)
+def _warn_once(folder: Path, reason: str) -> None:
+    remedy = "" if "LIBERO_CACHE" in reason else ". Set LIBERO_CACHE to a folder that you can write to"
+    _log.warning("nothing is cached in %s: %s%s", folder, reason, remedy)
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write plain data to a JSON file in one step, with a checksum; see `atomic_path`."""
+    text = json.dumps({**record, "sha256": _record_digest(record)}, indent=1)
+    with (
+        atomic_path(path) as temporary,
+        open(temporary, "w", encoding="utf-8", opener=_open_for_owner) as file,
+    ):
+        file.write(text)
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """Return the data of a file of `write_record`; None where it does not exist, is broken, or has no checksum."""
+    try:
+        if path.stat().st_size > _MAX_RECORD_BYTES:
+            return None
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return record if record.pop("sha256") == _record_digest(record) else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def _record_digest(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 @contextmanager

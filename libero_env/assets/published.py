@@ -6,7 +6,6 @@ are read once; the result is kept in the cache for as long as no size and no tim
 """
 
 import hashlib
-import json
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from types import MappingProxyType
 from libero_env.assets.hub import Remote, git_digest
 from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir
-from libero_env.storage import atomic_write_text
+from libero_env.storage import read_cached_record, write_cached_record
 
 COMMIT = "8f1084e3132a39270c3a13ebe37270a43ece2a01"
 ALLOW = "LIBERO_ASSETS_MODIFIED"
@@ -119,15 +118,11 @@ def check_folder(root: Path) -> FolderCheck:
     stamps = {name: (stat.st_size, stat.st_mtime_ns) for name, stat in _walk(root)}
     stamp = hashlib.sha256(repr(([(n, *stamps[n]) for n in sorted(stamps)], published_digest())).encode())
     stored = cache_dir() / "assets_checked" / f"{hashlib.sha256(str(root).encode()).hexdigest()[:16]}.json"
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        record = json.loads(stored.read_text(encoding="utf-8"))
-        if record["stamp"] == stamp.hexdigest():
-            fields = ("missing", "replaced", "damaged")
-            return FolderCheck(record["digest"], *(tuple(record[field]) for field in fields))
+    if (record := read_cached_record(stored)) is not None and record.get("stamp") == stamp.hexdigest():
+        fields = ("missing", "replaced", "damaged")
+        return FolderCheck(record["digest"], *(tuple(record[field]) for field in fields))
     found = _compare(root, {name: size for name, (size, _) in stamps.items()})
-    with suppress(OSError):  # without a cache it is read again by the next process
-        record = {"folder": str(root), "stamp": stamp.hexdigest(), **asdict(found)}
-        atomic_write_text(stored, json.dumps(record, indent=1))
+    write_cached_record(stored, {"folder": str(root), "stamp": stamp.hexdigest(), **asdict(found)})
     return found
 
 

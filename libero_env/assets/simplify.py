@@ -11,7 +11,7 @@ import numpy as np
 from libero_env.errors import LiberoError
 from libero_env.geometry import quat_to_mat
 from libero_env.paths import cache_dir
-from libero_env.storage import atomic_write_npz
+from libero_env.storage import cached_arrays
 
 _CACHE_VERSION = 3  # in the digests of `lod-*.npz`
 _MERGE_CACHE_VERSION = 2  # in the digests of `merge_and_simplify`
@@ -68,14 +68,37 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
         raise LiberoError(f"{file}: {error}; `libero assets download` downloads it") from error
     digest = hashlib.sha256(repr((_CACHE_VERSION, scale, faces)).encode() + content).hexdigest()[:24]
     path = cache_dir() / "meshes" / f"lod-{digest}.npz"
-    if path.exists():
-        with np.load(path) as stored:
-            arrays = tuple(stored[f"a{i}"] for i in range(4))
-    else:
+
+    def make() -> dict[str, np.ndarray]:
         whole = _load(file, scale)
         arrays = whole if len(whole[1]) <= faces else decimate(*whole, faces)
-        atomic_write_npz(path, {f"a{i}": array for i, array in enumerate(arrays)})
-    return arrays if len(arrays[1]) else None
+        return {f"a{i}": array for i, array in enumerate(arrays)}
+
+    stored = cached_arrays(path, make, _is_textured_mesh)
+    return (stored["a0"], stored["a1"], stored["a2"], stored["a3"]) if len(stored["a1"]) else None
+
+
+def _is_textured_mesh(arrays: dict[str, np.ndarray]) -> bool:
+    if set(arrays) != {"a0", "a1", "a2", "a3"}:
+        return False
+    vertices, triangles, texcoords, indices = (arrays[f"a{i}"] for i in range(4))
+    return (
+        _is_mesh(vertices, triangles)
+        and _are_indices(indices, len(texcoords))
+        and texcoords.ndim == 2
+        and texcoords.shape[1] == 2
+        and len(indices) in (0, len(triangles))
+    )
+
+
+def _is_mesh(vertices: np.ndarray, triangles: np.ndarray) -> bool:
+    return vertices.ndim == 2 and vertices.shape[1] == 3 and _are_indices(triangles, len(vertices))
+
+
+def _are_indices(triangles: np.ndarray, count: int) -> bool:
+    """Return whether an array has three indices below `count` for each triangle."""
+    shaped = triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype == np.int32
+    return shaped and (not triangles.size or 0 <= triangles.min() <= triangles.max() < count)
 
 
 def merge_and_simplify(
@@ -101,13 +124,18 @@ def merge_and_simplify(
 def _merged(
     path: Path, groups: tuple[tuple[MeshSource, ...], ...], faces: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    if path.exists():
-        with np.load(path) as stored:
-            return [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(groups))]
-    meshes = [_merge(sources, faces) for sources in groups]
-    arrays = {k: a for i, (v, f) in enumerate(meshes) for k, a in ((f"v{i}", v), (f"f{i}", f))}
-    atomic_write_npz(path, arrays)
-    return meshes
+    def make() -> dict[str, np.ndarray]:
+        meshes = [_merge(sources, faces) for sources in groups]
+        return {key: array for i, (v, f) in enumerate(meshes) for key, array in ((f"v{i}", v), (f"f{i}", f))}
+
+    def fits(arrays: dict[str, np.ndarray]) -> bool:
+        names = {f"{kind}{i}" for i in range(len(groups)) for kind in "vf"}
+        return set(arrays) == names and all(
+            _is_mesh(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(len(groups))
+        )
+
+    stored = cached_arrays(path, make, fits)
+    return [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(groups))]
 
 
 def _merge(sources: tuple[MeshSource, ...], faces: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import BUILTIN
-from libero_env.errors import LiberoError
+from libero_env.errors import BrokenFileError, LiberoError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import sample_settled
 from libero_env.parallel import progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
-from libero_env.storage import atomic_write_npz
+from libero_env.storage import atomic_write_npz, cached_arrays, read_npz
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50
@@ -89,7 +89,7 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
         Rows as of `generate_init_states`, (50, ...).
 
     Raises:
-        LiberoError: The states of the package were made for another model.
+        LiberoError: The states of the package were made for another model, or their file is damaged.
     """
     digest = scene_digest(scene)
     packaged = _packaged(task.suite).get(task.name)
@@ -100,13 +100,12 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
                 f"generate them again: libero tasks init-states {task.suite}"
             )
         return packaged[1]
-    path = _cached_path(task, digest)
-    if path.exists():
-        with np.load(path, allow_pickle=False) as stored:
-            return stored["states"]
-    states = generate_init_states(task, scene)
-    atomic_write_npz(path, {"states": states})
-    return states
+    width = 1 + scene.model.nq + scene.model.nv + 7 * len(scene.fixtures)
+    return cached_arrays(
+        _cached_path(task, digest),
+        lambda: {"states": generate_init_states(task, scene)},
+        lambda stored: set(stored) == {"states"} and stored["states"].shape == (NUM_INIT_STATES, width),
+    )["states"]
 
 
 def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray | None:
@@ -195,6 +194,14 @@ def _packaged(suite: str) -> dict[str, tuple[str, np.ndarray]]:
     path = shipped_path(suite)
     if not path.exists():
         return {}
-    with np.load(path, allow_pickle=False) as stored:
-        names = [name for name in stored.files if not name.endswith(".digest")]
+    try:
+        stored = read_npz(path)
+        names = [name for name in stored if not name.endswith(".digest")]
+        if not all(np.isfinite(stored[name]).all() for name in names):
+            raise BrokenFileError(f"{path} has numbers that are not finite")
         return {name: (str(stored[f"{name}.digest"]), stored[name]) for name in names}
+    except (BrokenFileError, KeyError, OSError) as error:
+        what = f"{path} has no {error}" if isinstance(error, KeyError) else str(error)
+        raise BrokenFileError(
+            f"{what}; it is a file of this package: install the package again, or restore the file"
+        ) from None
