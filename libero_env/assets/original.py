@@ -95,7 +95,7 @@ class OriginalPack:
                 f"the original assets contain no model of {category!r}, only its name; add one with "
                 "libero_env.objects.register_object, or use the builtin pack where it has one (LIBERO_ASSETS=builtin)"
             )
-        spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category))
+        spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category, Path(self.root)))
         self._simplify(spec)
         physics = load_physics(category)
         fields: dict[str, Any] = {name: getattr(physics, name) for name in _PHYSICS_FIELDS}

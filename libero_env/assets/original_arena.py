@@ -73,7 +73,7 @@ def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, 
     chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
     scene = chosen.pop("scene", "base")
     textures = {**own, **load_styles()["scene"][scene], **chosen}
-    assets, world = read_file(scene_file(root, workspace.name, scene))
+    assets, world = read_file(scene_file(root, workspace.name, scene), root)
     for element in assets:
         for kind, name in _TEXTURE_NAMES.items():
             if element.tag == "texture" and element.get("name") == name:

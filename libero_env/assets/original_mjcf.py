@@ -5,14 +5,16 @@ first of two assets of one name, and computed the mass of a body from collision 
 """
 
 import copy
+import os
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects.builtin.assemble import GLOWING_SITES, HIDDEN_GROUP
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
+from libero_env.objects.xml_file import parse_xml
 
 REMEDY = "`libero assets check` lists what is missing, `libero assets download` downloads it"
 _BODY_TAGS = ("body", "geom", "inertial", "joint", "site")
@@ -20,16 +22,38 @@ _ASSET_TAGS = ("material", "mesh", "texture")
 _REFERENCES = ("material", "mesh", "texture")
 
 
-def read_file(path: Path) -> tuple[list[ET.Element], ET.Element]:
+def read_file(path: Path, within: Path | None = None) -> tuple[list[ET.Element], ET.Element]:
     """Return the assets of a file, with absolute paths, and its world body, with default classes written out.
 
+    Args:
+        path: File to read.
+        within: Folder that files may be in which the file names; None for any.
+
     Raises:
-        LiberoError: The file is missing or not XML.
+        LiberoError: The file is missing or not XML, or names a file outside of `within`.
     """
     try:
-        root = ET.parse(path).getroot()
-    except (OSError, ET.ParseError) as error:
-        raise LiberoError(f"{path}: {error}; {REMEDY}") from error
+        root = parse_xml(path)
+    except InvalidInputError as error:
+        raise LiberoError(f"{error}; {REMEDY}") from error
+    for element in root.iterfind("asset/*[@file]"):
+        file = path.parent.absolute() / element.get("file", "")
+        if within is not None and not Path(os.path.normpath(file)).is_relative_to(within.absolute()):
+            raise LiberoError(f"{element.at}: {file} is outside of {within}; {REMEDY}")
+        element.set("file", str(file))
+    return written_out(root, path)
+
+
+def written_out(root: ET.Element, path: Path) -> tuple[list[ET.Element], ET.Element]:
+    """Return the assets and the world body of a file with default classes written out.
+
+    Args:
+        root: Elements of the file, with absolute paths; they are changed.
+        path: The file, for messages.
+
+    Raises:
+        LiberoError: There is no world body.
+    """
     world = root.find("worldbody")
     if world is None:
         raise LiberoError(f"{path}: no <worldbody>; {REMEDY}")
@@ -39,23 +63,26 @@ def read_file(path: Path) -> tuple[list[ET.Element], ET.Element]:
             element.attrib.setdefault(key, value)
     assets: dict[tuple[str, str], ET.Element] = {}
     for element in root.findall("asset/*"):
-        if "file" in element.attrib:
-            element.set("file", str((path.parent / element.attrib["file"]).absolute()))
-            if element.tag == "mesh":
-                element.attrib.setdefault("name", Path(element.attrib["file"]).stem)
+        if "file" in element.attrib and element.tag == "mesh":
+            element.attrib.setdefault("name", Path(element.attrib["file"]).stem)
         if element.tag in _ASSET_TAGS:
             assets.setdefault((element.tag, element.get("name", "")), element)
     return list(assets.values()), world
 
 
 @lru_cache(maxsize=64)
-def object_xml(path: Path, category: str) -> str:
+def object_xml(path: Path, category: str, within: Path | None = None) -> str:
     """Return the MJCF text of an object: one body `main` with the content of the file's body `object`.
+
+    Args:
+        path: MJCF file.
+        category: Name of the category; it becomes the prefix of the assets' names.
+        within: Folder that files may be in which the file names; None for any.
 
     Raises:
         LiberoError: A file is missing or not as expected.
     """
-    assets, world = read_file(path)
+    assets, world = read_file(path, within)
     body = world.find("body/body[@name='object']")
     if body is None:
         raise LiberoError(f"{path}: no body named 'object' below the outer body; {REMEDY}")

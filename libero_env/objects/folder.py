@@ -12,7 +12,8 @@ from typing import Any
 import mujoco
 import yaml
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.objects.mjcf_gate import Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.paths import objects_dir
 
@@ -100,27 +101,25 @@ def load(directory: Path, category: str) -> ObjectModel:
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
-    """Return an MJCF file with absolute paths of its meshes and textures, so that any scene can attach it.
+    """Return an MJCF file of an object with absolute paths of its meshes and textures, so that any scene can attach it.
 
     Raises:
-        LiberoError: The file cannot be read, or a mesh or texture is missing.
+        InvalidInputError: The file cannot be read, has what an object may not have, or a mesh or texture is missing or
+            elsewhere; see `libero_env.objects.mjcf_gate`.
+    """
+    return spec_of(read_mjcf(path))
+
+
+def spec_of(file: Mjcf) -> mujoco.MjSpec:
+    """Return the content of an MJCF file as MuJoCo reads it.
+
+    Raises:
+        InvalidInputError: MuJoCo cannot read it.
     """
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except (ValueError, OSError) as error:
-        raise LiberoError(f"{path}: {error}") from error
-    folders: Mapping[str, str] = {"mesh": spec.meshdir, "texture": spec.texturedir}
-    for kind, elements in (("mesh", spec.meshes), ("texture", spec.textures)):
-        for element in elements:
-            if element.file:
-                file = path.parent.absolute() / folders[kind] / element.file
-                if not file.is_file():
-                    raise LiberoError(
-                        f"{path}: {kind} {file} is missing; put it there, or fix the path in the file"
-                    )
-                element.file = str(file)
-    spec.meshdir = spec.texturedir = ""
-    return spec
+        return mujoco.MjSpec.from_string(file.text)
+    except ValueError as error:
+        raise InvalidInputError(file.explain(error)) from error
 
 
 def digest(directory: Path) -> str:

@@ -334,7 +334,7 @@ def broken(tmp_path: Path, kind: str) -> Path:
         ("empty", {}, "empty.obj: "),
         ("two", {}, "2 bodies"),
         ("weightless", {}, "has no mass"),
-        ("xml", {}, "xml.xml: "),
+        ("xml", {}, "xml.xml:1: not valid XML"),
         ("two", {"size": 0.1}, "defines size itself"),
         ("fbx", {}, "unknown format '.fbx'; valid: .xml"),
         ("large", {"size": 3.0}, "too large"),

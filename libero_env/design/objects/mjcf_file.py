@@ -1,6 +1,8 @@
 """Conversion of a user's MJCF file, of any convention, into the files of an object that scenes can attach."""
 
+import itertools
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -8,16 +10,21 @@ from xml.etree import ElementTree as ET
 import mujoco
 import numpy as np
 
-from libero_env.assets.original_mjcf import attachable_xml, read_file
+from libero_env.assets.original_mjcf import attachable_xml, written_out
 from libero_env.design.objects.mesh_file import Notify
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import delete
-from libero_env.objects.folder import MODEL, read_spec
+from libero_env.objects.folder import MODEL, spec_of
+from libero_env.objects.mjcf_gate import Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY
+from libero_env.objects.xml_file import explain
 
 INSIDE = 0.8  # size of `contain_region`, as a share of the bounds
 _HIDDEN = 3  # first geom group that viewers hide by default
+_INNER = "worldbody/body/body[@name='object']"  # the object in files made for the original
+_LARGEST, _SMALLEST = 10.0, 1e-3  # [m] longest side
+_HEAVIEST = 1e4  # [kg]
 
 
 def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
@@ -39,11 +46,14 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
     Raises:
         LiberoError: The file cannot be read, refers to a missing file, or does not contain exactly one object.
     """
-    spec = _read(path, name)
-    root = _root(spec, path, notify)
+    file = read_mjcf(path)
+    spec = _spec(file, name)
+    root = _root(spec, file, notify)
     _sort_geoms(spec)
-    _gather_files(spec, name, directory)
-    low, high = bounds_of(_compiled(spec, path))
+    names = _gather_files(spec, directory)
+    model = _compiled(spec, path)
+    _check_extent(model, path)
+    low, high = bounds_of(model)
     if container and all(site.name != "contain_region" for site in spec.sites):
         root.add_site(
             name="contain_region",
@@ -57,8 +67,11 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
     kilograms = float(model.body_subtreemass[model.body(ROOT_BODY).id])
     if kilograms < 1e-6:
         raise LiberoError(f"{path}: it has no mass; give its collision geoms a mass or density")
-    text = spec.to_xml().replace(f"{directory.absolute()}/", "")
-    (directory / MODEL).write_text(text, encoding="utf-8")
+    if kilograms > _HEAVIEST:
+        raise InvalidInputError(
+            f"{path}: its mass is {kilograms:.3g} kg; expected at most {_HEAVIEST:.0f} kg"
+        )
+    (directory / MODEL).write_text(_with_names(spec.to_xml(), names), encoding="utf-8")
     solid = int(((model.geom_contype | model.geom_conaffinity) > 0).sum())
     return {"mass": round(kilograms, 5), "collision": {"method": "mjcf", "pieces": solid}}
 
@@ -75,40 +88,46 @@ def bounds_of(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def _read(path: Path, name: str) -> mujoco.MjSpec:
-    try:
-        inner = ET.parse(path).getroot().find("worldbody/body/body[@name='object']")
-    except (OSError, ET.ParseError) as error:
-        raise LiberoError(f"{path}: {error}; an MJCF file is expected") from error
-    if inner is None:
-        spec = read_spec(path)
+def _spec(file: Mjcf, name: str) -> mujoco.MjSpec:
+    if file.root.find(_INNER) is None:
+        spec = spec_of(file)
         _rename(spec, name)
         return spec
-    assets, world = read_file(path)
+    assets, world = written_out(file.root, file.path)
     body = world.find("body/body[@name='object']")
     assert body is not None
     try:
         return mujoco.MjSpec.from_string(attachable_xml(name, assets, body))
     except ValueError as error:
-        raise LiberoError(f"{path}: {error}") from error
+        raise InvalidInputError(explain(error, file.path)) from error
 
 
-def _root(spec: mujoco.MjSpec, path: Path, notify: Notify) -> mujoco.MjsBody:
+def _root(spec: mujoco.MjSpec, file: Mjcf, notify: Notify) -> mujoco.MjsBody:
     """Return the body of the object, renamed to `main`, without a joint, at the origin and alone in the world."""
     bodies = list(spec.worldbody.bodies)
     if len(bodies) != 1:
-        raise LiberoError(
-            f"{path}: its world has {len(bodies)} bodies, but an object has one; move all its parts below one body"
+        raise InvalidInputError(
+            f"{file.path}: its world has {len(bodies)} bodies, but an object has one; move all its parts below one body"
         )
     body = bodies[0]
+    if any(other.name == ROOT_BODY for other in spec.bodies if other is not body and other.name != body.name):
+        raise InvalidInputError(
+            f"{file.path}: a part is named {ROOT_BODY!r}, as the object itself will be; rename it"
+        )
+    for equality in spec.equalities:
+        equality.name1, equality.name2 = (
+            ROOT_BODY if name == body.name else name for name in (equality.name1, equality.name2)
+        )
+    for exclude in spec.excludes:
+        exclude.bodyname1, exclude.bodyname2 = (
+            ROOT_BODY if name == body.name else name for name in (exclude.bodyname1, exclude.bodyname2)
+        )
     body.name, body.pos, body.quat = ROOT_BODY, (0, 0, 0), (1, 0, 0, 0)
-    around = (spec.worldbody.geoms, spec.worldbody.sites, spec.cameras, spec.lights)
-    about = (spec.actuators, spec.sensors, spec.keys)
-    omitted = [element for group in (*around, *about) for element in group]
+    omitted = [*spec.worldbody.geoms, *spec.worldbody.sites]
     moving = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
-    if omitted or moving:
+    if (count := len(omitted) + file.omitted) or moving:
         notify(
-            f"{path.name}: omitted are {len(omitted)} elements around the object (lights, cameras, actuators, ...) "
+            f"{file.path.name}: omitted are {count} elements around the object (lights, cameras, actuators, ...) "
             f"and {len(moving)} joints of its root body, to which scenes add a free joint"
         )
     for element in [*omitted, *body.joints]:
@@ -121,10 +140,13 @@ def _sort_geoms(spec: mujoco.MjSpec) -> None:
     geoms = list(spec.geoms)
     solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
     visuals = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]
+    named = {geom.name for geom in geoms}
     for number, geom in enumerate(solid):
         if not visuals:
             _add_visual(geom)
-        geom.group, geom.name = 0, geom.name or f"g{number}"
+        free = (f"g{k}" for k in itertools.count(number) if f"g{k}" not in named)
+        geom.group, geom.name = 0, geom.name or next(free)
+        named.add(geom.name)
     for geom in visuals:
         geom.group = 1
 
@@ -165,22 +187,49 @@ def _rename(spec: mujoco.MjSpec, name: str) -> None:
         asset.name = f"{name}_{asset.name}"
 
 
-def _gather_files(spec: mujoco.MjSpec, name: str, directory: Path) -> None:
-    """Copy the meshes and textures in use into the folder."""
+def _gather_files(spec: mujoco.MjSpec, directory: Path) -> dict[str, str]:
+    """Copy the meshes and textures in use into the folder; return the name of each new file by its path."""
+    names: dict[str, str] = {}
     for kind, elements in (("mesh", spec.meshes), ("texture", spec.textures)):
-        for element in elements:
+        for number, element in enumerate(elements):
             if not element.file:
                 continue
             source = Path(element.file)
-            if not source.is_file():
-                raise LiberoError(f"{kind} {source} is missing; put it there, or fix the path in the file")
-            target = directory / f"{element.name.removeprefix(f'{name}_') or kind}_{source.name}"
+            stem = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem)[:40]
+            target = directory / f"{kind}{number}_{stem}{source.suffix.lower()}"
             shutil.copyfile(source, target)
             element.file = str(target.absolute())
+            names[element.file] = target.name
+    return names
+
+
+def _with_names(text: str, names: Mapping[str, str]) -> str:
+    """Return an MJCF text with the names of files by their absolute paths replaced."""
+    root = ET.fromstring(text)
+    for element in root.iterfind("asset/*[@file]"):
+        element.set("file", names[element.attrib["file"]])
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
 
 
 def _compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise LiberoError(f"{path}: {error}") from error
+        raise InvalidInputError(explain(error, path)) from error
+
+
+def _check_extent(model: mujoco.MjModel, path: Path) -> None:
+    """Check the size of an object by the boxes around its geoms, before anything is computed along its surface."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    solid = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    if not len(solid):
+        return  # `bounds_of` says so
+    reach = np.linalg.norm(data.geom_xpos[solid], axis=1) + model.geom_rbound[solid]
+    longest = 2 * float(model.geom_rbound[solid].max())
+    if not reach.max() <= _LARGEST or longest < _SMALLEST:
+        raise InvalidInputError(
+            f"{path}: it reaches {reach.max():.3g} m, its largest part is {longest:.3g} m long; expected {_SMALLEST} "
+            f"to {_LARGEST:.0f} m: MJCF files are in metres"
+        )

@@ -136,7 +136,7 @@ def _scene(item: ObjectModel) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise LiberoError(f"{item.category}: {error}") from error
+        raise LiberoError(f"{item.category}: {' '.join(str(error).split())}") from error
 
 
 def _aim(model: mujoco.MjModel, centre: np.ndarray, distance: float, yaw: float) -> None:

@@ -1,0 +1,202 @@
+"""Object files from others: nothing is read or written outside of their folder, and nothing grows without bound."""
+
+import struct
+import time
+import zlib
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from libero_env.design.objects import add_object
+from libero_env.errors import LiberoError
+from libero_env.objects import catalog, folder, get_object
+from libero_env.objects.mjcf_gate import read_mjcf
+
+pytestmark = pytest.mark.sim
+
+BOX = '<geom type="box" size=".02 .02 .02" mass=".1"/>'
+MESH = '<geom type="mesh" mesh="m"/>'
+PAINTED = '<geom type="box" size=".02 .02 .02" mass=".1" material="p"/>'
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch) -> Path:
+    """A folder `own` for the files of an object, and objects and caches beside it."""
+    monkeypatch.setenv("LIBERO_OBJECTS", str(tmp_path / "objects"))
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(catalog, "_registered", {})
+    for name in ("own", "secret"):
+        (tmp_path / name).mkdir()
+        trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / name / "m.stl")
+    return tmp_path
+
+
+def mjcf(home: Path, *, geom: str = BOX, assets: str = "", inside: str = "", around: str = "") -> Path:
+    """An MJCF file with one body on line 3."""
+    path = home / "own" / "thing.xml"
+    path.write_text(
+        f"<mujoco>{around}\n<asset>{assets}</asset>\n"
+        f'<worldbody><body name="b">{geom}{inside}</body></worldbody></mujoco>'
+    )
+    return path
+
+
+def png(width: int, height: int, data: bytes) -> bytes:
+    """A PNG file with these bytes as its picture."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("name", ["../../victim/x", "{home}/victim/x", "a/b", "&quot;", "é", "..", "main"])
+def test_names_of_assets_never_become_paths(home, name):
+    name = name.format(home=home)
+    (home / "victim").mkdir()
+    (home / "victim" / "x_m.stl").write_text("precious")
+    mesh = f'<mesh name="{name}" file="m.stl"/>'
+    added = add_object(mjcf(home, assets=mesh, geom=f'<geom type="mesh" mesh="{name}"/>'))
+    assert [path.read_text() for path in (home / "victim").iterdir()] == ["precious"]
+    written = {path.name for path in added.folder.iterdir()}
+    assert written == {"object.xml", "object.yaml", "preview.png", "mesh0_m.stl"}
+    get_object("thing").spec.compile()
+
+
+@pytest.mark.parametrize(
+    ("around", "assets"),
+    [
+        ("", '<mesh name="m" file="../secret/m.stl"/>'),
+        ("", '<mesh name="m" file="{home}/secret/m.stl"/>'),
+        ("", '<mesh name="m" file="C:\\secret\\m.stl"/>'),
+        ("", '<mesh name="m" file="..\\secret\\m.stl"/>'),
+        ("", '<mesh name="m" file="linked.stl"/>'),
+        ("", '<mesh name="m" file="below/m.stl"/>'),
+        ("", '<mesh name="m" file="file:///etc/passwd"/>'),
+        ('<compiler meshdir="../secret"/>', '<mesh name="m" file="m.stl"/>'),
+        ('<compiler assetdir="{home}/secret"/>', '<mesh name="m" file="m.stl"/>'),
+        ('<include file="../secret/more.xml"/>', '<mesh name="m" file="m.stl"/>'),
+    ],
+)
+def test_files_elsewhere_are_not_read(home, around, assets):
+    (home / "own" / "linked.stl").symlink_to(home / "secret" / "m.stl")
+    (home / "own" / "below").symlink_to(home / "secret")
+    (home / "secret" / "more.xml").write_text("<mujoco/>")
+    path = mjcf(home, geom=MESH, assets=assets.format(home=home), around=around.format(home=home))
+    with pytest.raises(LiberoError, match=r"thing\.xml:[12]: .*outside of the folder") as caught:
+        add_object(path)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(LiberoError, match="outside of the folder"):
+        folder.read_spec(path)  # a stored object from somebody else
+
+
+def test_files_in_the_folder_are_found_as_mujoco_finds_them(home):
+    (home / "own" / "parts").mkdir()
+    (home / "own" / "m.stl").rename(home / "own" / "parts" / "m.stl")
+    (home / "own" / "more.xml").write_text('<mujoco><asset><mesh name="m" file="m.stl"/></asset></mujoco>')
+    around = '<compiler meshdir="parts"/><include file="more.xml"/>'
+    assert add_object(mjcf(home, geom=MESH, around=around)).properties["mass"] > 0
+    stripped = '<compiler meshdir="parts" strippath="true"/>'
+    path = mjcf(home, geom=MESH, around=stripped, assets='<mesh name="m" file="/home/me/m.stl"/>')
+    assert read_mjcf(path).root.find("asset/mesh").get("file") == str(home / "own" / "parts" / "m.stl")
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (
+            {"inside": '<replicate count="100000"><geom size=".01"/></replicate>'},
+            ":1: .*100001 elements <geom>",
+        ),
+        (
+            {"inside": '<replicate count="300"><replicate count="300"><site/></replicate></replicate>'},
+            "90000",
+        ),
+        ({"inside": "<body><joint/><geom size='.01'/></body>" * 101}, "101 elements <joint>; .* at most 100"),
+        ({"inside": "<frame>" * 200 + "</frame>" * 200}, ":3: elements within elements, more than 80 deep"),
+        ({"inside": '<composite type="cable" count="9 1 1"/>'}, ":3: <composite> in <body> is not used"),
+        ({"inside": '<flexcomp name="f" type="grid" count="300 300 30"/>'}, "<flexcomp> in <body>"),
+        ({"inside": '<attach model="x" prefix="y"/>'}, "<attach> in <body>"),
+        (
+            {"geom": '<geom type="box" size=".02 .02 .02"><plugin/></geom>'},
+            "<plugin> in <geom> .* it has no elements",
+        ),
+        ({"around": '<extension><plugin plugin="x"/></extension>'}, ":1: <extension>"),
+        ({"assets": '<hfield name="h" nrow="9999" ncol="9999" size="1 1 1 1"/>'}, ":2: <hfield>"),
+        ({"assets": '<model name="x" file="m.xml"/>'}, "<model> in <asset>"),
+        ({"assets": '<mseh name="x" file="m.stl"/>'}, "Did you mean 'mesh'"),
+        (
+            {"assets": '<texture name="t" type="2d" builtin="flat" width="60000" height="9"/>'},
+            "width .*60000",
+        ),
+        ({"assets": '<texture name="t" builtin="flat" width="8192" height="8192"/>'}, "402653184 pixels"),
+        (
+            {"assets": '<mesh name="m" vertex="nan 0 0 1 0 0 0 1 0 0 0 1"/>'},
+            "vertex of <mesh> has the value nan",
+        ),
+        ({"geom": '<geom size="nan"/>'}, ":3: size of <geom> has the value nan"),
+        ({"geom": '<geom size="1e30"/>'}, "value 1e[+]30; expected numbers up to 100"),
+        ({"geom": '<geom size="90"/>'}, "it reaches 90 m"),
+        ({"geom": '<geom size=".02" mass="1e308"/>'}, "mass of <geom> has the value 1e[+]308"),
+        ({"geom": '<geom size=".02" mass="1e9"/>'}, "its mass is 1e[+]09 kg"),
+        ({"geom": '<geom size=".02" rgba="red"/>'}, "rgba of <geom> is 'red'; expected numbers"),
+        ({"geom": '<geom size=".02" group="1.5"/>'}, "group of <geom> is '1.5'; expected a whole number"),
+        ({"geom": '<geom size=".02" typ="box"/>'}, "thing.xml:3: .*typ"),
+        ({"around": '<equality><weld body1="b"/></equality>'}, ":1: <weld> fixes the object to the world"),
+        ({"inside": '<body name="main"><geom size=".01"/></body>'}, "a part is named 'main'"),
+        ({"around": '<!DOCTYPE x [<!ENTITY y "z">]>'}, ":1: "),
+        ({"around": '<include file="thing.xml"/>'}, "included twice"),
+        ({"geom": PAINTED, "assets": '<texture name="t" file="big.png"/>'}, "20000 x 20000 pixels"),
+        ({"geom": PAINTED, "assets": '<texture name="t" file="bomb.png"/>'}, "more than its 8 x 8 pixels"),
+        ({"geom": MESH, "assets": '<mesh name="m" file="short.stl"/>'}, "no binary STL file of its size"),
+        ({"geom": MESH, "assets": '<mesh name="m" file="empty.obj"/>'}, "is empty"),
+        ({"geom": MESH, "assets": '<mesh name="m" file="nothing.obj"/>'}, "mesh .*nothing.obj is missing"),
+        ({"geom": MESH, "assets": '<mesh name="m" file="wrong.msh"/>'}, "a vertex that it does not have"),
+        ({"geom": MESH, "assets": '<mesh name="m" file="polygon.obj"/>'}, "a line has more than"),
+    ],
+)
+def test_what_an_object_may_not_have_is_named_with_its_line(home, parts, message):
+    own = home / "own"
+    (own / "big.png").write_bytes(png(20000, 20000, zlib.compress(b"")))
+    (own / "bomb.png").write_bytes(png(8, 8, zlib.compress(bytes(100 << 20))))
+    (own / "short.stl").write_bytes((own / "m.stl").read_bytes()[:-3])
+    (own / "empty.obj").touch()
+    (own / "wrong.msh").write_bytes(struct.pack("<4i9f3i", 3, 0, 0, 1, *range(9), 0, 1, 3))
+    (own / "polygon.obj").write_text("v 0 0 0\nf" + " 1" * 5000)
+    start = time.monotonic()
+    with pytest.raises(LiberoError, match=message) as caught:
+        add_object(mjcf(home, **parts))
+    assert "\n" not in str(caught.value) and time.monotonic() - start < 5
+    assert not list((home / "objects").iterdir())
+
+
+def test_what_belongs_to_a_scene_is_left_out(home):
+    around = (
+        '<option timestep="1e-300"/><size memory="100G" nkey="1000000000"/><visual/><custom><text name="a" data="b"/>'
+        '</custom><keyframe><key/><key/></keyframe><actuator><motor joint="j"/></actuator><default><motor/></default>'
+    )
+    inside = '<body name="c"><joint name="j"/><geom size=".01"/><camera name="eye"/></body>'
+    path = mjcf(home, around=around, inside=inside)
+    added = add_object(path)
+    assert "omitted are 4 elements around the object" in added.notes[0]
+    assert get_object("thing").spec.compile().nkey == 0
+
+
+def test_parts_may_be_joined_and_keep_clear_of_each_other(home):
+    inside = '<body name="c"><joint/><geom size=".01"/></body>'
+    around = (
+        '<contact><exclude body1="b" body2="c"/></contact><equality><weld body1="b" body2="c"/></equality>'
+    )
+    add_object(mjcf(home, inside=inside, around=around))
+    model = get_object("thing").spec.compile()
+    assert (model.nexclude, model.neq) == (1, 1)
+
+
+def test_geoms_get_names_that_are_free(home):
+    added = add_object(mjcf(home, inside='<geom name="g0" size=".01"/><geom size=".01"/>'))
+    assert added.properties["collision"]["pieces"] == 3
+    assert {geom.name for geom in get_object("thing").spec.geoms if geom.group == 0} == {"g0", "g1", "g2"}
