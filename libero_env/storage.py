@@ -137,13 +137,13 @@ def atomic_write_npz(target: Path, arrays: Mapping[str, Any], *, fsync: bool = F
     seal = _SEAL + hashlib.sha256(content).hexdigest().encode()
     with (
         atomic_path(target, fsync=fsync) as temporary,
-        open(temporary, "wb", opener=_open_for_owner) as file,
+        open(temporary, "wb", opener=open_for_owner) as file,
     ):
         file.write(content)
         file.write(seal)
 
 
-def _open_for_owner(path: str, flags: int) -> int:
+def open_for_owner(path: str, flags: int) -> int:
     """Open a new file that others may read at most, whatever the user's mask is."""
     return os.open(path, flags, 0o644)
 
@@ -314,7 +314,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
     text = json.dumps({**record, "sha256": _record_digest(record)}, indent=1)
     with (
         atomic_path(path) as temporary,
-        open(temporary, "w", encoding="utf-8", opener=_open_for_owner) as file,
+        open(temporary, "w", encoding="utf-8", opener=open_for_owner) as file,
     ):
         file.write(text)
 

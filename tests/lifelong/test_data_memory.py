@@ -1,5 +1,6 @@
 """Wherever frames are held and whatever reads them, batches are the same to the bit."""
 
+import itertools
 import json
 import multiprocessing
 import os
@@ -167,6 +168,64 @@ def test_files_of_a_killed_process_are_not_taken_as_complete(
     held = open_windows(source, language=LANGUAGE, memory="mmap")
     assert_same(everything(held), everything(open_windows(source, language=LANGUAGE, memory="host")))
     assert not left.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [*itertools.product(["images.u8", "arrays.npz", "index.json"], ["truncated", "changed"])]
+    + [("index.json", "of an earlier version"), ("images.u8", "missing")],
+)
+def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str, how: str) -> None:
+    source = DemoSource(path, SPEC)
+    expected = everything(open_windows(source, language=LANGUAGE, memory="mmap"))
+    (file,) = cache_root().glob(f"task_demo-*/{name}")
+    content = file.read_bytes()
+    half = len(content) // 2
+    file.unlink()  # the frames that are open keep it
+    if how == "truncated":
+        file.write_bytes(content[:half])
+    elif how == "changed":
+        file.write_bytes(content[:half] + bytes([content[half] ^ 4]) + content[half + 1 :])
+    elif how == "of an earlier version":
+        index = json.loads(content)
+        file.write_text(json.dumps({key: index[key] for key in ("source", "file", "shape")}))
+    assert_same(everything(open_windows(source, language=LANGUAGE, memory="mmap")), expected)
+    (line,) = [m for m in caplog.messages if "written again" in m]
+    assert line.startswith(str(file.parent)) and line.endswith("written again")
+    assert file.exists()
+
+
+def test_large_files_of_frames_are_compared_in_parts(tmp_path: Path) -> None:
+    file = tmp_path / "images.u8"
+    with file.open("wb") as handle:
+        handle.truncate(100 << 20)
+    before = frame_cache._images_digest(file)
+    for at, size in ((0, 1), ((100 << 20) - 1, 1), (30 << 20, 2 << 20)):
+        with file.open("rb+") as handle:
+            handle.seek(at)
+            handle.write(b"\1" * size)
+        assert frame_cache._images_digest(file) != before
+        before = frame_cache._images_digest(file)
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIBERO_CACHE", str(path))  # a file
+    with pytest.raises(DataError, match=r"cannot be written .* set data\.memory=host") as caught:
+        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="mmap")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_process_that_writes_for_too_long_is_named(path: Path, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(frame_cache, "_PATIENCE", 0.01)
+    monkeypatch.setattr(frame_cache, "_LONGEST_BUILD", 0.01)
+    source = DemoSource(path, SPEC)
+    with (
+        frame_cache._building(folder := cache_root() / "folder", source),
+        pytest.raises(DataError, match="another process has written it"),
+        frame_cache._building(folder, source),
+    ):
+        pytest.fail("two processes write the same folder")
+    assert caplog.messages == [f"waiting for another process, which writes {folder}"]
 
 
 def build(path: Path, counter: Path) -> None:

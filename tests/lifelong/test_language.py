@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -109,7 +110,7 @@ def test_embeddings_are_cached_by_model_and_text(
     models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = {name: embed(TEXTS, str(path), cache_dir=tmp_path) for name, path in models.items()}
-    assert len(list(tmp_path.glob("*.npy"))) == 2 * len(models) == 8
+    assert len(list(tmp_path.glob("*.npz"))) == 2 * len(models) == 8
     assert not list(tmp_path.glob("*.part"))
     monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
     for name, path in models.items():
@@ -123,7 +124,28 @@ def test_texts_that_are_not_shipped_are_cached_too(tmp_path: Path, monkeypatch: 
     made = embed(texts, cache_dir=tmp_path / "cache")
     monkeypatch.setattr(language, "encode_minilm", lambda *_: pytest.fail("encoded what was cached"))
     assert torch.equal(embed(texts, cache_dir=tmp_path / "cache"), made)
-    assert len(list((tmp_path / "cache").glob("*.npy"))) == 1
+    assert len(list((tmp_path / "cache").glob("*.npz"))) == 1
+
+
+@pytest.mark.parametrize("kept", [True, False], ids=["file of an earlier version", "broken file"])
+def test_embeddings_of_the_cache_are_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
+) -> None:
+    encoded = []
+    monkeypatch.setattr(language, "minilm_folder", lambda: tmp_path)
+    monkeypatch.setattr(
+        language, "encode_minilm", lambda texts, _: encoded.append(texts) or torch.ones(len(texts), 384)
+    )
+    made = embed(["fly to the moon"], cache_dir=tmp_path / "cache")
+    (path,) = (tmp_path / "cache").iterdir()
+    if kept:
+        np.save(path.with_suffix(".npy"), made[0].numpy())
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:100])
+    assert torch.equal(embed(["fly to the moon"], cache_dir=tmp_path / "cache"), made)
+    assert len(encoded) == (1 if kept else 2)
+    assert path.stat().st_size > 100
 
 
 def test_an_encoder_of_the_configuration_keeps_what_it_computed(
@@ -132,7 +154,7 @@ def test_an_encoder_of_the_configuration_keeps_what_it_computed(
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
     encoder = LanguageEncoder(str(models["roberta"]))
     made = encoder.embed(TEXTS)
-    assert len(list((tmp_path / "language").glob("*.npy"))) == 2
+    assert len(list((tmp_path / "language").glob("*.npz"))) == 2
     monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
     assert torch.equal(encoder.embed(TEXTS), made)
 
