@@ -10,13 +10,14 @@ import numpy as np
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_to_mat
 from libero_env.objects.model import ROOT_BODY
+from libero_env.sim.model_checks import STATES
 from libero_env.sim.scene import ROBOT, Scene, fixture_pose, initial_qpos
 from libero_env.tasks.problem import Atom, Region
 
 ARM_NOISE = 0.02  # [rad] standard deviation of the arm's joints around the rest pose, as in the original
 _CLEARANCE = 0.001  # [m] above the surface
 _MAX_TRIES = 500
-_CONDITIONS = {"Open": "open", "Close": "close", "Turnon": "turnon", "Turnoff": "turnoff"}
+_USUAL_GEOMS = 1500  # that may touch; scenes with more have fewer tries, each of which takes longer
 _OVER_SITE = 0.03  # [m] height over a site's box at which the surface that it marks may be
 _SITE_FRACTION = 0.3  # of the edges of a site's box, around its middle, in which objects are placed
 
@@ -45,7 +46,8 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
         fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
 
     Raises:
-        PlacementError: No placement without contact was found in 500 tries, or an init atom cannot be placed.
+        PlacementError: No placement without contact was found in 500 tries, or an init atom cannot be placed. Scenes of
+            unusual size have fewer tries.
     """
     places = _places(scene)
     model = copy(scene.model) if scene.fixtures else scene.model
@@ -58,7 +60,9 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
         model.body_quat[scene.fixture_bodies] = fixtures[:, 3:]
     _sample_joints(scene, data, rng)
     touching: set[str] = set()
-    for _ in range(_MAX_TRIES):
+    solid = int(np.count_nonzero(model.geom_contype | model.geom_conaffinity))
+    tries = fewer(_MAX_TRIES, solid, _USUAL_GEOMS)
+    for _ in range(tries):
         for name, place in places.items():
             if not place.flat:
                 mujoco.mj_kinematics(model, data)  # its carrier has been placed
@@ -69,9 +73,14 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
         if not touching:
             return Start(data.qpos.copy(), fixtures)
     raise PlacementError(
-        f"{scene.problem.language!r}: {', '.join(sorted(touching))} still collide after {_MAX_TRIES} tries. "
+        f"{scene.problem.language!r}: {', '.join(sorted(touching))} still collide after {tries} tries. "
         "(1) make their regions larger, (2) move the regions apart, (3) use fewer or smaller objects"
     )
+
+
+def fewer(tries: int, size: int, usual: int) -> int:
+    """Return a number of tries that takes about the same time in a scene of any size; `tries` up to the usual size."""
+    return tries if size <= usual else max(3, int(tries * (usual / size) ** 2))
 
 
 def lowest_point(scene: Scene, name: str, quat: np.ndarray) -> float:
@@ -164,7 +173,7 @@ def _sample_fixtures(scene: Scene, rng: np.random.Generator) -> np.ndarray:
 def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) -> None:
     """Sample the joints that init atoms require to be open, closed, turned on or off."""
     for atom in scene.problem.init:
-        if (state := _CONDITIONS.get(atom.predicate)) is None:
+        if (state := STATES.get(atom.predicate)) is None:
             continue
         owner = scene.owner(atom.args[0])
         ranges = scene.entities[owner].articulation if owner is not None else {}

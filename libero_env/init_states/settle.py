@@ -3,7 +3,7 @@
 import numpy as np
 
 from libero_env.errors import PlacementError
-from libero_env.init_states.placement import Start, sample_start
+from libero_env.init_states.placement import Start, fewer, sample_start
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene
 from libero_env.sim.simulation import Simulations
@@ -13,6 +13,7 @@ from libero_env.tasks.problem import Region
 _STILL_CHANGE = 2e-4  # [m, or quaternion units] largest change of an object at rest in half a second
 _MAX_HALF_SECONDS = 10
 _MAX_SAMPLES = 20
+_USUAL_FREEDOMS = 250  # of a scene; those with more have fewer samples, each of which takes longer
 _TOLERANCE = 0.02  # [m] distance by which an object may slide out of its rectangle
 
 
@@ -71,10 +72,12 @@ def sample_settled(
         fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
 
     Raises:
-        PlacementError: As `sample_start`; or no sample of 20 comes to rest where it should.
+        PlacementError: As `sample_start`; or no sample of 20 comes to rest where it should. Scenes of unusual size have
+            fewer samples.
     """
     view, reason = StateView(scene, simulations, i), ""
-    for _ in range(_MAX_SAMPLES):
+    samples = fewer(_MAX_SAMPLES, scene.model.nv, _USUAL_FREEDOMS)
+    for _ in range(samples):
         start = sample_start(scene, rng, fixtures)
         try:
             qpos = settle(simulations, i, start.qpos, scene.nq_robot, start.fixtures)
@@ -85,7 +88,7 @@ def sample_settled(
         if not (reason := "; ".join(start_faults(view))):
             return Start(qpos, start.fixtures)
     raise PlacementError(
-        f"{scene.problem.language!r}: none of {_MAX_SAMPLES} sampled starts agrees with the task: {reason}"
+        f"{scene.problem.language!r}: none of {samples} sampled starts agrees with the task: {reason}"
     )
 
 

@@ -14,6 +14,7 @@ from libero_env.sim.regions import BOX_BELOW, Box, contains, is_over, region_box
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or
+from libero_env.tasks.signatures import declare
 
 _ON_XY_DISTANCE = 0.03  # [m] between the origins of an object and the object under it
 _UP_HEIGHT = 1.0  # [m] in the world frame
@@ -145,7 +146,8 @@ def register_predicate(name: str, predicate: Predicate) -> None:
 
     Args:
         name: Name in task files; upper and lower case are the same.
-        predicate: Function that takes a `StateView` and the names of the atom, and returns a bool.
+        predicate: Function that takes a `StateView` and the names of the atom, and returns a bool. Task files must
+            give it as many names as it takes.
 
     Raises:
         LiberoError: The name is not valid in a task file.
@@ -156,6 +158,7 @@ def register_predicate(name: str, predicate: Predicate) -> None:
         )
     for table in SEMANTICS.values():
         table[name.capitalize()] = predicate
+    declare(name.capitalize(), predicate)
 
 
 def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:
@@ -197,18 +200,6 @@ def glowing_sites(view: StateView) -> set[int]:
             of_entity = np.isin(model.site_bodyid, view.scene.bodies[name])
             sites |= set(np.flatnonzero(of_entity & (model.site_group == GLOW_GROUP)).tolist())
     return sites
-
-
-def atoms_of(expression: Expression) -> tuple[Atom, ...]:
-    """Return all atoms of a goal, in reading order."""
-    match expression:
-        case Atom():
-            return (expression,)
-        case And(parts) | Or(parts):
-            return tuple(atom for part in parts for atom in atoms_of(part))
-        case Not(part) | ForAll(_, part):
-            return atoms_of(part)
-    raise TypeError(f"not a goal: {expression!r}")
 
 
 def _joints_in_state(view: StateView, address: str, state: str, opposite: str) -> list[bool]:

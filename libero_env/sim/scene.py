@@ -18,9 +18,11 @@ from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, load_works
 from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
-from libero_env.errors import UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
+from libero_env.sim.model_checks import check_models
+from libero_env.tasks.checks import check_problem
 from libero_env.tasks.problem import Problem, Region
 from libero_env.timing import TIMESTEP
 
@@ -123,8 +125,12 @@ def build_scene(
         robot: One of `libero_env.assets.robot.ROBOTS`.
 
     Raises:
+        ProblemError: The problem is not valid, see `libero_env.tasks.checks`; or a region is no site of its target's
+            model, or a goal has a state that the model does not have.
         UnknownNameError: A category of objects or fixtures has no model.
+        LiberoError: MuJoCo refuses the models, such as those with the same names.
     """
+    check_problem(problem)
     pack = pack or select_pack()
     return _build_scene(problem, pack, drawing or default_drawing(pack), robot)
 
@@ -137,10 +143,20 @@ def default_drawing(pack: Pack) -> str:
 def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
-    model = scene_spec(problem, pack, entities, drawing=drawing, robot=robot).compile()
+    spec = scene_spec(problem, pack, entities, drawing=drawing, robot=robot)
+    try:
+        model = spec.compile()
+    except ValueError as error:  # such as `repeated name 'table_visual' in geom`
+        text = " ".join(str(error).split())
+        raise LiberoError(
+            f"task {problem.language!r}: MuJoCo cannot build its scene ({text}); where a name repeats, rename the "
+            f"object that it begins with"
+        ) from error
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
-    return Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot)
+    scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot)
+    check_models(scene)
+    return scene
 
 
 class _SceneCache:

@@ -12,16 +12,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
 
-from libero_env.tasks.problem import (
-    And,
-    Atom,
-    Expression,
-    ForAll,
-    Not,
-    Or,
-    Problem,
-    Region,
-)
+from libero_env.tasks.checks import faults
+from libero_env.tasks.lines import Lines
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, Region
 from libero_env.tasks.sexpr import List, Word, fail, number, parse_tree, show
 
 SECTIONS = (
@@ -37,54 +30,75 @@ SECTIONS = (
     ":goal",
 )
 
+MAX_CHARACTERS = 1 << 20  # of a task file; the original's have 4,000
 _PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
 
-def parse(text: str, file: str = "<string>") -> Problem:
+def parse(text: str, file: str = "<string>", *, check: bool = True) -> Problem:
     """Return the problem of a BDDL text.
 
     Args:
         text: Content of a task file.
         file: Name of the file for error messages.
+        check: Whether to check what the text means, see `libero_env.tasks.checks`, and not only that it is of the
+            dialect.
 
     Raises:
         BDDLError: The text is not of the dialect, declares a name twice, or has an atom with a name that it does not
-            declare. The message is "file:line: what; expected ...".
+            declare; or no scene can be built from it. The message is "file:line: what; expected ...".
     """
-    return _Reader(file).problem(text)
+    if len(text) > MAX_CHARACTERS:
+        fail(file, 1, f"{len(text)} characters", f"a task file of at most {MAX_CHARACTERS}")
+    tree = parse_tree(text, file)
+    problem = _Reader(file).problem(tree)
+    for fault in faults(problem) if check else ():
+        fail(file, Lines(tree).of_part(fault.section, fault.part), fault.what, fault.expected)
+    return problem
 
 
 def read(path: str | Path) -> Problem:
-    """Return the problem of a task file; see `parse`."""
-    content = Path(path).read_bytes()
+    """Return the problem of a task file; see `parse`.
+
+    Raises:
+        OSError: The file cannot be read.
+        BDDLError: As `parse`.
+    """
+    return parse(read_text(path), str(path))
+
+
+def read_text(path: str | Path) -> str:
+    """Return the text of a task file, of one that is too long the beginning; errors as of `read`."""
+    with open(path, "rb") as file:
+        content = file.read(4 * MAX_CHARACTERS)
     try:
-        return parse(content.decode("utf-8-sig"), str(path))
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         fail(str(path), line, f"the byte 0x{content[error.start]:02x}", "UTF-8 text")
 
 
-def parse_expression(text: str, known: Collection[str], file: str = "<string>") -> Expression:
+def parse_expression(text: str, known: Collection[str], file: str = "<string>", line: int = 1) -> Expression:
     """Return the expression of an atom or goal, such as `On plate_1 stove_1` or `(Or (Open a) (Not (On b c)))`.
 
     Args:
         text: Text of the expression; the brackets of a single atom may be omitted.
         known: Names that it may refer to.
         file: Name of the source for error messages.
+        line: Line of the source that the text begins on, from 1.
 
     Raises:
         BDDLError: As in `parse`.
     """
-    return _Reader(file).expression(_one_list(text, file), set(known))
+    return _Reader(file).expression(_one_list(text, file, line), set(known))
 
 
-def parse_atom(text: str, known: Collection[str], file: str = "<string>") -> Atom:
+def parse_atom(text: str, known: Collection[str], file: str = "<string>", line: int = 1) -> Atom:
     """Return the atom of a text such as `On plate_1 stove_1`; see `parse_expression`."""
-    return _Reader(file).atom(_one_list(text, file), set(known))
+    return _Reader(file).atom(_one_list(text, file, line), set(known))
 
 
-def _one_list(text: str, file: str) -> List:
-    return parse_tree(text if text.lstrip().startswith("(") else f"({text})", file)
+def _one_list(text: str, file: str, line: int) -> List:
+    return parse_tree(text if text.lstrip().startswith("(") else f"({text})", file, line)
 
 
 def write(problem: Problem) -> str:
@@ -155,9 +169,8 @@ class _Reader:
         """Raise the error of a line in this file."""
         fail(self.file, line, what, expected)
 
-    def problem(self, text: str) -> Problem:
-        """Return the problem of a text."""
-        root = parse_tree(text, self.file)
+    def problem(self, root: List) -> Problem:
+        """Return the problem of the tree of a text."""
         if root.head != "define" or len(root.items) < 2:
             self.fail(root.line, "not a problem", "(define (problem NAME) ...)")
         title, *rest = root.items[1:]

@@ -110,6 +110,18 @@ class Problem:
         return next((region for region in self.regions if region.address == address), None)
 
 
+def atoms_of(expression: Expression) -> tuple[Atom, ...]:
+    """Return all atoms of a goal, in reading order."""
+    match expression:
+        case Atom():
+            return (expression,)
+        case And(parts) | Or(parts):
+            return tuple(atom for part in parts for atom in atoms_of(part))
+        case Not(part) | ForAll(_, part):
+            return atoms_of(part)
+    raise TypeError(f"not a goal: {expression!r}")
+
+
 def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
     """Return the differences in meaning of two problems, one line each; empty if they describe the same task.
 

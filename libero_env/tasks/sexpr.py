@@ -50,18 +50,23 @@ def _text(node: Word | List) -> str:
     return node.text if isinstance(node, Word) else f"({' '.join(map(_text, node.items))})"
 
 
-def parse_tree(text: str, file: str) -> List:
+def parse_tree(text: str, file: str, first: int = 1) -> List:
     """Return the one list in a text; `;` starts a comment.
+
+    Args:
+        text: Text to read.
+        file: Name of its file for error messages.
+        first: Line of the file that the text begins on, from 1.
 
     Raises:
         BDDLError: Brackets do not match or nest too deeply, the text is not one list, or it contains characters that
             are not text.
     """
     if bad := _UNREADABLE.search(text):
-        line = text.count("\n", 0, bad.start()) + 1
+        line = text.count("\n", 0, bad.start()) + first
         fail(file, line, f"the character {bad[0]!a}", "text; is this a complete task file?")
-    stack: list[tuple[list, int]] = [([], 1)]
-    line = 1
+    stack: list[tuple[list, int]] = [([], first)]
+    line = first
     for token in _TOKEN.findall(text):
         if token == "\n":
             line += 1
@@ -80,7 +85,7 @@ def parse_tree(text: str, file: str) -> List:
         fail(file, stack[-1][1], "this ( is never closed", "as many ( as )")
     roots = stack[0][0]
     if len(roots) != 1 or not isinstance(roots[0], List):
-        line = roots[1].line if len(roots) > 1 else 1
+        line = roots[1].line if len(roots) > 1 else first
         fail(file, line, f"{len(roots)} expressions at the top", "one (define (problem NAME) ...)")
     return roots[0]
 

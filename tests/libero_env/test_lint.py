@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from libero_env.assets.arena import WORKSPACES, load_workspace
-from libero_env.design.lint.checks import KINDS, Finding, lint_file, lint_task, lint_text
+from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text
 from libero_env.design.lint.scene import furthest_reach, reach
 from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
+from libero_env.tasks.signatures import KINDS
 from lifelong.cli import main as cli
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
@@ -41,7 +42,7 @@ FAULTS = [
     ("main_table - table", "main_table - tabel", "unknown-category", "error", "did you mean .*table"),
     ("(On plate_1 main", "(Onto plate_1 main", "unknown-predicate", "error", "On"),
     ("(On plate_1 main_table_plate_region)", "(On plate_1)", "arity", "error", "On takes 2"),
-    (GOAL, "(And (In akita_black_bowl_1 plate_1))", "kind", "error", "name a region there"),
+    (GOAL, "(And (In akita_black_bowl_1 plate_1))", "kind", "error", "a region there"),
     ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table)", "kind", "error", "main_table is a workspace"),
     ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plat_region)", "unknown-name", "error",
      "did you mean main_table_plate_region"),
@@ -55,7 +56,8 @@ FAULTS = [
     (" (:ranges ((0.04 -0.03 0.060000000000000005 -0.01)))", "", "region-ranges", "error", "no extent"),
     ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1) (:ranges ((0 0 1 1))))",
      "region-ranges", "error", "workspace only"),
-    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "region-ranges", "warning", "X0 < X1"),
+    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "region-ranges", "error",
+     "swapped corners.*X0 <= X1"),
     ("(-0.060000000000000005 0.12000000000000001 -0.04 0.14)", "(0.04 -0.03 0.060000000000000005 -0.01)",
      "duplicate-region", "warning", "same region as main_table_plate_region"),
     ("    akita_black_bowl_1\n    wooden_cabinet_1_top_region", "    akita_bowl_1", "unknown-name", "warning",

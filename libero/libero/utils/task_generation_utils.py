@@ -18,11 +18,10 @@ from libero.libero.utils.bddl_generation_utils import (
 )
 from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
 from libero_env.assets.arena import WORKSPACES
-from libero_env.design.lint.checks import KINDS
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.sim.predicates import atoms_of
 from libero_env.tasks.bddl import parse
 from libero_env.tasks.builder import entities_in_goal
+from libero_env.tasks.problem import atoms_of
 
 # Errors in user-defined scenes and tasks; each is reported for its task alone.
 _FAULTS: tuple[type[Exception], ...] = (LiberoError, ArithmeticError, AttributeError, LookupError)
@@ -126,11 +125,6 @@ def bddl_text(task: TaskInfoTuple) -> str:
             raise UnknownNameError("object category", category, categories)
     for atom in [*problem.init, *atoms_of(problem.goal)]:
         get_predicate_fn(atom.predicate)
-        count = len(KINDS.get(atom.predicate, atom.args))
-        if len(atom.args) != count:
-            raise LiberoError(
-                f"({atom.predicate} {' '.join(atom.args)}): {atom.predicate} takes {count} names"
-            )
     return text
 
 

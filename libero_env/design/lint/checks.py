@@ -4,41 +4,25 @@ Names and atoms are checked here, the instruction in `lint.instruction`, what ne
 """
 
 import re
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
 from libero_env.assets.arena import WORKSPACES, workspace_of_problem
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.design.lint.instruction import check_words
-from libero_env.design.lint.report import Finding, Report, spell
+from libero_env.design.lint.report import Finding, Report
 from libero_env.design.lint.scene import check_scene
 from libero_env.errors import BDDLError, UnknownNameError
-from libero_env.sim.predicates import PREDICATES, atoms_of
+from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
 from libero_env.tasks.authoring import FILE
 from libero_env.tasks.builder import language_from_name
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem
+from libero_env.tasks.checks import faults, kind_of, spell
+from libero_env.tasks.problem import Problem, atoms_of
 from libero_env.tasks.sexpr import List, Word, parse_tree
 
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
 
-_ENTITY = frozenset({"object", "fixture"})
-_PLACE = _ENTITY | {"region"}
-_ANY = _PLACE | {"workspace"}
-# Predicate -> kinds that each of its arguments may have; predicates that users register are not checked.
-KINDS: dict[str, tuple[frozenset[str], ...]] = {
-    "On": (_ENTITY, _PLACE),
-    "In": (_ENTITY, frozenset({"region"})),
-    "Stack": (_ENTITY, _PLACE),
-    "Up": (_ENTITY,),
-    "Open": (_PLACE,),
-    "Close": (_PLACE,),
-    "Turnon": (_PLACE,),
-    "Turnoff": (_PLACE,),
-    "Incontact": (_ANY - {"region"}, _ANY - {"region"}),
-    "Printjointstate": (_PLACE,),
-}
 STARTS = 5  # initial states that are checked by default
 
 
@@ -60,13 +44,9 @@ def lint_file(path: str | Path, pack: Pack | None = None, *, starts: int = START
         OSError: The file cannot be read.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        try:
-            bddl.read(path)
-        except BDDLError as error:
-            return [_syntax(error, str(path))]
-        raise
+        text = bddl.read_text(path)
+    except BDDLError as error:
+        return [_syntax(error, str(path))]
     return lint_text(text, str(path), None, pack, starts=starts)
 
 
@@ -90,7 +70,7 @@ def lint_text(
     report = Report(file, tree)
     _check_declared(report, tree)
     try:
-        problem = bddl.parse(text, file)
+        problem = bddl.parse(text, file, check=False)
     except BDDLError as error:
         finding = _syntax(error, file)
         if all(known.line != finding.line for known in report.findings):
@@ -99,15 +79,12 @@ def lint_text(
     if task is None:
         name = Path(file).stem
         task = Task(FILE, 0, name, language_from_name(name), problem.language, problem)
-    report.categories = set(problem.objects.values())
+    for fault in faults(problem):
+        report.fault(fault)
+        if fault.rule == "size":
+            return report.sorted()
     _check_categories(report, problem, pack)
-    for kind, atoms, lines in (
-        ("init", problem.init, report.lines.init),
-        ("goal", atoms_of(problem.goal), report.lines.goal),
-    ):
-        for atom, line in zip(atoms, lines, strict=True):
-            _check_atom(report, problem, atom, line, kind)
-    _check_goal(report, problem.goal)
+    _check_atoms(report, problem)
     _check_regions(report, problem)
     _check_places(report, problem)
     check_words(report, task, pack)
@@ -180,64 +157,22 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
         report.warning(1, "problem-name", what, "change one of them; only the workspace has an effect here")
 
 
-def kind_of(problem: Problem, name: str) -> str:
-    """Return `object`, `fixture`, `workspace` or `region`; a variable of a quantifier is an object."""
-    if name in problem.objects or name.startswith("?"):
-        return "object"
-    if category := problem.fixtures.get(name):
-        return "workspace" if category in WORKSPACES else "fixture"
-    return "region" if problem.region(name) is not None else "object"
-
-
-def _check_atom(report: Report, problem: Problem, atom: Atom, line: int, section: str) -> None:
-    if atom.predicate not in PREDICATES:
-        what = f"the predicate of {spell(atom)} does not exist"
-        report.error(line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
-        return
-    if (kinds := KINDS.get(atom.predicate)) is None:
-        return
-    if len(atom.args) != len(kinds):
-        what = f"{spell(atom)} has {len(atom.args)} arguments"
-        report.error(line, "arity", what, f"{atom.predicate} takes {len(kinds)}")
-        return
-    for name, allowed in zip(atom.args, kinds, strict=True):
-        if (kind := kind_of(problem, name)) not in allowed:
-            what = f"{spell(atom)}: {name} is {_article(kind)}"
-            remedy = f"name {' or '.join(_article(k) for k in sorted(allowed))} there"
-            report.error(line, "kind", what, remedy)
-    if section == "init" and atom.args[0] in problem.fixtures and atom.predicate in ("On", "In"):
-        region = problem.region(atom.args[1])
-        if region is None or not region.ranges:
-            what = f"{spell(atom)} does not place it: a fixture stands in a region of the workspace"
-            report.error(line, "kind", what, "name a region with :ranges whose target is the workspace")
-
-
-def _article(kind: str) -> str:
-    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
-
-
-def _check_goal(report: Report, goal: Expression) -> None:
-    line = report.lines.section(":goal")
-    match goal:
-        case (And(()) | Or(())) as node:
-            truth = "always" if isinstance(node, And) else "never"
-            report.error(
-                line,
-                "empty-goal",
-                f"an empty {type(node).__name__} is {truth} true",
-                "add the conditions that must hold",
-            )
-        case And(parts) | Or(parts):
-            for part in parts:
-                _check_goal(report, part)
-        case Not(part):
-            _check_goal(report, part)
-        case ForAll(variables, body):
-            for variable, category in variables:
-                if category not in report.categories:
-                    what = f"no object is a {category}: {variable} has no values and the part is always true"
-                    report.error(line, "empty-goal", what, report.suggest(category, report.categories))
-            _check_goal(report, body)
+def _check_atoms(report: Report, problem: Problem) -> None:
+    """Check that predicates exist, and that fixtures stand in regions of the workspace."""
+    atoms = zip(
+        (*problem.init, *atoms_of(problem.goal)), (*report.lines.init, *report.lines.goal), strict=True
+    )
+    for atom, line in atoms:
+        if atom.predicate not in PREDICATES:
+            what = f"the predicate of {spell(atom)} does not exist"
+            report.error(line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
+    for atom, line in zip(problem.init, report.lines.init, strict=True):
+        if atom.args[0] in problem.fixtures and atom.predicate in ("On", "In"):
+            region = problem.region(atom.args[-1])
+            if region is None or not region.ranges:
+                what = f"{spell(atom)} does not place it: a fixture stands in a region of the workspace"
+                remedy = "name a region with :ranges whose target is the workspace"
+                report.error(line, "kind", what, remedy)
 
 
 def _check_regions(report: Report, problem: Problem) -> None:
@@ -246,32 +181,14 @@ def _check_regions(report: Report, problem: Problem) -> None:
     seen: dict[tuple, str] = {}
     for region in problem.regions:
         line, address = report.lines.regions.get(region.address, 1), region.address
-        kind = kind_of(problem, region.target) if region.target in report.lines.entities else ""
         if address not in used | set(problem.obj_of_interest):
-            lost = "" if kind else f", and its target {region.target} is not declared"
+            is_known = region.target in report.lines.entities
+            lost = "" if is_known else f", and its target {region.target} is not declared"
             report.info(line, "unused-region", f"no atom names {address}{lost}", "remove it, or use it")
-        elif not kind:
-            what = f"{address}: its target {region.target} is not declared"
-            report.error(line, "region-target", what, report.suggest(region.target, report.lines.entities))
-        elif kind == "workspace" and not region.ranges:
-            report.error(
-                line, "region-ranges", f"{address} has no extent", "add (:ranges ((X0 Y0 X1 Y1))), metres"
-            )
-        elif kind != "workspace" and region.ranges:
-            what = f"{address}: ranges are for the workspace only, but {region.target} is {_article(kind)}"
-            report.error(
-                line, "region-ranges", what, "remove :ranges; the region is then the site of that name"
-            )
         for x0, y0, x1, y1 in region.ranges:
-            if x1 < x0 or y1 < y0 or (address in goal and (x0 == x1 or y0 == y1)):
-                add = report.error if address in goal else report.warning
-                remedy = "write (X0 Y0 X1 Y1) with X0 < X1 and Y0 < Y1"
-                add(
-                    line,
-                    "region-ranges",
-                    f"{address}: the rectangle ({x0:g} {y0:g} {x1:g} {y1:g}) is empty",
-                    remedy,
-                )
+            if address in goal and (x0 == x1 or y0 == y1):
+                what = f"{address}: the rectangle ({x0:g} {y0:g} {x1:g} {y1:g}) is empty"
+                report.error(line, "region-ranges", what, "write (X0 Y0 X1 Y1) with X0 < X1 and Y0 < Y1")
         key = (region.target, region.ranges, region.yaw)
         if region.ranges and address in used and (first := seen.setdefault(key, address)) != address:
             report.warning(
@@ -280,15 +197,10 @@ def _check_regions(report: Report, problem: Problem) -> None:
 
 
 def _check_places(report: Report, problem: Problem) -> None:
-    """Check that every object and fixture is placed once."""
-    placed = Counter(
-        atom.args[0] for atom in problem.init if atom.predicate in ("On", "In") and len(atom.args) == 2
-    )
+    """Check that every object and fixture is placed."""
+    placed = {atom.args[0] for atom in problem.init if atom.predicate in ("On", "In") and len(atom.args) == 2}
     for name in (*problem.objects, *problem.fixtures):
-        if placed[name] > 1:
-            what = f"{name} is placed {placed[name]} times"
-            report.error(report.lines.section(":init"), "placed-twice", what, "keep one of the atoms")
-        elif not placed[name] and kind_of(problem, name) != "workspace":
+        if name not in placed and kind_of(problem, name) != "workspace":
             add = report.error if name in problem.objects else report.warning
             where = "" if name in problem.objects else "; it stands in the centre of the workspace"
             remedy = f"add (On {name} REGION) to :init"

@@ -5,10 +5,10 @@ from collections.abc import Iterable
 
 from libero_env.assets.arena import WORKSPACES
 from libero_env.assets.pack import Pack
-from libero_env.design.lint.report import Report, spell
-from libero_env.sim.predicates import atoms_of
+from libero_env.design.lint.report import Report
 from libero_env.tasks import Task
-from libero_env.tasks.problem import Problem
+from libero_env.tasks.checks import spell
+from libero_env.tasks.problem import Problem, atoms_of
 
 # words of categories that do not name the object
 _QUALITIES = {

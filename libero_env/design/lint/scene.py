@@ -1,4 +1,4 @@
-"""Checks that need the built scene: sites, joints, reach, and initial states."""
+"""Checks that need the built scene: joints, reach, and initial states."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -9,18 +9,20 @@ import numpy as np
 
 from libero_env.assets.arena import Workspace
 from libero_env.assets.pack import BUILTIN, Pack
-from libero_env.design.lint.report import Report, spell
+from libero_env.design.lint.report import Report
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.init_states.placement import sample_start
 from libero_env.init_states.settle import settle, start_faults
 from libero_env.init_states.store import load_init_states, split_row
-from libero_env.sim.predicates import atoms_of, evaluate
+from libero_env.sim.model_checks import STATES
+from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene, initial_qpos
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 from libero_env.tasks.authoring import FILE
-from libero_env.tasks.problem import And, Atom, Region
+from libero_env.tasks.checks import ProblemError, spell
+from libero_env.tasks.problem import And, Atom, Region, atoms_of
 from libero_env.timing import CONTROL_HZ
 
 # The Panda's dimensions, [m] and [rad]: height of the shoulder above the base, upper arm and forearm (both offset by
@@ -34,8 +36,6 @@ _ARM_LENGTH = _UPPER + _FOREARM + hypot(_WRIST_OUT, _HAND) - _MARGIN  # [m] shou
 _MAX_MOVE = 0.005  # [m] motion of an object at rest during the idle steps
 _IDLE_STEPS = 10  # [control steps]
 _LEVEL_TOLERANCE = 0.03  # [m] height difference up to which a shape belongs to the surface
-
-_STATES = {"Open": "open", "Close": "close", "Turnon": "turnon", "Turnoff": "turnoff"}
 
 
 def reach(workspace: Workspace) -> tuple[float, float]:
@@ -58,47 +58,25 @@ def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
     """Build the scene, check its regions, then some of its initial states."""
     try:
         scene = build_scene(task.problem, pack)
-    except (LiberoError, ValueError) as error:
+    except ProblemError as error:
+        report.fault(error.fault)
+        return
+    except LiberoError as error:
         report.error(1, "scene", f"the scene cannot be built: {error}", "fix what it names")
         return
-    _check_addresses(report, scene)
+    _check_joints(report, scene)
     _check_tables(report, scene)
     if not report.broken:
         _check_starts(report, task, scene, starts)
 
 
-def _check_addresses(report: Report, scene: Scene) -> None:
-    """Check that regions in atoms have a site, and that what is opened or turned on has a joint."""
+def _check_joints(report: Report, scene: Scene) -> None:
+    """Check that what is opened or turned on has a joint."""
     for atom, line in _atoms(report, scene):
-        for name in atom.args:
-            _check_site(report, scene, name)
-        state, owner = _STATES.get(atom.predicate), scene.owner(atom.args[0]) if atom.args else None
-        if state is None or owner is None:
-            continue
-        known = scene.entities[owner].articulation
-        if not scene.joints.get(atom.args[0]):
-            what, remedy = (
-                f"{spell(atom)}: it has no joint",
-                "use an object with a joint, or a region on its moving part",
-            )
-            report.error(line, "no-joint", what, remedy)
-        elif state not in known:
-            what = f"{spell(atom)}: the state {state!r} of a {scene.entities[owner].category} is not defined"
-            remedy = f"it can be {', '.join(sorted(known)) or 'in no such state'}"
-            report.error(line, "no-joint", what, remedy)
-
-
-def _check_site(report: Report, scene: Scene, name: str) -> None:
-    region = scene.problem.region(name)
-    if region is None or region.ranges or mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_SITE, name) >= 0:
-        return
-    prefix = f"{region.target}_"
-    sites = [scene.model.site(s).name for s in range(scene.model.nsite)]
-    own = [site.removeprefix(prefix) for site in sites if site.startswith(prefix)]
-    remedy = (
-        report.suggest(region.name, own) if own else "use the name of the object itself; it has no regions"
-    )
-    report.error(report.lines.of(name), "no-site", f"{region.target} has no region {region.name!r}", remedy)
+        owner = scene.owner(atom.args[0]) if atom.predicate in STATES else None
+        if owner is not None and not scene.joints.get(atom.args[0]):
+            remedy = "use an object with a joint, or a region on its moving part"
+            report.error(line, "no-joint", f"{spell(atom)}: it has no joint", remedy)
 
 
 def _atoms(report: Report, scene: Scene) -> Iterator[tuple[Atom, int]]:

@@ -1,0 +1,72 @@
+"""BDDL texts through the parser, and through environment, reset and steps."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from libero_env.design.lint.checks import lint_text
+from libero_env.envs.env import LiberoEnv
+from libero_env.tasks import bddl, get_task
+from libero_env.tasks.problem import differences
+from libero_env.tasks.task import Task
+from tests.harness.fuzz import examples, survive
+from tests.harness.mutations import changed_text
+
+TASKS = ("libero_goal/3", "libero_object/0", "libero_10/2", "libero_90/2", "libero_spatial/4")
+TEXTS = [get_task(key).bddl_text for key in TASKS]
+SMALL = """(define (problem LIBERO_Floor_Manipulation) (:domain robosuite) (:language put it there)
+(:regions (near (:target floor) (:ranges ((-0.1 -0.1 -0.05 -0.05))) (:yaw_rotation ((0 pi/2))))
+ (far (:target floor) (:ranges ((0.1 0.1 0.15 0.15)))) (contain_region (:target basket_1)))
+(:fixtures floor - floor) (:objects milk_1 butter_1 - milk basket_1 - basket) (:obj_of_interest milk_1)
+(:init (On milk_1 floor_near) (On butter_1 milk_1) (On basket_1 floor_far))
+(:goal (And (In milk_1 basket_1_contain_region) (Or (Up milk_1) (Not (ForAll (?x - milk) (On ?x basket_1)))))))
+"""
+
+
+@st.composite
+def changed_bddl(draw, texts=(*TEXTS, SMALL, SMALL)):
+    text = draw(st.sampled_from(texts))
+    for _ in range(draw(st.integers(1, 3))):
+        text = draw(changed_text(text))
+    return text
+
+
+@pytest.mark.unit
+@given(text=changed_bddl())
+@examples(short=150, long=10000)
+def test_any_text_is_parsed_or_refused_with_a_line(text):
+    def attempt():
+        problem = bddl.parse(text, "fuzz.bddl")
+        assert differences(bddl.parse(bddl.write(problem)), problem) == []
+
+    survive("BDDL, parser", attempt)
+
+
+@pytest.mark.unit
+@given(text=changed_bddl())
+@examples(short=30, long=2000)
+def test_any_text_has_findings(text):
+    survive("BDDL, linter", lambda: lint_text(text, "fuzz.bddl", starts=0))
+
+
+@pytest.mark.sim
+@given(text=changed_bddl())
+@examples(short=6, long=1500)
+def test_any_text_makes_an_environment_or_is_refused(text):
+    survive("BDDL, environment", lambda: run(text))
+
+
+def run(text: str) -> None:
+    """Build the scene of a text, reset twice and step."""
+    problem = bddl.parse(text, "fuzz.bddl")
+    env = LiberoEnv(
+        Task("file", 0, "fuzz", "fuzz", problem.language, problem), cameras=(), observations=("objects",)
+    )
+    try:
+        env.reset(seed=0)
+        for _ in range(2):
+            obs, *_ = env.step(np.zeros(7))
+        assert all(np.isfinite(value).all() for value in obs.values())
+    finally:
+        env.close()

@@ -1,0 +1,228 @@
+"""Problems that no scene can be built from are refused: by the parser with a line, by the environment with the task."""
+
+import dataclasses
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+from libero_env.design.certify import certify
+from libero_env.design.lint.checks import lint_text
+from libero_env.envs.env import LiberoEnv
+from libero_env.errors import BDDLError, InvalidInputError, LiberoError, PlacementError
+from libero_env.sim.predicates import SEMANTICS, register_predicate
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import bddl
+from libero_env.tasks.checks import MAX_METRES, ProblemError, check_problem
+from libero_env.tasks.problem import And, Atom, ForAll, Not, Problem, Region
+from libero_env.tasks.problem_types import MAX_ENTITIES
+from libero_env.tasks.signatures import KINDS
+from libero_env.tasks.task import Task
+
+TEXT = """(define (problem LIBERO_Kitchen_Tabletop_Manipulation) (:domain robosuite)
+(:language put the bowl on the plate)
+(:regions
+ (bowl_place (:target kitchen_table) (:ranges ((-0.03 -0.02 0.03 0.02))) (:yaw_rotation ((0 pi/2))))
+ (plate_place (:target kitchen_table) (:ranges ((0.04 0.18 0.06 0.22))))
+ (cabinet_place (:target kitchen_table) (:ranges ((-0.01 -0.31 0.01 -0.29))) (:yaw_rotation ((pi pi))))
+ (top_region (:target wooden_cabinet_1)))
+(:fixtures kitchen_table - kitchen_table wooden_cabinet_1 - wooden_cabinet)
+(:objects bowl_1 bowl_2 - akita_black_bowl plate_1 - plate)
+(:obj_of_interest bowl_1)
+(:init (On bowl_1 kitchen_table_bowl_place)
+ (On plate_1 kitchen_table_plate_place)
+ (On bowl_2 plate_1)
+ (On wooden_cabinet_1 kitchen_table_cabinet_place))
+(:goal (And (Not (On bowl_1 plate_1))
+ (Open wooden_cabinet_1_top_region))))
+"""
+GOAL = TEXT[TEXT.index("(:goal") :]
+FAULTS = [  # old, new, line, message
+    ("(-0.03 -0.02 0.03 0.02)", "(0.03 -0.02 -0.03 0.02)", 4, "swapped corners; expected (X0 Y0 X1 Y1) with X0 <= X1"),
+    ("(-0.03 -0.02 0.03 0.02)", "(-0.03 0.02 0.03 -0.02)", 4, "swapped corners"),
+    ("(-0.03 -0.02 0.03 0.02)", "(-1e308 -0.02 1e308 0.02)", 4, "metres from -10 to 10"),
+    ("(-0.03 -0.02 0.03 0.02)", f"(0 0 0 {MAX_METRES + 0.1})", 4, "metres from -10 to 10"),
+    ("(0 pi/2)", "(pi/2 0)", 4, "LOW <= HIGH"),
+    ("(0 pi/2)", "(0 1e300)", 4, "radians from -100 to 100"),
+    ("(On bowl_1 plate_1)", "(On bowl_1)", 15, "(On bowl_1) has 1 name; expected 2: On takes 2 names"),
+    ("(On bowl_1 plate_1)", "(Up bowl_1 plate_1)", 15, "has 2 names; expected 1: Up takes 1 name"),
+    ("(On bowl_1 plate_1)", "(In bowl_1 plate_1)", 15, "plate_1 is an object; expected a region there"),
+    ("(On bowl_1 plate_1)", "(On kitchen_table plate_1)", 15, "kitchen_table is a workspace"),
+    ("(On bowl_1 plate_1)", "(On bowl_1 bowl_1)", 15, "is of bowl_1 and itself"),
+    ("(On bowl_2 plate_1)", "(On bowl_2 bowl_2)", 13, "is of bowl_2 and itself"),
+    ("(On plate_1 kitchen_table_plate_place)", "(On plate_1 bowl_2)", 12, "by way of others, on itself"),
+    ("(On bowl_2 plate_1)", "(On bowl_2 plate_1) (On bowl_2 kitchen_table_plate_place)", 13, "is placed 2 times"),
+    ("(Open wooden", "(On) (Open wooden", 16, "not an atom"),
+    (GOAL, "(:goal (And)))", 15, "an empty And is always true"),
+    (GOAL, "(:goal (Or (Up bowl_1) (Or))))", 15, "an empty Or is never true"),
+    (GOAL, "(:goal (ForAll (?x - milk) (Up ?x))))", 15, "no object is a milk"),
+    (GOAL, "(:goal (ForAll (bowl_1 - plate) (Up bowl_1))))", 15, "the variable 'bowl_1'; expected a new name"),
+    (GOAL, f"(:goal {'(ForAll (?x ?y - akita_black_bowl) ' * 8}(Up ?x){')' * 10}", 15, "stand for 65536 atoms"),
+    ("bowl_2 - akita", " ".join(f"b{i}" for i in range(MAX_ENTITIES)) + " bowl_2 - akita", 9, "at most 100"),
+    ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1) (:ranges ((0 0 1 1))))", 7,
+     "ranges are for the workspace only"),
+    ("(plate_place (:target kitchen_table) (:ranges ((0.04 0.18 0.06 0.22))))", "(plate_place (:target kitchen_table))",
+     5, "has no extent"),
+    ("(:target wooden_cabinet_1)", "(:target wooden_cabinet_1) (:rgba (0 0 1 1))", 0, ""),
+]  # fmt: skip
+NAMES = (
+    "robot0_base",
+    "robot",
+    "world",
+    "gripper0",
+    "mount0_x",
+    "ee",
+    "a/b",
+    "../x",
+    "x" * 200,
+    "-x",
+    "a\u202eb",
+)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(("old", "new", "line", "message"), FAULTS, ids=lambda value: str(value)[:30])
+def test_the_parser_and_the_linter_name_the_line(old, new, line, message):
+    assert old in TEXT
+    text = TEXT.replace(old, new)
+    if not line:
+        assert bddl.parse(text)
+        return
+    with pytest.raises(BDDLError) as caught:
+        bddl.parse(text, "mine.bddl")
+    assert str(caught.value).startswith(f"mine.bddl:{line}: ") and message in str(caught.value)
+    assert any(f.line == line and f.level == "error" for f in lint_text(text, "mine.bddl", starts=0))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_the_robot_and_those_that_are_no_names_are_refused(name):
+    with pytest.raises(BDDLError, match=r"mine\.bddl:9: the name "):
+        bddl.parse(TEXT.replace("bowl_1", name), "mine.bddl")
+
+
+@pytest.mark.unit
+def test_a_region_is_not_also_an_object():
+    text = TEXT.replace("bowl_2", "kitchen_table_plate_place")
+    with pytest.raises(BDDLError, match="is both a region of kitchen_table and an object"):
+        bddl.parse(text)
+
+
+@pytest.mark.unit
+def test_a_file_that_is_too_large_is_refused(tmp_path):
+    path = tmp_path / "large.bddl"
+    path.write_text("; " + "x" * (1 << 22))
+    with pytest.raises(BDDLError, match="characters; expected a task file of at most 1048576"):
+        bddl.read(path)
+
+
+PROBLEM = bddl.parse(TEXT)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"language": 3}, "language is 3; expected a text"),
+        ({"language": "a)b"}, "one line without"),
+        ({"language": "a\nb"}, "one line without"),
+        ({"objects": ["plate"]}, "objects is"),
+        ({"fixtures": {"kitchen_table": 1}}, "fixtures is"),
+        ({"regions": (Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),)}, "a tuple of Region"),
+        ({"regions": (Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),)}, "a tuple of Region"),
+        ({"regions": (Region("a", "kitchen_table", ((0.0, 0.0, math.nan, 1.0),)),)}, "metres from"),
+        ({"regions": [PROBLEM.regions[0]]}, "a tuple of Region"),
+        ({"init": (Atom("On", ()),)}, "a tuple of Atom"),
+        ({"init": (Atom("On", ("bowl_1", "nowhere")),)}, "nowhere is not declared"),
+        ({"goal": "Up bowl_1"}, "in the goal; expected Atom, And, Or, Not or ForAll"),
+        ({"goal": And([Atom("Up", ("bowl_1",))])}, "in the goal"),
+        ({"goal": ForAll(("?x", "plate"), Atom("Up", ("?x",)))}, "in the goal"),
+        ({"goal": And(tuple(Atom("Up", ("bowl_1",)) for _ in range(2000)))}, "the goal is too large"),
+        ({"scene_properties": {"floor": "a b)"}}, "words without"),
+        ({"name": "a b"}, "the name 'a b' of the problem"),
+        ({"obj_of_interest": "bowl_1"}, "a tuple of names"),
+    ],
+    ids=str,
+)
+def test_a_problem_made_in_python_is_checked(changes, message):
+    problem = dataclasses.replace(PROBLEM, **changes)
+    with pytest.raises(ProblemError) as caught:
+        build_scene(problem)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
+
+
+@pytest.mark.unit
+def test_a_goal_of_any_depth_is_refused_without_recursion():
+    goal = Atom("Up", ("bowl_1",))
+    for _ in range(100_000):
+        goal = Not(goal)
+    try:
+        with pytest.raises(InvalidInputError, match="the goal is too large; expected at most 64 levels"):
+            check_problem(Problem("p", "x", goal, PROBLEM.fixtures, PROBLEM.objects))
+    finally:
+        while isinstance(goal, Not):  # its own end would recurse
+            goal = goal.part
+
+
+@pytest.mark.unit
+def test_a_users_predicate_takes_as_many_names_as_its_function(monkeypatch):
+    for table in (*SEMANTICS.values(), KINDS):
+        monkeypatch.setitem(table, "Near", None)
+    register_predicate("near", lambda view, a, b: True)
+    text = TEXT.replace("(On bowl_1 plate_1)", "(Near bowl_1 kitchen_table)")
+    assert bddl.parse(text).goal.parts[0] == Not(Atom("Near", ("bowl_1", "kitchen_table")))
+    with pytest.raises(BDDLError, match="Near takes 2 names"):
+        bddl.parse(text.replace("(Near bowl_1 kitchen_table)", "(Near bowl_1)"))
+    register_predicate("near", lambda view, *names: True)
+    assert bddl.parse(text.replace("(Near bowl_1 kitchen_table)", "(Near bowl_1)"))
+
+
+def task(text: str) -> Task:
+    problem = bddl.parse(text)
+    return Task("file", 0, "mine", "mine", problem.language, problem)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("top_region", "upper_region", "wooden_cabinet_1 has no region 'upper_region'. Did you mean"),
+        (
+            "(On bowl_2 plate_1)",
+            "(On bowl_2 plate_1_lid)",
+            "plate_1 has no region 'lid'; expected plate_1 itself",
+        ),
+        (
+            "(Open wooden_cabinet_1_top_region)",
+            "(Turnon wooden_cabinet_1)",
+            "'turnon' of a wooden_cabinet is not",
+        ),
+        ("bowl_2", "wooden_cabinet_1_cabinet_top", "repeated name"),
+    ],
+)
+def test_what_the_models_lack_is_one_error_everywhere(old, new, message, tmp_path):
+    text = TEXT.replace(old, new)
+    if "lid" in new:
+        text = text.replace("(top_region (:t", "(lid (:target plate_1)) (top_region (:t")
+    broken = task(text)
+    with pytest.raises(LiberoError) as caught:
+        LiberoEnv(broken, cameras=())
+    assert message in str(caught.value)
+    (found,) = [f for f in lint_text(text, "mine.bddl", starts=1) if f.level == "error"]
+    assert message.partition(";")[0] in str(found)
+    (certificate,) = certify([broken], 1, out=tmp_path, progress=False)
+    assert message in certificate.outcomes[0].reason
+
+
+@pytest.mark.sim
+def test_the_task_runs_as_long_as_nothing_is_wrong_and_placement_ends_in_seconds():
+    env = LiberoEnv(task(TEXT), cameras=())
+    env.reset(seed=0)
+    assert env.step(np.zeros(7))[4]["progress"]
+    env.close()
+    env = LiberoEnv(task(TEXT.replace("(-0.03 -0.02 0.03 0.02)", "(0.05 0.2 0.05 0.2)")), cameras=())
+    with pytest.raises(PlacementError, match="still collide after 500 tries"):
+        env.reset(seed=0)
+    env.close()
