@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from libero_env.storage import atomic_path, show_bytes
-from lifelong.errors import CheckpointError
+from lifelong.errors import CheckpointError, DamagedCheckpointError
 
 FORMAT = "lifelong-2"
 FIRST_FORMAT = "lifelong-1"  # without a checksum
@@ -33,13 +33,14 @@ _DTYPES = (
 )
 
 
-def save(path: Path, tree: dict[str, Any]) -> None:
+def save(path: Path, tree: dict[str, Any], *, previous: Path | None = None) -> None:
     """Write a tree to a file, which replaces an older one in one step. It is on disk when this returns.
 
     Args:
         path: File to write; its folder is created.
         tree: Nested dictionaries (with keys of type str or int), lists and tuples. Leaves are tensors, str, int,
             float, bool or None.
+        previous: Name that an older file is given, in the same folder; None for one that is replaced.
 
     Raises:
         CheckpointError: A leaf is of another type, or the file cannot be written.
@@ -54,6 +55,8 @@ def save(path: Path, tree: dict[str, Any]) -> None:
     try:
         with atomic_path(path, fsync=True) as temporary:
             temporary.write_bytes(content)
+            if previous is not None and path.exists():
+                os.replace(path, previous)
     except OSError as error:
         message = f"cannot write {path}: {error}. Free some space; an older file is intact"
         raise CheckpointError(message) from error
@@ -67,7 +70,8 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         device: Device of the tensors.
 
     Raises:
-        CheckpointError: The file is missing, damaged, or was not written by `save`.
+        DamagedCheckpointError: The file is damaged, or was not written by `save`.
+        CheckpointError: The file is missing.
     """
     return read(path, device)[0]
 
@@ -92,7 +96,7 @@ def read(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Any]
             raise ValueError("it holds no dictionary")
         return tree, head["format"] == FORMAT
     except (OSError, SafetensorError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path} is broken, or is no checkpoint ({error})") from error
+        raise DamagedCheckpointError(f"{path} is broken, or is no checkpoint ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,9 @@ def check(tree: Any, form: Any, source: Path | str, policy: torch.nn.Module | No
     Args:
         tree: Tree, or a part of one.
         form: Type of the value; `{type: form}` for a dictionary of any keys of the type; `{name: form}` for one with
-            exactly these keys; a tuple of forms for alternatives, of which the last one is reported; None for None;
-            `Weights` for weights of the policy. Numbers in tensors must be finite, except where the policy's are not.
+            exactly these keys; `[form]` for a list; a tuple of forms for alternatives, of which the last one is
+            reported; None for None; `Weights` for weights of the policy. Numbers in tensors must be finite, except
+            where the policy's own are not.
         source: Where it comes from, for error messages.
         policy: Policy that `Weights` refer to.
 
@@ -253,6 +258,10 @@ def _difference(value: Any, form: Any, own: Mapping[str, Tensor], path: str = ""
         return _weights_difference(value, form, own, path)
     if isinstance(form, dict):
         return _dict_difference(value, form, own, path)
+    if isinstance(form, list):
+        return _dict_difference(
+            dict(enumerate(value)) if isinstance(value, list) else value, {int: form[0]}, own, path
+        )
     kind = type(None) if form is None else form
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         return f"{path or 'it'} is of type {type(value).__name__}; expected {kind.__name__}"

@@ -17,6 +17,10 @@ class CheckpointError(LifelongError, ValueError):
     """Raised for a checkpoint that is missing, broken, or does not fit the model."""
 
 
+class DamagedCheckpointError(CheckpointError):
+    """Raised for a checkpoint that is not as it was written, or a file that never was one."""
+
+
 class TrainingError(LifelongError, RuntimeError):
     """Raised when training cannot continue: the loss is not finite, or the dataset is empty."""
 

@@ -227,9 +227,7 @@ def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Ma
     began = time.perf_counter()
     datasets = _open_datasets(context)
     with context.envs:
-        if pretraining is not None and not context.ranks.broadcast(lambda: context.directory.started):
-            _pretrain(pretraining, context, plain)
-        TaskSequence(context, datasets).run()
+        TaskSequence(context, datasets, prepare=lambda: _pretrain(pretraining, context, plain)).run()
     if context.ranks.first:
         seconds = time.perf_counter() - began
         context.directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
@@ -250,8 +248,10 @@ def _find_demos(context: RunContext) -> list[Path]:
     return paths
 
 
-def _pretrain(pretraining: RunContext, context: RunContext, plain: Mapping[str, Any]) -> None:
-    """Train the policy on what comes before the sequence, or load its weights if that is done."""
+def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mapping[str, Any]) -> None:
+    """Train the policy on what comes before the sequence, if anything does, or load its weights if that is done."""
+    if pretraining is None:
+        return
     ranks, directory, began = context.ranks, pretraining.directory, time.perf_counter()
     config, suite = _pretraining_config(plain), str(plain["pretrain"]["suite"])
     with _opened(pretraining, config, resume=True):

@@ -3,21 +3,21 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
 from torch import Tensor
 
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
-from lifelong.errors import CheckpointError
+from lifelong.errors import CheckpointError, ConfigError
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import RunDirectory, result_relevant
-from lifelong.results.saved_config import upgrade_config
+from lifelong.results.saved_config import read_saved_config, upgrade_config
 from lifelong.settings import PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
@@ -47,14 +47,12 @@ def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
 
 def _last_checkpoint(run: Path) -> Path:
     """Return the checkpoint after the last task of a finished run."""
-    found = {
-        int(f.stem[5:]): f for f in (run / "checkpoints").glob("task_*.safetensors") if f.stem[5:].isdecimal()
-    }
-    if not found:
+    folder = RunDirectory(run).checkpoints
+    if not (found := folder.tasks()):
         raise CheckpointError(
             f"{run} has no checkpoints/task_<k>.safetensors: it is no run directory, or no task is learned yet"
         )
-    last = found[max(found)]
+    last = folder.task_path(found[-1])
     if not ResultLog(run / "results.jsonl").read().finished:
         raise CheckpointError(
             f"{run} is not finished; finish it, or name one of its checkpoints, such as init_from={last}"
@@ -109,6 +107,9 @@ def pretraining_directory(folder: Path, config: Mapping[str, Any]) -> RunDirecto
     relevant = result_relevant(config)
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
     for file in sorted(folder.glob("*/config.yaml")):
-        if result_relevant(upgrade_config(yaml.safe_load(file.read_text(encoding="utf-8")))) == relevant:
-            return RunDirectory(file.parent)
+        with suppress(
+            ConfigError
+        ):  # a broken one belongs to another pretraining, or says so when it is opened
+            if result_relevant(upgrade_config(read_saved_config(file))) == relevant:
+                return RunDirectory(file.parent)
     return RunDirectory(folder / digest)

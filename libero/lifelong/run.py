@@ -38,6 +38,7 @@ from libero.lifelong.utils import (
 from libero_env.demos.generate import ensure_demos
 from libero_env.storage import atomic_path
 from lifelong import checkpoints
+from lifelong.algorithms.base import load_algorithm
 from lifelong.errors import ConfigError
 from lifelong.tracking import Tracker
 
@@ -211,9 +212,10 @@ class _Run:
         """Load weights, memory and results as they were after a task."""
         path = self._state_path(task)
         state = checkpoints.load(path, self.cfg.device)
+        checkpoints.check(state, {"policy": dict, "algorithm": dict}, path)
         checkpoints.load_weights(self.algo.policy, state["policy"], path)
         windows = {k: DictWindows(dataset, k) for k, dataset in enumerate(self.datasets)}
-        self.algo.hooks.load_state_dict(state["algorithm"], cast(Any, windows))
+        load_algorithm(self.algo.hooks, state["algorithm"], cast(Any, windows), self.algo.policy, path)
         stored = torch.load(path.with_name("result.pt"), weights_only=True)
         summary.update({key: np.asarray(value) if key in RESULTS else value for key, value in stored.items()})
         print(f"[info] resuming after task {task} of {path.parent}")

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -22,6 +22,8 @@ class AGEM(Algorithm):
 
     LIBERO's code has `FirstWindows` as memory and augments its windows. No results of that are published.
     """
+
+    state_form = {"memory": MEMORY_FORM}
 
     def __init__(self, *, memory: ReplayMemory, ratio: float = 1.0, augment_reference: bool = False):
         """Create the algorithm.

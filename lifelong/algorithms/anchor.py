@@ -6,7 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lifelong.checkpoints import Weights
+from lifelong.errors import CheckpointError
 from lifelong.policies.base import Policy
+
+ANCHOR_FORM = {"importance": Weights(), "anchor": Weights()}
 
 
 class Anchor:
@@ -58,5 +62,11 @@ class Anchor:
         return {"importance": dict(self.importance), "anchor": dict(self.weights)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned.
+
+        Raises:
+            CheckpointError: Other weights are anchored than have an importance.
+        """
+        if odd := sorted(state["importance"].keys() ^ state["anchor"].keys()):
+            raise CheckpointError(f"{odd[0]} has an importance or an anchor, but not both")
         self.importance, self.weights = dict(state["importance"]), dict(state["anchor"])

@@ -25,12 +25,15 @@ The hooks from `begin_task` to `end_task` are called for every task, or for ever
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from lifelong import checkpoints
 from lifelong.data.windows import TaskWindows
+from lifelong.errors import CheckpointError, DataError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -87,9 +90,12 @@ class Algorithm:
     Attributes:
         augment: Augmentation of training batches, for algorithms that also apply it elsewhere; None for no
             augmentation.
+        state_form: Form of what the class's own `state_dict` returns, see `lifelong.checkpoints.check`. A state from a
+            file is checked by it before `load_state_dict` gets it; without one it is not checked.
     """
 
     augment: Augmentation | None = None
+    state_form: ClassVar[Any] = {}
 
     def set_augmentation(self, augment: Augmentation | None) -> None:
         """Receive the augmentation of training batches, before any other hook and also when a run is resumed."""
@@ -183,3 +189,33 @@ class Algorithm:
             state: State from `state_dict`.
             datasets: Windows of the tasks learned so far, by position; each is read when it is accessed.
         """
+
+
+def load_algorithm(
+    algorithm: Algorithm,
+    state: Mapping[str, Any],
+    datasets: Mapping[int, TaskWindows],
+    policy: Policy,
+    source: Path,
+) -> None:
+    """Load an algorithm's state from a file.
+
+    Args:
+        algorithm: Algorithm to load into.
+        state: State as the file has it.
+        datasets: Windows of the tasks learned so far, by position.
+        policy: Policy that the algorithm belongs to.
+        source: The file, for error messages.
+
+    Raises:
+        CheckpointError: The state is that of another algorithm, or of another policy.
+    """
+    for kind in type(algorithm).__mro__:  # a class with a state_dict of its own may have another form
+        if "state_form" in vars(kind):
+            checkpoints.check(state, algorithm.state_form, f"{source}: the state of the algorithm", policy)
+        if "state_form" in vars(kind) or "state_dict" in vars(kind):
+            break
+    try:
+        algorithm.load_state_dict(state, datasets)
+    except DataError as error:
+        raise CheckpointError(f"{source}: {error}") from error

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -28,6 +28,8 @@ class DERpp(Algorithm):
     * |.|^2 is summed over an action's dimensions and averaged over steps and windows. Inputs are not
       augmented there: z was not.
     """
+
+    state_form = {"memory": MEMORY_FORM, "outputs": {int: Tensor}}
 
     def __init__(self, *, budget: int = 10_000, ratio: float = 1.0, alpha: float = 0.3):
         """Create the algorithm.

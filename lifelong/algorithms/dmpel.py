@@ -50,6 +50,14 @@ class DMPEL(Algorithm):
       layers with experts.
     """
 
+    state_form = {
+        **dict.fromkeys(("task_index", "base_left", "seed"), int),
+        "library": {int: {str: {"a": Tensor, "b": Tensor}}},
+        "router": ({}, {"enter": Tensor, "keys": Tensor, "bias": Tensor}),
+        "memory": {int: {"queries": Tensor, "coefficients": Tensor}},
+        "episodes": ({}, {"queries": Tensor, "of_window": Tensor}),
+    }
+
     def __init__(
         self,
         *,

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -20,6 +20,8 @@ class ER(Algorithm):
     results of Liu et al., table 8 (FWT / NBT / AUC of ResNet-T: LONG .48 / .32 / .32, SPATIAL .65 / .27 / .56,
     OBJECT .67 / .43 / .44, GOAL .64 / .34 / .49).
     """
+
+    state_form = {"memory": MEMORY_FORM}
 
     def __init__(self, *, memory: ReplayMemory, ratio: float = 1.0):
         """Create the algorithm.

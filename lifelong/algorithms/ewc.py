@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.anchor import Anchor
+from lifelong.algorithms.anchor import ANCHOR_FORM, Anchor
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.importance import ImportanceEstimator, SampleFisher
 from lifelong.data.windows import TaskWindows
@@ -24,6 +24,8 @@ class EWC(Algorithm):
     Liu et al., table 8 (FWT / NBT / AUC of ResNet-T: LONG .13 / .22 / .02, SPATIAL .23 / .33 / .06,
     OBJECT .56 / .69 / .16, GOAL .32 / .48 / .06).
     """
+
+    state_form = ANCHOR_FORM
 
     def __init__(
         self,

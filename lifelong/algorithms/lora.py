@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm
+from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.nn.adapters import check_matches, freeze_statistics, initial_pair, matches
@@ -30,6 +31,13 @@ class LoRA(Algorithm):
     `base_tasks`, or as it was pretrained with `base_tasks=0`, and by default every matrix is adapted,
     because a base that has learned one task has no general features. There is no dropout before A.
     """
+
+    state_form = {
+        **dict.fromkeys(("task_index", "base_left", "base_last", "seed"), int),
+        "base": Weights(),
+        "pairs": {int: {str: {"a": Tensor, "b": Tensor}}},
+        "own": {int: Weights()},
+    }
 
     def __init__(
         self,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
+from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
@@ -24,6 +25,8 @@ class LwF(Algorithm):
     one output layer, and the instruction takes the place of the choice among them. No data are kept. Observations
     are not augmented in this term.
     """
+
+    state_form = {"weights": Weights(), "languages": {int: Tensor}}
 
     def __init__(self, *, strength: float = 3.0):
         """Create the algorithm.

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.anchor import Anchor
+from lifelong.algorithms.anchor import ANCHOR_FORM, Anchor
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.importance import ActionSensitivity
 from lifelong.data.windows import TaskWindows
@@ -20,6 +20,8 @@ class MAS(Algorithm):
     `Omega_i += mean over windows of |d |h(x)|^2 / d theta_i|` (section 4.1), see `ActionSensitivity`; the loss of
     later tasks gains `strength * sum_i Omega_i (theta_i - anchor_i)^2`.
     """
+
+    state_form = {"anchor": ANCHOR_FORM}
 
     def __init__(self, *, strength: float = 1.0, windows: int = 512):
         """Create the algorithm.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, ConfigError
 from lifelong.policies.base import Policy
@@ -32,6 +33,8 @@ class PackNet(Algorithm):
     LONG .22 / .08 / .25, SPATIAL .55 / .07 / .63, OBJECT .60 / .17 / .60, GOAL .63 / .06 / .75). Two differences
     remain: there, gradients are clipped before they are zeroed, and retraining keeps the epoch with the best success.
     """
+
+    state_form = {"task_index": int, "pruned": bool, "owner": Weights()}
 
     def __init__(self, *, prune_perc: float = 0.75, post_prune_share: float = 1.0, masks_only: bool = False):
         """Create the algorithm.

@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.anchor import Anchor
+from lifelong.algorithms.anchor import ANCHOR_FORM, Anchor
 from lifelong.algorithms.base import Algorithm
+from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 
@@ -25,6 +26,8 @@ class SI(Algorithm):
     Where the best epoch's weights are kept, these are the anchor; the importance is still that of the whole
     path, so that omega and Delta are of the same path.
     """
+
+    state_form = {"anchor": ANCHOR_FORM, "omega": Weights(), "way": Weights()}
 
     def __init__(self, *, strength: float = 0.1, damping: float = 1e-3):
         """Create the algorithm.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
+from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 
@@ -19,6 +20,8 @@ class SingleTask(Algorithm):
     policy, and columns of the success matrix are constant. The weights of all tasks are kept in memory and in every
     checkpoint.
     """
+
+    state_form = {"initial": (None, Weights(complete=True)), "learned": {int: Weights(complete=True)}}
 
     def __init__(self) -> None:
         self._initial: dict[str, Tensor] | None = None

@@ -10,6 +10,8 @@ from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset
 from lifelong.errors import DataError
 from lifelong.types import Batch
 
+MEMORY_FORM = {"budget": int, "indices": {str: Tensor}}  # see `lifelong.checkpoints.check`
+
 
 class ReplayMemory:
     """A uniform sample of the windows of each past task, within one budget.
@@ -97,6 +99,9 @@ class ReplayMemory:
         Raises:
             DataError: A dataset is missing or has fewer windows than the state refers to; the memory is unchanged.
         """
+        for task, kept in state["indices"].items():
+            if not task.isdecimal() or kept.dtype != torch.int64 or kept.dim() != 1 or (kept < 0).any():
+                raise DataError(f"the memory's windows of task {task!r} are no indices")
         indices = {int(task): i.clone() for task, i in state["indices"].items()}
         absent = sorted(set(indices) - set(datasets))
         if absent:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from libero_env.tasks import Task
 from lifelong import checkpoints
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.base import Algorithm, load_algorithm
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, LifelongError
@@ -113,15 +113,15 @@ def restore(source: Path, *, after: int | None = None, device: str = "auto") -> 
     instructions = tuple(t.language for t in (*before, *tasks))
     spec = data.spec(language.embed(instructions).shape[1])
     policy, algorithm = build(config.policy, spec=spec).to(where), build(config.algo)
-    state = checkpoints.load(checkpoint, where)
+    state = RunDirectory(path).checkpoints.load_task(checkpoint, where)
     checkpoints.load_weights(policy, state["policy"], checkpoint)
     if type(algorithm).policy_for is not Algorithm.policy_for:
-        algorithm.load_state_dict(state["algorithm"], _NoWindows(path))
+        load_algorithm(algorithm, state["algorithm"], _NoWindows(path), policy, checkpoint)
     return LoadedRun(
         path=path,
         checkpoint=checkpoint,
         tasks=tasks,
-        learned=int(state["task"]),
+        learned=state["task"],
         policy=policy.eval(),
         algorithm=algorithm,
         eval=build(config.eval),
@@ -139,8 +139,8 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
     """Return the directory of the run, the checkpoint, and the position of the task it was written after."""
     if source.is_file():
         return source.parent.parent, source, -1
-    directory = RunDirectory(source)
-    there = sorted(int(p.stem.removeprefix("task_")) for p in source.glob("checkpoints/task_*.safetensors"))
+    folder = RunDirectory(source).checkpoints
+    there = folder.tasks()
     if not (source / "config.yaml").is_file() or not there:
         raise LifelongError(
             f"{source} is no run directory with a learned task: it needs config.yaml and checkpoints"
@@ -148,7 +148,7 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
     if after is not None and after not in there:
         raise LifelongError(f"{source} has no checkpoint after task {after}; valid: {there}")
     chosen = there[-1] if after is None else after
-    return source, directory.task_path(chosen), chosen
+    return source, folder.task_path(chosen), chosen
 
 
 def _read_config(file: Path) -> dict[str, Any]:

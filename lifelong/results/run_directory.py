@@ -2,11 +2,13 @@
 
 config.yaml      resolved configuration
 results.jsonl    records, append-only
-checkpoints/     task_<k>.safetensors after each task; progress and best weights of the current task
+checkpoints/     see `lifelong.results.checkpoint_folder`
 videos/          recorded rollouts
 """
 
 import fcntl
+import hashlib
+import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,10 +18,10 @@ from typing import Any
 import yaml
 
 from libero_env.storage import PART_SUFFIX, atomic_write_text
-from lifelong import checkpoints
 from lifelong.errors import ConfigError, LifelongError
+from lifelong.results.checkpoint_folder import CheckpointFolder
 from lifelong.results.log import ResultLog
-from lifelong.results.saved_config import upgrade_config
+from lifelong.results.saved_config import read_saved_config, upgrade_config
 
 # Keys that may differ between the start of a run and its resumption, because they change no result.
 VOLATILE = (
@@ -33,6 +35,12 @@ VOLATILE = (
     "data.memory",
     "data.backend",
 )
+# Keys that are not part of a run's digest, which its checkpoints carry. Never changed, so that runs of earlier versions
+# resume: the digest is that of the saved configuration, which stays as the run's first process wrote it.
+_NOT_IN_DIGEST = (
+    *("device", "progress", "resume", "run_id", "runs_dir", "threads", "wandb"),
+    *("data.memory", "data.backend"),
+)
 
 
 class RunDirectory:
@@ -41,7 +49,9 @@ class RunDirectory:
     def __init__(self, path: Path):
         self.path = path
         self.log = ResultLog(path / "results.jsonl")
+        self.checkpoints = CheckpointFolder(path / "checkpoints", self._identity)
         self.videos = path / "videos"
+        self._digest: str | None = None
 
     @contextmanager
     def opened(self, config: Mapping[str, Any], resume: bool) -> Iterator["RunDirectory"]:
@@ -60,18 +70,20 @@ class RunDirectory:
             if not resume and self.path.exists():
                 os.rename(self.path, _free_name(self.path))
             self.path.mkdir(exist_ok=True)
-            for part in self.path.rglob(f"*{PART_SUFFIX}"):  # left by a process that was killed
-                part.unlink()
+            self._digest = None
+            for part in self.path.rglob(f".*{PART_SUFFIX}"):  # left by a process that was killed
+                part.unlink(missing_ok=True)
+            self.checkpoints.clear_unfinished()
             self._check_config(dict(config))
             yield self
 
     def _check_config(self, config: dict[str, Any]) -> None:
         file = self.path / "config.yaml"
         if not file.exists():
-            atomic_write_text(file, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+            text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+            atomic_write_text(file, text, fsync=True)
             return
-        old = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        was, now = result_relevant(upgrade_config(old)), result_relevant(config)
+        was, now = result_relevant(upgrade_config(read_saved_config(file))), result_relevant(config)
         changed = [k for k in {**was, **now} if was.get(k, "absent") != now.get(k, "absent")]
         if changed:
             pairs = [(k, was.get(k, "absent"), now.get(k, "absent")) for k in changed[:4]]
@@ -82,37 +94,24 @@ class RunDirectory:
                 "another name with run_id=NAME, or start again with resume=false (the old run is kept beside it)"
             )
 
-    @property
-    def started(self) -> bool:
-        """Whether there is any checkpoint."""
-        return any((self.path / "checkpoints").glob("*.safetensors"))
-
-    def task_path(self, task: int) -> Path:
-        """Return the path of the checkpoint written after a task."""
-        return self.path / "checkpoints" / f"task_{task}.safetensors"
-
-    @property
-    def progress_path(self) -> Path:
-        """Path of the checkpoint written while a task is learned."""
-        return self.path / "checkpoints" / "progress.safetensors"
-
-    @property
-    def best_path(self) -> Path:
-        """Path of the best weights so far of the task being learned."""
-        return self.path / "checkpoints" / "best.safetensors"
-
-    def progress(self, task: int, device: Any = "cpu") -> dict[str, Any] | None:
-        """Read the saved progress on a task; None if there is none."""
-        if not self.progress_path.exists():
-            return None
-        state = checkpoints.load(self.progress_path, device)
-        return state if state["task"] == task else None
+    def _identity(self) -> str | None:
+        """Return the digest of the saved configuration, by which checkpoints of this run are known."""
+        if self._digest is None and (self.path / "config.yaml").exists():
+            self._digest = run_digest(read_saved_config(self.path / "config.yaml"))
+        return self._digest
 
 
 def result_relevant(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a configuration that affect results, by dotted key."""
     volatile = tuple(f"{key}." for key in VOLATILE)
     return {k: v for k, v in _flat(dict(config)).items() if not f"{k}.".startswith(volatile)}
+
+
+def run_digest(saved: Mapping[str, Any]) -> str:
+    """Return 16 hex digits that identify a run by its config.yaml, wherever and on whatever device it is run."""
+    left_out = tuple(f"{key}." for key in _NOT_IN_DIGEST)
+    kept = {k: v for k, v in _flat(dict(saved)).items() if not f"{k}.".startswith(left_out)}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 @contextmanager

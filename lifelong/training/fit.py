@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.checkpoints import load_weights
+from lifelong.checkpoints import check, load_weights
 from lifelong.data.windows import WindowDataset
-from lifelong.errors import TrainingError
+from lifelong.errors import CheckpointError, TrainingError
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator, seeded
 from lifelong.training.distributed import Ranks
@@ -114,7 +114,7 @@ def fit(
     first, loss, penalty = 0, math.nan, 0.0
     if resume is not None:
         load_weights(policy, resume["policy"], "the training state")
-        optimizer.load_state_dict(resume["optimizer"])
+        _load_optimizer(optimizer, resume["optimizer"])
         first, loss, penalty = resume["epoch"], resume["loss"], resume["penalty"]
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
     on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer))
@@ -166,3 +166,19 @@ def _make_optimizer(trained: list[nn.Parameter], settings: FitSettings) -> torch
     return torch.optim.AdamW(
         trained, lr=settings.lr, betas=tuple(settings.betas), weight_decay=settings.weight_decay
     )
+
+
+def _load_optimizer(optimizer: torch.optim.AdamW, state: dict[str, Any]) -> None:
+    """Load the state of an optimiser; raise CheckpointError where it is that of other parameters."""
+    moments = {"step": Tensor, "exp_avg": Tensor, "exp_avg_sq": Tensor}
+    check(state, {"state": {int: moments}, "param_groups": [dict]}, "the state of the optimiser")
+    shapes = [p.shape for group in optimizer.param_groups for p in group["params"]]
+    numbers = [group["params"] for group in optimizer.state_dict()["param_groups"]]
+    fits = [group.get("params") for group in state["param_groups"]] == numbers and all(
+        number in range(len(shapes)) and entry[name].shape == shapes[number]
+        for number, entry in state["state"].items()
+        for name in ("exp_avg", "exp_avg_sq")
+    )
+    if not fits:
+        raise CheckpointError("the state of the optimiser belongs to other parameters than those of this run")
+    optimizer.load_state_dict(state)

@@ -124,7 +124,7 @@ def outcome(path, log):
         key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
         key += tuple(values.get("costs", ()))
         assert kept.setdefault(key, values) == values, "a record was made twice, and differs"
-    return kept, checkpoints.load(RunDirectory(path).task_path(TASKS - 1))
+    return kept, checkpoints.load(RunDirectory(path).checkpoints.task_path(TASKS - 1))
 
 
 def assert_same(a, b):

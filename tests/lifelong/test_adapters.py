@@ -14,6 +14,7 @@ from lifelong.data.windows import WindowSubset
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import Router, expert_output
 from lifelong.seeding import generator, seeded
+from lifelong.sequence.stages import TrainingPhase
 from lifelong.streams import StageWindows
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
@@ -112,7 +113,7 @@ def test_the_weights_kept_are_those_of_the_best_epoch(harness, tmp_path, make, m
         return record
 
     monkeypatch.setattr(sequence, "_evaluate", staged)
-    monkeypatch.setattr(sequence, "_best_epoch", lambda stretch, until: min(until, 1))
+    monkeypatch.setattr(TrainingPhase, "best_epoch", lambda self, results, until: min(until, 1))
     sequence.run()
     assert torch.equal(kept["then"], kept["end"])
 

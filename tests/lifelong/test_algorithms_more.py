@@ -13,6 +13,7 @@ from lifelong.data.windows import JoinedWindows
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator
+from lifelong.sequence.stages import training_phases
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
@@ -147,15 +148,14 @@ def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(harness
     cells = [(r.phase, r.learned, r.task) for r in results.of(EvalRecord)]
     assert cells == [("matrix", last, task) for task in range(harness.TASKS)]
     assert [(r.task, r.epoch) for r in results.of(LossRecord)] == [(last, 1), (last, 2)]
-    assert not RunDirectory(tmp_path).best_path.exists()
+    assert not RunDirectory(tmp_path).checkpoints.best_path.exists()
 
 
 def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(harness, tmp_path):
     p = harness.run_context(tmp_path, "multitask")
     object.__setattr__(p, "fit", FitSettings(epochs=2, steps_per_epoch=3, precision="fp32"))
-    sequence = harness.sequence(p)
-    assert [s.steps_per_epoch for s in sequence._phases((0, 1, 2))] == [9]
-    assert [s.steps_per_epoch for s in sequence._phases((1,))] == [3]
+    assert [phase.steps_per_epoch for phase in training_phases(p, (0, 1, 2))] == [9]
+    assert [phase.steps_per_epoch for phase in training_phases(p, (1,))] == [3]
 
 
 def test_joined_windows_are_those_of_all_tasks_once_each():

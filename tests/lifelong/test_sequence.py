@@ -36,5 +36,5 @@ def test_select_last_keeps_the_last_weights(tmp_path):
     p = run_context(tmp_path, "sequential")
     object.__setattr__(p.eval, "select", "last")
     sequence(p).run()
-    assert not p.directory.best_path.exists()
+    assert not p.directory.checkpoints.best_path.exists()
     assert {r.best_epoch for r in p.directory.log.read().of(TaskEndRecord)} == {2}

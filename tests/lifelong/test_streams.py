@@ -210,7 +210,7 @@ def kept(path: Path) -> tuple[dict, dict]:
         if isinstance(record, EvalRecord | LossRecord | TaskEndRecord):
             values = {k: v for k, v in asdict(record).items() if k != "seconds"}
             records[tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))] = values
-    return records, checkpoints.load(RunDirectory(path).task_path(3))
+    return records, checkpoints.load(RunDirectory(path).checkpoints.task_path(3))
 
 
 @pytest.mark.parametrize("algorithm", [lambda: DERpp(budget=12), SingleTask])
@@ -372,14 +372,14 @@ def test_a_policy_may_start_from_a_finished_runs_weights(tmp_path) -> None:
     run = RunDirectory(tmp_path / "run")
     for task in (0, 1, 10):
         state = {"task": task, "policy": {"w": torch.full((2,), float(task))}, "algorithm": {}}
-        checkpoints.save(run.task_path(task), state)
+        checkpoints.save(run.checkpoints.task_path(task), state)
     run.log.append(LossRecord(task=0, epoch=1, loss=1.0, seconds=1.0))
     with pytest.raises(CheckpointError, match=r"not finished.*init_from=.*task_10\.safetensors"):
         load_initial_weights(run.path)
     run.log.append(RunEndRecord(seconds=1.0, finished=utc_now()))
     weights, file = load_initial_weights(run.path)
-    assert weights["w"].tolist() == [10.0, 10.0] and file == run.task_path(10)
-    assert load_initial_weights(run.task_path(1))[0]["w"].tolist() == [1.0, 1.0]
+    assert weights["w"].tolist() == [10.0, 10.0] and file == run.checkpoints.task_path(10)
+    assert load_initial_weights(run.checkpoints.task_path(1))[0]["w"].tolist() == [1.0, 1.0]
 
 
 def test_paths_without_weights_are_refused(tmp_path) -> None:
@@ -387,7 +387,7 @@ def test_paths_without_weights_are_refused(tmp_path) -> None:
         load_initial_weights(tmp_path)
     with pytest.raises(CheckpointError, match="no checkpoint at"):
         load_initial_weights(tmp_path / "absent")
-    progress = RunDirectory(tmp_path).progress_path
+    progress = RunDirectory(tmp_path).checkpoints.progress_path
     checkpoints.save(progress, {"task": 0, "policy": None, "fit": {}})
     with pytest.raises(CheckpointError, match="holds no policy's weights"):
         load_initial_weights(progress)
@@ -399,7 +399,7 @@ def test_single_task_starts_each_task_from_the_pretrained_weights(tmp_path) -> N
     before(p, tmp_path / "first")
     trained = {k: v.clone() for k, v in p.policy.state_dict().items()}
     sequence(p).run()
-    initial = checkpoints.load(p.directory.task_path(2))["algorithm"]["initial"]
+    initial = checkpoints.load(p.directory.checkpoints.task_path(2))["algorithm"]["initial"]
     assert_same(dict(initial), trained)
 
 

@@ -8,8 +8,10 @@ each other wherever one reads what another has written, or is about to overwrite
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -17,45 +19,23 @@ from torch import Tensor
 
 from libero_env.timing import CONTROL_PERIOD
 from lifelong import checkpoints
-from lifelong.algorithms.base import Phase
+from lifelong.algorithms.base import load_algorithm
 from lifelong.context import RunContext
 from lifelong.data.windows import TaskWindows
+from lifelong.errors import CheckpointError, DamagedCheckpointError
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import generator, seeded
+from lifelong.sequence.stages import TrainingPhase, mean_rate, training_phases
 from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
 from lifelong.training.fit import EpochEnd, fit
 
+State = dict[str, Any]  # of a checkpoint
+
 # First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` has another.
 FIT, END_TASK, ROLLOUT = 1, 2, 3
 SAVE_EVERY = 60.0  # [s] between two saves during training, besides those at points of the learning curve
-
-
-@dataclass(frozen=True)
-class TrainingPhase:
-    """One phase of an algorithm on one stage: a task, or tasks that are learned together.
-
-    Attributes:
-        stage: Positions of the tasks.
-        number: Number of the phase within the stage, from 0.
-        kind: Phase as the algorithm defines it.
-        epochs: Number of epochs of the phase.
-        steps_per_epoch: Number of steps per epoch; None: every window once.
-        offset: Number of epochs of the stage's earlier phases.
-    """
-
-    stage: Sequence[int]
-    number: int
-    kind: Phase
-    epochs: int
-    steps_per_epoch: int | None
-    offset: int
-
-    @property
-    def task(self) -> int:
-        """Position of the last task, which identifies the stage."""
-        return self.stage[-1]
 
 
 class TaskSequence:
@@ -64,52 +44,110 @@ class TaskSequence:
     Args:
         context: Everything the run consists of.
         datasets: Windows of each task, by position; each is read when first used.
+        prepare: Function that brings the policy to where the first task begins, called before it is learned from its
+            start; by default the policy is there.
     """
 
-    def __init__(self, context: RunContext, datasets: Mapping[int, TaskWindows]):
-        self.context = context
-        self.log = context.directory.log
+    def __init__(
+        self,
+        context: RunContext,
+        datasets: Mapping[int, TaskWindows],
+        prepare: Callable[[], None] = lambda: None,
+    ):
+        self.context, self.prepare = context, prepare
+        self.log, self.checkpoints = context.directory.log, context.directory.checkpoints
         self.stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
         self.data = StageData(datasets, self.stages, context.stream, context.seed)
+        self._reached = -1  # number of the stage after which the policy is; -1: before the first
         self._saved = time.monotonic()
         context.algorithm.set_augmentation(context.augment)
 
     def run(self, *, evaluate: bool = True) -> None:
         """Learn what is not learned yet, and evaluate all tasks so far after each stage.
 
+        What is damaged or lost is learned or measured again, to the same bits.
+
         Args:
             evaluate: Whether to fill the success matrix.
         """
-        done = self._resume()
-        if done and evaluate:
-            self.context.ranks.broadcast(self._evaluate_seen_tasks, self.stages[done - 1])
-        for stage in self.stages[done:]:
-            self._learn_stage(stage)
-            if evaluate:
-                self.context.ranks.broadcast(self._evaluate_seen_tasks, stage)
+        ranks = self.context.ranks
+        for number, stage in enumerate(self.stages):
+            if ranks.broadcast(self._to_learn, number):
+                self._learn_stage(number)
+            if evaluate and ranks.broadcast(self._to_evaluate, stage):
+                self._restore(number)
+                ranks.broadcast(self._evaluate_seen_tasks, stage)
+        self._restore(len(self.stages) - 1)
 
-    def _resume(self) -> int:
-        """Load the checkpoint of the last stage that was learned, and return how many stages are."""
-        done = 0
-        while done < len(self.stages) and self.context.directory.task_path(self.stages[done][-1]).exists():
-            done += 1
-        if done:
-            self._load_checkpoint(self.stages[done - 1][-1])
-        return done
+    def _to_learn(self, number: int) -> bool:
+        """Return whether a stage is to be learned: it is new, or points of its learning curve are lost."""
+        learned = self.checkpoints.tasks()
+        if not any(stage[-1] in learned for stage in self.stages[number:]):
+            return True
+        stage, results = self.stages[number], self.log.read()
+        lost = [e for phase in training_phases(self.context, stage) for e in phase.missing_points(results)]
+        if lost:
+            self._log(
+                f"{self.log.path} lacks points of the learning curve of task {stage[-1] + 1} (epochs "
+                f"{', '.join(map(str, lost[:5]))}): it is learned again to measure them"
+            )
+        return bool(lost)
 
-    def _load_checkpoint(self, task: int) -> None:
-        path = self.context.directory.task_path(task)
-        self._load_state(checkpoints.load(path, self.context.device), str(path))
+    def _to_evaluate(self, stage: Sequence[int]) -> bool:
+        """Return whether the stage's row of the success matrix is incomplete."""
+        results, task = self.log.read(), stage[-1]
+        row = [results.evaluation("matrix", task, seen) for seen in range(task + 1)]
+        return None in row or results.task_end(task) is None
 
-    def _load_state(self, state: Mapping[str, Any], source: str) -> None:
+    def _restore(self, number: int) -> None:
+        """Bring the policy and the algorithm to where they were after a stage, or before the first one (-1)."""
+        if self._reached == number:
+            return
+        path = self.checkpoints.task_path(self.stages[number][-1])
+        state = self._load(path, partial(self.checkpoints.load_task, path))
+        if state is None:
+            self._learn_stage(number)
+            return
+        self._load_state(state, path)
+        self._reached = number
+
+    def _load(self, path: Path, load: Callable[[torch.device], State]) -> State | None:
+        """Return the state in a checkpoint on all ranks; see `_load_intact`."""
+        found: list[State | None] = []
+
+        def look() -> bool:
+            found.append(self._load_intact(path, load))
+            return found[0] is not None
+
+        there = self.context.ranks.broadcast(look)
+        return found[0] if found else load(self.context.device) if there else None
+
+    def _load_intact(self, path: Path, load: Callable[[torch.device], State]) -> State | None:
+        """Return the state in a checkpoint; None where there is none, or a damaged one, which is set aside."""
+        if not path.exists():
+            return None
+        try:
+            return load(self.context.device)
+        except DamagedCheckpointError as error:
+            name = self.checkpoints.set_aside(path).name
+            self._log(f"{error}; it is kept as {name}, and the run goes on from what was saved before it")
+            return None
+
+    def _load_state(self, state: State, path: Path) -> None:
+        policy, algorithm = self.context.policy, self.context.algorithm
         if state.get("policy") is not None:
-            checkpoints.load_weights(self.context.policy, state["policy"], source)
-        self.context.algorithm.load_state_dict(state["algorithm"], self.data)
+            checkpoints.load_weights(policy, state["policy"], path)
+        load_algorithm(algorithm, state["algorithm"], self.data, policy, path)
 
-    def _learn_stage(self, stage: Sequence[int]) -> None:
+    def _learn_stage(self, number: int) -> None:
         """Train on a stage, from its start or from its saved progress, and write its checkpoint."""
-        context, task = self.context, stage[-1]
-        dataset, saved = self.data[task], context.directory.progress(task, context.device)
+        context, stage = self.context, self.stages[number]
+        task, phases, saved = stage[-1], training_phases(context, stage), self._progress(stage)
+        if saved is None and number:
+            self._restore(number - 1)
+        elif saved is None:
+            self.prepare()
+        dataset = self.data[task]
         title = f"Task {task + 1}/{len(context.tasks)}: {context.tasks[task].language}"
         if len(stage) > 1:
             title = f"Tasks {stage[0] + 1}-{task + 1}/{len(context.tasks)}: together"
@@ -118,26 +156,50 @@ class TaskSequence:
         costs.reset_peak(context.device)
         if saved is None:
             context.algorithm.begin_task(task, dataset, context.policy)
-        else:
-            self._load_state(saved, str(context.directory.progress_path))
         first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
-        for phase in self._phases(stage)[first:]:
+        for phase in phases[first:]:
             self._train(phase, dataset, resume if phase.number == first else None)
             context.ranks.broadcast(self._save_progress, task, phase.number + 1)
         context.ranks.broadcast(self._end_task, task, dataset)
         if not context.ranks.first:
-            self._load_checkpoint(task)
+            path = self.checkpoints.task_path(task)
+            self._load_state(self.checkpoints.load_task(path, context.device), path)
+        self._reached = number
 
-    def _phases(self, stage: Sequence[int]) -> list[TrainingPhase]:
-        """Return the phases of training on a stage, in order."""
-        phases, offset, fit_settings = [], 0, self.context.fit
-        steps = fit_settings.steps_per_epoch
-        steps = steps and steps * len(stage)  # as many for each task, together or not
-        for number, phase in enumerate(self.context.algorithm.phases()):
-            epochs = max(1, round(fit_settings.epochs * phase.share))
-            phases.append(TrainingPhase(stage, number, phase, epochs, steps, offset))
-            offset += epochs
-        return phases
+    def _progress(self, stage: Sequence[int]) -> State | None:
+        """Load the latest saved progress on a stage that training can go on from, and return it; None without any."""
+        for path in (self.checkpoints.progress_path, self.checkpoints.previous_path):
+            state = self._load(path, partial(self.checkpoints.load_progress, path))
+            if state is not None and self.context.ranks.broadcast(self._is_usable, state, stage):
+                self._load_state(state, path)
+                return state
+            if state is not None and state["task"] == stage[-1]:
+                self._log(f"{path} is not used: records or weights that go with it are lost")
+        return None
+
+    def _is_usable(self, state: State, stage: Sequence[int]) -> bool:
+        """Return whether what comes after a saved progress needs nothing that is lost.
+
+        It may need the points of the learning curve before it, and the weights of the best of them.
+        """
+        phases, fit, results = training_phases(self.context, stage), state["fit"], self.log.read()
+        if state["task"] != stage[-1] or not 0 <= state["phase"] <= len(phases):
+            return False
+        if any(phase.missing_points(results) for phase in phases[: state["phase"]]):
+            return False
+        if fit is None or state["phase"] == len(phases):
+            return fit is None
+        phase = phases[state["phase"]]
+        if not 0 <= fit["epoch"] <= phase.epochs or phase.missing_points(results, before=fit["epoch"]):
+            return False
+        best = (
+            phase.best_epoch(results, phase.epochs) if phase.selects_best and phase.points(results) else None
+        )
+        if best is None or best >= fit["epoch"]:  # not reached yet: its weights will be saved
+            return True
+        path = self.checkpoints.best_path
+        kept = self._load_intact(path, self.checkpoints.load_best)
+        return kept is not None and (kept["task"], kept["epoch"]) == (stage[-1], best)
 
     def _train(self, phase: TrainingPhase, dataset: TaskWindows, resume: dict[str, Any] | None) -> None:
         """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""
@@ -158,7 +220,7 @@ class TaskSequence:
             progress=bool(context.progress),
             ranks=context.ranks,
         )
-        if self._selects_best(phase):
+        if phase.selects_best:
             self._load_best(phase)
         context.algorithm.end_phase(phase.kind, context.policy)
 
@@ -179,49 +241,34 @@ class TaskSequence:
             self._save_progress(task, phase.number, end.state())
         if not (due and phase.kind.measures_transfer):
             return
-        success = _mean_rate([self._evaluate("curve", task, member, epoch) for member in phase.stage])
+        success = mean_rate([self._evaluate("curve", task, member, epoch) for member in phase.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
         self._log(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
-        if self._selects_best(phase) and self._best_epoch(phase, end.epoch) == end.epoch:
-            best = {
-                "task": task,
-                "epoch": end.epoch,
-                "policy": context.policy.state_dict(),
-                "own": self._algorithm_parameters(),
-            }
-            checkpoints.save(context.directory.best_path, best)
+        if phase.selects_best and phase.best_epoch(self.log.read(), end.epoch) == end.epoch:
+            weights, own = context.policy.state_dict(), self._algorithm_parameters()
+            self.checkpoints.save_best(task, end.epoch, weights, own)
 
     def _algorithm_parameters(self) -> list[Tensor]:
         """Return the parameters that are trained besides those of the policy."""
         of_policy = {id(p) for p in self.context.policy.parameters()}
         return [p for p in self.context.algorithm.trained(self.context.policy) if id(p) not in of_policy]
 
-    def _selects_best(self, phase: TrainingPhase) -> bool:
-        return self.context.eval.select == "best" and phase.kind.measures_transfer
-
-    def _best_epoch(self, phase: TrainingPhase, until: int) -> int:
-        """Return the earliest epoch of the phase with the highest success on the learning curve so far."""
-        results, rates = self.log.read(), {}
-        for epoch in self.context.eval.curve_epochs(phase.epochs):
-            keys = [("curve", phase.task, task, phase.offset + epoch) for task in phase.stage]
-            found = [record for key in keys if (record := results.evaluation(*key)) is not None]
-            if epoch <= until and len(found) == len(keys):
-                rates[epoch] = _mean_rate(found)
-        return max(rates, key=lambda e: (rates[e], -e))
-
     def _load_best(self, phase: TrainingPhase) -> None:
         """Load the weights of the phase's best epoch."""
-        context, path = self.context, self.context.directory.best_path
-        best = context.ranks.broadcast(self._best_epoch, phase, phase.epochs)
-        state = checkpoints.load(path, context.device)
+        context, path = self.context, self.checkpoints.best_path
+        best = context.ranks.broadcast(lambda: phase.best_epoch(self.log.read(), phase.epochs))
+        state = self.checkpoints.load_best(context.device)
         if (state["task"], state["epoch"]) != (phase.task, best):
-            raise checkpoints.CheckpointError(
+            raise CheckpointError(
                 f"{path} is of task {state['task']}, epoch {state['epoch']}; expected task {phase.task}, "
-                f"epoch {best}. Start again with resume=false"
+                f"epoch {best}. Run the same command again: the task is learned from its start"
             )
-        checkpoints.load_weights(context.policy, state["policy"], str(path))
+        checkpoints.load_weights(context.policy, state["policy"], path)
+        own = self._algorithm_parameters()
+        if [p.shape for p in own] != [kept.shape for kept in state["own"]]:
+            raise CheckpointError(f"{path} has other parameters of the algorithm than this run")
         with torch.no_grad():
-            for parameter, kept in zip(self._algorithm_parameters(), state.get("own", []), strict=True):
+            for parameter, kept in zip(own, state["own"], strict=True):
                 parameter.copy_(kept)
 
     def _save_progress(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
@@ -229,7 +276,7 @@ class TaskSequence:
         algorithm = self.context.algorithm.state_dict()
         state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": algorithm}
         state["policy"] = None if fit_state is not None else self.context.policy.state_dict()
-        checkpoints.save(self.context.directory.progress_path, state)
+        self.checkpoints.save_progress(state)
         self._saved = time.monotonic()
 
     def _end_task(self, task: int, dataset: TaskWindows) -> None:
@@ -245,21 +292,20 @@ class TaskSequence:
         with algorithm.policy_for(task, policy) as acting:
             spent |= costs.action_costs(acting) | costs.peak_costs(self.context.device)
         self.log.append(CostRecord(task=task, costs=spent))
-        state = {"task": task, "policy": policy.state_dict(), "algorithm": algorithm.state_dict()}
-        checkpoints.save(self.context.directory.task_path(task), state)
+        self.checkpoints.save_task(task, policy.state_dict(), algorithm.state_dict())
 
     def _evaluate_seen_tasks(self, stage: Sequence[int]) -> None:
         """Fill the stage's row of the success matrix: all tasks so far, as far as not recorded yet."""
         task, results = stage[-1], self.log.read()
-        first = self._phases(stage)[0]
-        best = self._best_epoch(first, first.epochs) if self._selects_best(first) else first.epochs
+        first = training_phases(self.context, stage)[0]
+        best = first.best_epoch(results, first.epochs)
         row = [self._evaluate("matrix", task, seen, best) for seen in range(task + 1)]
         if results.task_end(task) is None:
             spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
             spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in row)
             spent += sum(r.seconds for r in row)
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
-        new, mean = _mean_rate([r for r in row if r.task in stage]), _mean_rate(row)
+        new, mean = mean_rate([r for r in row if r.task in stage]), mean_rate(row)
         values = {"success/just_learned": new, "success/mean": mean, "tasks": task + 1}
         self.context.tracker.log(values)
         self._log(f"  learned: success {new:.0%} on it, {mean:.0%} over {task + 1} so far{self._eta(task)}")
@@ -319,11 +365,6 @@ class TaskSequence:
     def _log(self, text: str) -> None:
         if self.context.ranks.first:
             print(text, flush=True)
-
-
-def _mean_rate(records: Sequence[EvalRecord]) -> float:
-    """Return the mean success of evaluations."""
-    return sum(r.rate for r in records) / len(records)
 
 
 def _eval_record(

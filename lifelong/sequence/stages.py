@@ -1,0 +1,94 @@
+"""The phases of training on a stage, and what their learning curves have recorded so far."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+
+from lifelong.algorithms.base import Phase
+from lifelong.context import RunContext
+from lifelong.results.records import EvalRecord
+from lifelong.results.results import Results
+
+
+@dataclass(frozen=True)
+class TrainingPhase:
+    """One phase of an algorithm on one stage: a task, or tasks that are learned together.
+
+    Attributes:
+        stage: Positions of the tasks.
+        number: Number of the phase within the stage, from 0.
+        kind: Phase as the algorithm defines it.
+        epochs: Number of epochs of the phase.
+        steps_per_epoch: Number of steps per epoch; None: every window once.
+        offset: Number of epochs of the stage's earlier phases.
+        curve: Epochs of the phase at which its learning curve has points; empty where success is not its measure.
+        selects_best: Whether the weights of the best point are kept, rather than the last ones.
+    """
+
+    stage: Sequence[int]
+    number: int
+    kind: Phase
+    epochs: int
+    steps_per_epoch: int | None
+    offset: int
+    curve: tuple[int, ...]
+    selects_best: bool
+
+    @property
+    def task(self) -> int:
+        """Position of the last task, which identifies the stage."""
+        return self.stage[-1]
+
+    def points(self, results: Results) -> dict[int, float]:
+        """Return the mean success over the stage's tasks at each point of the curve that is recorded for all."""
+        found = {}
+        for epoch in self.curve:
+            keys = [("curve", self.task, task, self.offset + epoch) for task in self.stage]
+            records = [record for key in keys if (record := results.evaluation(*key)) is not None]
+            if len(records) == len(keys):
+                found[epoch] = mean_rate(records)
+        return found
+
+    def best_epoch(self, results: Results, until: int) -> int:
+        """Return the earliest epoch with the highest recorded success; a phase without a curve ends with its last one.
+
+        Args:
+            results: Records of the run, with at least one point of the curve.
+            until: Last epoch to consider.
+        """
+        if not self.selects_best:
+            return self.epochs
+        rates = {epoch: rate for epoch, rate in self.points(results).items() if epoch <= until}
+        return max(rates, key=lambda epoch: (rates[epoch], -epoch))
+
+    def missing_points(self, results: Results, before: int | None = None) -> list[int]:
+        """Return the epochs whose points of the curve are not recorded, of those before an epoch or of all."""
+        found = self.points(results)
+        return [e for e in self.curve if e not in found and (before is None or e < before)]
+
+
+def training_phases(context: RunContext, stage: Sequence[int]) -> list[TrainingPhase]:
+    """Return the phases of training on a stage, in order."""
+    fit, phases = context.fit, context.algorithm.phases()
+    epochs = [max(1, round(fit.epochs * phase.share)) for phase in phases]
+    steps = fit.steps_per_epoch and fit.steps_per_epoch * len(stage)  # as many for each task, together or not
+    return [
+        TrainingPhase(
+            stage=stage,
+            number=number,
+            kind=phase,
+            epochs=count,
+            steps_per_epoch=steps,
+            offset=offset,
+            curve=context.eval.curve_epochs(count) if phase.measures_transfer else (),
+            selects_best=context.eval.select == "best" and phase.measures_transfer,
+        )
+        for number, (phase, count, offset) in enumerate(
+            zip(phases, epochs, accumulate(epochs, initial=0), strict=False)
+        )
+    ]
+
+
+def mean_rate(records: Sequence[EvalRecord]) -> float:
+    """Return the mean success of evaluations."""
+    return sum(record.rate for record in records) / len(records)
