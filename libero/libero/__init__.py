@@ -79,6 +79,6 @@ def get_assets_path() -> str:
 
 def set_libero_default_path(custom_location: str | os.PathLike | None = None) -> None:
     """Write the configuration file with the paths of `get_default_path_dict`."""
-    path = _config_file()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.safe_dump(get_default_path_dict(custom_location)), encoding="utf-8")
+    from libero_env.storage import atomic_write_text
+
+    atomic_write_text(_config_file(), yaml.safe_dump(get_default_path_dict(custom_location)), fsync=True)

@@ -73,12 +73,25 @@ def read_states(path: str | Path) -> np.ndarray:
 def write_states(path: str | Path, rows: np.ndarray) -> None:
     """Write rows (n, size) in the original's format, which `torch.load` and `read_states` read."""
     path = Path(path)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(states_content(rows, path.stem))
+
+
+def states_content(rows: np.ndarray, name: str) -> bytes:
+    """Return the content of a file of `write_states`.
+
+    Args:
+        rows: States, (n, size).
+        name: Folder in the zip.
+    """
     # Names of the older NumPy, which all versions read.
     content = pickle.dumps(np.ascontiguousarray(rows, np.float64), protocol=2)
     content = content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, data in (("data.pkl", content), ("version", b"3\n")):
-            archive.writestr(zipfile.ZipInfo(f"{path.stem}/{name}", _EPOCH), data)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for part, data in (("data.pkl", content), ("version", b"3\n")):
+            archive.writestr(zipfile.ZipInfo(f"{name}/{part}", _EPOCH), data)
+    return stream.getvalue()
 
 
 def _read_file(path: Path) -> bytes:

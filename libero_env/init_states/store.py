@@ -92,7 +92,7 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
         LiberoError: The states of the package were made for another model, or their file is damaged.
     """
     digest = scene_digest(scene)
-    packaged = _packaged(task.suite).get(task.name)
+    packaged = packaged_states(task.suite).get(task.name)
     if packaged is not None and (packaged[0] == digest or scene.pack.name == BUILTIN):
         if packaged[0] != digest:
             raise LiberoError(
@@ -190,7 +190,12 @@ def scene_digest(scene: Scene) -> str:
 
 
 @lru_cache(maxsize=8)
-def _packaged(suite: str) -> dict[str, tuple[str, np.ndarray]]:
+def packaged_states(suite: str) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the digest of the scene and the initial states of each task of a suite; empty where it is not packaged.
+
+    Raises:
+        BrokenFileError: The file of the package is damaged.
+    """
     path = shipped_path(suite)
     if not path.exists():
         return {}

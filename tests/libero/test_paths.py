@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from libero._adapters.envs import files
 from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
 from libero_env.demos.curate import find_demo_files
-from libero_env.errors import UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.pickles import read_states, write_states
 from libero_env.tasks import bddl
 
@@ -151,3 +152,32 @@ def test_a_user_defined_benchmark():
         assert benchmark.get_benchmark("mine")().get_task_names() == names
     finally:
         del benchmark.BENCHMARK_MAPPING["mine"], benchmark.task_maps["mine"]
+
+
+@pytest.fixture
+def fresh_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    monkeypatch.setattr(files, "_checked", set())
+    return tmp_path / "cache"
+
+
+@pytest.mark.parametrize("key", ["bddl_files", "init_states"])
+def test_generated_files_that_are_damaged_are_written_again(fresh_cache, monkeypatch, caplog, key):
+    root = Path(get_libero_path(key))
+    paths = sorted(path for path in root.rglob("*.*") if path.is_file() and path.name != ".complete")
+    contents = [path.read_bytes() for path in paths]
+    paths[0].write_bytes(contents[0][:20])
+    paths[1].unlink()
+    paths[2].write_bytes(b"of my own")
+    monkeypatch.setattr(files, "_checked", set())  # as in another process
+    assert get_libero_path(key) == str(root)
+    assert [path.read_bytes() for path in paths] == contents
+    assert paths[2].with_name(f"{paths[2].name}.changed").read_bytes() == b"of my own"
+    assert [message.split(" has changed")[0] for message in caplog.messages] == [str(paths[0]), str(paths[2])]
+
+
+def test_a_cache_of_task_files_that_cannot_be_written_is_one_line(fresh_cache):
+    fresh_cache.write_text("a file")
+    with pytest.raises(LiberoError, match=r"cannot be written there \(Not a directory\); set LIBERO_CACHE"):
+        get_libero_path("bddl_files")

@@ -14,7 +14,7 @@ from libero_env.assets import published, simplify
 from libero_env.errors import BrokenFileError, LiberoError
 from libero_env.init_states import store
 from libero_env.paths import cache_dir, config_file, demos_dir, read_config
-from libero_env.sim.scene import build_scene, scene_spec
+from libero_env.sim.scene import build_scene
 from libero_env.storage import (
     atomic_write_npz,
     cached_arrays,
@@ -288,30 +288,35 @@ def test_a_broken_file_of_the_package_is_named(tmp_path, monkeypatch):
     path = tmp_path / "libero_spatial.npz"
     monkeypatch.setattr(store, "shipped_path", lambda suite: path)
     for content in (store.__file__, None):
-        store._packaged.cache_clear()
+        store.packaged_states.cache_clear()
         path.write_bytes(Path(content).read_bytes() if content else b"")
         with pytest.raises(
             BrokenFileError, match=r"libero_spatial\.npz is no file of arrays .* install the package again"
         ):
-            store._packaged("libero_spatial")
+            store.packaged_states("libero_spatial")
     atomic_write_npz(path, {"x": np.zeros((2, 3))})
     with pytest.raises(BrokenFileError, match=r"no 'x\.digest'"):
-        store._packaged("libero_spatial")
-    store._packaged.cache_clear()
+        store.packaged_states("libero_spatial")
+    store.packaged_states.cache_clear()
 
 
-@pytest.mark.sim
-def test_truncated_caches_stop_no_environment(tmp_path, monkeypatch, lines):
-    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
-    problem = get_task("libero_spatial/0").problem
-    vertices = []
-    for content in (slice(None), slice(500)):
-        for file in tmp_path.glob("meshes/*.npz"):
-            file.write_bytes(file.read_bytes()[content])
+@pytest.mark.unit
+def test_truncated_caches_of_meshes_stop_no_model(tmp_path, monkeypatch, lines):
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    file = tmp_path / "ball.obj"
+    trimesh.creation.icosphere(3).export(file)
+    sources = ((simplify.MeshSource("ball", str(file), (0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),),)
+    found = []
+    for size in (None, 500):
+        for cached in (tmp_path / "cache").glob("meshes/*.npz"):
+            cached.write_bytes(cached.read_bytes()[:size])
         simplify._merged.cache_clear()
-        vertices.append(scene_spec(problem).compile().mesh_vert)
-    assert (vertices[0] == vertices[1]).all()
-    assert len(lines()) == 2  # one for each file
+        simplify._simplified.cache_clear()
+        merged = simplify.merge_and_simplify("ball", "ball", sources, 300)
+        found.append([*merged[0], *simplify._simplified(str(file), (1.0, 1.0, 1.0), 300)])
+    assert all((before == after).all() for before, after in zip(*found, strict=True))
+    assert len(found[0][1]) <= 300 and len(lines()) == 2  # one for each file
 
 
 @pytest.mark.sim

@@ -1,21 +1,29 @@
 """The tasks of this package as files of the original: `<suite>/<task>.bddl`, `<suite>/<task>.pruned_init`."""
 
 import hashlib
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
 from libero._adapters.envs.models import assets_folder
-from libero_env.init_states.pickles import write_states
-from libero_env.init_states.store import shipped_path
+from libero_env.errors import LiberoError
+from libero_env.init_states.pickles import states_content
+from libero_env.init_states.store import packaged_states, shipped_path
 from libero_env.paths import cache_dir, demos_dir
-from libero_env.storage import atomic_path
+from libero_env.storage import (
+    atomic_path,
+    check_trusted,
+    make_cache_folder,
+    open_for_owner,
+    read_record,
+    write_record,
+)
 from libero_env.tasks import Task, get_suite, suite_names
 
-_COMPLETE = ".complete"  # written last: after an interruption all files are written again
+_COMPLETE = ".complete"  # digests of all files; written last, so after an interruption all are compared again
+_log = logging.getLogger(__name__)
 
 
 def generated_paths() -> dict[str, str]:
@@ -30,13 +38,60 @@ def generated_paths() -> dict[str, str]:
 
 
 def ensure(key: str, path: str) -> None:
-    """Write the files if `path` is a default folder and they are missing; of demonstrations, write links."""
-    if key == "datasets" and path == generated_paths()[key]:
+    """Write the files if `path` is a default folder and they are missing or damaged; of demonstrations, write links.
+
+    Raises:
+        LiberoError: The files cannot be written, or another user can have written them.
+    """
+    if path != generated_paths().get(key):
+        return
+    if key == "datasets":
         _link_demos(Path(path))
-    writers: dict[str, Callable[[Path], None]] = {"bddl_files": _write_tasks, "init_states": _write_states}
-    if key in writers and path == generated_paths()[key] and not (Path(path) / _COMPLETE).exists():
-        writers[key](Path(path))
-        (Path(path) / _COMPLETE).touch()
+    elif key in _CONTENTS and not (path in _checked and (Path(path) / _COMPLETE).exists()):
+        _ensure_files(Path(path), _CONTENTS[key])
+        _checked.add(path)
+
+
+_checked: set[str] = set()  # folders whose files this process has compared
+
+
+def _ensure_files(root: Path, contents: Callable[[], Iterator[tuple[str, bytes]]]) -> None:
+    """Compare files with what they had when they were written, and write those that differ again."""
+    check_trusted(root.parent)
+    written = read_record(root / _COMPLETE) or {}
+    if written and all(_digest(root / name) == digest for name, digest in written.items()):
+        return
+    try:
+        digests = {name: _replace(root / name, content) for name, content in contents()}
+        write_record(root / _COMPLETE, digests)
+    except OSError as error:
+        raise LiberoError(
+            f"{root}: the files of the tasks cannot be written there ({error.strerror or error}); set LIBERO_CACHE to "
+            "a folder that you can write to"
+        ) from error
+
+
+def _replace(path: Path, content: bytes) -> str:
+    """Write a file unless it has this content; a file with other content, perhaps somebody's own, is kept beside it."""
+    digest = hashlib.sha256(content).hexdigest()
+    if (found := _digest(path)) != digest:
+        if found is not None:
+            kept = path.with_name(f"{path.name}.changed")
+            path.replace(kept)
+            _log.warning(
+                "%s has changed since it was written; it is written again, and kept as %s", path, kept.name
+            )
+        make_cache_folder(path.parent)
+        with atomic_path(path) as temporary, open(temporary, "wb", opener=open_for_owner) as file:
+            file.write(content)
+    return digest
+
+
+def _digest(path: Path) -> str | None:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
 
 
 def _link_demos(root: Path) -> None:
@@ -79,21 +134,18 @@ def _states_digest() -> str:
     return hashlib.sha256(repr(stamps).encode()).hexdigest()[:12]
 
 
-def _write_tasks(root: Path) -> None:
+def _task_files() -> Iterator[tuple[str, bytes]]:
     for suite, tasks in suite_tasks().items():
-        folder = root / suite
-        folder.mkdir(parents=True, exist_ok=True)
         for task in tasks:
-            (folder / f"{task.name}.bddl").write_text(task.bddl_text, encoding="utf-8")
-        names = "".join(f"{suite}/{task.name}.bddl\n" for task in tasks)
-        (folder / "tasks_info.txt").write_text(names, encoding="utf-8")
+            yield f"{suite}/{task.name}.bddl", task.bddl_text.encode()
+        yield f"{suite}/tasks_info.txt", "".join(f"{suite}/{task.name}.bddl\n" for task in tasks).encode()
 
 
-def _write_states(root: Path) -> None:
-    root.mkdir(parents=True, exist_ok=True)
+def _state_files() -> Iterator[tuple[str, bytes]]:
     for suite, tasks in suite_tasks().items():
-        if not shipped_path(suite).exists():
-            continue
-        with np.load(shipped_path(suite), allow_pickle=False) as stored:
-            for task in tasks:
-                write_states(root / suite / f"{task.name}.pruned_init", stored[task.name])
+        stored = packaged_states(suite)
+        for task in tasks if stored else ():
+            yield f"{suite}/{task.name}.pruned_init", states_content(stored[task.name][1], task.name)
+
+
+_CONTENTS = {"bddl_files": _task_files, "init_states": _state_files}
