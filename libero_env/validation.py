@@ -9,6 +9,7 @@ import difflib
 import inspect
 import json
 import math
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -30,6 +31,7 @@ LineOf = Callable[[Sequence[Key]], int | None]
 MAX_YAML_BYTES = 4 << 20
 _MAX_NODES = 200_000  # of a document, each alias counted as often as it is used
 _MAX_DEPTH = 60
+_MAX_WHOLE = 10**300  # whole numbers beyond it count as infinite
 _MAX_SHOWN = 80  # characters of a value in a message
 _MAX_FAULTS = 4  # in a message
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -92,6 +94,84 @@ def validate_arguments(
     kind = _arguments_kind(target)
     if kind is not None:
         validate(kind, dict(arguments), prefix=prefix, error=error)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The keyword parameters of a function or class.
+
+    Attributes:
+        types: Annotation of each parameter by its name; `Any` for those without, or whose names cannot be resolved.
+        required: Names of the parameters without a default.
+        any_key: Whether other names are accepted too (`**kwargs`).
+    """
+
+    types: Mapping[str, Any]
+    required: frozenset[str]
+    any_key: bool
+
+
+@lru_cache(maxsize=256)
+def parameters_of(target: Callable[..., Any]) -> Parameters | None:
+    """Return the parameters of a function or class; None where they are not known, as of some builtins."""
+    try:
+        found = inspect.signature(target).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    try:
+        hints = get_type_hints(target.__init__ if inspect.isclass(target) else target, include_extras=True)
+    except (NameError, TypeError, AttributeError):  # names that exist for type checkers only
+        hints = {}
+    named = [p for p in found if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    return Parameters(
+        types={p.name: hints.get(p.name, Any) for p in named},
+        required=frozenset(p.name for p in named if p.default is p.empty),
+        any_key=any(p.kind is p.VAR_KEYWORD for p in found),
+    )
+
+
+class OneOf:
+    """Annotation of a text that is one of several names: `Annotated[str, OneOf(names)]`.
+
+    For names that are known at run time only; otherwise use `Literal`.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Return the schema that pydantic checks."""
+        from pydantic_core import core_schema
+
+        return core_schema.literal_schema(list(self.names))
+
+
+def accepted(kind: Any) -> str:
+    """Return in words which values a type takes, such as `whole number, at least 1`; empty where that is not known."""
+    return _in_words(_adapter(kind).json_schema()) if is_plain(kind) else ""
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """Return a JSON schema in words."""
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(filter(None, map(_in_words, schema["anyOf"]))))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(map(str, schema.get("enum", [schema.get("const")])))
+    kind = str(schema.get("type", ""))
+    if kind == "array":
+        entries = _in_words(schema.get("items", {}))
+        return f"list of {entries}" if entries else "list"
+    words = {"integer": "whole number", "number": "number", "boolean": "true, false", "string": "text"}
+    bounds = [f"{said} {_number(schema[key])}" for key, said in _BOUNDS.items() if key in schema]
+    return ", ".join(filter(None, [words.get(kind, kind), *bounds]))
+
+
+_BOUNDS = {
+    "minimum": "at least",
+    "exclusiveMinimum": "above",
+    "maximum": "at most",
+    "exclusiveMaximum": "below",
+}
 
 
 @dataclass(frozen=True)
@@ -188,6 +268,10 @@ def _plain(value: Any, error: type[LiberoError]) -> Any:
         return {_text_key(key, error): _plain(part, error) for key, part in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(part, error) for part in value]
+    if isinstance(value, int) and abs(value) > _MAX_WHOLE:
+        return math.inf
+    if isinstance(value, str) and not value.isascii() and any("\ud800" <= c <= "\udfff" for c in value):
+        raise error(f"the text {_shown(value)} has a character that is none (a lone surrogate)")
     if value is None or isinstance(value, bool | int | float | str):
         return value  # numbers that are not finite become NaN or Infinity, which every type refuses
     tolist = getattr(value, "tolist", None)  # of arrays and numbers of NumPy
@@ -237,34 +321,37 @@ def _configure(kind: Any) -> None:
 
 @lru_cache(maxsize=256)
 def _arguments_kind(target: Callable[..., Any]) -> Any:
-    """Return a model of the parameters of a function or class; None where they are not known."""
-    from pydantic import create_model
+    """Return a typed dictionary of the parameters of a function or class; None where they are not known."""
+    from typing_extensions import TypedDict
 
-    try:
-        parameters = inspect.signature(target).parameters.values()
-    except (TypeError, ValueError):  # of some builtins
+    found = parameters_of(target)
+    if found is None:
         return None
-    try:
-        hints = get_type_hints(target.__init__ if inspect.isclass(target) else target, include_extras=True)
-    except (NameError, TypeError, AttributeError):  # names that exist for type checkers only
-        hints = {}
-    config = _config("allow" if any(p.kind is p.VAR_KEYWORD for p in parameters) else "forbid")
-    fields: dict[str, Any] = {}
-    for one in parameters:
-        if one.kind not in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY) or one.name.startswith("_"):
-            continue
-        hint = hints.get(one.name, Any)
-        fields[one.name] = (hint if _is_plain(hint) else Any, None)
-    return create_model("Arguments", __config__=config, **fields)
+    hints = {n: t if is_plain(t) else Any for n, t in found.types.items() if not n.startswith("_")}
+    kind: Any = TypedDict("Arguments", hints, total=False)  # type: ignore[misc]
+    kind.__pydantic_config__ = _config("allow" if found.any_key else "forbid")
+    return kind
 
 
-def _is_plain(hint: Any) -> bool:
+def is_plain(kind: Any) -> bool:
     """Return whether values of a type are plain data: a function or a tensor is not."""
+    try:
+        hash(kind)
+    except TypeError:  # of annotations with lists
+        return False
+    return _has_schema(kind)
+
+
+@lru_cache(maxsize=256)
+def _has_schema(kind: Any) -> bool:
     from pydantic import PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError
 
     try:
-        _adapter(hint).json_schema()
-    except (PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError, TypeError):
+        _adapter(kind).json_schema()
+    except (
+        *(PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError),
+        *(NameError, TypeError),  # names that exist for type checkers only
+    ):
         return False
     return True
 
@@ -296,7 +383,7 @@ def _describe(path: tuple[Key, ...], group: Sequence["ErrorDetails"], kind: Any)
     first = group[0]
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         valid = _field_names(kind, path[:-1])
-        listed = f" Valid: {', '.join(valid)}" if valid else ""
+        listed = f" Valid: {', '.join(valid) or 'none'}" if _node(kind, path[:-1]) is not None else ""
         return f"is an unknown key.{suggest(path[-1], valid)}{listed}"
     if first["type"] in ("missing", "missing_argument"):
         return "is missing"
@@ -305,7 +392,14 @@ def _describe(path: tuple[Key, ...], group: Sequence["ErrorDetails"], kind: Any)
     wanted = list(dict.fromkeys(_expected(error) for error in group))
     if _takes_none(kind, path):
         wanted.append("null")
-    return f"is {_shown(first['input'])}; expected {' or '.join(wanted)}"
+    names = [
+        n
+        for e in group
+        if e["type"] == "literal_error"
+        for n in re.findall(r"'([^']*)'", e["ctx"]["expected"])
+    ]
+    near = suggest(first["input"], names) if isinstance(first["input"], str) else ""
+    return f"is {_shown(first['input'])}; expected {' or '.join(wanted)}{near and f'.{near}'}"
 
 
 _WORDS = {
@@ -334,13 +428,13 @@ def _expected(error: "ErrorDetails") -> str:
     kind, context = error["type"], error.get("ctx", {})
     match kind:
         case "greater_than":
-            return f"above {context['gt']:g}"
+            return f"above {_number(context['gt'])}"
         case "greater_than_equal":
-            return f"at least {context['ge']:g}"
+            return f"at least {_number(context['ge'])}"
         case "less_than":
-            return f"below {context['lt']:g}"
+            return f"below {_number(context['lt'])}"
         case "less_than_equal":
-            return f"at most {context['le']:g}"
+            return f"at most {_number(context['le'])}"
         case "literal_error":
             return f"one of {context['expected']}"
         case "too_short":
@@ -352,6 +446,10 @@ def _expected(error: "ErrorDetails") -> str:
         case "string_too_short":
             return "a text that is not empty"
     return _WORDS.get(kind) or error["msg"]
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 def _field_names(kind: Any, path: Sequence[Key]) -> list[str]:

@@ -1,6 +1,6 @@
 """A run: build everything from the configuration, learn the task sequence, write the results."""
 
-import copy
+import os
 import sys
 import time
 from collections.abc import Mapping
@@ -16,10 +16,12 @@ from libero_env.assets.pack import select_pack
 from libero_env.envs.batch import BatchEnv
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
+from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
+from lifelong.errors import ConfigError
 from lifelong.evaluation.environment_record import renderer_name_or_none
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
@@ -32,18 +34,16 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence
-from lifelong.settings import BenchmarkSettings, PretrainSettings, RunSettings, build, check_values
+from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, RunSettings, plain_data
 from lifelong.streams import StreamSettings
 from lifelong.training.distributed import Ranks
+from lifelong.training.memory import check_memory, memory_limit, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 
-GROUPS = (
-    *("algo", "benchmark", "stream", "pretrain", "policy", "data"),
-    *("augmentation", "train", "eval", "language", "wandb"),
-)
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
+EXAMPLE_DIM = 384  # of instructions' embeddings, by which a policy is measured before they are computed
 INIT = 0  # first word of the seed of the policy's initial weights, see lifelong.sequence
 
 
@@ -61,17 +61,18 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     Raises:
         LiberoError: The configuration, the data or the directory is invalid.
     """
-    config = _with_drawing(config)
-    top = OmegaConf.masked_copy(config, [str(k) for k in config if k not in GROUPS])
-    check_values(top, RunSettings)
-    settings = RunSettings(**{str(k): v for k, v in top.items()})
-    _set_threads(settings, Path(settings.runs_dir) / _run_name(names, settings))
+    plain = _with_drawing(plain_data(config))
+    checked = Configuration(plain)
+    checked.check()
+    settings = checked.settings()
+    path = Path(settings.runs_dir) / _run_name(names, settings)
+    _check_writable(path)
+    _set_threads(settings, path)
     keep_freed_memory()
     with deterministic(settings.deterministic):
         # before anything is written: an invalid configuration leaves no trace
-        context, pretraining = _build_contexts(config, names, settings, ranks)
+        context, pretraining = _build_contexts(checked, names, settings, ranks)
         directory = context.directory
-        plain: Any = OmegaConf.to_container(config, resolve=True)
         with _opened(context, plain, settings.resume):
             finished = ranks.broadcast(lambda: directory.log.read().finished)
             if finished and ranks.first:
@@ -102,28 +103,32 @@ def _set_threads(settings: RunSettings, directory: Path) -> None:
 
 
 def _build_contexts(
-    config: DictConfig, names: Mapping[str, str], settings: RunSettings, ranks: Ranks
+    config: Configuration, names: Mapping[str, str], settings: RunSettings, ranks: Ranks
 ) -> tuple[RunContext, RunContext | None]:
     """Return the context of the run, and that of the pretraining before it if there is any."""
-    benchmark: BenchmarkSettings = build(config.benchmark)
+    benchmark: BenchmarkSettings = config.build("benchmark")
     tasks, device = benchmark.sequence(), ranks.device(settings.device)
-    stream: StreamSettings = build(config.stream)
-    pretrain: PretrainSettings = build(config.pretrain)
-    first = pretrain.sequence()
-    data: DataSettings = build(config.data)
+    stream: StreamSettings = config.build("stream")
+    data: DataSettings = config.build("data")
     check_folder(data)
-    fit: FitSettings = build(config.train)
+    pretrain: PretrainSettings = config.build("pretrain")
+    first = pretrain.sequence()
+    demos, algorithm = stream.demos(data.demos, len(tasks), benchmark.group_size), config.build("algo")
+    fit: FitSettings = config.build("train")
+    evaluation: EvalSettings = config.build("eval")
+    augment, tracker = config.build("augmentation"), config.build("wandb")
+    _check_memory(config, data, fit, evaluation, algorithm, max(demos), device)
     if fit.compile != "off":
         check_compiler(device)
-    languages = ranks.broadcast(lambda: build(config.language).embed([t.language for t in (*first, *tasks)]))
+    languages = ranks.broadcast(
+        lambda: config.build("language").embed([t.language for t in (*first, *tasks)])
+    )
     spec = data.spec(languages.shape[1])
     with seeded(settings.seed, INIT):
-        policy = build(config.policy, spec=spec).to(device)
+        policy = config.build("policy", spec=spec).to(device)
     if settings.init_from is not None:
         weights, file = load_initial_weights(Path(settings.init_from).expanduser())
         load_weights(policy, weights, file)
-    demos, algorithm = stream.demos(data.demos, len(tasks), benchmark.group_size), build(config.algo)
-    evaluation: EvalSettings = build(config.eval)
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
     context = RunContext(
         tasks=tasks,
@@ -134,12 +139,12 @@ def _build_contexts(
         algorithm=algorithm,
         fit=fit,
         eval=evaluation,
-        augment=build(config.augmentation),
+        augment=augment,
         stream=stream,
         group_size=benchmark.group_size,
         envs=EnvPool(partial(_make_env, tasks, spec, evaluation, data), evaluation.open_environments),
         directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
-        tracker=build(config.wandb),
+        tracker=tracker,
         seed=settings.seed,
         device=device,
         progress=progress if ranks.first else False,
@@ -147,27 +152,58 @@ def _build_contexts(
     )
     if not first:
         return context, None
-    plain = OmegaConf.to_container(config, resolve=True)
     folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite)
-    directory = pretraining_directory(folder, _pretraining_config(plain))
+    directory = pretraining_directory(folder, _pretraining_config(config.values))
     return context, pretraining_context(
         context, tasks=first, languages=languages[: len(first)], settings=pretrain, directory=directory
     )
 
 
+def _check_writable(directory: Path) -> None:
+    """Check that a directory exists or can be made, and files in it.
+
+    Raises:
+        ConfigError: They cannot.
+    """
+    nearest = next(folder for folder in (directory, *directory.parents) if os.path.lexists(folder))
+    if not nearest.is_dir():
+        raise ConfigError(f"runs_dir: {nearest} is a file; expected a folder, in which {directory} is made")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ConfigError(f"runs_dir: nothing can be written into {nearest}, in which {directory} is made")
+
+
 def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
     """Return the run's directory below `runs_dir`, which is also its name in W&B."""
-    words = [names["policy"], f"seed{settings.seed}", *([settings.run_id] if settings.run_id else [])]
+    words = [names["policy"], f"seed{settings.seed}", *([str(settings.run_id)] if settings.run_id else [])]
     return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
 
 
-def _with_drawing(config: DictConfig) -> DictConfig:
+def _with_drawing(config: dict[str, Any]) -> dict[str, Any]:
     """Return a configuration that names how images are drawn, so that the saved one does."""
-    if OmegaConf.select(config, "data.drawing") is not None:
+    data = config.get("data")
+    if not isinstance(data, dict) or data.get("drawing") is not None:
         return config
-    config = copy.deepcopy(config)
-    OmegaConf.update(config, "data.drawing", default_drawing(select_pack()), force_add=True)
-    return config
+    return {**config, "data": {**data, "drawing": default_drawing(select_pack())}}
+
+
+def _check_memory(
+    config: Configuration,
+    data: DataSettings,
+    fit: FitSettings,
+    evaluation: EvalSettings,
+    algorithm: Algorithm,
+    demos: int,
+    device: torch.device,
+) -> None:
+    """Refuse what cannot fit into memory, and sizes of a policy that do not work together."""
+    weights = policy_bytes(config, data.spec(EXAMPLE_DIM))
+    ratio = getattr(algorithm, "ratio", 0.0)
+    episodes = max(evaluation.episodes, evaluation.curve_episodes)
+    needs = training_needs(
+        data, fit, weights, demos, episodes, ratio if isinstance(ratio, int | float) else 0.0
+    )
+    available = None if device.type != "cuda" else torch.cuda.get_device_properties(device).total_memory
+    check_memory(needs, memory_limit() + (available or 0))
 
 
 def _pretraining_config(plain: Any) -> dict[str, Any]:

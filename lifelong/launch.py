@@ -23,6 +23,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 from lifelong import experiment
 from lifelong.errors import ConfigError
 from lifelong.report.page import write_report
+from lifelong.results.saved_config import upgrade_config
 from lifelong.training.distributed import Ranks, process_group, rank
 
 
@@ -112,10 +113,11 @@ def _user_folders(words: Sequence[str]) -> list[Path]:
 
 def _compose_and_run(words: list[str], folder: Path, ranks: Ranks) -> int:
     """Run the jobs of the command line, several after `-m`; return the worst exit status."""
-    status = 0
+    status, began = 0, False
 
     def job(config: DictConfig) -> Path | None:
-        nonlocal status
+        nonlocal status, began
+        began = True
         try:
             return experiment.run(config, HydraConfig.get().runtime.choices, ranks)
         except Exception as error:  # noqa: BLE001 - told by kind; the other jobs of a sweep go on
@@ -126,7 +128,13 @@ def _compose_and_run(words: list[str], folder: Path, ranks: Ranks) -> int:
 
     sys.argv[1:] = words  # where Hydra reads them
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
-    hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(job)()
+    try:
+        hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(job)()
+    except (AssertionError, AttributeError, OSError, TypeError, ValueError) as error:
+        if began or isinstance(error, LiberoError):
+            raise
+        # raised by Hydra for overrides that it cannot apply, or a folder of its own that cannot be made
+        raise ConfigError(f"the configuration cannot be composed: {error}") from error
     return status
 
 
@@ -138,25 +146,47 @@ def _with_suggestion(error: Exception, words: Sequence[str]) -> LiberoError | No
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         node: Any = compose("config", [w for w in words if re.match(r"\w+=\w+$", w) and _is_choice(w)])
-    *parents, _ = found[1].split(".")
-    path = []
-    for name in parents:
-        if not OmegaConf.is_dict(node) or name not in node:
-            break
-        node = node[name]
-        path.append(name)
-    valid = (
-        [".".join([*path, str(key)]) for key in node if key != "_target_"]
-        if OmegaConf.is_dict(node)
-        else path
-    )
-    wanted = ".".join(found[1].split(".")[: len(path) + 1])
-    close = difflib.get_close_matches(wanted, valid, n=1)
-    hint = f" Did you mean {close[0]}?" if close else ""
+    plain: Any = OmegaConf.to_container(node)
+    valid = sorted(key for key in _dotted(plain) if not key.rpartition(".")[2].startswith("_"))
+    top, _, rest = found[1].partition(".")
+    if rest and top in plain:
+        within = [key for key in valid if key.startswith(f"{top}.")]
+    else:
+        within = sorted({key.partition(".")[0] for key in valid})
+    wanted = found[1] if rest and top in plain else top
+    near = [*_renamed(plain, wanted), *difflib.get_close_matches(wanted, within, n=1)]
+    hint = f" Did you mean {near[0]}?" if near else ""
     return ConfigError(
-        f"unknown key {wanted} of the configuration.{hint} Valid: {', '.join(valid)}; "
+        f"unknown key {wanted} of the configuration.{hint} Valid: {', '.join(within) or 'none'}; "
         f"+{found[1]}=... adds a key that the chosen files lack"
     )
+
+
+def _dotted(node: Any, prefix: str = "") -> list[str]:
+    """Return the dotted keys of all values of a configuration."""
+    if not isinstance(node, dict) or not node:
+        return [prefix]
+    return [
+        name
+        for key, part in node.items()
+        for name in _dotted(part, f"{prefix}.{key}" if prefix else str(key))
+    ]
+
+
+def _renamed(config: dict[str, Any], name: str) -> list[str]:
+    """Return the key of today for a key of earlier versions, such as `policy.head_hidden`."""
+    group, _, key = name.partition(".")
+    if group not in ("policy", "algo"):
+        return []
+    target, marked = {"_target_": config[group].get("_target_")}, "\0"  # a value that can be found again
+    upgraded = upgrade_config({group: {**target, key: marked}})
+    return [found for found in _dotted(upgraded) if found != name and _value(upgraded, found) == marked]
+
+
+def _value(config: Any, name: str) -> Any:
+    for key in name.split("."):
+        config = config[key]
+    return config
 
 
 def _is_choice(word: str) -> bool:

@@ -6,15 +6,18 @@ algorithms, in records and in the names of files.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
+from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
-from lifelong.types import Batch
+from lifelong.types import Batch, Count
 
 BLUR = 4  # first word of the seeds of blurred boundaries, see `lifelong.sequence`
 
@@ -41,15 +44,12 @@ class StreamSettings:
     then no longer that on an unseen task.
     """
 
-    demos_later: int | float | Sequence[int] | None = None
-    blur: float = 0.0
-    blur_reach: int = 1
+    demos_later: Count | Annotated[float, Field(gt=0, le=1)] | Sequence[Count] | None = None
+    blur: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    blur_reach: Count = 1
 
     def __post_init__(self) -> None:
-        if not 0 <= self.blur < 1:
-            raise ConfigError(f"stream.blur is {self.blur}; it must be a share: at least 0 and below 1")
-        if self.blur_reach < 1:
-            raise ConfigError(f"stream.blur_reach is {self.blur_reach}; it must be at least 1 stage")
+        validate_arguments(type(self), vars(self), prefix=("stream",), error=ConfigError)
 
     def demos(self, full: int, tasks: int, first: int = 1) -> tuple[int, ...]:
         """Return the number of demonstrations of each task.
@@ -60,34 +60,20 @@ class StreamSettings:
             first: Number of tasks of the first stage.
 
         Raises:
-            ConfigError: `demos_later` is not a number of demonstrations, or a list of the wrong length.
+            ConfigError: `demos_later` is a list of the wrong length.
         """
         later, rest = self.demos_later, tasks - first
         if later is None:
             counts = [full] * rest
         elif isinstance(later, int | float):
-            counts = [later if isinstance(later, int) else self._share(later, full)] * rest
+            counts = [later if isinstance(later, int) else max(1, round(later * full))] * rest
         else:
             counts = list(later)
             if len(counts) != rest:
                 raise ConfigError(
                     f"stream.demos_later lists {len(counts)} tasks; {rest} come after the first stage"
                 )
-        if any(not isinstance(n, int) or n < 1 for n in counts):
-            raise ConfigError(
-                f"stream.demos_later is {later!r}; valid: numbers of demonstrations, at least 1, or a share "
-                "such as 0.2"
-            )
         return (*[full] * first, *counts)
-
-    @staticmethod
-    def _share(share: float, full: int) -> int:
-        if not 0 < share <= 1:
-            raise ConfigError(
-                f"stream.demos_later is {share}; as a share it must be above 0 and at most 1.0; write a number of "
-                "demonstrations without a decimal point"
-            )
-        return max(1, round(share * full))
 
 
 def learning_stages(algorithm: Algorithm, tasks: int, group_size: int = 1) -> Stages:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError, LifelongError
 
 
@@ -26,8 +27,12 @@ class Tracker:
         project: str = "libero-lifelong",
         entity: str | None = None,
     ):
-        if mode not in ("disabled", "offline", "online"):
-            raise ConfigError(f"wandb.mode is {mode!r}; valid: disabled, offline, online")
+        validate_arguments(
+            Tracker,
+            {"mode": mode, "project": project, "entity": entity},
+            prefix=("wandb",),
+            error=ConfigError,
+        )
         self.mode, self.project, self.entity = mode, project, entity
         self._run: Any = None
 

@@ -5,9 +5,28 @@ Shape legend: B batch, T time, V views, H W C image, A action, D size of a readi
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Annotated
 
 import torch
+from pydantic import AfterValidator, Field
 from torch import Tensor
+
+
+def _check_path(text: str) -> str:
+    if not text or "\0" in text:
+        raise ValueError(f"{text!r} is no path")
+    return text
+
+
+# Ranges of settings. Their upper ends are beyond what any machine can do; what this one can do is checked apart.
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+Natural = Annotated[int, Field(ge=0, le=1_000_000_000)]
+Width = Annotated[int, Field(ge=1, le=1_000_000)]  # of a layer or an image
+Depth = Annotated[int, Field(ge=0, le=1000)]  # number of layers
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+PathText = Annotated[str, AfterValidator(_check_path)]
 
 
 @dataclass(frozen=True)

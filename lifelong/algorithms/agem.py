@@ -10,7 +10,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
-from lifelong.types import Batch
+from lifelong.types import Batch, NonNegative
 
 
 class AGEM(Algorithm):
@@ -25,7 +25,7 @@ class AGEM(Algorithm):
 
     state_form = {"memory": MEMORY_FORM}
 
-    def __init__(self, *, memory: ReplayMemory, ratio: float = 1.0, augment_reference: bool = False):
+    def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0, augment_reference: bool = False):
         """Create the algorithm.
 
         Args:

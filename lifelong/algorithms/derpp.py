@@ -10,7 +10,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
-from lifelong.types import Batch
+from lifelong.types import Batch, Count, NonNegative
 
 _CHUNK = 32  # windows per forward pass at the end of a task
 
@@ -31,7 +31,7 @@ class DERpp(Algorithm):
 
     state_form = {"memory": MEMORY_FORM, "outputs": {int: Tensor}}
 
-    def __init__(self, *, budget: int = 10_000, ratio: float = 1.0, alpha: float = 0.3):
+    def __init__(self, *, budget: Count = 10_000, ratio: NonNegative = 1.0, alpha: NonNegative = 0.3):
         """Create the algorithm.
 
         Args:

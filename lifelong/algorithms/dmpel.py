@@ -18,7 +18,7 @@ from lifelong.nn.adapters import freeze_statistics, initial_pair
 from lifelong.nn.experts import Router, expert_output, expert_shape, routed_layers
 from lifelong.nn.tokens import standardise
 from lifelong.policies.base import Policy
-from lifelong.types import Batch, Observation
+from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Width
 
 _QUERY = "routing_query"  # key among the readings of a batch; policies read only those of their spec
 _FREE = 0.002  # [nat] divergence that replay tolerates: coefficients that are off by 0.03
@@ -61,16 +61,16 @@ class DMPEL(Algorithm):
     def __init__(
         self,
         *,
-        rank: int = 16,
-        alpha: float = 32.0,
-        experts: int = 1,
-        top_k: int = 3,
+        rank: Width = 16,
+        alpha: NonNegative = 32.0,
+        experts: Width = 1,
+        top_k: Natural = 3,
         adapted: Sequence[str] = ("*",),
-        hidden: int = 64,
-        pool: int = 4,
-        replay: float = 10.0,
-        replay_size: int = 50,
-        base_tasks: int = 1,
+        hidden: Width = 64,
+        pool: Width = 4,
+        replay: NonNegative = 10.0,
+        replay_size: Count = 50,
+        base_tasks: Natural = 1,
     ):
         """Create the algorithm.
 

@@ -9,7 +9,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
-from lifelong.types import Batch
+from lifelong.types import Batch, NonNegative
 
 
 class ER(Algorithm):
@@ -23,7 +23,7 @@ class ER(Algorithm):
 
     state_form = {"memory": MEMORY_FORM}
 
-    def __init__(self, *, memory: ReplayMemory, ratio: float = 1.0):
+    def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0):
         """Create the algorithm.
 
         Args:

@@ -11,6 +11,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.importance import ImportanceEstimator, SampleFisher
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
+from lifelong.types import NonNegative
 
 
 class EWC(Algorithm):
@@ -30,8 +31,8 @@ class EWC(Algorithm):
     def __init__(
         self,
         *,
-        strength: float | None = None,
-        gamma: float = 0.9,
+        strength: NonNegative | None = None,
+        gamma: NonNegative = 0.9,
         estimator: ImportanceEstimator | None = None,
     ):
         """Create the algorithm.

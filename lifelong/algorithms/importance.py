@@ -9,7 +9,7 @@ from torch import Tensor
 from lifelong.data.windows import WindowDataset
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
-from lifelong.types import Batch
+from lifelong.types import Batch, Count, Natural
 
 
 class ImportanceEstimator(ABC):
@@ -33,7 +33,7 @@ class ImportanceEstimator(ABC):
     training = False
     strength = 1.0
 
-    def __init__(self, *, windows: int = 512, batch_size: int = 1, augment: bool = False):
+    def __init__(self, *, windows: Natural = 512, batch_size: Count = 1, augment: bool = False):
         if windows < 0 or batch_size < 1:
             raise ConfigError(
                 f"an estimate from {windows} windows in batches of {batch_size}; valid: 0 (all) or more, at least 1"
@@ -98,7 +98,7 @@ class SampleFisher(ImportanceEstimator):
 
     strength = 1500.0
 
-    def __init__(self, *, windows: int = 512, augment: bool = False):
+    def __init__(self, *, windows: Natural = 512, augment: bool = False):
         super().__init__(windows=windows, augment=augment)
 
     def objective(self, policy: Policy, batch: Batch) -> Tensor:
@@ -125,7 +125,7 @@ class BatchFisher(ImportanceEstimator):
     training = True
     strength = 5e4
 
-    def __init__(self, *, windows: int = 512, batch_size: int = 32, augment: bool = False):
+    def __init__(self, *, windows: Natural = 512, batch_size: Count = 32, augment: bool = False):
         super().__init__(windows=windows, batch_size=batch_size, augment=augment)
 
     def objective(self, policy: Policy, batch: Batch) -> Tensor:
@@ -147,7 +147,7 @@ class ActionSensitivity(ImportanceEstimator):
         windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
     """
 
-    def __init__(self, *, windows: int = 512):
+    def __init__(self, *, windows: Natural = 512):
         super().__init__(windows=windows)
 
     def objective(self, policy: Policy, batch: Batch) -> Tensor:

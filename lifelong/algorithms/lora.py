@@ -13,6 +13,7 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.nn.adapters import check_matches, freeze_statistics, initial_pair, matches
 from lifelong.policies.base import Policy
+from lifelong.types import Natural, NonNegative, Width
 
 
 class LoRA(Algorithm):
@@ -42,11 +43,11 @@ class LoRA(Algorithm):
     def __init__(
         self,
         *,
-        rank: int = 16,
-        alpha: float = 32.0,
+        rank: Width = 16,
+        alpha: NonNegative = 32.0,
         adapted: Sequence[str] = ("*",),
         own: Sequence[str] = ("*bias*", "*norm*"),
-        base_tasks: int = 1,
+        base_tasks: Natural = 1,
     ):
         """Create the algorithm.
 

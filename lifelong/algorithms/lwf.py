@@ -12,7 +12,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
-from lifelong.types import Batch
+from lifelong.types import Batch, NonNegative
 
 
 class LwF(Algorithm):
@@ -28,7 +28,7 @@ class LwF(Algorithm):
 
     state_form = {"weights": Weights(), "languages": {int: Tensor}}
 
-    def __init__(self, *, strength: float = 3.0):
+    def __init__(self, *, strength: NonNegative = 3.0):
         """Create the algorithm.
 
         Args:

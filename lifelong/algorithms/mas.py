@@ -11,6 +11,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.importance import ActionSensitivity
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
+from lifelong.types import Natural, NonNegative
 
 
 class MAS(Algorithm):
@@ -23,7 +24,7 @@ class MAS(Algorithm):
 
     state_form = {"anchor": ANCHOR_FORM}
 
-    def __init__(self, *, strength: float = 1.0, windows: int = 512):
+    def __init__(self, *, strength: NonNegative = 1.0, windows: Natural = 512):
         """Create the algorithm.
 
         Args:

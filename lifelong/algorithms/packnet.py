@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
@@ -12,6 +13,7 @@ from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, ConfigError
 from lifelong.policies.base import Policy
+from lifelong.types import NonNegative
 
 _NORMS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._InstanceNorm)
 _DIVIDED = (nn.Linear, nn.Conv2d)  # layers whose weights LIBERO's code divides
@@ -36,7 +38,13 @@ class PackNet(Algorithm):
 
     state_form = {"task_index": int, "pruned": bool, "owner": Weights()}
 
-    def __init__(self, *, prune_perc: float = 0.75, post_prune_share: float = 1.0, masks_only: bool = False):
+    def __init__(
+        self,
+        *,
+        prune_perc: Annotated[float, Field(gt=0, lt=1)] = 0.75,
+        post_prune_share: NonNegative = 1.0,
+        masks_only: bool = False,
+    ):
         """Create the algorithm.
 
         Args:

@@ -11,6 +11,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
+from lifelong.types import NonNegative, Positive
 
 
 class SI(Algorithm):
@@ -29,7 +30,7 @@ class SI(Algorithm):
 
     state_form = {"anchor": ANCHOR_FORM, "omega": Weights(), "way": Weights()}
 
-    def __init__(self, *, strength: float = 0.1, damping: float = 1e-3):
+    def __init__(self, *, strength: NonNegative = 0.1, damping: Positive = 1e-3):
         """Create the algorithm.
 
         Args:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset
 from lifelong.errors import DataError
-from lifelong.types import Batch
+from lifelong.types import Batch, Count
 
 MEMORY_FORM = {"budget": int, "indices": {str: Tensor}}  # see `lifelong.checkpoints.check`
 
@@ -27,7 +27,7 @@ class ReplayMemory:
         DataError: The budget is below one.
     """
 
-    def __init__(self, budget: int) -> None:
+    def __init__(self, budget: Count) -> None:
         if budget < 1:
             raise DataError(f"the memory's budget is {budget} windows; it must be at least 1")
         self.budget = budget
@@ -127,7 +127,7 @@ class FirstWindows(ReplayMemory):
         budget: Number of windows kept of each task.
     """
 
-    def __init__(self, budget: int) -> None:
+    def __init__(self, budget: Count) -> None:
         super().__init__(budget)
         self.per_task = budget
 

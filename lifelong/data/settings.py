@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.demos.read import LOW_DIM_KEYS
-from libero_env.errors import UnknownNameError
-from libero_env.sim.scene import DRAWINGS
+from libero_env.validation import OneOf, validate_arguments
 from lifelong.data.loading import BACKENDS, MEMORY
-from lifelong.types import PolicySpec
+from lifelong.errors import ConfigError
+from lifelong.types import PathText, PolicySpec, Width
 
 CAMERAS = {
     "agentview_rgb": "agentview",
@@ -37,35 +39,25 @@ class DataSettings:
             None for the default of the models. The saved configuration of a run has the one that was used.
     """
 
-    demos: int
-    image_size: int
-    seq_len: int
-    views: Sequence[str]
-    proprio: Sequence[str]
+    demos: Annotated[int, Field(ge=1, le=100_000)]
+    image_size: Width
+    seq_len: Annotated[int, Field(ge=1, le=100_000)]
+    views: Sequence[Annotated[str, OneOf(CAMERAS)]]
+    proprio: Sequence[Annotated[str, OneOf(LOW_DIM_KEYS)]]
     pairing: Literal["aligned", "stored"] = "aligned"
     labels: Literal["expert", "executed"] = "expert"
-    robot: str = DEFAULT_ROBOT
-    folder: str | None = None
-    memory: str = "auto"
-    backend: str = "native"
+    robot: Annotated[str, OneOf(ROBOTS)] = DEFAULT_ROBOT
+    folder: PathText | None = None
+    memory: Annotated[str, OneOf(MEMORY)] = "auto"
+    backend: Annotated[str, OneOf(BACKENDS)] = "native"
     drawing: Literal["fast", "faithful"] | None = None
 
     def __post_init__(self) -> None:
-        valid = {
-            "pairing": ("aligned", "stored"),
-            "labels": ("expert", "executed"),
-            "robot": ROBOTS,
-            "memory": MEMORY,
-            "backend": BACKENDS,
-            "views": CAMERAS,
-            "proprio": LOW_DIM_KEYS,
-            "drawing": (None, *DRAWINGS),
-        }
-        for key, names in valid.items():
-            value = getattr(self, key)
-            for name in [value] if value is None or isinstance(value, str) else value:
-                if name not in names:
-                    raise UnknownNameError(f"data.{key}", name, names)
+        validate_arguments(type(self), vars(self), prefix=("data",), error=ConfigError)
+        for key in ("views", "proprio"):
+            names = list(getattr(self, key))
+            if len(set(names)) < len(names):
+                raise ConfigError(f"data.{key} is {names}; expected each name once")
 
     def spec(self, language_dim: int) -> PolicySpec:
         """Return the inputs and outputs of a policy for these data.

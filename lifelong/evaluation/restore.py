@@ -1,14 +1,12 @@
 """Loading of a run's policy for acting, from the run's directory or one of its checkpoints."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
-from omegaconf import OmegaConf
 
 from libero_env.tasks import Task
 from lifelong import checkpoints
@@ -19,10 +17,11 @@ from lifelong.errors import CheckpointError, LifelongError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
-from lifelong.results.saved_config import upgrade_config
-from lifelong.settings import BenchmarkSettings, build
+from lifelong.results.saved_config import read_saved_config, upgrade_config
+from lifelong.settings import BenchmarkSettings, Configuration
 from lifelong.streams import learning_stages
 from lifelong.training.distributed import Ranks
+from lifelong.training.memory import Need, check_memory, policy_bytes
 
 
 @dataclass(frozen=True)
@@ -91,28 +90,36 @@ class LoadedRun:
             yield policy
 
 
-def restore(source: Path, *, after: int | None = None, device: str = "auto") -> LoadedRun:
+def restore(
+    source: Path, *, after: int | None = None, device: str = "auto", allow: Sequence[str] = ()
+) -> LoadedRun:
     """Load a run's policy from a checkpoint.
+
+    The run may be somebody else's: its configuration is read as plain data, and builds classes of this package only.
 
     Args:
         source: Directory of a run, or a file in its `checkpoints` folder.
         after: Position of the task after which the checkpoint was written; by default that of the file, or the last.
         device: Device for the policy: `auto`, `cpu`, `cuda`, `cuda:<number>`.
+        allow: Packages whose classes the configuration may name too, such as that of a policy of your own.
 
     Raises:
+        ConfigError: The configuration is not valid, or names a class of another package.
         LifelongError: There is no such run or checkpoint, or it does not match its configuration.
     """
     path, checkpoint, after = _find(source, after)
-    config = OmegaConf.create(upgrade_config(_read_config(path / "config.yaml")))
+    config = _read_config(path / "config.yaml", allow)
     where = Ranks().device(device)
-    benchmark: BenchmarkSettings = build(config.benchmark)
+    benchmark: BenchmarkSettings = config.build("benchmark")
     tasks = benchmark.sequence()
-    data: DataSettings = build(config.data)
-    language = build(config.language)
-    before: tuple[Task, ...] = build(config.pretrain).sequence() if "pretrain" in config else ()
+    data: DataSettings = config.build("data")
+    language = config.build("language")
+    before: tuple[Task, ...] = config.build("pretrain").sequence() if "pretrain" in config.values else ()
     instructions = tuple(t.language for t in (*before, *tasks))
     spec = data.spec(language.embed(instructions).shape[1])
-    policy, algorithm = build(config.policy, spec=spec).to(where), build(config.algo)
+    weights = policy_bytes(config, spec)
+    check_memory([Need(f"the policy's weights ({path / 'config.yaml'})", weights or 0)])
+    policy, algorithm = config.build("policy", spec=spec).to(where), config.build("algo")
     state = RunDirectory(path).checkpoints.load_task(checkpoint, where)
     checkpoints.load_weights(policy, state["policy"], checkpoint)
     if type(algorithm).policy_for is not Algorithm.policy_for:
@@ -124,8 +131,8 @@ def restore(source: Path, *, after: int | None = None, device: str = "auto") -> 
         learned=state["task"],
         policy=policy.eval(),
         algorithm=algorithm,
-        eval=build(config.eval),
-        seed=int(config.seed),
+        eval=config.build("eval"),
+        seed=config.values["seed"],
         device=where,
         language=language,
         instructions=instructions,
@@ -151,13 +158,18 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
     return source, folder.task_path(chosen), chosen
 
 
-def _read_config(file: Path) -> dict[str, Any]:
-    try:
-        config = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise LifelongError(f"{file} is missing: a checkpoint needs the configuration of its run") from error
-    if not isinstance(config, dict):
-        raise LifelongError(f"{file} is not a configuration: expected a YAML mapping")
+def _read_config(file: Path, allow: Sequence[str]) -> Configuration:
+    """Return the parts of a run's configuration that acting needs, checked."""
+    if not file.is_file():
+        raise LifelongError(f"{file} is missing: a checkpoint needs the configuration of its run")
+    values = upgrade_config(read_saved_config(file))
+    language = values.get("language")
+    if isinstance(language, dict):  # nothing is written into a folder that the file names
+        values["language"] = {key: value for key, value in language.items() if key != "cache_dir"}
+    config = Configuration(values, source=str(file), allowed=tuple(allow))
+    config.check_some(("benchmark", "data", "language", "policy", "algo", "eval"), ("seed",))
+    if "pretrain" in values:
+        config.check_some(("pretrain",))
     return config
 
 

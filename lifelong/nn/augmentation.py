@@ -7,11 +7,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from lifelong.types import Batch
+from lifelong.types import Batch, NonNegative, Share
 
 
 class Augmentation(ABC):
@@ -56,7 +58,7 @@ class RandomShift(Augmentation):
         pixels: Largest shift in each direction.
     """
 
-    def __init__(self, pixels: int = 4) -> None:
+    def __init__(self, pixels: Annotated[int, Field(ge=0, le=10_000)] = 4) -> None:
         self.pixels = pixels
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -102,11 +104,11 @@ class ColorJitter(Augmentation):
 
     def __init__(
         self,
-        brightness: float = 0.3,
-        contrast: float = 0.3,
-        saturation: float = 0.3,
-        hue: float = 0.3,
-        keep: float = 0.1,
+        brightness: NonNegative = 0.3,
+        contrast: NonNegative = 0.3,
+        saturation: NonNegative = 0.3,
+        hue: NonNegative = 0.3,
+        keep: Share = 0.1,
     ) -> None:
         self.brightness, self.contrast, self.saturation = brightness, contrast, saturation
         self.hue, self.keep = hue, keep

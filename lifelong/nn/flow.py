@@ -5,12 +5,15 @@ Shape legend: B batch, T time, H chunk, E latent, A action.
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead
+from lifelong.types import Depth, Width
 
 _EVAL_SEED = 0
 _OCTAVES = 6  # frequencies that encode the time
@@ -48,11 +51,11 @@ class FlowHead(ActionHead):
         *,
         in_dim: int,
         action_dim: int,
-        chunk: int = 5,
-        execute: int = 3,
-        steps: int = 10,
-        hidden: int = 1024,
-        layers: int = 2,
+        chunk: Width = 5,
+        execute: Width = 3,
+        steps: Annotated[int, Field(ge=1, le=1000)] = 10,
+        hidden: Width = 1024,
+        layers: Depth = 2,
     ) -> None:
         super().__init__()
         if not 1 <= execute <= chunk or steps < 1:

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lifelong.types import Depth, NonNegative, Width
+
 
 class ActionHead(nn.Module, ABC):
     """Distribution of actions in [-1, 1]^A, given latents (..., E).
@@ -99,11 +101,11 @@ class GMMHead(ActionHead):
         *,
         in_dim: int,
         action_dim: int,
-        modes: int = 5,
-        hidden: int = 1024,
-        layers: int = 2,
+        modes: Width = 5,
+        hidden: Width = 1024,
+        layers: Depth = 2,
         norm: bool = False,
-        min_std: float = 1e-4,
+        min_std: NonNegative = 1e-4,
         low_eval_noise: bool = False,
     ) -> None:
         super().__init__()
@@ -179,7 +181,7 @@ class DeterministicHead(ActionHead):
     """
 
     def __init__(
-        self, *, in_dim: int, action_dim: int, hidden: int = 1024, layers: int = 2, norm: bool = False
+        self, *, in_dim: int, action_dim: int, hidden: Width = 1024, layers: Depth = 2, norm: bool = False
     ) -> None:
         super().__init__()
         self.trunk = _trunk(in_dim, hidden, layers, norm)

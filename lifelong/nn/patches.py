@@ -9,7 +9,8 @@ from torch.nn import functional
 
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import TransformerLayer
-from lifelong.nn.vision import make_norm
+from lifelong.nn.vision import Norm, Side, make_norm
+from lifelong.types import Depth, Share, Width
 
 
 class PatchEncoder(nn.Module):
@@ -32,17 +33,17 @@ class PatchEncoder(nn.Module):
         self,
         *,
         image_size: tuple[int, int],
-        dim: int = 128,
-        width: int = 64,
-        stem_kernel: int = 7,
-        stem_stride: int = 2,
-        patch: int = 8,
-        norm: str = "group",
+        dim: Width = 128,
+        width: Width = 64,
+        stem_kernel: Side = 7,
+        stem_stride: Side = 2,
+        patch: Side = 8,
+        norm: Norm = "group",
     ) -> None:
         super().__init__()
         padding = stem_kernel // 2
         cells = [(n + 2 * padding - stem_kernel) // stem_stride + 1 for n in image_size]
-        if any(n % patch for n in cells):
+        if any(n < patch or n % patch for n in cells):
             raise PolicyError(
                 f"images of {tuple(image_size)} give {cells[0]} x {cells[1]} cells after the stem, which patches "
                 f"of {patch} x {patch} do not tile; change policy.encoder.patch or policy.encoder.stem_stride"
@@ -87,13 +88,13 @@ class SpatialTransformer(nn.Module):
         *,
         views: int,
         patches: int,
-        dim: int = 128,
-        out_dim: int = 64,
-        layers: int = 7,
-        heads: int = 8,
-        head_dim: int = 120,
-        mlp_dim: int = 256,
-        dropout: float = 0.1,
+        dim: Width = 128,
+        out_dim: Width = 64,
+        layers: Depth = 7,
+        heads: Width = 8,
+        head_dim: Width = 120,
+        mlp_dim: Width = 256,
+        dropout: Share = 0.1,
     ) -> None:
         super().__init__()
         self.positions = nn.Parameter(torch.randn(views, patches, dim))

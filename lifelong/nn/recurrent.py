@@ -3,7 +3,12 @@
 Shape legend: B batch, T time, F features of a frame.
 """
 
+from typing import Annotated
+
+from pydantic import Field
 from torch import nn
+
+from lifelong.types import Share, Width
 
 
 class TemporalLSTM(nn.LSTM):
@@ -16,7 +21,14 @@ class TemporalLSTM(nn.LSTM):
         dropout: Dropout between the layers; without effect where there is one.
     """
 
-    def __init__(self, *, in_dim: int, hidden: int = 1024, layers: int = 2, dropout: float = 0.0) -> None:
+    def __init__(
+        self,
+        *,
+        in_dim: int,
+        hidden: Width = 1024,
+        layers: Annotated[int, Field(ge=1, le=1000)] = 2,
+        dropout: Share = 0.0,
+    ) -> None:
         super().__init__(
             input_size=in_dim,
             hidden_size=hidden,

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lifelong.types import Depth, Share, Width
+
 
 def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
     """Return sine and cosine position codes, (length, dim) (Vaswani et al., 2017, section 3.5).
@@ -99,12 +101,12 @@ class TemporalTransformer(nn.Module):
     def __init__(
         self,
         *,
-        dim: int = 64,
-        layers: int = 4,
-        heads: int = 6,
-        head_dim: int = 64,
-        mlp_dim: int = 256,
-        dropout: float = 0.1,
+        dim: Width = 64,
+        layers: Depth = 4,
+        heads: Width = 6,
+        head_dim: Width = 64,
+        mlp_dim: Width = 256,
+        dropout: Share = 0.1,
         max_length: int = 10,
     ) -> None:
         super().__init__()

@@ -4,12 +4,18 @@ Shape legend: N images, C channels, H W image, K keypoints, L language embedding
 """
 
 from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
 from lifelong.errors import PolicyError
+from lifelong.types import Positive, Width
+
+Norm = Literal["group", "batch", "none"]  # see `make_norm`
+Side = Annotated[int, Field(ge=1, le=1000)]  # [pixels or cells] of a kernel, a stride or a patch
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:
@@ -21,10 +27,15 @@ def make_norm(kind: str, channels: int) -> nn.Module:
         channels: C.
 
     Raises:
-        PolicyError: Another kind.
+        PolicyError: Another kind, or channels that cannot be divided into groups.
     """
     if kind == "group":
-        return nn.GroupNorm(max(1, channels // 8), channels)
+        groups = max(1, channels // 8)
+        if channels % groups:
+            raise PolicyError(
+                f"{channels} channels cannot be normalised in groups of 8; use a multiple of 8, or another norm"
+            )
+        return nn.GroupNorm(groups, channels)
     if kind == "batch":
         return nn.BatchNorm2d(channels)
     if kind == "none":
@@ -185,16 +196,16 @@ class ResNetFiLMEncoder(nn.Module):
         *,
         image_size: tuple[int, int],
         language_dim: int,
-        latent_dim: int = 64,
-        width: int = 64,
-        stage_blocks: Sequence[int] = (2, 2),
-        stem_kernel: int = 7,
-        stem_stride: int = 2,
+        latent_dim: Width = 64,
+        width: Width = 64,
+        stage_blocks: Annotated[Sequence[Annotated[int, Field(ge=0, le=100)]], Field(max_length=8)] = (2, 2),
+        stem_kernel: Side = 7,
+        stem_stride: Side = 2,
         stem_pool: bool = True,
-        keypoints: int | None = None,
-        temperature: float = 1.0,
-        readout: str = "keypoints",
-        norm: str = "group",
+        keypoints: Width | None = None,
+        temperature: Positive = 1.0,
+        readout: Literal["keypoints", "flat"] = "keypoints",
+        norm: Norm = "group",
     ) -> None:
         super().__init__()
         stem = [
@@ -212,7 +223,7 @@ class ResNetFiLMEncoder(nn.Module):
                 self.films.append(FiLM(language_dim=language_dim, channels=out))
                 channels = out
         size = self._map_size(image_size)
-        keypoints = keypoints or latent_dim // 2
+        keypoints = keypoints or max(1, latent_dim // 2)
         self.readout = make_readout(readout, channels, size, keypoints, temperature)
         self.project = nn.Linear(2 * keypoints, latent_dim)
         self.to(memory_format=torch.channels_last)

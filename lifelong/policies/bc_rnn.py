@@ -3,6 +3,8 @@
 Shape legend: B batch, T time, F features of a frame, A action, L language embedding.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor, nn
 
@@ -12,7 +14,7 @@ from lifelong.nn.recurrent import TemporalLSTM
 from lifelong.nn.tokens import LanguageToken, ProprioScaling, standardise
 from lifelong.nn.vision import ResNetFiLMEncoder
 from lifelong.policies.history import Component, HistoryPolicy
-from lifelong.types import Observation, PolicySpec
+from lifelong.types import Observation, PolicySpec, Share, Width
 
 
 class BCRNN(HistoryPolicy):
@@ -47,15 +49,15 @@ class BCRNN(HistoryPolicy):
         self,
         *,
         spec: PolicySpec,
-        image_embed: int = 64,
-        text_embed: int = 32,
+        image_embed: Width = 64,
+        text_embed: Width = 32,
         encoder: Component = ResNetFiLMEncoder,
         temporal: Component = TemporalLSTM,
         head: Component = GMMHead,
-        memory: str = "reset",
+        memory: Literal["reset", "window"] = "reset",
         stochastic: bool = False,
         normalise_proprio: bool = True,
-        proprio_dropout: float = 0.0,
+        proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic)

@@ -11,7 +11,7 @@ from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import ResNetFiLMEncoder
 from lifelong.policies.history import Component, HistoryPolicy
-from lifelong.types import Observation, PolicySpec
+from lifelong.types import Observation, PolicySpec, Share, Width
 
 
 class BCTransformer(HistoryPolicy):
@@ -43,13 +43,13 @@ class BCTransformer(HistoryPolicy):
         self,
         *,
         spec: PolicySpec,
-        embed_dim: int = 64,
+        embed_dim: Width = 64,
         encoder: Component = ResNetFiLMEncoder,
         temporal: Component = TemporalTransformer,
         head: Component = GMMHead,
         stochastic: bool = False,
         normalise_proprio: bool = True,
-        proprio_dropout: float = 0.0,
+        proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic)

@@ -6,12 +6,13 @@ Shape legend: B batch, T time, V views, P patches, M tokens per step, S token of
 import torch
 from torch import Tensor, nn
 
+from lifelong.errors import PolicyError
 from lifelong.nn.heads import GMMHead
 from lifelong.nn.patches import PatchEncoder, SpatialTransformer
 from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.policies.history import Component, HistoryPolicy
-from lifelong.types import Observation, PolicySpec
+from lifelong.types import Observation, PolicySpec, Share, Width
 
 
 class BCViLT(HistoryPolicy):
@@ -45,15 +46,15 @@ class BCViLT(HistoryPolicy):
         self,
         *,
         spec: PolicySpec,
-        patch_embed: int = 128,
-        embed_dim: int = 64,
+        patch_embed: Width = 128,
+        embed_dim: Width = 64,
         encoder: Component = PatchEncoder,
         spatial: Component = SpatialTransformer,
         temporal: Component = TemporalTransformer,
         head: Component = GMMHead,
         stochastic: bool = False,
         normalise_proprio: bool = True,
-        proprio_dropout: float = 0.0,
+        proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic)
@@ -61,6 +62,8 @@ class BCViLT(HistoryPolicy):
         encoders = {view: encoder(image_size=spec.image_size, dim=patch_embed) for view in spec.views}
         self.encoders = nn.ModuleDict(encoders)
         self.spatial_language = LanguageToken(language_dim=spec.language_dim, dim=patch_embed)
+        if not encoders:
+            raise PolicyError("data.views is []; this policy sees nothing without a camera")
         patches = encoders[spec.views[0]].patches
         self.spatial = spatial(views=len(encoders), patches=patches, dim=patch_embed, out_dim=embed_dim)
         self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)

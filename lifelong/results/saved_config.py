@@ -109,7 +109,7 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
         "algo": upgrade_algorithm,
     }
     return {
-        key: upgrades[key](node) if key in upgrades else node
+        key: upgrades[key](node) if key in upgrades and isinstance(node, Mapping) else node
         for key, node in config.items()
         if key != "compat"
     }
@@ -130,10 +130,10 @@ def upgrade_policy(node: Mapping[str, Any]) -> Node:
     Args:
         node: The `policy` node, all of its keys or some; nodes of other policies and of today come back unchanged.
     """
-    components = dict(_POLICIES.get(node.get("_target_", ""), {}))
-    if not components or isinstance(node.get("head", "gmm"), Mapping):
+    components, head = dict(_POLICIES.get(str(node.get("_target_")), {})), node.get("head", "gmm")
+    if not components or not isinstance(head, str) or head not in _HEADS:
         return dict(node)
-    components["head"] = _HEADS[node.get("head", "gmm")]
+    components["head"] = _HEADS[head]
     flat = {"head", *(key for _, keys in (*components.values(), *_HEADS.values()) for key in keys)}
     upgraded = {key: value for key, value in node.items() if key not in flat}
     for name, (target, keys) in components.items():
@@ -148,7 +148,7 @@ def upgrade_algorithm(node: Mapping[str, Any]) -> Node:
     Args:
         node: The `algo` node; nodes of other algorithms and of today come back unchanged.
     """
-    target = node.get("_target_")
+    target = str(node.get("_target_"))
     if target not in _REPLAY | {_EWC, _PACKNET} or {"memory", "estimator", "masks_only"} & set(node):
         return dict(node)
     upgraded = dict(node)

@@ -65,12 +65,16 @@ class Ranks:
             name = "cuda" if torch.cuda.is_available() else "cpu"
         try:
             device = torch.device(name)
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>") from error
-        if device.type != "cuda":
+        if device.type in ("cpu", "mps"):
             return device
+        if device.type != "cuda":  # such as meta, which holds no values
+            raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>")
         if not torch.cuda.is_available():
             raise ConfigError(f"device={name}, but torch finds no GPU; use device=auto or device=cpu")
+        if (device.index or 0) >= (count := torch.cuda.device_count()):
+            raise ConfigError(f"device={name}, but this machine has {count} GPUs, counted from 0")
         return device if self.size == 1 else self._own_gpu(device)
 
     def _own_gpu(self, device: torch.device) -> torch.device:

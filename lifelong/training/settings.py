@@ -2,10 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Any, Literal
 
+from pydantic import BeforeValidator, Field
+
+from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
-from lifelong.training.precision import COMPILE_MODES
+from lifelong.types import Count, Natural, NonNegative
+
+
+def _read_off(value: Any) -> Any:
+    return "off" if value is False else value  # YAML reads an unquoted off as False
+
+
+Rate = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)
@@ -30,25 +40,19 @@ class FitSettings:
             replays CUDA graphs. Compilation changes rounding.
     """
 
-    epochs: int = 50
-    batch_size: int = 32
-    steps_per_epoch: int | None = None
-    lr: float = 1e-4
-    lr_min: float = 1e-5
-    warmup_steps: int = 0
-    betas: Sequence[float] = (0.9, 0.999)
-    weight_decay: float = 1e-4
-    grad_clip: float = 100.0
+    epochs: Count = 50
+    batch_size: Count = 32
+    steps_per_epoch: Count | None = None
+    lr: NonNegative = 1e-4
+    lr_min: NonNegative = 1e-5
+    warmup_steps: Natural = 0
+    betas: Annotated[Sequence[Rate], Field(min_length=2, max_length=2)] = (0.9, 0.999)
+    weight_decay: NonNegative = 1e-4
+    grad_clip: NonNegative = 100.0
     precision: Literal["auto", "bf16", "fp32"] = "auto"
-    accumulate: int = 1
-    compile: Literal["off", "default", "reduce-overhead"] = "off"
+    accumulate: Count = 1
+    compile: Annotated[Literal["off", "default", "reduce-overhead"], BeforeValidator(_read_off)] = "off"
 
     def __post_init__(self) -> None:
-        if self.compile is False:  # YAML reads an unquoted off as False
-            object.__setattr__(self, "compile", "off")
-        for name, valid in (("precision", ("auto", "bf16", "fp32")), ("compile", COMPILE_MODES)):
-            if getattr(self, name) not in valid:
-                raise ConfigError(f"train.{name} is {getattr(self, name)!r}; valid: {', '.join(valid)}")
-        for name in ("epochs", "batch_size", "accumulate"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"train.{name} is {getattr(self, name)}; it must be at least 1")
+        object.__setattr__(self, "compile", _read_off(self.compile))
+        validate_arguments(type(self), vars(self), prefix=("train",), error=ConfigError)

@@ -14,9 +14,9 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 import lifelong
 from lifelong.errors import ConfigError
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.experiment import GROUPS
 from lifelong.launch import check_choices
 from lifelong.settings import RunSettings
+from lifelong.settings.targets import GROUPS
 from tests.harness.configs import CONFIGS, FILES, composed
 
 GIVEN = {"policy": {"spec"}}  # what the experiment adds
@@ -147,7 +147,7 @@ def test_known_choices_and_other_overrides_pass():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"select": "worst"}, "valid: best, last"),
+        ({"select": "worst"}, "expected one of 'best' or 'last'"),
         ({"selection": "apart", "episodes": 40, "curve_episodes": 20}, "need 60 initial states"),
         ({"episodes": 0}, "at least 1"),
     ],

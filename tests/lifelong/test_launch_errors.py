@@ -40,7 +40,7 @@ def here(tmp_path, monkeypatch) -> Path:
             "error: unknown key train.epoch of the configuration. Did you mean train.epochs? Valid:",
         ),
         ("trian.epochs=3", "error: unknown key trian of the configuration. Did you mean train?"),
-        ("+train.foo=3", "error: unknown key train.foo. Valid: epochs,"),
+        ("+train.foo=3", "error: train.foo is an unknown key. Valid: epochs,"),
         ("train.epochs", "error: Error parsing override 'train.epochs'"),
         ("data.folder=demoz", "error: data.folder=demoz does not exist. Did you mean demos?"),
     ],
@@ -60,7 +60,7 @@ def test_values_fit_the_parameters_of_their_target():
     for changes, message in [
         ({"steps_per_epoch": "x"}, "steps_per_epoch is 'x'; expected a whole number or null"),
         ({"epochs": True}, "epochs is True; expected a whole number"),
-        ({"epoch": 3}, "unknown key epoch. Did you mean epochs?"),
+        ({"epoch": 3}, "epoch is an unknown key. Did you mean 'epochs'?"),
     ]:
         with pytest.raises(ConfigError) as error:
             build(OmegaConf.create({**FIT, **changes}))

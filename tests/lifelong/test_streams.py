@@ -163,7 +163,7 @@ def test_invalid_numbers_of_demonstrations_are_refused(later) -> None:
 
 @pytest.mark.parametrize("change", [{"blur": 1.0}, {"blur": -0.1}, {"blur_reach": 0}])
 def test_invalid_blur_is_refused(change) -> None:
-    with pytest.raises(ConfigError, match=f"stream.{next(iter(change))} is .*at least"):
+    with pytest.raises(ConfigError, match=f"stream.{next(iter(change))} is .*expected (at least|below)"):
         StreamSettings(**change)
 
 
@@ -171,7 +171,7 @@ def test_group_sizes_must_divide_the_number_of_tasks() -> None:
     assert len(BenchmarkSettings("libero_goal", group_size=5).sequence()) == 10
     with pytest.raises(ConfigError, match="groups of 1, 2, 5, 10"):
         BenchmarkSettings("libero_goal", group_size=3).sequence()
-    with pytest.raises(ConfigError, match="groups of 1, 2, 4"):
+    with pytest.raises(ConfigError, match="at least 1|groups of 1, 2, 4"):
         BenchmarkSettings("libero_goal", tasks=4, group_size=0).sequence()
 
 

@@ -1,99 +1,44 @@
 """Settings of the run, the task sequence and pretraining."""
 
-import difflib
-import inspect
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated
 
-from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig, OmegaConf
+from pydantic import AfterValidator, Field
 
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
 from libero_env.tasks.files import OWN, read_suite
-from lifelong.data.settings import CAMERAS, DataSettings
+from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
-
-__all__ = ["CAMERAS", "BenchmarkSettings", "DataSettings", "PretrainSettings", "RunSettings", "build"]
-
-
-def build(node: DictConfig, **arguments: Any) -> Any:
-    """Build the object that a node of the configuration describes, with plain lists and dictionaries inside.
-
-    Args:
-        node: Node with `_target_`, the dotted path of a class or function.
-        arguments: Further keyword arguments of the target.
-
-    Raises:
-        ConfigError: The target has no parameter of a key's name, or takes no value of this kind.
-    """
-    check_values(node, get_object(node._target_))
-    return instantiate(node, _convert_="all", _partial_=True)(**arguments)
+from lifelong.types import Count, Natural, PathText
 
 
-def check_values(node: DictConfig, target: Callable[..., Any]) -> None:
-    """Check the keys of a node, and values that should be numbers or truths, against the signature of its target.
-
-    Args:
-        node: Node of the configuration.
-        target: Class or function that takes its keys as arguments.
-
-    Raises:
-        ConfigError: A key is unknown, or a value is of the wrong kind.
-    """
-    try:
-        parameters = inspect.signature(target).parameters
-    except ValueError:  # of some builtins, such as dict, which take anything
-        return
-    any_key = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    try:
-        hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
-    except (NameError, TypeError):  # of a user's class: names that exist for type checkers only
-        hints = {}
-    for key in map(str, node):
-        if key.startswith("_") or OmegaConf.is_missing(node, key):
-            continue
-        name = node._get_full_key(key)
-        if key not in parameters and not any_key:
-            close = difflib.get_close_matches(key, parameters, n=1)
-            hint = f" Did you mean {close[0]}?" if close else ""
-            raise ConfigError(f"unknown key {name}.{hint} Valid: {', '.join(parameters)}")
-        if key in hints and not _is_of(node[key], hints[key]):
-            kinds = " or ".join(KINDS.get(kind, str(kind)) for kind in get_args(hints[key]) or (hints[key],))
-            raise ConfigError(f"{name} is {node[key]!r}; expected {kinds}")
+def _check_name(name: int | float | str) -> int | float | str:
+    if not re.fullmatch(r"[^\W.][^/\\\0\n]*", str(name)) or len(str(name)) > 100:
+        raise ValueError(
+            f"{name!r} is no name; expected up to 100 characters, a letter or digit first, no / and no \\"
+        )
+    return name
 
 
-KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
-
-
-def _is_of(value: Any, hint: Any) -> bool:
-    """Return whether a value is of a kind; kinds other than numbers, truths and null are not checked."""
-    if isinstance(hint, UnionType) or get_origin(hint) is Union:
-        return any(_is_of(value, one) for one in get_args(hint))
-    if hint is NoneType:
-        return value is None
-    if hint is bool:
-        return isinstance(value, bool) or value in (0, 1)
-    if hint in (int, float):
-        return isinstance(value, int if hint is int else (int, float)) and not isinstance(value, bool)
-    return True
+Name = Annotated[int | float | str, AfterValidator(_check_name)]  # of a directory
 
 
 @dataclass(frozen=True)
 class RunSettings:
     """Keys at the top of the configuration; see configs/config.yaml."""
 
-    seed: int
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
     device: str
-    threads: int
-    runs_dir: str
-    run_id: str | None
+    threads: Annotated[int, Field(ge=0, le=4096)]
+    runs_dir: PathText
+    run_id: Name | None
     resume: bool
     progress: bool | None
     deterministic: bool
-    init_from: str | None
+    init_from: PathText | None
 
 
 @dataclass(frozen=True)
@@ -113,11 +58,14 @@ class BenchmarkSettings:
     """
 
     suite: str
-    order: int = 0
-    tasks: int | Sequence[int | str] | None = None
-    horizon: int = 600
-    group_size: int = 1
-    files: Sequence[str] | None = None
+    order: Natural = 0
+    tasks: Count | Annotated[Sequence[Natural | str], Field(min_length=1)] | None = None
+    horizon: Count = 600
+    group_size: Count = 1
+    files: Annotated[Sequence[PathText], Field(min_length=1)] | None = None
+
+    def __post_init__(self) -> None:
+        validate_arguments(type(self), vars(self), prefix=("benchmark",), error=ConfigError)
 
     def sequence(self) -> tuple[Task, ...]:
         """Return the tasks in learning order.
@@ -138,7 +86,7 @@ class BenchmarkSettings:
     def _suite(self) -> Suite:
         if self.files is None and self.suite != OWN:
             return get_suite(self.suite)
-        if not self.files or isinstance(self.files, str):
+        if not self.files:
             raise ConfigError(
                 f"benchmark.files is {self.files!r}; give a list of task files: '[a.yaml,b.bddl]'"
             )
@@ -176,15 +124,12 @@ class PretrainSettings:
     """
 
     suite: str | None = None
-    tasks: int | Sequence[int | str] | None = None
-    demos: int | None = None
-    epochs: int | None = None
+    tasks: Count | Annotated[Sequence[Natural | str], Field(min_length=1)] | None = None
+    demos: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    epochs: Count | None = None
 
     def __post_init__(self) -> None:
-        for name in ("demos", "epochs"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(f"pretrain.{name} is {value}; it must be at least 1, or null")
+        validate_arguments(type(self), vars(self), prefix=("pretrain",), error=ConfigError)
 
     def sequence(self) -> tuple[Task, ...]:
         """Return the tasks; none without pretraining.
