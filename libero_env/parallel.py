@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import connection
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -72,6 +73,41 @@ def end_with_parent() -> None:
 def cpu_count() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def available_memory() -> int | None:
+    """Return how much memory a new process could use, [bytes]; None where the system does not say it."""
+    found = []
+    if (meminfo := Path("/proc/meminfo")).is_file():
+        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
+        found.append(1024 * int(lines["MemAvailable"].split()[0]))
+    for folder, limit, used in (
+        ("/sys/fs/cgroup", "memory.max", "memory.current"),
+        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
+    ):
+        texts = [Path(folder, name) for name in (limit, used)]
+        if all(path.is_file() for path in texts):
+            most, now = (path.read_text().strip() for path in texts)
+            found += [int(most) - int(now)] if most.isdecimal() else []
+    return max(0, min(found)) if found else None
+
+
+def require_memory(needed: float, what: str, remedy: str) -> None:
+    """Check that memory is available before it is asked for; a process that takes too much is killed.
+
+    Args:
+        needed: Estimate of what is needed, [bytes].
+        what: What it is needed for.
+        remedy: What to change.
+
+    Raises:
+        LiberoError: There is less; the message has both figures.
+    """
+    there = available_memory()
+    if there is not None and needed > there:
+        raise LiberoError(
+            f"{what} needs about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are free: {remedy}"
+        )
 
 
 def progress_bar(*iterable: Any, progress: bool | None = None, **options: Any) -> tqdm:

@@ -88,7 +88,7 @@ def sync_folder(folder: Path) -> None:
 def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:
     """Write a UTF-8 text file in one step; see `atomic_path`."""
     with atomic_path(target, fsync=fsync) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # half a character of UTF-16
 
 
 def create_text(target: Path, text: str) -> bool:
@@ -109,7 +109,7 @@ def create_text(target: Path, text: str) -> bool:
         return False
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
     try:
-        with open(temporary, "w", encoding="utf-8") as file:
+        with open(temporary, "w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())

@@ -310,5 +310,11 @@ def _write_results(directory: RunDirectory, config: Mapping[str, Any]) -> None:
     """Write results.json and the report."""
     results = directory.log.read()
     write_summary(directory.path / "results.json", results, config)
-    page = write_report([directory.path])
+    try:
+        page = write_report([directory.path])
+    except Exception as error:
+        error.add_note(
+            f"the run is finished and its results are kept; `libero report {directory.path}` writes its report"
+        )
+        raise
     print(f"{results.learned_tasks()} tasks learned. Report: {page}")

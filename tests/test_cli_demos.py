@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import pytest
 
+from libero_env.cli import arguments
 from libero_env.cli import demos as cli_demos
 from libero_env.demos.read import read_demos
 from libero_env.demos.record import RecordingReport
@@ -90,10 +91,10 @@ def test_failures_are_counted_by_kind():
 
 
 def test_sizes_are_one_number_or_two():
-    assert cli_demos.size("64") == (64, 64) and cli_demos.size("48x64") == (48, 64)
+    assert arguments.size("64") == (64, 64) and arguments.size("48x64") == (48, 64)
     for wrong in ("0", "1x2x3", "4x"):
         with pytest.raises((argparse.ArgumentTypeError, ValueError)):
-            cli_demos.size(wrong)
+            arguments.size(wrong)
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from libero_env import parallel
 from libero_env.cli import ending
 from libero_env.errors import LiberoError, code_of
 from libero_env.parallel import spawn_pool
+from libero_env.tasks import read_task
 from lifelong import launch
 from lifelong.cli import main as cli
 
@@ -136,7 +138,7 @@ def test_errors_by_kind(capsys):
             "the module ending_lacking raised ModuleNotFoundError: No module named 'a_package",
         ),
         (":", "'' is no name of a module"),
-        ("a\0b:c", "is no name of a module"),
+        ("a b:c", "is no name of a module"),
     ],
 )
 def test_a_policy_that_cannot_be_made_is_the_users(policy, message, here, capsys):
@@ -209,6 +211,80 @@ def test_mistyped_options_are_one_line(capsys):
             cli.main(words)
         found = capsys.readouterr().err
         assert found.startswith("error: ") and found.count("\n") == 1 and "--help" in found
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["eval", "m:f", "--size", "0"],
+        ["eval", "m:f", "--seed", "-1"],
+        ["eval", "m:f", "--timeout", "nan"],
+        ["eval", "m:f", "--timeout", "inf"],
+        ["eval", "m:f", "--horizon", "0"],
+        ["eval", "m:f", "--policy-threads", "1000000000"],
+        ["eval", "m:f", "--episodes", "1.5"],
+        ["eval", "m:f", "--out", ""],
+        ["eval", "m:f", "--after", "-1"],
+        ["eval", "m:f", "--in-flight", "0"],
+        ["serve", "run", "--port", "99999"],
+        ["saliency", "run", "--stride", "nan"],
+        ["power", "--tests", "1" + 400 * "0"],
+        ["power", "--episodes", "1" + 30 * "0"],
+        ["power", "--alpha", "nan"],
+        ["compare", "a", "b", "--alpha", "0"],
+        ["demos", "generate", "--task", "libero_goal/3", "--seed", "-1"],
+        ["demos", "generate", "--task", "libero_goal/3", "--noise", "nan"],
+        ["demos", "generate", "--task", "libero_goal/3", "--workers", "-3"],
+        ["demos", "generate", "--task", "libero_goal/3", "--size", "99999999"],
+        ["demos", "export", "a", "--out", "b", "--settle", "-1"],
+        ["tasks", "preview", "libero_goal/3", "--starts", "0"],
+        ["tasks", "certify", "libero_goal/3", "--require", "7"],
+        ["tasks", "lint", "libero_goal/3", "--starts", "10000000"],
+        ["objects", "add", "a.obj", "--mass", "-1"],
+        ["teleop", "libero_goal/3", "--pos-sensitivity", "nan"],
+    ],
+    ids=" ".join,
+)
+def test_numbers_out_of_range_are_one_line(words, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(words)
+    found = capsys.readouterr().err
+    assert found.startswith("error: argument ") and " is " in found and found.count("\n") == 1
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["tasks", "show", "a\0"], "null character"),
+        (["tasks", "new", "../elsewhere"], "is not the name of a task"),
+        (["tasks", "new", "mine", "--goal", ""], "an atom of the goal is empty"),
+        (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
+        (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
+    ],
+)
+def test_names_that_are_none(words, message, here, capsys):
+    assert cli.main(words) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert found.startswith("error: ") and message in found and found.count("\n") == 1
+    assert not list(here.parent.glob("*.yaml"))
+
+
+@pytest.mark.unit
+def test_a_new_task_may_have_any_instruction(here, capsys):
+    language = "put: [the 'bowl'] #1 on\nthe plate"
+    assert cli.main(["tasks", "new", "mine", "--language", language]) == 0
+    assert read_task("mine.yaml").language.split() == language.split()
+
+
+@pytest.mark.unit
+def test_memory_is_looked_at_before_it_is_asked_for(monkeypatch):
+    assert parallel.available_memory() > 10**6
+    monkeypatch.setattr(parallel, "available_memory", lambda: 10**9)
+    parallel.require_memory(0.9e9, "this", "less of it")
+    with pytest.raises(LiberoError, match=r"this needs about 2.0 GB of memory; 1.0 GB are free: less of it"):
+        parallel.require_memory(2e9, "this", "less of it")
 
 
 @pytest.mark.unit

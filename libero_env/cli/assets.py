@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers
 
 
@@ -13,12 +14,12 @@ def register(subparsers: Subparsers) -> None:
     install = commands.add_parser(
         "install", help="install the original's models (340 MB) with pip, the pinned version, verified"
     )
-    install.add_argument("--dest", type=Path, help="folder (default: the running environment)")
+    install.add_argument("--dest", type=arguments.path, help="folder (default: the running environment)")
     install.set_defaults(run=run_install)
     download = commands.add_parser(
         "download", help="download the same from the Hugging Face Hub (420 MB); resumes where it was stopped"
     )
-    download.add_argument("--dest", type=Path, help="folder (default: assets in the cache)")
+    download.add_argument("--dest", type=arguments.path, help="folder (default: assets in the cache)")
     download.add_argument(
         "--revision", help="commit, tag or branch of the data set (default: a pinned commit)"
     )
@@ -26,7 +27,9 @@ def register(subparsers: Subparsers) -> None:
     info = commands.add_parser("info", help="print which models scenes are built from, and why")
     info.set_defaults(run=run_info)
     check = commands.add_parser("check", help="check that all files of the models exist and are unchanged")
-    check.add_argument("folder", nargs="?", type=Path, help="folder to check (default: the models in use)")
+    check.add_argument(
+        "folder", nargs="?", type=arguments.path, help="folder to check (default: the models in use)"
+    )
     check.set_defaults(run=run_check)
 
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.cli import demos_edit
-from libero_env.cli.arguments import Subparsers, modalities, positive, size
+from libero_env.cli import arguments, demos_edit
+from libero_env.cli.arguments import Subparsers, modalities
 from libero_env.demos.curate import describe, find_demo_files
 
 if TYPE_CHECKING:
@@ -28,10 +28,10 @@ def register(subparsers: Subparsers) -> None:
     _register_download(commands)
     paths = "files or folders (default: where demonstrations are kept)"
     info = commands.add_parser("info", help="list the demonstration files in a folder")
-    info.add_argument("paths", nargs="*", type=Path, help=paths)
+    info.add_argument("paths", nargs="*", type=arguments.path, help=paths)
     info.set_defaults(run=run_info)
     check = commands.add_parser("check", help="read files completely and report what is in them or broken")
-    check.add_argument("paths", nargs="*", type=Path, help=paths)
+    check.add_argument("paths", nargs="*", type=arguments.path, help=paths)
     check.set_defaults(run=run_check)
     demos_edit.register(commands)
 
@@ -43,10 +43,15 @@ def _register_generate(commands: Subparsers) -> None:
     tasks = generate.add_mutually_exclusive_group(required=True)
     tasks.add_argument("--benchmark", "--suite", help="all tasks of a suite, such as libero_object")
     tasks.add_argument("--task", help="one task, such as libero_goal/3")
-    tasks.add_argument("--bddl", type=Path, help="a user-defined task file")
+    tasks.add_argument("--bddl", type=arguments.path, help="a user-defined task file")
     add = generate.add_argument
-    add("--n", type=positive, default=50, help="demonstrations of each task (default: 50)")
-    add("--size", type=size, default=(128, 128), help="size of the images, 128 or 120x160 (default: 128)")
+    add("--n", type=arguments.positive, default=50, help="demonstrations of each task (default: 50)")
+    add(
+        "--size",
+        type=arguments.size,
+        default=(128, 128),
+        help="size of the images, 128 or 120x160 (default: 128)",
+    )
     add("--cameras", nargs="+", default=CAMERAS, help=f"cameras to render (default: {' '.join(CAMERAS)})")
     add(
         "--no-images",
@@ -57,7 +62,12 @@ def _register_generate(commands: Subparsers) -> None:
     add("--depth", action="store_true", help="record depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
     add("--robot", default="libero", help="model of the arm: libero, or robosuite-1.4.1 (default: libero)")
-    add("--seed", type=int, default=0, help="seed of starts, motion styles and action noise (default: 0)")
+    add(
+        "--seed",
+        type=arguments.seed,
+        default=0,
+        help="seed of starts, motion styles and action noise (default: 0)",
+    )
     add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
     add(
         "--variation",
@@ -66,15 +76,28 @@ def _register_generate(commands: Subparsers) -> None:
         default=VARIATIONS,
         help="what varies: the motion style, noise on the executed actions, pushes (default: all)",
     )
-    add("--noise", type=float, help="standard deviation of the noise on actions (default: 0.12)")
+    add(
+        "--noise",
+        type=arguments.number(0, 10),
+        help="standard deviation of the noise on actions (default: 0.12)",
+    )
     add(
         "--pairing",
         choices=("aligned", "libero"),
         default="aligned",
         help="store the observation before an action, or the one after it as the original does (default: aligned)",
     )
-    add("--workers", type=int, default=0, help="number of processes (default: one per core)")
-    add("--folder", type=Path, help="where to keep the files (default: LIBERO_DEMOS, or in the cache)")
+    add(
+        "--workers",
+        type=arguments.processes_or_all,
+        default=0,
+        help="number of processes (default: one per core)",
+    )
+    add(
+        "--folder",
+        type=arguments.path,
+        help="where to keep the files (default: LIBERO_DEMOS, or in the cache)",
+    )
     generate.set_defaults(run=run_generate, go_on="what is recorded is kept; the same command goes on")
 
 
@@ -85,7 +108,7 @@ def _register_download(commands: Subparsers) -> None:
     )
     add = download.add_argument
     add("names", nargs="+", help="suites such as libero_object, or tasks such as libero_object/3")
-    add("--dest", type=Path, help="folder to write (default: where demonstrations are kept)")
+    add("--dest", type=arguments.path, help="folder to write (default: where demonstrations are kept)")
     add("--revision", help="commit, tag or branch of the data set (default: a pinned commit)")
     add("--overwrite", action="store_true", help="replace existing files of other contents")
     download.set_defaults(run=run_download, go_on="what is downloaded is kept; the same command goes on")

@@ -1,9 +1,9 @@
 """`libero demos replay|rerender|filter|export`: replay, render again, filter and convert demonstration files."""
 
 import argparse
-from pathlib import Path
 
-from libero_env.cli.arguments import Subparsers, modalities, size
+from libero_env.cli import arguments
+from libero_env.cli.arguments import Subparsers, modalities
 
 _ASSETS = "where models come from: builtin, original, or a folder with the original's"
 
@@ -19,12 +19,12 @@ def register(commands: Subparsers) -> None:
 def _register_replay(commands: Subparsers) -> None:
     parser = commands.add_parser("replay", help="replay demonstrations and report success and drift")
     add = parser.add_argument
-    add("file", type=Path)
+    add("file", type=arguments.path)
     add("--by", choices=("action", "state"), default="action", help="(default: action)")
-    add("--demo", nargs="+", type=int, help="numbers of demonstrations (default: all)")
-    add("--video", type=Path, help="video to write, .mp4, .webp or .gif")
+    add("--demo", nargs="+", type=arguments.whole(0), help="numbers of demonstrations (default: all)")
+    add("--video", type=arguments.path, help="video to write, .mp4, .webp or .gif")
     add("--cameras", nargs="+", default=("agentview",), help="cameras of the video (default: agentview)")
-    add("--size", type=size, default=(256, 256), help="size of the video (default: 256)")
+    add("--size", type=arguments.size, default=(256, 256), help="size of the video (default: 256)")
     add("--assets", help=_ASSETS)
     parser.set_defaults(run=run_replay)
 
@@ -32,9 +32,9 @@ def _register_replay(commands: Subparsers) -> None:
 def _register_rerender(commands: Subparsers) -> None:
     parser = commands.add_parser("rerender", help="render the recorded states again, with other cameras")
     add = parser.add_argument
-    add("file", type=Path)
-    add("out", type=Path, help="the new file")
-    add("--size", type=size, default=(128, 128), help="128 or 120x160 (default: 128)")
+    add("file", type=arguments.path)
+    add("out", type=arguments.path, help="the new file")
+    add("--size", type=arguments.size, default=(128, 128), help="128 or 120x160 (default: 128)")
     add("--cameras", nargs="+", default=("agentview", "robot0_eye_in_hand"))
     add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
     add("--depth", action="store_true", help="render depth too, in metres")
@@ -46,19 +46,24 @@ def _register_rerender(commands: Subparsers) -> None:
 def _register_filter(commands: Subparsers) -> None:
     parser = commands.add_parser("filter", help="write some of the demonstrations or steps of a file")
     add = parser.add_argument
-    add("file", type=Path)
-    add("out", type=Path, help="the new file")
+    add("file", type=arguments.path)
+    add("out", type=arguments.path, help="the new file")
     add("--success", action="store_true", help="keep only demonstrations that reached the goal")
     add("--no-ops", action="store_true", help="leave out steps in which the action does nothing")
-    add("--threshold", type=float, default=1e-3, help="largest motion of a no-op (default: 0.001)")
+    add(
+        "--threshold",
+        type=arguments.number(0, 1),
+        default=1e-3,
+        help="largest motion of a no-op (default: 0.001)",
+    )
     parser.set_defaults(run=run_filter)
 
 
 def _register_export(commands: Subparsers) -> None:
     parser = commands.add_parser("export", help="write files as one data set in another format")
     add = parser.add_argument
-    add("files", nargs="+", type=Path, help="files or folders")
-    add("--out", type=Path, required=True, help="a new folder")
+    add("files", nargs="+", type=arguments.path, help="files or folders")
+    add("--out", type=arguments.path, required=True, help="a new folder")
     add("--format", choices=("lerobot",), default="lerobot", help="LeRobotDataset v3.0 (default)")
     add("--labels", choices=("expert", "executed"), default="expert", help="(default: expert)")
     add(
@@ -70,7 +75,7 @@ def _register_export(commands: Subparsers) -> None:
     )
     add(
         "--settle",
-        type=int,
+        type=arguments.whole(0, 1000),
         default=10,
         help="with --as: waiting steps before the first action (default: 10)",
     )

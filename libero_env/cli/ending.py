@@ -122,20 +122,23 @@ def report(error: BaseException, *, who: str = "", mistakes: tuple[type[BaseExce
         return SIGNALLED + signal.SIGPIPE
     if is_debugging():
         traceback.print_exception(error)
+    told = _told(error, mistakes)
+    if told is None and not is_debugging():
+        traceback.print_exception(error)
+    notes = [note for note in getattr(error, "__notes__", ()) if not note.startswith(RAISED_BY)]
+    _say("\n".join([f"error: {who}{told or _request()}", *notes]))
+    return MISTAKE if told else DEFECT
+
+
+def _told(error: BaseException, mistakes: tuple[type[BaseException], ...]) -> str | None:
+    """Return what its user is told about an error; None if it is a fault of this package."""
     if isinstance(error, LiberoError):
-        _say(f"error: {who}{str(error).strip()}")
-    elif (told := _raised_by_user(error)) is not None:
-        _say(f"error: {who}{told}")
-    elif isinstance(error, mistakes):
-        _say(f"error: {who}{' '.join(str(error).split())}")
-    elif (lack := _lack(error)) is not None:
-        _say(f"error: {who}{lack}")
-    else:
-        if not is_debugging():
-            traceback.print_exception(error)
-        _say(f"error: {who}{_request()}")
-        return DEFECT
-    return MISTAKE
+        return str(error).strip() or type(error).__name__
+    if told := _raised_by_user(error):
+        return told
+    if isinstance(error, mistakes):
+        return " ".join(str(error).split()) or type(error).__name__
+    return _lack(error)
 
 
 def _say(text: str) -> None:
@@ -167,19 +170,14 @@ def _raised_by_user(error: BaseException) -> str | None:
         if own or notes or syntax:
             shown = own or (frames[ours[-1] + 1 :] if ours else [])
             lines = "".join(traceback.format_list(shown[-_MAX_FRAMES:])).rstrip()
-            text = "".join(traceback.format_exception_only(_without_notes(link))).strip()
+            said = traceback.format_exception_only(link)
+            noted = sum(len(note.split("\n")) for note in getattr(link, "__notes__", ()))
+            text = "".join(said[: len(said) - noted]).strip()
             culprit = notes[0].removeprefix(RAISED_BY) if notes else "code of yours"
             more = "" if is_debugging() else "(--debug shows the whole traceback)"
             return "\n".join(part for part in (f"{culprit} raised {text}", lines, more) if part)
         link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
     return None
-
-
-def _without_notes(error: BaseException) -> BaseException:
-    notes = getattr(error, "__notes__", None)
-    if notes:
-        notes[:] = [note for note in notes if not note.startswith(RAISED_BY)]
-    return error
 
 
 def _is_user_file(name: str) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers
 
 
@@ -27,18 +28,18 @@ def register(subparsers: Subparsers) -> None:
         command.set_defaults(run=run)
     preview = commands.add_parser("preview", help="render an object from all sides")
     preview.add_argument("name", metavar="NAME")
-    preview.add_argument("--out", type=Path, help="the picture (default: NAME.png here)")
+    preview.add_argument("--out", type=arguments.path, help="the picture (default: NAME.png here)")
     preview.set_defaults(run=run_preview)
 
 
 def _register_add(commands: Subparsers) -> None:
     add = commands.add_parser("add", help="convert an MJCF, OBJ, GLB, glTF, STL or PLY file into an object")
-    add.add_argument("file", type=Path)
-    option = add.add_argument
+    add.add_argument("file", type=arguments.path)
+    option, measure = add.add_argument, arguments.number(0, 1e6, open_ends=True)
     option("--name", help="name in task files (default: the file's name)")
-    option("--size", type=float, help="longest side, m (default: that of the file, whose unit is guessed)")
-    option("--mass", type=float, help="kg (default: by density)")
-    option("--density", type=float, help="kg/m^3 (default: 400)")
+    option("--size", type=measure, help="longest side, m (default: that of the file, whose unit is guessed)")
+    option("--mass", type=measure, help="kg (default: by density)")
+    option("--density", type=measure, help="kg/m^3 (default: 400)")
     option(
         "--up",
         choices=("z", "y"),
@@ -50,14 +51,19 @@ def _register_add(commands: Subparsers) -> None:
         default="decompose",
         help="convex pieces, the convex hull, or boxes (default: decompose; without CoACD boxes)",
     )
-    option("--faces", type=int, default=3000, help="largest number of triangles for display (default: 3000)")
+    option(
+        "--faces",
+        type=arguments.whole(4, 1_000_000),
+        default=3000,
+        help="most triangles for display (default: 3000)",
+    )
     option(
         "--container", action="store_true", help="objects can be put In it: adds the region contain_region"
     )
     option("--replace", action="store_true", help="replace a user-defined object of this name")
     option(
         "--out",
-        type=Path,
+        type=arguments.path,
         help="folder (default: LIBERO_OBJECTS, else objects beside the configuration file)",
     )
     add.set_defaults(run=run_add)
@@ -134,9 +140,12 @@ def run_show(args: argparse.Namespace) -> None:
 def run_preview(args: argparse.Namespace) -> None:
     """Render an object and print the path of the picture."""
     from libero_env.design.objects.trial import draw_object
+    from libero_env.design.preview import check_picture
     from libero_env.objects import get_object
 
-    print(draw_object(get_object(args.name), args.out or Path(f"{args.name}.png")))
+    item, out = get_object(args.name), args.out or Path(f"{args.name}.png")
+    check_picture(out)
+    print(draw_object(item, out))
 
 
 def run_remove(args: argparse.Namespace) -> None:

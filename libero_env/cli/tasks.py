@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.cli import tasks_new
+from libero_env.cli import arguments, tasks_new
 from libero_env.cli.arguments import Subparsers
 
 if TYPE_CHECKING:
@@ -22,7 +22,9 @@ def register(subparsers: Subparsers) -> None:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     listing = commands.add_parser("list", help="the tasks of one suite, or of all")
     listing.add_argument("suite", nargs="?", help="such as libero_object")
-    listing.add_argument("--order", type=int, default=0, help="one of the published sequences (0 to 20)")
+    listing.add_argument(
+        "--order", type=arguments.whole(0), default=0, help="one of the published sequences (0 to 20)"
+    )
     listing.set_defaults(run=run_tasks_list)
     show = commands.add_parser("show", help="the BDDL of a task")
     show.add_argument("task", help="such as libero_object/3, the task's name, or a task file")
@@ -33,11 +35,14 @@ def register(subparsers: Subparsers) -> None:
     states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
     states.add_argument(
         "--out",
-        type=Path,
+        type=arguments.path,
         help="folder for the .npz files (default: those in the package; for a file, the cache)",
     )
     states.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, help="number of processes (default: one per core)"
+        "--jobs",
+        type=arguments.processes,
+        default=os.cpu_count() or 1,
+        help="number of processes (default: one per core)",
     )
     states.set_defaults(run=run_tasks_init_states)
     _register_checks(commands)
@@ -51,14 +56,25 @@ def _register_checks(commands: Subparsers) -> None:
     )
     _add_tasks(certify)
     certify.add_argument(
-        "--states", type=_states, default=50, help="initial states of each task, 1 to 50 (default: 50)"
+        "--states",
+        type=arguments.whole(1, 50),
+        default=50,
+        help="initial states of each task, 1 to 50 (default: 50)",
     )
-    certify.add_argument("--jobs", type=int, default=0, help="number of processes (default: one per core)")
     certify.add_argument(
-        "--out", type=Path, default=Path("certificates"), help="folder (default: certificates)"
+        "--jobs",
+        type=arguments.processes_or_all,
+        default=0,
+        help="number of processes (default: one per core)",
     )
     certify.add_argument(
-        "--require", type=float, default=0.8, help="success rate that each task must reach (default: 0.8)"
+        "--out", type=arguments.path, default=Path("certificates"), help="folder (default: certificates)"
+    )
+    certify.add_argument(
+        "--require",
+        type=arguments.share,
+        default=0.8,
+        help="success rate that each task must reach (default: 0.8)",
     )
     certify.add_argument(
         "--disturb", action="store_true", help="add noise to the actions, as demonstrations do"
@@ -71,7 +87,10 @@ def _register_checks(commands: Subparsers) -> None:
         "--level", choices=LEVELS, default="warning", help="lowest level that is printed (default: warning)"
     )
     lint.add_argument(
-        "--starts", type=int, default=5, help="initial states to check; 0 simulates nothing (default: 5)"
+        "--starts",
+        type=arguments.whole(0, 1000),
+        default=5,
+        help="initial states to check; 0 simulates nothing (default: 5)",
     )
     lint.set_defaults(run=run_lint)
 
@@ -84,13 +103,6 @@ def _add_tasks(parser: argparse.ArgumentParser) -> None:
         help="such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml",
     )
     parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
-
-
-def _states(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 50:
-        raise argparse.ArgumentTypeError(f"{text} is not from 1 to 50")
-    return value
 
 
 def find_tasks(names: Sequence[str]) -> list["Task"]:

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers
 
 
@@ -37,7 +38,7 @@ def _register_new(commands: Subparsers) -> None:
         help="such as 'On red_coffee_mug_1 plate_1' (default: first on last)",
     )
     add("--language", help="the instruction (default: it describes the goal)")
-    add("--out", type=Path, default=Path(), help="folder (default: here)")
+    add("--out", type=arguments.path, default=Path(), help="folder (default: here)")
     add("--bddl", action="store_true", help="also write the BDDL file")
     new.set_defaults(run=run_new)
 
@@ -48,9 +49,14 @@ def _register_preview(commands: Subparsers) -> None:
     )
     add = preview.add_argument
     add("task", help="a file that ends in .yaml or .bddl, or such as libero_goal/3")
-    add("--starts", type=int, default=3, help="number of initial states, one per row (default: 3)")
+    add(
+        "--starts",
+        type=arguments.whole(1, 50),
+        default=3,
+        help="number of initial states, one per row (default: 3)",
+    )
     add("--cameras", nargs="+", help="one per column (default: agentview robot0_eye_in_hand birdview)")
-    add("--size", type=int, default=256, help="pixels of a picture (default: 256)")
+    add("--size", type=arguments.side, default=256, help="pixels of a picture (default: 256)")
     add(
         "--video",
         nargs="?",
@@ -60,7 +66,7 @@ def _register_preview(commands: Subparsers) -> None:
     )
     add(
         "--out",
-        type=Path,
+        type=arguments.path,
         help="file of the pictures (default: TASK.png here); the video is written beside it",
     )
     preview.set_defaults(run=run_preview)
@@ -77,6 +83,8 @@ def run_new(args: argparse.Namespace) -> None:
     from libero_env.tasks import read_task
     from libero_env.tasks.files import write_task
 
+    if args.name.startswith(".") or Path(args.name).name != args.name:
+        raise LiberoError(f"{args.name!r} is not the name of a task, such as my_task; --out is the folder")
     path = args.out / f"{args.name}.yaml"
     if path.exists():
         raise LiberoError(f"{path} exists already; choose another name, or remove it")

@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from libero_env.cli.arguments import Subparsers, positive, size
+from libero_env.cli import arguments
+from libero_env.cli.arguments import Subparsers
 
 
 def register(subparsers: Subparsers) -> None:
@@ -11,16 +12,23 @@ def register(subparsers: Subparsers) -> None:
     parser = subparsers.add_parser("teleop", help="record demonstrations by hand: keyboard or 3D mouse")
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("task", nargs="?", help="such as libero_goal/3")
-    task.add_argument("--bddl", type=Path, help="a user-defined task file")
+    task.add_argument("--bddl", type=arguments.path, help="a user-defined task file")
     add = parser.add_argument
     add(
         "--out",
-        type=Path,
+        type=arguments.path,
         help="demonstration file (default: <task>_demo.hdf5 here); demonstrations that it has are kept",
     )
-    add("--n", type=positive, default=1, help="demonstrations that the file shall have (default: 1)")
-    add("--size", type=size, default=(128, 128), help="size of the images, 128 or 120x160 (default: 128)")
-    add("--seed", type=int, default=0, help="seed of the starts (default: 0)")
+    add(
+        "--n", type=arguments.positive, default=1, help="demonstrations that the file shall have (default: 1)"
+    )
+    add(
+        "--size",
+        type=arguments.size,
+        default=(128, 128),
+        help="size of the images, 128 or 120x160 (default: 128)",
+    )
+    add("--seed", type=arguments.seed, default=0, help="seed of the starts (default: 0)")
     add("--camera", default="agentview", help="camera shown while recording (default: agentview)")
     add("--screen", default="auto", choices=("auto", "window", "terminal"), help="where it is shown")
     add_device_options(parser)
@@ -29,12 +37,12 @@ def register(subparsers: Subparsers) -> None:
 
 def add_device_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the input device."""
-    add = parser.add_argument
+    add, sensitivity, usb_id = parser.add_argument, arguments.number(-100, 100), arguments.whole(0, 0xFFFF)
     add("--device", default="keyboard", choices=("keyboard", "spacemouse"), help="input device")
-    add("--pos-sensitivity", type=float, default=1.0, help="factor on translations (default: 1)")
-    add("--rot-sensitivity", type=float, default=1.0, help="factor on rotations (default: 1)")
-    add("--vendor-id", type=int, default=9583, help="USB vendor of the 3D mouse (default: 9583)")
-    add("--product-id", type=int, default=50741, help="USB product of the 3D mouse (default: 50741)")
+    add("--pos-sensitivity", type=sensitivity, default=1.0, help="factor on translations (default: 1)")
+    add("--rot-sensitivity", type=sensitivity, default=1.0, help="factor on rotations (default: 1)")
+    add("--vendor-id", type=usb_id, default=9583, help="USB vendor of the 3D mouse (default: 9583)")
+    add("--product-id", type=usb_id, default=50741, help="USB product of the 3D mouse (default: 50741)")
 
 
 def run_teleop(args: argparse.Namespace) -> int:

@@ -178,7 +178,7 @@ def markdown_table(certificates: Sequence[Certificate]) -> str:
         length = f"{row['median_length']:g} ({row['max_length']})" if row["successes"] else ""
         reasons = Counter(row["failures"].values()).most_common(2)
         why = "; ".join(f"{count}x {reason}" for reason, count in reasons).replace("|", "/")
-        name = f"{row['id']} {row['task'].replace('_', ' ')}"
+        name = " ".join([row["id"], *row["task"].replace("_", " ").replace("|", "/").split()])
         lines.append(f"| {name} | {row['successes']}/{row['states']} | {length} | {row['retries']} | {why} |")
     good, total = sum(len(c.lengths) for c in certificates), sum(len(c.outcomes) for c in certificates)
     lines.append(f"| all | **{good}/{total} = {100 * good / max(total, 1):.1f} %** | | | |")

@@ -64,10 +64,10 @@ def draw_figure(certificates: Sequence[Certificate], path: Path, title: str) -> 
         np.ma.masked_invalid(steps), cmap=colours, aspect="auto", interpolation="nearest", vmin=0
     )
     labels = [f"{_label(c)}  {100 * c.rate:.0f} %" for c in certificates]
-    axes.set_yticks(range(len(labels)), labels, fontsize=6)
+    axes.set_yticks(range(len(labels)), labels, fontsize=6, parse_math=False)  # names are texts of users
     axes.set_xlabel("initial state; red where the goal was not reached", fontsize=7)
     axes.tick_params(axis="x", labelsize=6)
-    axes.set_title(title, fontsize=8)
+    axes.set_title(title, fontsize=8, parse_math=False)
     figure.colorbar(image, ax=axes, shrink=min(1.0, 20 / len(certificates))).ax.tick_params(labelsize=6)
     figure.savefig(path)
 

@@ -8,6 +8,7 @@ from PIL import Image, ImageDraw
 
 from libero_env.demos.video import write_video
 from libero_env.envs.env import LiberoEnv
+from libero_env.errors import LiberoError
 from libero_env.expert import Expert
 from libero_env.expert.rollout import MAX_STEPS
 from libero_env.sim.observations import image_name
@@ -38,6 +39,7 @@ def contact_sheet(
         PlacementError: There is no collision-free placement of the objects.
         UnknownNameError: A camera does not exist.
     """
+    check_picture(path)
     env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
     try:
         rows = [
@@ -56,6 +58,16 @@ def contact_sheet(
     path.parent.mkdir(parents=True, exist_ok=True)
     sheet.save(path)
     return path
+
+
+def check_picture(path: Path) -> None:
+    """Check that the name of a file says how a picture is stored.
+
+    Raises:
+        LiberoError: It ends in nothing that is known.
+    """
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp", ".gif", ".bmp", ".tiff"):
+        raise LiberoError(f"{path}: the name of a picture ends in .png, .jpg, .webp, .gif, .bmp or .tiff")
 
 
 def expert_video(

@@ -1,5 +1,6 @@
 """Template of a user-defined task: a valid YAML file with comments on what can be changed."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from math import hypot
 
@@ -65,7 +66,9 @@ def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
     """Return an instruction for a goal; it is correct for atoms like those of `_default_goal`."""
     phrases = []
     for atom in goal:
-        predicate, *args = atom.strip("()").split()
+        predicate, *args = atom.strip("()").split() or [""]
+        if not predicate:
+            raise LiberoError("an atom of the goal is empty; write for example 'On plate_1 stove_1'")
         plain = [names.get(arg, arg).replace("_", " ").replace(" 1", "") for arg in args]
         if predicate in ("On", "In") and len(plain) == 2:
             phrases.append(
@@ -117,7 +120,7 @@ def _text(
     goal: Sequence[str],
     language: str,
 ) -> str:
-    lines = [f"language: {language}", f"scene: {scene}"]
+    lines = [f"language: {_scalar(language)}", f"scene: {_scalar(scene)}"]
     lines += [f"furniture: [{', '.join(furniture)}]"] if furniture else []
     lines += [f"objects: [{', '.join(objects)}]"] if objects else []
     lines += [
@@ -125,4 +128,10 @@ def _text(
     ]
     lines += ["place:", *(f"  {name}: {place}" for name, place in places.items())] if places else []
     lines += ["# all of these must hold: On, In, Open, Close, Turnon, Turnoff, Up, Stack, ...", "goal:"]
-    return "\n".join([*lines, *(f"  - {atom}" for atom in goal)]) + "\n"
+    return "\n".join([*lines, *(f"  - {_scalar(atom)}" for atom in goal)]) + "\n"
+
+
+def _scalar(text: str) -> str:
+    """Return a text as YAML has it in one line, in quotes where it would be read as something else."""
+    plain = yaml.safe_dump(text, allow_unicode=True, width=float("inf")).removesuffix("...\n").strip()
+    return json.dumps(text) if "\n" in plain else plain

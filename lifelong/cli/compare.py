@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.cli.arguments import Subparsers, positive
+from libero_env.cli import arguments
+from libero_env.cli.arguments import Subparsers
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -47,10 +48,15 @@ def _add_compare(subparsers: Subparsers) -> None:
         help="compare although this setting differs, such as protocol.horizon, environment.robot or tasks",
     )
     parser.add_argument(
-        "--alpha", type=float, default=0.05, help="probability of a false difference (default: 0.05)"
+        "--alpha",
+        type=arguments.probability,
+        default=0.05,
+        help="probability of a false difference (default: 0.05)",
     )
     parser.add_argument("--tasks", action="store_true", help="show every task in the terminal")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for compare.html and compare.json")
+    parser.add_argument(
+        "--out", type=arguments.path, metavar="DIR", help="folder for compare.html and compare.json"
+    )
     parser.set_defaults(run=run_compare)
 
 
@@ -59,26 +65,40 @@ def _add_power(subparsers: Subparsers) -> None:
     parser.add_argument(
         "results", nargs="*", metavar="RESULT", help="two results to take the success and discordance from"
     )
-    parser.add_argument("--base", type=float, help="success rate of the one policy (default: 0.9)")
+    parser.add_argument("--base", type=arguments.share, help="success rate of the one policy (default: 0.9)")
     parser.add_argument(
         "--difference",
-        type=float,
+        type=arguments.number(-1, 1),
         help="success of the other minus that, such as 0.03 (default: a table of several)",
     )
     share = parser.add_mutually_exclusive_group()
     share.add_argument(
-        "--discordance", type=float, help="share of starts in which exactly one of the two succeeds"
+        "--discordance", type=arguments.share, help="share of starts in which exactly one of the two succeeds"
     )
     share.add_argument(
-        "--correlation", type=float, help="correlation of the two outcomes in a start, instead"
+        "--correlation",
+        type=arguments.number(-1, 1),
+        help="correlation of the two outcomes in a start, instead",
     )
-    parser.add_argument("--power", type=float, default=0.8, help="probability of showing it (default: 0.8)")
     parser.add_argument(
-        "--alpha", type=float, default=0.05, help="probability of a false difference (default: 0.05)"
+        "--power", type=arguments.probability, default=0.8, help="probability of showing it (default: 0.8)"
     )
-    parser.add_argument("--tests", type=positive, default=1, help="number of comparisons that share alpha")
     parser.add_argument(
-        "--episodes", type=positive, help="print the smallest difference that so many episodes show instead"
+        "--alpha",
+        type=arguments.probability,
+        default=0.05,
+        help="probability of a false difference (default: 0.05)",
+    )
+    parser.add_argument(
+        "--tests",
+        type=arguments.whole(1, 1_000_000),
+        default=1,
+        help="number of comparisons that share alpha",
+    )
+    parser.add_argument(
+        "--episodes",
+        type=arguments.whole(1, 2_000_000),
+        help="print the smallest difference that they show instead",
     )
     parser.set_defaults(run=run_power)
 
@@ -95,7 +115,9 @@ def _add_results(subparsers: Subparsers) -> None:
         choices=("vla-eval", "lerobot"),
         help="vla-eval: SUITE_aggregate.json for each suite; lerobot: eval_info.json",
     )
-    export.add_argument("--out", type=Path, metavar="DIR", help="folder of the files (default: the result's)")
+    export.add_argument(
+        "--out", type=arguments.path, metavar="DIR", help="folder of the files (default: the result's)"
+    )
     export.set_defaults(run=run_export)
 
 
@@ -104,8 +126,6 @@ def run_compare(args: argparse.Namespace) -> None:
     from lifelong.report.judgement import judge, write_judgement
     from lifelong.report.judgement_text import render
 
-    if not 0 < args.alpha < 1:
-        raise ConfigError(f"--alpha is a probability between 0 and 1, not {args.alpha:g}")
     sides = [*_single_sides(args.results), *(_group(words) for words in args.group)]
     control = None
     if args.control:

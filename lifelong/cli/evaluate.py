@@ -8,8 +8,8 @@ from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.cli import ending
-from libero_env.parallel import cpu_count
+from libero_env.cli import arguments, ending
+from libero_env.parallel import cpu_count, require_memory
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,11 +41,17 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
     """Add what decides the numbers: tasks, starts, protocol, models."""
     parser.add_argument("--suite", nargs="+", metavar="SUITE", help="suites or tasks (default: the run's)")
     parser.add_argument(
-        "--after", type=int, help="of a run: the policy after this task, from 0 (default: the last)"
+        "--after",
+        type=arguments.whole(0),
+        help="of a run: the policy after this task, from 0 (default: the last)",
     )
-    parser.add_argument("--starts", default="all", help="all, reporting or selection (default: all 50)")
     parser.add_argument(
-        "--episodes", type=int, help="number of these starts, from the first on (default: all of them)"
+        "--starts", choices=("all", "reporting", "selection"), default="all", help="(default: all 50)"
+    )
+    parser.add_argument(
+        "--episodes",
+        type=arguments.positive,
+        help="number of these starts, from the first on (default: all of them)",
     )
     parser.add_argument(
         "--protocol",
@@ -54,30 +60,36 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
         help="libero, openpi, ..., see `libero protocols list`; or a card of your own, my.yaml (default: libero)",
     )
     parser.add_argument(
-        "--horizon", type=int, help="maximum number of control steps (default: the protocol's)"
+        "--horizon", type=arguments.horizon, help="maximum number of control steps (default: the protocol's)"
     )
-    parser.add_argument("--size", type=int, help="image size in pixels, for a policy that does not define it")
+    parser.add_argument(
+        "--size", type=arguments.side, help="image size in pixels, for a policy that does not define it"
+    )
     parser.add_argument(
         "--names",
         choices=("native", "original", "protocol"),
         help="what a policy of your own receives: this package's observations, the original's, or the protocol's "
         "inputs (default: native for upright images, otherwise original)",
     )
-    parser.add_argument("--videos", type=int, default=0, metavar="N", help="record N episodes of each task")
-    parser.add_argument("--seed", type=int, default=0, help="seed of stochastic policies (default: 0)")
+    parser.add_argument(
+        "--videos", type=arguments.whole(0), default=0, metavar="N", help="record N episodes of each task"
+    )
+    parser.add_argument(
+        "--seed", type=arguments.seed, default=0, help="seed of stochastic policies (default: 0)"
+    )
     parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
     parser.add_argument(
         "--robot", help="arm: libero, or robosuite-1.4.1 (default: the protocol's, or that of the run)"
     )
     parser.add_argument(
         "--unit-starts",
-        type=int,
+        type=arguments.positive,
         metavar="N",
         help="episodes of a task that are run in one batch (default: 10)",
     )
     parser.add_argument(
         "--policy-threads",
-        type=int,
+        type=arguments.processes,
         metavar="N",
         help="threads of a policy on the CPU (default: 1 for a run's)",
     )
@@ -86,30 +98,38 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
 def _add_work_options(parser: argparse._ArgumentGroup) -> None:
     """Add what does not change the numbers: folder, processes, device."""
     parser.add_argument(
-        "--out", type=Path, help="folder of the results (default: in the run, or eval/POLICY)"
+        "--out", type=arguments.path, help="folder of the results (default: in the run, or eval/POLICY)"
     )
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="processes that share the work (default: 1)"
+        "--workers",
+        type=arguments.processes,
+        default=1,
+        metavar="N",
+        help="processes that share the work (default: 1)",
     )
     parser.add_argument(
-        "--retries", type=int, default=1, metavar="N", help="further attempts after an error (default: 1)"
+        "--retries",
+        type=arguments.whole(0, 1000),
+        default=1,
+        metavar="N",
+        help="further attempts after an error (default: 1)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument(
         "--threads",
-        type=int,
+        type=arguments.processes_or_all,
         default=0,
         help="threads of the simulations (default: all cores, shared by the workers)",
     )
     parser.add_argument(
         "--timeout",
-        type=float,
+        type=arguments.seconds,
         default=300.0,
         help="seconds until a policy server must answer (default: 300)",
     )
     parser.add_argument(
         "--in-flight",
-        type=int,
+        type=arguments.positive,
         metavar="N",
         help="requests that a policy server gets before it has answered (default: one for each episode of a batch)",
     )
@@ -122,27 +142,41 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         help="of a result that is run again: what may differ from then, such as mujoco (default: nothing)",
     )
     parser.add_argument(
-        "--status", type=Path, metavar="OUT", help="only say how far the evaluation in this folder is"
+        "--status",
+        type=arguments.path,
+        metavar="OUT",
+        help="only say how far the evaluation in this folder is",
     )
 
 
 def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
     parser = subparsers.add_parser("saliency", help="images of where a policy looks during a rollout")
     parser.add_argument(
-        "policy", type=Path, metavar="RUN", help="a run's directory, or one of its checkpoints"
+        "policy", type=arguments.path, metavar="RUN", help="a run's directory, or one of its checkpoints"
     )
-    parser.add_argument("--task", type=int, default=0, help="position in the run's sequence (default: 0)")
-    parser.add_argument("--after", type=int, help="the policy after this task, from 0 (default: the last)")
-    parser.add_argument("--start", type=int, default=0, help="initial state of the rollout (default: 0)")
-    parser.add_argument("--moments", type=int, default=6, help="number of images (default: 6)")
+    parser.add_argument(
+        "--task", type=arguments.whole(0), default=0, help="position in the run's sequence (default: 0)"
+    )
+    parser.add_argument(
+        "--after", type=arguments.whole(0), help="the policy after this task, from 0 (default: the last)"
+    )
+    parser.add_argument(
+        "--start", type=arguments.whole(0, 49), default=0, help="initial state of the rollout (default: 0)"
+    )
+    parser.add_argument(
+        "--moments", type=arguments.whole(1, 100), default=6, help="number of images (default: 6)"
+    )
     parser.add_argument(
         "--stride",
-        type=float,
+        type=arguments.number(1, 128),
         default=8.0,
         help="distance of two places in pixels of a 128-pixel image (default: 8)",
     )
     parser.add_argument(
-        "--horizon", type=int, default=200, help="maximum number of control steps (default: 200)"
+        "--horizon",
+        type=arguments.horizon,
+        default=200,
+        help="maximum number of control steps (default: 200)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.set_defaults(run=run_saliency)
@@ -159,15 +193,19 @@ def run_eval(args: argparse.Namespace) -> None:
     if args.status:
         print(describe_status(args.status))
         return
-    check_eval(args)
+    if args.policy is None:
+        raise ConfigError("no policy is named; it comes first: libero eval RUN_DIR --suite libero_goal")
     args.threads = args.threads or max(1, cpu_count() // args.workers)
     plan = plan_eval(args)
+    workers = min(args.workers, len(plan.units))
+    remedy = "fewer --workers, --unit-starts or --videos, or a smaller --size"
+    require_memory(plan.memory(workers), f"an evaluation by {workers} processes", remedy)
     if args.again:
         plan.folder.clear()
     print(HEADER, flush=True)
     helpers = argparse.Namespace(**(vars(args) | {"again": False}))
     try:
-        with policy_threads(plan), Crew(args.workers - 1, help_eval, helpers) as crew:
+        with policy_threads(plan), Crew(workers - 1, help_eval, helpers) as crew:
             result = Worker(
                 plan,
                 on_result=lambda row: print(table_row(row), flush=True),
@@ -202,25 +240,6 @@ def help_eval(args: argparse.Namespace) -> None:
                 Worker(plan).run()
         except Exception as error:  # noqa: BLE001 - told by kind
             sys.exit(ending.report(error, who="a worker ended: "))
-
-
-def check_eval(args: argparse.Namespace) -> None:
-    """Check the numbers among the arguments.
-
-    Raises:
-        ConfigError: No policy is named, or a number is too small.
-    """
-    if args.policy is None:
-        raise ConfigError("no policy is named; it comes first: libero eval RUN_DIR --suite libero_goal")
-    for name, least in (("workers", 1), ("retries", 0), ("threads", 0), ("videos", 0)):
-        if getattr(args, name) < least:
-            raise ConfigError(f"--{name} is {getattr(args, name)}; it must be at least {least}")
-    if args.timeout <= 0:
-        raise ConfigError(f"--timeout is {args.timeout:g} s; it must be positive")
-    if args.in_flight is not None and args.in_flight < 1:
-        raise ConfigError(f"--in-flight is {args.in_flight}; it must be at least 1")
-    if args.policy_threads is not None and args.policy_threads < 1:
-        raise ConfigError(f"--policy-threads is {args.policy_threads}; it must be at least 1")
 
 
 def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":

@@ -4,11 +4,11 @@ import argparse
 import io
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NoReturn
 
-from libero_env.cli import assets, demos, ending, objects, tasks, teleop
+from libero_env.cli import arguments, assets, demos, ending, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
+from libero_env.errors import InvalidInputError
 from lifelong.cli import compare, evaluate, protocols, serve
 
 TRAIN_HELP = """\
@@ -47,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> int:
+    if any("\0" in word for word in words):  # from Python only: a system passes none
+        raise InvalidInputError("a word of the command line has a null character, which no name can have")
     if words[:1] == ["train"] and not {"-h", "--help"} & set(words):
         return run_train(words[1:])  # Hydra reads the rest: options in any place, overrides
     args = build_parser().parse_args(words)
@@ -135,11 +137,15 @@ def register_report(subparsers: Subparsers) -> None:
     """Add `libero report RUN_DIR...`."""
     parser = subparsers.add_parser("report", help="a page about one run, or about several side by side")
     parser.add_argument(
-        "run_dirs", nargs="+", type=Path, metavar="RUN_DIR", help="such as runs/libero_object/ewc/..."
+        "run_dirs",
+        nargs="+",
+        type=arguments.path,
+        metavar="RUN_DIR",
+        help="such as runs/libero_object/ewc/...",
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=arguments.path,
         help="the page, or a folder for it (default: report.html in the run directory; for several, comparison/ here)",
     )
     parser.set_defaults(run=run_report)

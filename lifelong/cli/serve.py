@@ -3,30 +3,36 @@
 import argparse
 import asyncio
 import contextlib
-from pathlib import Path
+
+from libero_env.cli import arguments
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
     """Add the command `libero serve RUN`."""
     parser = subparsers.add_parser("serve", help="serve a run's policy in openpi's WebSocket protocol")
     parser.add_argument(
-        "policy", type=Path, metavar="RUN", help="a run's directory, or one of its checkpoints"
+        "policy", type=arguments.path, metavar="RUN", help="a run's directory, or one of its checkpoints"
     )
-    parser.add_argument("--after", type=int, help="the policy after this task, from 0 (default: the last)")
+    parser.add_argument(
+        "--after", type=arguments.whole(0), help="the policy after this task, from 0 (default: the last)"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument(
-        "--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)"
+        "--port",
+        type=arguments.whole(0, 65535),
+        default=8000,
+        help="port to listen on, 0 for a free one (default: 8000)",
     )
     parser.add_argument(
         "--seed",
-        type=int,
+        type=arguments.seed,
         default=0,
         help="seed of stochastic policies, for clients that send none (default: 0)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument(
         "--policy-threads",
-        type=int,
+        type=arguments.processes,
         default=1,
         metavar="N",
         help="threads of a policy on the CPU, as of `libero eval` (default: 1)",
@@ -44,7 +50,7 @@ def run_serve(args: argparse.Namespace) -> None:
 
     served = ServedPolicy(restore(args.policy, after=args.after, device=args.device), seed=args.seed)
     if served.run.device.type == "cpu":
-        torch.set_num_threads(max(1, args.policy_threads))
+        torch.set_num_threads(args.policy_threads)
     server = PolicyServer(served.metadata, served.session, host=args.host, port=args.port)
 
     def ready(port: int) -> None:

@@ -30,6 +30,8 @@ from lifelong.results.evaluation_file import EvaluationResult, TaskResult
 from lifelong.results.records import installed_versions
 from lifelong.results.summary import json_safe
 
+# Memory, as measured with libero_10/0
+PROCESS_BYTES, SIMULATION_BYTES, IMAGE_COPIES = 600e6, 2e6, 7
 DECISIVE = ("mujoco", "models", "models_digest")  # versions that the results of one evaluation must share
 
 
@@ -99,6 +101,14 @@ class SuiteEvaluation:
     @property
     def _resolved_protocol(self) -> dict[str, Any]:
         return json_safe(self.protocol.resolved())
+
+    def memory(self, workers: int) -> float:
+        """Return an estimate of the memory that so many processes need, [bytes]; policies need theirs besides."""
+        height, width = self.protocol.pixels.render_size or (128, 128)
+        image = 3 * height * width * len(self.protocol.pixels.cameras)
+        batch = min(self.unit_starts, len(self.init_states))
+        frames = min(self.videos, batch) * -(-(self.protocol.episode.horizon or 0) // self.record_every)
+        return workers * (PROCESS_BYTES + batch * (SIMULATION_BYTES + IMAGE_COPIES * image) + frames * image)
 
     def pool(self) -> EnvPool:
         """Return a pool that keeps the environment of the last unit open, for the next one of the same task."""

@@ -3,7 +3,9 @@
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
 STYLE = {
+    "text.parse_math": False,  # labels are texts of users: $ is a character
     "svg.fonttype": "none",
     "svg.hashsalt": "lifelong",
     "pdf.fonttype": 42,
@@ -176,7 +179,15 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
             colour, marker = LINE_COLOURS[place], LINE_MARKERS[place % len(LINE_MARKERS)]
             style: dict[str, Any] = {"ls": "--", "mfc": "white"} if turn else {}
             axes.plot(
-                x, mean, color=colour, marker=marker, ms=3.8, lw=1.4, label=line.label, clip_on=False, **style
+                x,
+                mean,
+                color=colour,
+                marker=marker,
+                ms=3.8,
+                lw=1.4,
+                label=shorten(line.label),
+                clip_on=False,
+                **style,
             )
             band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
             axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)
@@ -196,7 +207,7 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
 def as_svg(figure: Figure) -> str:
     """Return the figure as an inline SVG with transparent background, in the page's font and text colour."""
     buffer = io.StringIO()
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE), _any_script():
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(INK, "currentColor")
@@ -208,7 +219,7 @@ def as_svg(figure: Figure) -> str:
 
 def save(figure: Figure, stem: Path) -> None:
     """Write `stem`.png (300 dpi) and `stem`.pdf, black on white."""
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE), _any_script():
         FigureCanvasAgg(figure)
         for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
             figure.savefig(
@@ -216,8 +227,23 @@ def save(figure: Figure, stem: Path) -> None:
             )
 
 
-def shorten(text: str, length: int) -> str:
-    """Return the text, shortened at a word with an ellipsis if it is longer than `length` characters."""
+@contextmanager
+def _any_script() -> Iterator[None]:
+    """Draw characters that the font lacks as boxes, without a warning for each."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        warnings.filterwarnings("ignore", "Matplotlib currently does not support", UserWarning)
+        yield
+
+
+def shorten(text: str, length: int = 120) -> str:
+    """Return the text in one line of printable characters, shortened at a word with an ellipsis if it is longer.
+
+    Args:
+        text: Any text, such as an instruction.
+        length: Maximum number of characters.
+    """
+    text = "".join(c if c.isprintable() else " " for c in text)
     if len(text) <= length:
         return text
     cut = text[: length - 1].rsplit(" ", 1)[0] if " " in text[: length - 1] else text[: length - 1]
@@ -227,7 +253,7 @@ def shorten(text: str, length: int) -> str:
 def _draw_matrix(axes: Axes, panel: Panel, label_rows: bool) -> matplotlib.image.AxesImage:
     size = len(panel.rates)
     image = axes.imshow(100 * panel.rates, cmap=success_colours(), vmin=0, vmax=100)
-    axes.set_title(panel.title)
+    axes.set_title(shorten(panel.title))
     every = 1 if size <= 12 else math.ceil(size / 10)
     ticks = range(0, size, every)
     named = label_rows and every == 1

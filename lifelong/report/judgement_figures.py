@@ -45,7 +45,7 @@ def forest_figure(c: Comparison, control: Comparison | None = None) -> Figure:
             band = 100 * control.total.difference.by_chance
             axes.axvspan(-band, band, color=LINE_COLOURS[-1], alpha=0.15, lw=0)
         axes.axvline(0, color=INK, lw=0.6)
-        axes.set_yticks(range(len(parts)), [name for _, name, _ in parts])
+        axes.set_yticks(range(len(parts)), [shorten(name) for _, name, _ in parts])
         axes.tick_params(axis="y", length=0)
         axes.set_ylim(len(parts) - 0.4, -0.6)
         axes.set_xlabel(f"{shorten(c.first, 30)} − {shorten(c.second, 30)}, percentage points")
@@ -77,7 +77,7 @@ def sequential_figure(tests: Mapping[str, SequentialTest]) -> Figure:
         axes.axhline(-np.log10(alpha), color=INK, lw=0.7, ls="--")
         axes.set_ylim(bottom=max(lowest - 0.3, -4))
         axes.set_xlabel("pairs, one start of every task after the other")
-        axes.set_ylabel(r"evidence, $\log_{10} e$")
+        axes.set_ylabel("evidence, log₁₀ e")
         hide_spines(axes)
         legend_below(figure)
     return figure

@@ -327,7 +327,6 @@ def test_commands(tmp_path, monkeypatch, capsys):
         (["compare", "a", "nothing"], "nothing does not exist"),
         (["compare", "a", "old"], "the format is libero-evaluation/99"),
         (["compare", "a", "nan"], "successes are not all true or false"),
-        (["compare", "a", "b", "--alpha", "5"], "--alpha is a probability"),
         (["compare", "--group", "a"], "--group NAME RESULT"),
         (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
         (["power", "a"], "takes two results, not 1"),

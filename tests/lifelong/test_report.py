@@ -461,3 +461,28 @@ def test_lines_of_many_methods_are_distinguishable():
     lines = [line for line in figure.axes[0].get_lines() if not line.get_label().startswith("_")]
     looks = {(x.get_color(), x.get_marker(), x.get_linestyle(), x.get_markerfacecolor()) for x in lines}
     assert len(looks) == len(lines) == 14
+
+
+HOSTILE = [
+    r"$\frac{",
+    "a $ b $ c_1^{",
+    "\\",
+    "<script>alert(1)</script>",
+    "two\nlines\x00\x1b[2J",
+    "\u202eright to left \u05d0\u05d1",
+    "lone \ud800 surrogate",
+    "漢字 🤖",
+    "long " * 400,
+    "{{ 7 * 7 }}",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
+def test_any_text_is_shown_as_it_is(text, tmp_path):
+    run = make_run(tmp_path / "run", tasks=2, epochs=(0, 2))
+    first, *others = (run / "results.jsonl").read_text().splitlines()
+    changed = json.loads(first) | {"instructions": [text, "b"], "algo": text}
+    (run / "results.jsonl").write_text("\n".join([json.dumps(changed), *others]) + "\n")
+    for page in (write_report([run]), write_report([run, make_run(tmp_path / "two", tasks=2)], tmp_path)):
+        html = page.read_text(encoding="utf-8")
+        assert "<script>alert" not in html and "title>49" not in html
