@@ -22,6 +22,11 @@ POLICY_HELP = (
     "eval.json, which is run again"
 )
 
+ALLOW_HELP = (
+    "packages of others whose classes a run's configuration, or a result that is run again, may name "
+    "(default: none; their code is executed)"
+)
+
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
     """Add the commands `libero eval POLICY` and `libero saliency RUN`."""
@@ -115,6 +120,7 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         help="further attempts after an error (default: 1)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
     parser.add_argument(
         "--threads",
         type=arguments.processes_or_all,
@@ -179,6 +185,7 @@ def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
         help="maximum number of control steps (default: 200)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
     parser.set_defaults(run=run_saliency)
 
 
@@ -345,6 +352,7 @@ def run_saliency(args: argparse.Namespace) -> None:
         horizon=args.horizon,
         settings=SaliencySettings(stride=args.stride),
         device=args.device,
+        allow=args.allow,
     )
     print(path)
     print(write_report([path.parents[1]]))

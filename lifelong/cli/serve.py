@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 
 from libero_env.cli import arguments
+from lifelong.cli.evaluate import ALLOW_HELP
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
@@ -30,6 +31,7 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
         help="seed of stochastic policies, for clients that send none (default: 0)",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
     parser.add_argument(
         "--policy-threads",
         type=arguments.processes,
@@ -48,7 +50,9 @@ def run_serve(args: argparse.Namespace) -> None:
     from lifelong.evaluation.servers.serving import PolicyServer
     from lifelong.evaluation.servers.sessions import ServedPolicy
 
-    served = ServedPolicy(restore(args.policy, after=args.after, device=args.device), seed=args.seed)
+    served = ServedPolicy(
+        restore(args.policy, after=args.after, device=args.device, allow=args.allow), seed=args.seed
+    )
     if served.run.device.type == "cpu":
         torch.set_num_threads(args.policy_threads)
     server = PolicyServer(served.metadata, served.session, host=args.host, port=args.port)

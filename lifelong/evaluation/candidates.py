@@ -70,7 +70,7 @@ class RunPolicy(PolicyUnderTest):
     def __init__(self, args: argparse.Namespace):
 
         self.args = args
-        self.run = restore(Path(args.policy), after=args.after, device=args.device)
+        self.run = restore(Path(args.policy), after=args.after, device=args.device, allow=args.allow)
         digest = hashlib.sha256(self.run.checkpoint.read_bytes()).hexdigest()[:16]
         self.identity = {"run": str(self.run.path), "after": self.run.learned, "weights": digest}
         self.out = self.run.path / "eval" / f"after_{self.run.learned:02d}"

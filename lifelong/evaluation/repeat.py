@@ -30,11 +30,13 @@ def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Nam
 
     Raises:
         ResultsError: The result does not say which policy it is of.
+        ConfigError: It is of a policy in a module that the user has not allowed.
     """
     evaluated = result.evaluated
     kind = next((name for name in POLICIES if evaluated.get(name)), None)
     if kind is None:
         raise ResultsError(f"{args.policy} does not say which policy it is of: {dict(evaluated)}")
+    _check_code(str(evaluated[kind]), args)
     path = Path(args.policy)
     folder = path if path.is_dir() else path.parent
     changes = {
@@ -51,6 +53,18 @@ def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Nam
         "out": args.out or folder / "again",
     }
     return argparse.Namespace(**(vars(args) | changes))
+
+
+def _check_code(policy: str, args: argparse.Namespace) -> None:
+    """Refuse to run code that a result, which may be somebody else's, names: unless the user has allowed it."""
+    module, colon, _ = policy.partition(":")
+    package = module.partition(".")[0]
+    runs_code = bool(colon) and "://" not in policy and not Path(policy).exists()
+    if runs_code and not {module, package} & set(args.allow):
+        raise ConfigError(
+            f"{args.policy} is of the policy {policy}, whose code would be run; if you know and trust it, "
+            f"allow it with --allow {package}"
+        )
 
 
 def repeated_card(result: EvaluationResult, where: str) -> Card:

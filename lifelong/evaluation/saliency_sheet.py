@@ -1,5 +1,6 @@
 """Contact sheets of a run's saliency: images of where its policy looks while it acts."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -56,6 +57,7 @@ def draw_saliency(
     horizon: int = 200,
     settings: SaliencySettings = SaliencySettings(),  # noqa: B008 - frozen
     device: str = "auto",
+    allow: Sequence[str] = (),
 ) -> Path:
     """Run one episode of a run's policy, and draw where the policy looks at some moments.
 
@@ -68,6 +70,7 @@ def draw_saliency(
         horizon: Maximum number of control steps.
         settings: Resolution of the saliency maps.
         device: See `lifelong.evaluation.restore.restore`.
+        allow: See `lifelong.evaluation.restore.restore`.
 
     Returns:
         The contact sheet, `saliency/task_<k>_after_<l>.png` in the run's directory, with its caption in a text file
@@ -77,7 +80,7 @@ def draw_saliency(
         ConfigError: The task does not exist, or there are no moments.
         LiberoError: The run cannot be read, or its policy has no `predict`.
     """
-    run = restore(source, after=after, device=device)
+    run = restore(source, after=after, device=device, allow=allow)
     if not 0 <= task < len(run.tasks) or moments < 1:
         raise ConfigError(
             f"task {task} and {moments} moments; valid: tasks 0 to {len(run.tasks) - 1}, and 1 moment or more"

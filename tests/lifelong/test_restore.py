@@ -84,7 +84,9 @@ def test_a_run_is_evaluated_with_the_drawing_that_it_was_trained_with(tmp_path, 
     del config["data"]["drawing"]  # as in runs of earlier versions
     config["data"] |= saved
     file.write_text(yaml.safe_dump(config))
-    args = Namespace(policy=str(tmp_path / "run"), after=None, device="cpu", threads=1, assets="builtin")
+    args = Namespace(
+        policy=str(tmp_path / "run"), after=None, device="cpu", threads=1, assets="builtin", allow=[]
+    )
     policy = RunPolicy(args)
     env = policy.env(policy.run.tasks[0], 1, policy.protocol(load_card("libero")))
     try:

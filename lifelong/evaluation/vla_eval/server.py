@@ -7,6 +7,7 @@ It asks for `LiberoBenchmark` with the run's own observations, which reach it as
 `libero eval RUN`.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +28,24 @@ class RunServer(PredictModelServer):
         after: The policy after this task, from 0; None for the last.
         device: `auto`, `cpu`, `cuda`, `cuda:1`.
         seed: Seed of stochastic policies.
+        allow: Packages whose classes the run's configuration may name besides this one's.
 
     Raises:
         MissingPackageError: vla-eval is not installed.
         LifelongError: There is no such run or checkpoint.
     """
 
-    def __init__(self, run: str, after: int | None = None, device: str = "auto", seed: int = 0):
+    def __init__(
+        self,
+        run: str,
+        after: int | None = None,
+        device: str = "auto",
+        seed: int = 0,
+        allow: Sequence[str] = (),
+    ):
         require()
         super().__init__()
-        self.served = ServedPolicy(restore(Path(run), after=after, device=device), seed=seed)
+        self.served = ServedPolicy(restore(Path(run), after=after, device=device, allow=allow), seed=seed)
         self.seed = seed
         self._sessions: dict[str, Session] = {}
         self._begins: dict[str, dict[str, Any]] = {}

@@ -1,0 +1,173 @@
+"""A run directory may be somebody else's: nothing that it names is executed, resolved, or written to."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lifelong.cli.main import main
+from lifelong.errors import ConfigError
+from lifelong.evaluation.repeat import repeated
+from lifelong.evaluation.restore import restore
+from lifelong.settings.targets import GROUPS, find_target
+from tests.harness.configs import CONFIGS
+from tests.harness.runs import make_run
+
+pytestmark = pytest.mark.unit
+
+HOSTILE = [
+    *("os.system", "subprocess.run", "builtins.open", "builtins.exec", "torch.load", "torch.hub.load"),
+    *(
+        "shutil.copyfile",
+        "importlib.import_module",
+        "pickle.loads",
+        "hydra.utils.instantiate",
+        "a",
+        "",
+        "..",
+        "os.",
+    ),
+    *(
+        "lifelong.checkpoints.save",
+        "lifelong.training.precision.subprocess.run",
+        "lifelong.results.records.os.system",
+    ),
+    *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.source.Path"),
+    *(
+        "lifelong.cli.main.main",
+        "lifelong.cli.__main__.main",
+        "lifelong.algorithms.er.ER.__init__",
+        "lifelong",
+    ),
+    *(
+        "lifelong.algorithms.er.ER.mro",
+        "lifelong.settings.nodes.build",
+        "lifelong.settings.targets.find_target",
+    ),
+    *("lifelong.policies.base.Policy.__subclasses__", "lifelong.language.encoder.np.load", "lifelong.nn"),
+    *(
+        "libero_env.storage.atomic_path",
+        "lifelong.evaluation.candidates.load_callable",
+        "lifelong.data.loading.Path",
+    ),
+    *("lifelong.tracking.__builtins__", "lifelong.nn.augmentation.ABC", "lifelong.launch.CombinedReport"),
+]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("stranger") / "run"
+    make_run(folder)
+    return folder
+
+
+@pytest.fixture
+def changed(run):
+    """A function that changes the saved configuration for the test."""
+    file = run / "config.yaml"
+    before = file.read_text()
+
+    def change(**changes):
+        config = yaml.safe_load(before)
+        for key, value in changes.items():
+            *parents, last = key.split("__")
+            node = config
+            for parent in parents:
+                node = node[parent]
+            node[last] = value
+        file.write_text(yaml.safe_dump(config))
+        return run
+
+    yield change
+    file.write_text(before)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_other_code_is_not_reached(name):
+    with pytest.raises(ConfigError):
+        find_target(name, ())
+
+
+def test_every_target_of_the_configuration_files_may_be_saved():
+    for file in CONFIGS.rglob("*.yaml"):
+        for line in file.read_text().splitlines():
+            key, _, name = line.strip().removeprefix("- ").partition("_target_: ")
+            if name and not key and "CombinedReport" not in name:
+                assert find_target(name.split()[0], ()) is find_target(name.split()[0])
+
+
+@pytest.mark.parametrize(
+    "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "wandb", "pretrain"})
+)
+@pytest.mark.parametrize("target", ["posix.mkdir", "lifelong.evaluation.candidates.importlib.import_module"])
+def test_a_strangers_run_executes_nothing(group, target, changed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = changed(**{group: {"_target_": target, "path": "made", "name": "made"}})
+    for command in (["eval", str(folder)], ["serve", str(folder)], ["saliency", str(folder)]):
+        assert main(command) == 2
+    assert not (tmp_path / "made").exists()
+
+
+def test_components_are_looked_at_too(changed, tmp_path, capsys):
+    evil = {"_target_": "posix.mkdir", "path": str(tmp_path / "made")}
+    for place in (
+        "policy__encoder",
+        "policy__stochastic",
+        "eval__episodes",
+        "data__views",
+        "language__model",
+    ):
+        for value in (evil, [evil], {"within": evil}):
+            assert main(["eval", str(changed(**{place: value}))]) == 2
+            assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "made").exists()
+
+
+def test_interpolations_are_texts(changed, monkeypatch, capsys):
+    monkeypatch.setenv("SECRET", "hidden")
+    assert (
+        main(["eval", str(changed(data__folder="${oc.env:SECRET}", language__model="${oc.env:SECRET}"))]) == 2
+    )
+    found = capsys.readouterr().err
+    assert "hidden" not in found and "${oc.env:SECRET}" in found
+
+
+def test_nothing_is_written_into_a_folder_that_a_configuration_names(changed, tmp_path):
+    found = restore(changed(language__cache_dir=str(tmp_path / "cache")), device="cpu")
+    assert found.language.cache_dir is None and not (tmp_path / "cache").exists()
+
+
+def test_a_package_can_be_allowed_by_name(changed, tmp_path, monkeypatch):
+    """Its own classes, not what it imports."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "__init__.py").write_text("")
+    (tmp_path / "mine" / "algorithm.py").write_text(
+        "import os\nfrom lifelong.algorithms.base import Algorithm\nclass Mine(Algorithm):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    folder = changed(algo={"_target_": "mine.algorithm.Mine"})
+    with pytest.raises(ConfigError, match="allow it with --allow mine"):
+        restore(folder, device="cpu")
+    assert "mine" not in sys.modules
+    assert type(restore(folder, device="cpu", allow=["mine"]).algorithm).__name__ == "Mine"
+    for other in ("mine.algorithm.os.mkdir", "mine_too.Mine", "mine"):
+        with pytest.raises(ConfigError):
+            restore(changed(algo={"_target_": other}), device="cpu", allow=["mine"])
+
+
+def test_a_saved_policy_that_no_memory_holds_is_refused(changed):
+    with pytest.raises(ConfigError, match="of memory, and there are .*the policy's weights"):
+        restore(changed(policy__embed_dim=1_000_000, policy__temporal__mlp_dim=1_000_000), device="cpu")
+
+
+def test_code_named_by_a_result_needs_permission(tmp_path, monkeypatch):
+    result = argparse.Namespace(evaluated={"policy": "evil:make"}, tasks=[], unit_starts=1, environment={})
+    args = argparse.Namespace(policy=str(tmp_path), policy_threads=None, out=None, allow=[])
+    for kind in ("policy", "run", "server"):
+        result.evaluated = {kind: "evil.part:make"}
+        with pytest.raises(ConfigError, match="allow it with --allow evil"):
+            repeated(args, result)
+    args.allow = ["evil"]
+    assert repeated(args, result).policy == "evil.part:make"
