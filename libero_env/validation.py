@@ -262,12 +262,14 @@ def suggest(name: object, valid: Iterable[object]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
-def _plain(value: Any, error: type[LiberoError]) -> Any:
+def _plain(value: Any, error: type[LiberoError], depth: int = 0) -> Any:
     """Return a value as JSON has it; texts stand for dates and others that JSON lacks."""
+    if depth > _MAX_DEPTH:
+        raise error(f"lists or keys within each other, more than {_MAX_DEPTH} deep")
     if isinstance(value, Mapping):
-        return {_text_key(key, error): _plain(part, error) for key, part in value.items()}
+        return {_text_key(key, error): _plain(part, error, depth + 1) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(part, error) for part in value]
+        return [_plain(part, error, depth + 1) for part in value]
     if isinstance(value, int) and abs(value) > _MAX_WHOLE:
         return math.inf
     if isinstance(value, str) and not value.isascii() and any("\ud800" <= c <= "\udfff" for c in value):
@@ -275,7 +277,8 @@ def _plain(value: Any, error: type[LiberoError]) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value  # numbers that are not finite become NaN or Infinity, which every type refuses
     tolist = getattr(value, "tolist", None)  # of arrays and numbers of NumPy
-    return tolist() if callable(tolist) else str(value)
+    found = tolist() if callable(tolist) else str(value)
+    return found if isinstance(found, str) else _plain(found, error, depth + 1)
 
 
 def _text_key(key: object, error: type[LiberoError]) -> str:
@@ -345,13 +348,12 @@ def is_plain(kind: Any) -> bool:
 @lru_cache(maxsize=256)
 def _has_schema(kind: Any) -> bool:
     from pydantic import PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError
+    from pydantic_core import SchemaError  # of a protocol
 
+    no_schema = (PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError, SchemaError)
     try:
         _adapter(kind).json_schema()
-    except (
-        *(PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError),
-        *(NameError, TypeError),  # names that exist for type checkers only
-    ):
+    except (*no_schema, NameError, TypeError):  # names that exist for type checkers only
         return False
     return True
 

@@ -3,21 +3,25 @@
 from collections.abc import Sequence
 from typing import Any, Unpack
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from libero_env.envs.checks import ResetRequest, check_options, checked_actions
+from libero_env.envs.checks import (
+    ResetRequest,
+    checked_actions,
+    checked_index,
+    checked_indices,
+    checked_options,
+    checked_truth,
+)
 from libero_env.envs.config import EnvConfig, EnvOptions, show_options
+from libero_env.envs.vector import LiberoVectorEnv
 from libero_env.envs.world import World
-from libero_env.errors import LiberoError
 from libero_env.sim.rewards import Reward
 from libero_env.tasks import Task
-from libero_env.timing import CONTROL_HZ
 
 
-class BatchEnv(gymnasium.vector.VectorEnv):
+class BatchEnv(LiberoVectorEnv):
     """Simulations of one task that are stepped together; the results of each are bit-identical to `LiberoEnv`.
 
     There is no autoreset: a simulation whose episode is over does not move, is not rendered, and returns reward 0
@@ -38,6 +42,8 @@ class BatchEnv(gymnasium.vector.VectorEnv):
 
     Raises:
         UnknownNameError: The task, a camera, an option or a value of an option does not exist.
+        InvalidInputError: A value is of another kind or outside of its range, or the memory does not suffice.
+        ClosedEnvironmentError: By every method, after `close`.
 
     Example:
         >>> envs = BatchEnv("libero_object/3", num_envs=4, cameras=("agentview",), camera_size=(64, 64))
@@ -49,8 +55,6 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         [False, False, False, False]
         >>> envs.close()
     """
-
-    metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
 
     @show_options
     def __init__(
@@ -65,18 +69,18 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         self.config = EnvConfig.from_options(config, options)
         self.reward = Reward(self.config.reward, self.config.reward_scale)
         self.world = World(task, num_envs, threads=num_threads, config=self.config)
-        self.task, self.num_envs, self.render_mode = self.world.task, num_envs, None
+        self.task, self.num_envs, self.render_mode = self.world.task, self.world.num, None
         self.single_observation_space = self.world.observation_space()
         self.single_action_space = self.world.action_space()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.render_images = True
-        self._generators = [np.random.default_rng() for _ in range(num_envs)]
+        self._generators = [np.random.default_rng() for _ in range(self.num_envs)]
         self._images = self.world.empty_images()
-        self._steps = np.zeros(num_envs, np.int64)
-        self._running = np.zeros(num_envs, bool)
-        self._success = np.zeros(num_envs, bool)
-        self._progress = np.zeros((num_envs, len(self.world.atoms)), bool)
+        self._steps = np.zeros(self.num_envs, np.int64)
+        self._running = np.zeros(self.num_envs, bool)
+        self._success = np.zeros(self.num_envs, bool)
+        self._progress = np.zeros((self.num_envs, len(self.world.atoms)), bool)
 
     @property
     def atoms(self) -> tuple[str, ...]:
@@ -102,26 +106,33 @@ class BatchEnv(gymnasium.vector.VectorEnv):
                 `reset_mask`: which simulations to reset, (num_envs,) bool; by default all.
 
         Raises:
-            UnknownNameError: An option does not exist.
-            LiberoError: An initial state does not exist, or seeds or mask have the wrong length.
-            PlacementError: The objects do not fit.
+            UnknownNameError: An option does not exist; nothing has changed.
+            InvalidInputError: An initial state does not exist, or seeds, mask or starts have the wrong length or are of
+                another kind; nothing has changed.
+            PlacementError: The objects do not fit; none of these simulations is in an episode.
         """
         self._check_open()
-        options = options or {}
-        check_options(options, valid=("init_state", "start", "outdated_controller", "reset_mask"))
-        request = ResetRequest.from_arguments(self.num_envs, seed, options)
-        if not (ids := request.ids).size:
+        options = checked_options(options, valid=("init_state", "start", "outdated_controller", "reset_mask"))
+        request, outdated = (
+            ResetRequest.from_arguments(self.num_envs, seed, options),
+            checked_truth(options, "outdated_controller"),
+        )
+        ids, rows = request.ids, None
+        if request.starts is not None:
+            rows = self.world.checked_starts(request.starts[ids])
+        elif request.init_states is not None:
+            rows = self.world.init_rows(request.init_states[ids])
+        if not ids.size:
             return self._observe(ids), self._info()
+        self._running[ids] = False  # until it is done: an error or an interruption ends the episodes
         for i in ids:
             if (new_seed := request.seeds[i]) is not None:
                 self._generators[i] = np.random.Generator(np.random.PCG64(new_seed))
-        if request.starts is not None:
-            self.world.reset_to(ids, request.starts[ids])
-        elif request.init_states is not None:
-            self.world.reset_to_init(ids, request.init_states[ids])
+        if rows is not None:
+            self.world.reset_to(ids, rows)
         else:
             self.world.reset_random(ids, [self._generators[i] for i in ids])
-        if options.get("outdated_controller"):
+        if outdated:
             self.world.simulations.outdate_controller(ids)
         self._steps[ids], self._running[ids], self._success[ids] = 0, True, False
         self._check_goals(ids)
@@ -141,30 +152,40 @@ class BatchEnv(gymnasium.vector.VectorEnv):
             episodes that are over.
 
         Raises:
-            ActionError: The shape is wrong, or a value is not finite; no state has changed.
+            ActionError: The shape is wrong, or a value is no finite number; no state has changed.
         """
         self._check_open()
         actions = checked_actions(actions, self.num_envs, self.world.controller.action_dim)
-        ids = np.flatnonzero(self._running)
+        running, ids = self._running.copy(), np.flatnonzero(self._running)
+        self._running[:] = False  # until it is done: a step that is interrupted has moved some substeps
         reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
         state = None
         if ids.size:
             state = self.world.step_and_observe(ids, actions, self._images if self.render_images else None)
             reached[ids], rewards[ids] = self._check_goals(ids)
             self._steps[ids] += 1
-        truncated = self._running & ~reached & (self._steps >= self.config.horizon)
+        truncated = running & ~reached & (self._steps >= self.config.horizon)
         self._success |= reached
-        self._running &= ~(reached | truncated)
+        self._running = running & ~(reached | truncated)
         return self._observation(state), rewards, reached, truncated, self._info()
 
     def get_state(self, i: int) -> np.ndarray:
         """Return the state of simulation i, as `LiberoEnv.get_state`."""
+        self._check_open()
+        i = checked_index(i, self.num_envs)
         return np.append(self.world.simulations.get_state(i), float(self._steps[i]))
 
     def set_state(self, i: int, state: np.ndarray) -> None:
-        """Restore a state of `get_state`, of this or of a single environment, in simulation i."""
-        self.world.simulations.set_state(i, np.asarray(state[:-1], np.float64))
-        self._steps[i], self._running[i], self._success[i] = int(state[-1]), True, False
+        """Restore a state in simulation i; see `LiberoEnv.set_state`.
+
+        Raises:
+            InvalidInputError: There is no such simulation, or the state is not valid; nothing has changed.
+        """
+        self._check_open()
+        i, state = checked_index(i, self.num_envs), self.world.checked_state(state)
+        self._running[i] = False
+        self._steps[i] = self.world.restore(i, state)
+        self._running[i], self._success[i] = True, False
 
     def render_cameras(self, ids: Sequence[int] | None = None) -> dict[str, np.ndarray]:
         """Render the observed images of the current states: name -> (n, H, W, ...).
@@ -172,17 +193,14 @@ class BatchEnv(gymnasium.vector.VectorEnv):
         Args:
             ids: Indices of the simulations; by default all.
         """
-        rows = np.arange(self.num_envs) if ids is None else np.asarray(ids, np.int64)
+        self._check_open()
+        rows = checked_indices(ids, self.num_envs)
         self.world.render_cameras(rows, self._images)
         return {key: images[rows] for key, images in self._images.items()}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulations and the OpenGL context."""
         self.world.close()
-
-    def _check_open(self) -> None:
-        if self.closed:
-            raise LiberoError(f"these simulations of {self.task.id} are closed; make others")
 
     def _check_goals(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in each of the simulations, and its reward; note the truth of atoms."""

@@ -1,13 +1,29 @@
-"""Checks of what callers pass to environments."""
+"""Checks of what callers pass to environments; nothing has changed when one of them fails."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
+import gymnasium
 import numpy as np
 
-from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.errors import (
+    ActionError,
+    ClosedEnvironmentError,
+    InvalidInputError,
+    LiberoError,
+    UnknownNameError,
+)
 from libero_env.sim.osc import ACTION_DIM
+
+Shape = tuple[int, ...]
+_MAX_SEED_BITS = 4096
+
+
+class ClosedGymEnvironmentError(ClosedEnvironmentError, gymnasium.error.ClosedEnvironmentError):
+    """An environment is used after `close`; the error is Gymnasium's and the package's."""
 
 
 def checked_actions(actions: object, num: int | None = None, size: int = ACTION_DIM) -> np.ndarray:
@@ -19,32 +35,133 @@ def checked_actions(actions: object, num: int | None = None, size: int = ACTION_
         size: Length of an action.
 
     Raises:
-        ActionError: The shape is wrong, or a value is not finite.
+        ActionError: The shape is wrong, or a value is no finite real number.
     """
-    shape = (size,) if num is None else (num, size)
+    return checked_numbers(actions, "actions", ((size,) if num is None else (num, size),), ActionError)
+
+
+def checked_numbers(
+    value: object, name: str, shapes: Sequence[Shape], error: type[LiberoError] = InvalidInputError
+) -> np.ndarray:
+    """Return an array of finite numbers as float64.
+
+    Args:
+        value: Array, or what NumPy makes one of.
+        name: Name of the value in messages.
+        shapes: Shapes that are valid.
+        error: Type of the error.
+
+    Raises:
+        InvalidInputError: The shape is wrong, or a value is no finite real number; or `error`.
+    """
+    expected = f"{name}: expected finite numbers of shape {' or '.join(map(str, shapes))}"
     try:
-        array = np.asarray(actions, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ActionError(
-            f"expected actions of shape {shape}, got {type(actions).__name__}: {error}"
-        ) from None
-    if array.shape != shape:
-        raise ActionError(f"expected actions of shape {shape}, got {array.shape}")
+        array = _real_array(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as reason:  # the last but one is of tensors
+        text = " ".join(str(reason).split())
+        raise error(f"{expected}, got {type(value).__name__}: {text[:200]}") from None
+    if array.shape not in shapes:
+        raise error(f"{expected}, got {array.shape}")
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise ActionError(f"actions must be finite; entry {where} is {array[tuple(where)]}")
+        raise error(f"{name} must be finite; entry {where} is {array[tuple(where)]}")
     return array
 
 
-def check_options(options: Mapping[str, Any], valid: Sequence[str]) -> None:
-    """Check the names of reset options.
+def _real_array(value: object) -> np.ndarray:
+    """Return an array as float64; raise a TypeError for what is no real number, such as a text or a masked entry."""
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise TypeError("some of its entries are masked")
+    array = np.asarray(value)
+    if array.dtype == np.float64:
+        return array
+    if array.dtype.kind == "O":
+        if odd := [one for one in array.ravel() if not isinstance(one, Real)]:
+            raise TypeError(f"{type(odd[0]).__name__} is no real number")
+    elif array.dtype.kind not in "biuf":
+        raise TypeError(f"{array.dtype} is no real number")
+    with np.errstate(over="ignore"):  # what is too large becomes infinite
+        return array.astype(np.float64)
+
+
+def checked_index(i: object, count: int, name: str = "index") -> int:
+    """Return an index from 0 to `count - 1` as int.
 
     Raises:
+        InvalidInputError: It is another value.
+    """
+    if not isinstance(i, bool | np.bool_):
+        try:
+            index = operator.index(i)  # type: ignore[arg-type]
+        except TypeError:
+            index = -1
+        if 0 <= index < count:
+            return index
+    raise InvalidInputError(f"{name} {i!r:.80}: expected a whole number from 0 to {count - 1}")
+
+
+def checked_indices(ids: object, count: int) -> np.ndarray:
+    """Return indices from 0 to `count - 1`, (k,); None stands for all.
+
+    Raises:
+        InvalidInputError: They are other values.
+    """
+    if ids is None:
+        return np.arange(count)
+    if isinstance(ids, str) or not hasattr(ids, "__iter__"):
+        raise InvalidInputError(f"ids={ids!r:.80}: expected a list of indices from 0 to {count - 1}")
+    return np.array([checked_index(i, count) for i in ids], np.int64)
+
+
+def checked_seed(seed: object) -> int | None:
+    """Return a seed as int; None stands for none.
+
+    Raises:
+        InvalidInputError: It is no whole number from 0.
+    """
+    if seed is None:
+        return None
+    if not isinstance(seed, bool | np.bool_ | str | bytes):
+        try:
+            number = operator.index(seed)  # type: ignore[arg-type]
+        except TypeError:
+            number = -1
+        if number >= 0 and number.bit_length() <= _MAX_SEED_BITS:
+            return number
+    raise InvalidInputError(f"seed={seed!r:.80}: expected a whole number from 0, or None")
+
+
+def checked_options(options: object, valid: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return reset options, after a check of their names; None stands for none.
+
+    Args:
+        options: What the caller passed.
+        valid: Names of options; None for any.
+
+    Raises:
+        InvalidInputError: They are no dictionary.
         UnknownNameError: An option does not exist.
     """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise InvalidInputError(f"options={options!r:.80}: expected a dictionary")
     for name in options:
-        if name not in valid:
+        if valid is not None and name not in valid:
             raise UnknownNameError("reset option", name, valid)
+    return dict(options)
+
+
+def checked_truth(options: Mapping[str, Any], name: str) -> bool:
+    """Return a reset option that is true or false; false where it is not given.
+
+    Raises:
+        InvalidInputError: It is another value.
+    """
+    value = options.get(name, False)
+    if not isinstance(value, bool | np.bool_):
+        raise InvalidInputError(f"{name}={value!r:.80}: expected true or false")
+    return bool(value)
 
 
 @dataclass(frozen=True)
@@ -75,35 +192,38 @@ class ResetRequest:
             options: Reset options `init_state`, `start` and `reset_mask`; others are ignored.
 
         Raises:
-            LiberoError: Seeds, mask, initial states or starts have the wrong length.
+            InvalidInputError: Seeds, mask, initial states or starts have the wrong length or are of another kind.
         """
-        mask = np.asarray(options.get("reset_mask", np.ones(num_envs, bool)), bool)
-        if mask.shape != (num_envs,):
-            raise LiberoError(f"reset_mask: expected ({num_envs},) booleans, got shape {mask.shape}")
-        init_states = None
+        mask = np.ones(num_envs, bool)
+        if "reset_mask" in options:
+            mask = checked_numbers(options["reset_mask"], "reset_mask", ((num_envs,),)) != 0
+        init_states = starts = None
         if "init_state" in options:
-            init_states = np.asarray(options["init_state"])
-            if init_states.shape not in ((), (1,), (num_envs,)):
-                raise LiberoError(
-                    f"init_state: expected one or {num_envs} integers, got shape {init_states.shape}"
-                )
+            init_states = whole_numbers(options["init_state"], "init_state", ((), (1,), (num_envs,)))
             init_states = np.broadcast_to(init_states, (num_envs,))
-        starts = None
         if "start" in options:
-            starts = np.asarray(options["start"], np.float64)
-            if starts.ndim != 2 or len(starts) != num_envs or not np.isfinite(starts).all():
-                raise LiberoError(
-                    f"start: expected {num_envs} rows of finite numbers, got shape {starts.shape}"
-                )
+            width = np.shape(options["start"])[-1:] if hasattr(options["start"], "__len__") else (1,)
+            starts = checked_numbers(options["start"], "start", ((num_envs, *width),))
         return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts)
 
 
-def _seeds(num_envs: int, seed: int | Sequence[int | None] | None) -> list[int | None]:
+def whole_numbers(value: object, name: str, shapes: Sequence[Shape]) -> np.ndarray:
+    """Return an array of whole numbers, int64.
+
+    Raises:
+        InvalidInputError: The shape is wrong, or a value is no whole number.
+    """
+    array = checked_numbers(value, name, shapes)
+    if np.asarray(value).dtype.kind not in "iu":
+        raise InvalidInputError(f"{name}={value!r:.80}: expected whole numbers")
+    return array.astype(np.int64)
+
+
+def _seeds(num_envs: int, seed: object) -> list[int | None]:
     """Return one seed for each environment."""
-    if seed is None:
-        return [None] * num_envs
-    if isinstance(seed, int | np.integer):
-        return [int(seed) + i for i in range(num_envs)]
-    if len(seed) != num_envs:
-        raise LiberoError(f"seed: expected one or {num_envs} seeds, got {len(seed)}")
-    return [None if s is None else int(s) for s in seed]
+    if isinstance(seed, list | tuple | np.ndarray) and np.ndim(seed):
+        if len(seed) != num_envs:
+            raise InvalidInputError(f"seed: expected one or {num_envs} seeds, got {len(seed)}")
+        return [checked_seed(one) for one in seed]
+    first = checked_seed(seed)
+    return [None if first is None else first + i for i in range(num_envs)]

@@ -1,19 +1,25 @@
 """Configuration that the environments share."""
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Annotated, Any, TypedDict, TypeVar
+
+import numpy as np
+from pydantic import Field
 
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
-from libero_env.errors import UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
+from libero_env.validation import validate_arguments
 
 AFTER, SUBSTEP = OBSERVED = ("after", "substep")
+Pixels = Annotated[int, Field(ge=1)]  # the renderer knows the largest size
+Horizon = Annotated[int, Field(ge=1, le=10**9)]
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
 
@@ -38,12 +44,13 @@ class EnvConfig:
             2 ms, poses and images 4 ms before the end.
 
     Raises:
+        InvalidInputError: A value is of another kind or outside of its range.
         UnknownNameError: The semantics, the drawing, the robot or the time of observation do not exist.
     """
 
     cameras: Sequence[str] = DEFAULT_CAMERAS
-    camera_size: tuple[int, int] = (128, 128)
-    horizon: int = 600
+    camera_size: tuple[Pixels, Pixels] = (128, 128)
+    horizon: Horizon = 600
     observations: Sequence[str] = DEFAULT_OBSERVATIONS
     controller: str = "osc_pose"
     control_delta: bool = True
@@ -56,10 +63,21 @@ class EnvConfig:
     observed: str = AFTER
 
     def __post_init__(self) -> None:
-        height, width = self.camera_size
-        object.__setattr__(self, "cameras", tuple(self.cameras))
-        object.__setattr__(self, "camera_size", (int(height), int(width)))
-        object.__setattr__(self, "observations", tuple(self.observations))
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        for name in ("cameras", "camera_size", "observations"):
+            if isinstance(values[name], Iterable) and not isinstance(values[name], str | bytes | Mapping):
+                values[name] = tuple(values[name])
+        if isinstance(values["camera_size"], tuple):
+            values["camera_size"] = tuple(map(_whole, values["camera_size"]))
+        values["horizon"] = _whole(self.horizon)
+        validate_arguments(EnvConfig, values)
+        assets = values["assets"]
+        if not (assets is None or isinstance(assets, str | Path) or hasattr(assets, "add_arena")):
+            raise InvalidInputError(
+                f"assets is {assets!r:.80}; expected builtin, original, a folder, or a Pack"
+            )
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
         if self.semantics not in SEMANTICS:
             raise UnknownNameError("semantics", self.semantics, SEMANTICS)
         if self.drawing is not None and self.drawing not in DRAWINGS:
@@ -78,13 +96,23 @@ class EnvConfig:
             options: Fields to replace, by name.
 
         Raises:
+            InvalidInputError: `config` is no configuration, or a value is not valid.
             UnknownNameError: An option is not a field; the message lists the fields and names the nearest.
         """
+        if not (config is None or isinstance(config, cls)):
+            raise InvalidInputError(f"config is {config!r:.80}; expected an EnvConfig or None")
         names = [field.name for field in fields(cls)]
         for name in options:
             if name not in names:
                 raise UnknownNameError("environment option", name, names)
         return replace(config or cls(), **options)
+
+
+def _whole(value: Any) -> Any:
+    """Return a whole number of any type as int; other values as they are."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return int(value) if isinstance(value, np.integer) else value
 
 
 class EnvOptions(TypedDict, total=False):

@@ -5,7 +5,13 @@ from typing import Any, Unpack
 import gymnasium
 import numpy as np
 
-from libero_env.envs.checks import check_options, checked_actions
+from libero_env.envs.checks import (
+    ClosedGymEnvironmentError,
+    checked_actions,
+    checked_options,
+    checked_seed,
+    whole_numbers,
+)
 from libero_env.envs.config import EnvConfig, EnvOptions, show_options
 from libero_env.envs.world import World
 from libero_env.errors import LiberoError, UnknownNameError
@@ -40,6 +46,8 @@ class LiberoEnv(gymnasium.Env):
 
     Raises:
         UnknownNameError: The task, a camera, an option or a value of an option does not exist.
+        InvalidInputError: A value of an option is of another kind or outside of its range.
+        ClosedEnvironmentError: By every method, after `close`.
 
     Example:
         >>> env = LiberoEnv("libero_object/3", camera_size=(64, 64))
@@ -89,16 +97,20 @@ class LiberoEnv(gymnasium.Env):
             options: `{"init_state": i}` starts from the i-th of the 50 stored states instead of a new placement.
 
         Raises:
-            UnknownNameError: An option does not exist.
-            LiberoError: The initial state does not exist.
-            PlacementError: The objects do not fit.
+            InvalidInputError: The seed is no whole number from 0, or there is no such initial state; nothing has
+                changed.
+            UnknownNameError: An option does not exist; nothing has changed.
+            PlacementError: The objects do not fit; no episode is running.
         """
         self._check_open()
-        super().reset(seed=seed)
-        options = options or {}
-        check_options(options, valid=("init_state",))
+        seed, options, rows = checked_seed(seed), checked_options(options, valid=("init_state",)), None
         if "init_state" in options:
-            self.world.reset_to_init([0], np.atleast_1d(options["init_state"]))
+            chosen = whole_numbers(options["init_state"], "init_state", ((), (1,)))
+            rows = self.world.init_rows(np.atleast_1d(chosen))
+        super().reset(seed=seed)
+        self._running = False  # until it is done: an error or an interruption ends the episode
+        if rows is not None:
+            self.world.reset_to([0], rows)
         else:
             self.world.reset_random([0], [self.np_random])
         self._steps, self._running = 0, True
@@ -111,14 +123,15 @@ class LiberoEnv(gymnasium.Env):
             action: Action, (7,) by default, see `action_space`; values outside of it are clipped.
 
         Raises:
-            ActionError: The shape is wrong, or a value is not finite; the state has not changed.
+            ActionError: The shape is wrong, or a value is no finite number; the state has not changed.
             LiberoError: No episode is running.
         """
         self._check_open()
         action = checked_actions(action, size=self.world.controller.action_dim)
         if not self._running:
-            raise LiberoError("no episode is running; call reset()")
+            raise LiberoError("no episode is running, or its last call was interrupted; call reset()")
         images = self._images if self.render_images else None
+        self._running = False  # until it is done: a step that is interrupted has moved some substeps
         state = self.world.step_and_observe([0], action[None], images)
         self._steps += 1
         info = self._info()
@@ -141,22 +154,12 @@ class LiberoEnv(gymnasium.Env):
                 controller and the number of steps.
 
         Raises:
-            LiberoError: The vector has another length, or is not finite.
+            InvalidInputError: The vector has another length, or a value is outside of its range; nothing has changed.
         """
         self._check_open()
-        state = np.asarray(state, np.float64)
-        model, size = self.world.scene.model, self.world.simulations.state_size + 1
-        if state.shape not in ((size,), (1 + model.nq + model.nv,)) or not np.isfinite(state).all():
-            raise LiberoError(
-                f"a state of {self.task.id} is {size} finite numbers (get_state) or {1 + model.nq + model.nv} "
-                f"([time, qpos, qvel]); got shape {state.shape}"
-            )
-        if state.size == size:
-            self.world.simulations.set_state(0, state[:-1])
-            self._steps = int(state[-1])
-        else:
-            self.world.set_physics_state(0, state)
-            self._steps = 0
+        state = self.world.checked_state(state)
+        self._running = False
+        self._steps = self.world.restore(0, state)
         self._running = True
         return self._observe()
 
@@ -168,16 +171,17 @@ class LiberoEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # Gymnasium declares any type
         """Return the image of the agent's camera, (H, W, 3) uint8, in `rgb_array` mode, else None."""
+        self._check_open()
         return self.world.render(0, "agentview") if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Free the simulation and the OpenGL context."""
-        self._closed = True
+        """Free the simulation and the OpenGL context. Idempotent."""
         self.world.close()
+        self._closed = True
 
     def _check_open(self) -> None:
         if self._closed:
-            raise LiberoError(f"this environment of {self.task.id} is closed; make another")
+            raise ClosedGymEnvironmentError(f"this environment of {self.task.id} is closed; make another")
 
     def _observe(self) -> dict[str, np.ndarray]:
         if self.render_images:

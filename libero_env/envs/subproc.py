@@ -7,22 +7,30 @@ itself. Observations are passed in shared memory. A worker that dies, or does no
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from pydantic import Field
 
-from libero_env.envs.checks import ResetRequest, checked_actions
+from libero_env.envs.checks import (
+    ResetRequest,
+    checked_actions,
+    checked_index,
+    checked_indices,
+    checked_options,
+)
 from libero_env.envs.config import EnvConfig, EnvOptions, show_options
+from libero_env.envs.vector import LiberoVectorEnv
 from libero_env.envs.worker import Failure, Worker, checked_space, shut_down, wait_for
 from libero_env.envs.worker_host import open_libero
-from libero_env.errors import LiberoError
-from libero_env.timing import CONTROL_HZ
+from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.validation import validate
 
 EnvSpec = Mapping[str, Any] | Callable[[], gymnasium.Env]
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Outcome = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
 
@@ -48,7 +56,7 @@ class WorkerError(LiberoError):
         self.failed, self.outcome = dict(failed), outcome
 
 
-class SubprocEnv(gymnasium.vector.VectorEnv):
+class SubprocEnv(LiberoVectorEnv):
     """Environments in worker processes, one in each; the same seeds give the same results as `LiberoEnv`.
 
     There is no autoreset: an environment whose episode is over does not move, and returns reward 0 until it is reset.
@@ -71,7 +79,9 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
     Raises:
         WorkerError: A worker could not make its environment.
         UnknownNameError: An option does not exist.
-        LiberoError: There are no environments, or their action spaces differ.
+        InvalidInputError: There are no environments, or a value is of another kind or outside of its range.
+        LiberoError: Their action spaces differ.
+        ClosedEnvironmentError: By every method, after `close`.
 
     Example:
         >>> specs = [{"task": "libero_object/0"}, {"task": "libero_goal/3"}]
@@ -85,8 +95,6 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         >>> envs.close()
     """
 
-    metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
-
     @show_options
     def __init__(
         self,
@@ -98,17 +106,24 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         config: EnvConfig | None = None,
         **options: Unpack[EnvOptions],
     ):
-        if not specs:
-            raise LiberoError("SubprocEnv needs at least one environment")
+        self.timeout = validate(Seconds, timeout, prefix=("timeout",))
+        self.start_timeout = validate(Seconds, start_timeout, prefix=("start_timeout",))
+        devices = validate(list[Annotated[int, Field(ge=0)]], list(gl_devices), prefix=("gl_devices",))
+        if not isinstance(specs, Sequence) or isinstance(specs, str) or not specs:
+            raise InvalidInputError("SubprocEnv needs a list of at least one environment")
+        for spec in specs:
+            if not (callable(spec) or isinstance(spec, Mapping)):
+                raise InvalidInputError(
+                    f"{spec!r:.80} describes no environment; expected a dictionary or a function"
+                )
         common = {"config": EnvConfig.from_options(config, options)}
         factories = [spec if callable(spec) else _factory({**common, **spec}) for spec in specs]
         self.num_envs, self.render_mode = len(specs), None
-        self.timeout, self.start_timeout = timeout, start_timeout
         self.tasks = tuple(_task_name(spec) for spec in specs)
         self._workers: list[Worker] = []
         self._finalizer = weakref.finalize(self, shut_down, self._workers)
         for i, factory in enumerate(factories):
-            variables = {"MUJOCO_EGL_DEVICE_ID": str(gl_devices[i % len(gl_devices)])} if gl_devices else {}
+            variables = {"MUJOCO_EGL_DEVICE_ID": str(devices[i % len(devices)])} if devices else {}
             self._workers.append(Worker(self.tasks[i], factory, variables))
         try:
             self._spaces = self._open()
@@ -137,9 +152,11 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             WorkerError: Some workers failed; the others have been reset.
-            LiberoError: Seeds, mask or initial states have the wrong length.
+            InvalidInputError: Seeds, mask or initial states have the wrong length or are of another kind; nothing has
+                changed.
         """
-        options = options or {}
+        self._check_open()
+        options = checked_options(options)
         request = ResetRequest.from_arguments(self.num_envs, seed, options)
         others = {key: value for key, value in options.items() if key not in ("reset_mask", "init_state")}
         ids = [int(i) for i in request.ids]
@@ -164,6 +181,7 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
             ActionError: The shape is wrong, or a value is not finite; no state has changed.
             WorkerError: Some workers failed; the others have stepped, see `WorkerError.outcome`.
         """
+        self._check_open()
         actions = checked_actions(actions, self.num_envs, self._action_size)
         ids = [int(i) for i in np.flatnonzero(self._running)]
         for i in ids:
@@ -191,7 +209,8 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
         Raises:
             WorkerError: Some workers failed; `outcome` has None for them.
         """
-        indices = list(range(self.num_envs)) if indices is None else [int(i) for i in indices]
+        self._check_open()
+        indices = [int(i) for i in checked_indices(indices, self.num_envs)]
         failed = self._reopen([i for i in indices if not self._workers[i].opened])
         called = [i for i in indices if i not in failed]
         for i in called:
@@ -205,7 +224,8 @@ class SubprocEnv(gymnasium.vector.VectorEnv):
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state of `get_state` in environment i."""
-        self.call("set_state", np.asarray(state, np.float64), indices=[i])
+        i = checked_index(i, self.num_envs)
+        self.call("set_state", state, indices=[i])
         self._running[i], self._success[i] = True, False
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -202,7 +202,7 @@ def wait_for(
             elif answer[0]:
                 answers[i] = answer[1]
             else:
-                failures[i] = Failure(f"it raised\n{answer[1]}", False)
+                failures[i] = Failure(answer[1], False)
         if not ready:
             break
     for i in waiting:

@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from libero_env.errors import LiberoError
 from libero_env.parallel import end_with_parent
 
 
@@ -103,8 +104,10 @@ def serve(
             number, command, args = pipe.recv()
             try:
                 answer = ForkingPickler.dumps((number, True, getattr(host, command)(*args)))
+            except LiberoError as error:  # its text says it all
+                answer = ForkingPickler.dumps((number, False, f"it raised {type(error).__name__}: {error}"))
             except Exception:  # noqa: BLE001 - the other end raises it
-                answer = ForkingPickler.dumps((number, False, traceback.format_exc()))
+                answer = ForkingPickler.dumps((number, False, f"it raised\n{traceback.format_exc()}"))
             pipe.send_bytes(answer)
             if command == "close":
                 return

@@ -5,16 +5,20 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Unpack
+from typing import Annotated, Any, Unpack
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
+from pydantic import Field
 
 from libero_env.assets.pack import select_pack
+from libero_env.envs.checks import checked_numbers
 from libero_env.envs.config import AFTER, EnvConfig, EnvOptions, show_options
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
+from libero_env.parallel import require_memory
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.observations import Observer, is_of_joints
 from libero_env.sim.predicates import evaluate
@@ -23,6 +27,10 @@ from libero_env.sim.simulation import WATCHED, Indices, make_simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.problem import And, atoms_of
+from libero_env.validation import validate
+
+Count = Annotated[int, Field(ge=1)]
+Threads = Annotated[int, Field(ge=0, le=4096)]
 
 
 class World:
@@ -57,12 +65,21 @@ class World:
         **options: Unpack[EnvOptions],
     ):
         self.config = config = EnvConfig.from_options(config, options)
+        num, threads = (
+            validate(Count, num, prefix=("num_envs",)),
+            validate(Threads, threads, prefix=("num_threads",)),
+        )
+        if not isinstance(task, Task | str):
+            raise InvalidInputError(
+                f"task is {task!r:.80}; expected a Task, or a text such as libero_object/3"
+            )
         self.controller = get_controller(config.controller, config.control_delta)
         self.task = get_task(task) if isinstance(task, str) else task
         assets = config.assets
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
-        self.num = num
+        self.num, self.threads = num, threads
         self.scene = build_scene(self.task.problem, pack, drawing=config.drawing, robot=config.robot)
+        self._check_memory()
         self.simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
         self.simulations.controller_state = ControllerState(num, self.controller)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
@@ -90,16 +107,22 @@ class World:
             init_states: Index of the initial state of each of them.
 
         Raises:
-            LiberoError: An initial state does not exist.
+            InvalidInputError: An initial state does not exist.
+        """
+        self.reset_to(ids, self.init_rows(np.asarray(init_states)))
+
+    def init_rows(self, init_states: np.ndarray) -> np.ndarray:
+        """Return stored initial states by index, (k,) integers -> (k, n).
+
+        Raises:
+            InvalidInputError: An initial state does not exist.
         """
         stored = self.init_states
-        chosen = np.asarray(init_states)
-        if chosen.shape != (len(ids),) or not np.issubdtype(chosen.dtype, np.integer):
-            raise LiberoError(f"init_state: expected {len(ids)} integers, got {init_states!r}")
-        if ((chosen < 0) | (chosen >= len(stored))).any():
-            raise LiberoError(f"init_state {chosen.tolist()}: {self.task.id} has 0 to {len(stored) - 1}")
-        qpos, qvel, fixtures = split_row(self.scene.model, stored[chosen])
-        self.simulations.reset(ids, qpos, qvel, fixtures=fixtures)
+        if ((init_states < 0) | (init_states >= len(stored))).any():
+            raise InvalidInputError(
+                f"init_state {init_states.tolist()}: {self.task.id} has 0 to {len(stored) - 1}"
+            )
+        return stored[init_states]
 
     def reset_to(self, ids: Indices, rows: np.ndarray) -> None:
         """Start simulations from given states.
@@ -109,17 +132,69 @@ class World:
             rows: States [time, qpos, qvel, pose of each fixture], (k, 1 + nq + nv + 7 nfixtures).
 
         Raises:
-            LiberoError: The states have another length.
+            InvalidInputError: The states have another length, or numbers that no physics has.
+        """
+        qpos, qvel, poses = split_row(self.scene.model, self.checked_starts(rows))
+        self.simulations.reset(ids, qpos, qvel, fixtures=poses)
+
+    def checked_starts(self, rows: np.ndarray) -> np.ndarray:
+        """Return states for `reset_to`, (k, n), after a check of their length and range.
+
+        Raises:
+            InvalidInputError: They are not of this task, or not of any physics.
         """
         model, fixtures = self.scene.model, len(self.scene.fixtures)
         size = 1 + model.nq + model.nv + 7 * fixtures
-        if rows.shape != (len(ids), size):
-            raise LiberoError(
+        if rows.ndim != 2 or rows.shape[1] != size:
+            raise InvalidInputError(
                 f"{self.task.id}: a start has {size} numbers, [time, qpos, qvel] and the poses of {fixtures} fixtures; "
-                f"got {rows.shape[-1]}. Is it one of another task?"
+                f"got {rows.shape[-1] if rows.ndim else 1}. Is it one of another task?"
             )
-        qpos, qvel, poses = split_row(model, rows)
-        self.simulations.reset(ids, qpos, qvel, fixtures=poses)
+        self._check_range(rows)
+        return rows
+
+    def checked_state(self, state: object) -> np.ndarray:
+        """Return a state for `restore` as float64.
+
+        Args:
+            state: State of `LiberoEnv.get_state`, or [time, qpos, qvel].
+
+        Raises:
+            InvalidInputError: It has another length, or numbers that no physics has.
+        """
+        model, size = self.scene.model, self.simulations.state_size + 1
+        name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
+        array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
+        self._check_range(array)
+        if array.size == size and not (array[-1] >= 0 and array[-1].is_integer()):
+            raise InvalidInputError(
+                f"a state ends with its number of steps, a whole number; got {array[-1]:g}"
+            )
+        return array
+
+    def restore(self, i: int, state: np.ndarray) -> int:
+        """Restore a state of `checked_state` in simulation i, and return the number of steps of its episode."""
+        if state.size == self.simulations.state_size + 1:
+            self.simulations.set_state(i, state[:-1])
+            return int(state[-1])
+        self.set_physics_state(i, state)
+        return 0
+
+    def _check_range(self, states: np.ndarray) -> None:
+        """Raise unless MuJoCo takes the numbers: it resets a simulation with larger ones, without an error."""
+        if not (np.abs(states) <= mujoco.mjMAXVAL).all():
+            raise InvalidInputError(
+                f"{self.task.id}: a state has a number beyond {mujoco.mjMAXVAL:g}, or no number"
+            )
+
+    def _check_memory(self) -> None:
+        """Raise if the simulations and their images do not fit into memory."""
+        if self.num == 1:
+            return
+        height, width = self.config.camera_size
+        images = 16 * height * width * len(self.config.cameras)
+        needed = self.num * (self.scene.model.narena + self.scene.model.nbuffer // 8 + images)
+        require_memory(needed, f"num_envs={self.num}", "take fewer simulations or smaller images")
 
     def reset_random(self, ids: Indices, generators: Sequence[np.random.Generator]) -> None:
         """Start simulations from new placements.
@@ -238,6 +313,12 @@ class World:
         """Free the OpenGL context and the simulations."""
         self.observer.close()
         self.simulations.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise InvalidInputError(
+            "an environment cannot be copied or pickled: it holds a compiled simulation and an OpenGL context. Make "
+            "another with the same task and config=, and pass it the state: set_state(get_state())"
+        )
 
     def _exists(self, name: str) -> bool:
         return name in self.scene.entities or self.task.problem.region(name) is not None

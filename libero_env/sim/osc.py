@@ -118,8 +118,8 @@ def rotate(w, current, out):
     q = np.empty(4, np.float32)  # wxyz
     q[0] = np.cos(angle / 2.0)
     norm = 0.0
-    for i in range(3):
-        q[1 + i] = w[i] / angle * np.sin(angle / 2.0)
+    for i in range(3):  # the squares of the smallest numbers are 0
+        q[1 + i] = w[i] / angle * np.sin(angle / 2.0) if angle > 0.0 else 0.0
     for i in range(4):
         norm += np.float64(q[i] * q[i])  # as BLAS sums single precision
     scale = np.sqrt(2.0 / np.float64(np.float32(norm)))

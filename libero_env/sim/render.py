@@ -6,10 +6,12 @@ processes.
 
 import importlib
 import os
+import threading
+import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Protocol
+from functools import cache, lru_cache
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -22,6 +24,12 @@ REMEDY = (
     "install a GL library (Debian and Ubuntu: apt-get install -y libegl1 libgl1-mesa-dri libosmesa6), or set "
     "MUJOCO_GL to one of egl, osmesa, glfw; `libero doctor` checks it"
 )
+FORKED = (
+    "this process was forked from one that has rendered, and OpenGL does not survive that. Render first in the new "
+    "process, or start processes with multiprocessing.get_context('spawn')"
+)
+_opened_in: set[int] = set()  # processes, this one or those it was forked from, that have opened a context
+_unreachable: list[Any] = []  # contexts of other threads and processes: to free them here would free others
 
 
 class GLContext(Protocol):
@@ -47,15 +55,20 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
         Name of the backend and the context.
 
     Raises:
-        RenderError: No backend works here; the message states why and what to install.
+        RenderError: No backend works here, or this process is a fork of one that has opened a context, which would
+            hang; the message states what to do.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if _opened_in and os.getpid() not in _opened_in:
+        raise RenderError(FORKED)
     if chosen and chosen not in BACKENDS:
         raise RenderError(f"MUJOCO_GL={chosen} is not a backend; valid: {', '.join(BACKENDS)}. Or unset it")
     failures = []
     for name in (chosen,) if chosen else ("egl", "osmesa"):
         try:
-            return name, importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+            context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+            _opened_in.add(os.getpid())
+            return name, context
         except Exception as error:  # noqa: BLE001 - each backend fails in its own way (ImportError, AttributeError, GL)
             failures.append(
                 f"{name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
@@ -114,8 +127,8 @@ class RenderTarget:
 class Renderer:
     """Renderer of a model's cameras.
 
-    Visual geoms (group 1) are rendered, and the sites that glow. Use it from one thread only; close it, or use it as a
-    context manager.
+    Visual geoms (group 1) are rendered, and the sites that glow. The OpenGL context belongs to the thread that renders
+    first; others may not render, nor close it while that thread runs. Close it, or use it as a context manager.
 
     Args:
         model: Model to render.
@@ -139,6 +152,7 @@ class Renderer:
         self._model, self._height, self._width, self._faithful = model, height, width, faithful
         self._culling = Culling(model) if cull else None
         self._gl: GLContext | None = None
+        self._owner = 0, threading.current_thread()
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
 
@@ -166,10 +180,14 @@ class Renderer:
             glowing_sites: Indices of the sites to show.
 
         Raises:
-            RenderError: No OpenGL backend works here.
+            RenderError: No OpenGL backend works here, or the context belongs to another thread or process.
         """
         if self._gl is None:
-            self._gl = self._open()
+            self._gl, self._owner = self._open(), (os.getpid(), threading.current_thread())
+            _watch_forks()
+            _renderers.add(self)
+        elif self._owner[1] is not threading.current_thread() or self._owner[0] != os.getpid():
+            raise RenderError(self._owner_text())
         self._gl.make_current()
         all_categories = mujoco.mjtCatBit.mjCAT_ALL
         for k, target in enumerate(targets):
@@ -250,12 +268,36 @@ class Renderer:
         scene.ngeom += 1
 
     def close(self) -> None:
-        """Free the OpenGL context; the renderer opens a new one when it is used again."""
-        if self._gl is not None:
+        """Free the OpenGL context; the renderer opens a new one when it is used again.
+
+        That of a thread that has ended, or of the process that this one was forked from, cannot be freed.
+
+        Raises:
+            RenderError: It belongs to another thread, which runs; nothing has changed.
+        """
+        if self._gl is None:
+            return
+        pid, thread = self._owner
+        if pid == os.getpid() and thread is threading.current_thread():
             self._gl.make_current()
             self._context.free()
             self._gl.free()
-            self._gl = None
+        elif pid == os.getpid() and thread.is_alive():
+            raise RenderError(self._owner_text())
+        else:
+            _unreachable.append((self._gl, self._context))
+        self._gl = None
+
+    def _owner_text(self) -> str:
+        """Return why this thread cannot use the context."""
+        pid, thread = self._owner
+        if pid != os.getpid():
+            return FORKED
+        ended = "" if thread.is_alive() else ", which has ended"
+        return (
+            f"the images of this environment are rendered by thread {thread.name!r}{ended}; this is thread "
+            f"{threading.current_thread().name!r}. Render and close it there, or make an environment in each thread"
+        )
 
     def __enter__(self) -> "Renderer":
         return self
@@ -286,3 +328,17 @@ class Renderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._viewport = mujoco.MjrRect(0, 0, self._width, self._height)
         return gl
+
+
+_renderers: "weakref.WeakSet[Renderer]" = weakref.WeakSet()  # that have had a context
+
+
+@cache
+def _watch_forks() -> None:
+    """Keep the contexts of this process in its forks, where freeing them would hang."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_keep_contexts)
+
+
+def _keep_contexts() -> None:
+    _unreachable.extend((renderer._gl, renderer._context) for renderer in _renderers)

@@ -5,15 +5,18 @@ There are two ways to step, with the same interface and the same bits: `LoopSimu
 substeps. Each substep runs the controller on the current kinematics, then the rest of the step, then the kinematics.
 """
 
+import os
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from functools import cached_property
+from functools import cache, cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from libero_env.errors import LiberoError
+from libero_env.errors import ClosedEnvironmentError, LiberoError
 from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.osc import REST, ArmIndex
@@ -44,9 +47,20 @@ _SOLVES_BEFORE_STEP = 2 if FORWARD_WARM_STARTS else 0
 
 # Substeps after which the original observes: kinematics of the first, positions of the second
 WATCHED = (SUBSTEPS - 2, SUBSTEPS - 1)
+FORKED = (
+    "this process was forked from the one that made the environment, and can neither step nor render it. Make "
+    "environments after the fork, or start processes with multiprocessing.get_context('spawn')"
+)
 Indices = Sequence[int] | np.ndarray
 KinematicsHook = Callable[[mujoco.MjData], None]
 Watch = Callable[[int, np.ndarray], None]  # number of substeps done, indices of the simulations
+
+
+class _Closed(dict[Any, Any]):
+    """What closed simulations have instead of their fields and states."""
+
+    def __missing__(self, key: object) -> None:
+        raise ClosedEnvironmentError("this simulation is closed; make another environment")
 
 
 class Simulations(ABC):
@@ -104,8 +118,8 @@ class Simulations(ABC):
         """Return MjData of simulation i, for reading what `fields` does not have, such as contacts."""
 
     def close(self) -> None:
-        """Free the simulations."""
-        self.fields = {}
+        """Free the simulations. Idempotent."""
+        self.fields = _Closed()
 
     def reset(
         self,
@@ -252,13 +266,13 @@ class LoopSimulations(Simulations):
 
     def __init__(self, model: mujoco.MjModel, num: int = 1, fixture_bodies: Indices = ()):
         super().__init__(model, num, fixture_bodies)
-        self._datas = [mujoco.MjData(self.model) for _ in range(num)]
-        self._views = [self._view(data) for data in self._datas]
+        self._datas: Any = [mujoco.MjData(self.model) for _ in range(num)]
+        self._views: Any = [self._view(data) for data in self._datas]
         # One simulation is read in place; several are copied together after each step.
         self.fields = (
             self._views[0] if num == 1 else {k: np.concatenate([v[k] for v in self._views]) for k in _FIELDS}
         )
-        self._calls = [(self._inputs(v), v["ctrl"]) for v in self._views]
+        self._calls: Any = [(self._inputs(v), v["ctrl"]) for v in self._views]
 
     def _view(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         """Return views of the fields of one simulation, (1, ...)."""
@@ -324,7 +338,7 @@ class LoopSimulations(Simulations):
 
     def close(self) -> None:
         super().close()
-        self._views, self._calls, self._datas = [], [], []
+        self._views = self._calls = self._datas = _Closed()
 
 
 class BatchSimulations(Simulations):
@@ -339,7 +353,9 @@ class BatchSimulations(Simulations):
 
     def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Indices = ()):
         super().__init__(model, num, fixture_bodies)
-        self._batch = Batch(model, num, nthread=threads, persistent=True)
+        self._batch: Any = Batch(model, num, nthread=threads, persistent=True)
+        _watch_forks()
+        _batches.add(self)
         self.fields = {name: self._batch.bind(name) for name in _FIELDS}
         self.fields["site_xmat"] = self.fields["site_xmat"].reshape(num, model.nsite, 9)
         self._time, self._qacc_warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
@@ -388,7 +404,36 @@ class BatchSimulations(Simulations):
 
     def close(self) -> None:
         super().close()
-        self._batch = self._time = self._qacc_warmstart = self._body_pos = self._body_quat = None
+        self._batch = _Without("this simulation is closed; make another environment", ClosedEnvironmentError)
+        self._time = self._qacc_warmstart = self._body_pos = self._body_quat = _Closed()
+
+
+class _Without:
+    """What a batch is replaced by where it cannot be used."""
+
+    def __init__(self, message: str, error: type[LiberoError] = LiberoError):
+        self._error = error(message)
+
+    def __getattr__(self, name: str) -> Any:
+        raise self._error
+
+
+_batches: "weakref.WeakSet[BatchSimulations]" = weakref.WeakSet()
+_inherited: list[Any] = []  # never freed: their threads are not in this process
+
+
+@cache
+def _watch_forks() -> None:
+    """Let a forked process raise where it uses a batch of its parent, whose threads it would wait for without end."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_leave_batches)
+
+
+def _leave_batches() -> None:
+    for simulations in list(_batches):
+        _inherited.append(simulations._batch)
+        simulations._batch = _Without(FORKED)
+    _batches.clear()
 
 
 def make_simulations(

@@ -1,0 +1,397 @@
+"""Edges of the environments: what is refused changes nothing, and what cannot work says so."""
+
+import copy
+import multiprocessing as mp
+import pickle
+import threading
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ClosedEnvironmentError as GymClosed
+
+from libero_env import BatchEnv, LiberoEnv, SubprocEnv
+from libero_env.envs import EnvConfig
+from libero_env.errors import (
+    ActionError,
+    ClosedEnvironmentError,
+    InvalidInputError,
+    LiberoError,
+    RenderError,
+    UnknownNameError,
+)
+from libero_env.sim.osc import rotate
+
+TASK = "libero_object/3"
+
+BAD_VALUES = {
+    "horizon": (0, -5, 1.5, "abc", True, None, float("inf")),
+    "camera_size": (128, (0, 1), (1.5, 2), ("a", 1), None, (1, 2, 3), (-1, 8), "ab"),
+    "cameras": (None, "agentview", [3], 3),
+    "observations": (None, "rgb", [1]),
+    "controller": (3, None, [1]),
+    "control_delta": ("no", None, 1),
+    "reward_scale": ("a", float("nan"), float("inf"), None, 1j),
+    "assets": (3, ["original"]),
+    "semantics": ([1], None),
+    "drawing": ([1], 3),
+    "robot": ([1], None),
+    "observed": ([1], None),
+    "reward": ([1], None),
+}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("name", BAD_VALUES)
+def test_options_of_another_kind_are_named_with_their_value(name):
+    for value in BAD_VALUES[name]:
+        with pytest.raises(InvalidInputError, match=rf"^{name}.* is "):
+            EnvConfig(**{name: value})
+
+
+@pytest.mark.unit
+def test_options_of_numpy_and_whole_floats_are_made_plain():
+    config = EnvConfig(horizon=np.int64(5), camera_size=np.array([32, 48]), reward_scale=np.float32(0.5))
+    assert (config.horizon, config.camera_size, config.reward_scale) == (5, (32, 48), 0.5)
+    assert EnvConfig(cameras=iter(["agentview"])).cameras == ("agentview",)
+    assert type(EnvConfig(horizon=7.0).horizon) is int
+
+
+@pytest.mark.unit
+def test_arguments_of_constructors_are_checked():
+    for task in (3, None, ["a"], 1.5, b"libero_object/3"):
+        with pytest.raises(InvalidInputError, match="^task is"):
+            LiberoEnv(task, cameras=())
+    for num in (0, -1, 1.5, "a", None, True):
+        with pytest.raises(InvalidInputError, match="^num_envs is"):
+            BatchEnv(TASK, num, cameras=())
+    for threads in (-1, 1.5, "a", None, 10**6):
+        with pytest.raises(InvalidInputError, match="^num_threads is"):
+            BatchEnv(TASK, 2, num_threads=threads, cameras=())
+    for config in (3, {}, {"horizon": 3}):
+        with pytest.raises(InvalidInputError, match="^config is"):
+            LiberoEnv(TASK, config=config)
+    for options in ({"timeout": 0}, {"timeout": float("nan")}, {"start_timeout": None}, {"gl_devices": [-1]}):
+        with pytest.raises(InvalidInputError, match=next(iter(options))):
+            SubprocEnv([{"task": TASK}], **options)
+    for specs in ([], [3], "ab"):
+        with pytest.raises(InvalidInputError):
+            SubprocEnv(specs)
+
+
+@pytest.mark.sim
+def test_simulations_that_do_not_fit_into_memory_are_refused():
+    with pytest.raises(LiberoError, match=r"num_envs=1000000000 needs about .* are free: take fewer"):
+        BatchEnv(TASK, 10**9, cameras=())
+
+
+@pytest.mark.sim
+def test_names_of_gymnasium_take_the_same_checks():
+    import libero_env.registration  # noqa: F401 - registers the tasks
+
+    with pytest.raises(InvalidInputError, match="horizon is 0; expected at least 1"):
+        gymnasium.make("libero/libero_object-3", horizon=0, cameras=())
+
+
+@pytest.fixture(scope="module")
+def env():
+    with LiberoEnv(TASK, cameras=()) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def batch():
+    with BatchEnv(TASK, 2, cameras=()) as made:
+        yield made
+
+
+def digest(env):
+    """All that the future of an environment depends on."""
+    if isinstance(env, BatchEnv):
+        states = [env.get_state(i) for i in range(env.num_envs)]
+        return (
+            np.array(states).tobytes(),
+            env.running.tolist(),
+            str([g.bit_generator.state for g in env._generators]),
+        )
+    return env.get_state().tobytes(), env._running, str(env.np_random.bit_generator.state)
+
+
+def interrupted(*_: object):
+    """What a call does during which Ctrl-C is pressed."""
+    raise KeyboardInterrupt
+
+
+SEEDS = (-1, 1.5, "abc", True, float("nan"), [1], np.float64(3), 1j, 2**5000)
+INIT_STATES = (99, -1, 1.0, "a", None, [1, 2], True, [], 10**30, {}, 1j, np.nan, [[1], [2, 3]])
+
+
+@pytest.mark.sim
+def test_refused_resets_change_nothing(env, batch):
+    for one in (env, batch):
+        one.reset(seed=4)
+        before = digest(one)
+        for seed in SEEDS:
+            with pytest.raises(InvalidInputError, match="seed"):
+                one.reset(seed=seed)
+        for chosen in INIT_STATES:
+            if (one, chosen) != (batch, [1, 2]):
+                with pytest.raises(InvalidInputError, match="init_state"):
+                    one.reset(seed=5, options={"init_state": chosen})
+        for options in ([1], "abc", 3, [("init_state", 0)]):
+            with pytest.raises(InvalidInputError, match="expected a dictionary"):
+                one.reset(seed=5, options=options)
+        for options in ({"int_state": 1}, {1: 2}, {None: 1}):
+            with pytest.raises(UnknownNameError):
+                one.reset(seed=5, options=options)
+        assert digest(one) == before
+    wide = len(batch.get_state(0))
+    others = {"reset_mask": ([True], "ab", [0.5, np.nan], [[True, False]]), "outdated_controller": (1, "no")}
+    others["start"] = (3, "a", np.zeros((2, 3)), np.full((2, wide), np.nan), [[1], [1, 2]])
+    for name, values in others.items():
+        for value in values:
+            with pytest.raises(InvalidInputError, match=f"{name}|a start has"):
+                batch.reset(seed=5, options={name: value})
+    assert digest(batch) == before
+
+
+@pytest.mark.sim
+def test_seeds_of_any_integer_type_are_the_same(env):
+    states = []
+    for seed in (3, np.int64(3), np.uint8(3), np.array(3)):
+        env.reset(seed=seed)
+        states.append(env.get_state())
+    assert (np.array(states) == states[0]).all()
+    env.reset(seed=2**200)
+
+
+BAD_ACTIONS = [
+    np.zeros(7) * 1j,
+    [1 + 2j] * 7,
+    [None] * 7,
+    ["1"] * 7,
+    [b"1"] * 7,
+    "abc",
+    None,
+    {},
+    np.zeros(8),
+    np.zeros((1, 7)),
+    [np.nan] * 7,
+    [10**400] * 7,
+    [[1], [2, 3]],
+    np.ma.masked_array(np.zeros(7), mask=[0] * 6 + [1]),
+    np.zeros(7, "M8[s]"),
+    np.zeros(7, "m8[s]"),
+    np.array([object()] * 7),
+]
+
+
+@pytest.mark.sim
+def test_refused_actions_change_nothing(env):
+    import torch
+
+    env.reset(seed=4)
+    before = digest(env)
+    for action in [*BAD_ACTIONS, torch.zeros(7, requires_grad=True), torch.zeros(7, dtype=torch.complex64)]:
+        with pytest.raises(ActionError, match="actions"):
+            env.step(action)
+    assert digest(env) == before
+    for action in (
+        torch.zeros(7),
+        [True] * 7,
+        np.zeros(7, object),
+        np.ma.masked_array(np.zeros(7)),
+        (0,) * 7,
+    ):
+        env.step(action)
+
+
+@pytest.mark.sim
+def test_refused_states_change_nothing(env, batch):
+    env.reset(seed=4), batch.reset(seed=4)
+    own, short = env.get_state(), env.world.physics_state(0)
+    bad = [own * np.nan, own[:-1], own[:3], None, "a", [], own * 1j, own[None], np.append(own[:-1], 1.5)]
+    bad += [np.append(own[:-1], -1.0), own * 1e300, np.append(own[:-1], np.inf), short * np.nan, short + 1e12]
+    before = digest(env), digest(batch)
+    for state in bad:
+        with pytest.raises(InvalidInputError, match="state"):
+            env.set_state(state)
+        with pytest.raises(InvalidInputError, match="state"):
+            batch.set_state(1, state)
+    for index in (2, -1, 0.5, "a", None, True):
+        with pytest.raises(InvalidInputError, match="whole number from 0 to 1"):
+            batch.set_state(index, own)
+        with pytest.raises(InvalidInputError, match="whole number from 0 to 1"):
+            batch.get_state(index)
+        if index is not None:
+            with pytest.raises(InvalidInputError, match="0 to 1"):
+                batch.render_cameras(index if index == "a" else [index])
+    assert (digest(env), digest(batch)) == before
+    batch.set_state(1, short)  # as files of the original have it
+    env.set_state(own.astype(object))
+    np.testing.assert_array_equal(env.get_state(), own)
+
+
+@pytest.mark.sim
+def test_after_close_every_method_says_so():
+    single, many = LiberoEnv(TASK, cameras=(), render_mode="rgb_array"), BatchEnv(TASK, 2, cameras=())
+    single.reset(seed=0), many.reset(seed=0)
+    state, view, world = single.get_state(), single.view, single.world
+    for env in (single, many):
+        env.close()
+        env.close()
+    uses = [single.reset, single.render, single.get_state, single.render_cameras]
+    uses += [lambda: single.step(np.zeros(7)), lambda: single.set_state(state)]
+    uses += [many.reset, many.render, many.render_cameras, lambda: many.step(np.zeros((2, 7)))]
+    uses += [lambda: many.get_state(0), lambda: many.set_state(0, state)]
+    for use in uses:
+        with pytest.raises(GymClosed, match="closed; make") as caught:
+            use()
+        assert isinstance(caught.value, ClosedEnvironmentError)
+    inner = [lambda: view.eef_pos, lambda: world.progress(0), lambda: world.reset_to_init([0], [0])]
+    inner += [lambda: world.step([0], np.zeros((1, 7))), lambda: many.world.simulations.data(0)]
+    inner += [
+        lambda: many.world.simulations.time(0),
+        lambda: world.render(0, "agentview"),
+        world.proprioception,
+    ]
+    for use in inner:
+        with pytest.raises(ClosedEnvironmentError):
+            use()
+    assert single.action_space.sample().shape == (7,)
+
+
+@pytest.mark.sim
+def test_processes_are_closed_too():
+    with SubprocEnv([{"task": TASK}], cameras=()) as env:
+        env.reset(seed=0)
+        with pytest.raises(
+            LiberoError, match=r"worker 0 \(libero_object/3\): it raised .*init_state \[99\]"
+        ) as caught:
+            env.reset(options={"init_state": 99})
+        assert "Traceback" not in str(caught.value)
+        state = env.call("get_state", indices=[0])[0]
+        for indices in ([1], [-1], [0.5], "a", 3):
+            with pytest.raises(InvalidInputError, match="0 to 0"):
+                env.call("get_state", indices=indices)
+        with pytest.raises(InvalidInputError, match="cannot be sent"):
+            env.call("set_state", lambda: 0)
+        with pytest.raises(InvalidInputError, match="copied"):
+            copy.deepcopy(env)
+    uses = [env.reset, env.render, lambda: env.call("pid"), lambda: env.get_state(0)]
+    for use in [*uses, lambda: env.set_state(0, state), lambda: env.step(np.zeros((1, 7)))]:
+        with pytest.raises(GymClosed):
+            use()
+
+
+@pytest.mark.sim
+def test_environments_are_not_copied(env, batch):
+    for one in (env, batch, env.world):
+        for duplicate in (copy.deepcopy, pickle.dumps):
+            with pytest.raises(InvalidInputError, match="cannot be copied or pickled"):
+                duplicate(one)
+
+
+@pytest.mark.sim
+def test_images_belong_to_the_thread_that_renders():
+    env = LiberoEnv(TASK, cameras=("agentview",), camera_size=(16, 16))
+    env.reset(seed=0)
+    state, errors = env.get_state(), []
+
+    def elsewhere():
+        for use in (env.render_cameras, env.close):
+            try:
+                use()
+            except RenderError as error:
+                errors.append(str(error))
+
+    thread = threading.Thread(target=elsewhere, name="other")
+    thread.start()
+    thread.join()
+    assert len(errors) == 2
+    assert (
+        "thread 'MainThread'; this is thread 'other'" in errors[0]
+        and "make an environment in each" in errors[0]
+    )
+    np.testing.assert_array_equal(env.get_state(), state)
+    env.render_cameras()
+    env.close()
+    first = LiberoEnv(TASK, cameras=("agentview",), camera_size=(16, 16))
+    thread = threading.Thread(target=first.reset, name="first")
+    thread.start()
+    thread.join()
+    with pytest.raises(RenderError, match="thread 'first', which has ended"):
+        first.render_cameras()
+    first.close()  # its context cannot be freed, its simulation is
+
+
+def in_fork(use, answers):
+    try:
+        use()
+        answers.send("done")
+    except LiberoError as error:
+        answers.send(str(error))
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_forked_processes_raise_where_they_would_hang():
+    """They inherit neither the threads of a batch nor those of OpenGL."""
+    env = LiberoEnv(TASK, cameras=("agentview",), camera_size=(16, 16))
+    many = BatchEnv(TASK, 2, cameras=())
+    env.reset(seed=0), many.reset(seed=0)
+    uses = [
+        lambda: env.step(np.zeros(7)),
+        lambda: many.step(np.zeros((2, 7))),
+        lambda: LiberoEnv(TASK, cameras=("agentview",), camera_size=(16, 16)).reset(seed=0),
+        lambda: (env.close(), many.close()),
+    ]
+    said = []
+    for use in uses:
+        here, there = mp.Pipe()
+        process = mp.get_context("fork").Process(target=in_fork, args=(use, there))
+        process.start()
+        said.append(here.recv() if here.poll(60.0) else "hangs")
+        process.kill()
+        process.join()
+    assert said[3] == "done" and all("was forked" in text and "spawn" in text for text in said[:3]), said
+    env.step(np.zeros(7)), many.step(np.zeros((2, 7)))
+    env.close(), many.close()
+
+
+@pytest.mark.sim
+def test_an_interrupted_step_or_reset_ends_the_episode(env, batch, monkeypatch):
+    for one, action in ((env, np.zeros(7)), (batch, np.zeros((2, 7)))):
+        one.reset(seed=0)
+        state = one.get_state(*(() if one is env else (0,)))
+        for call in (lambda one=one, action=action: one.step(action), lambda one=one: one.reset(seed=1)):
+            with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+                patch.setattr(one.world.simulations, "_substeps", interrupted)
+                patch.setattr(one.world.simulations, "_start", interrupted)
+                call()
+            if one is env:
+                with pytest.raises(LiberoError, match="interrupted; call reset"):
+                    one.step(action)
+            else:
+                assert not one.running.any()
+        one.reset(seed=0)
+        np.testing.assert_array_equal(one.get_state(*(() if one is env else (0,))), state)
+        one.step(action)
+
+
+@pytest.mark.unit
+def test_rotations_whose_squares_vanish_are_none():
+    current, out = np.linspace(-1.0, 1.0, 9), np.empty(9)
+    for small in (1e-320, 1e-170, -1e-300, 5e-324):
+        rotate(np.array([small, 0.0, -small]), current, out)
+        np.testing.assert_array_equal(out, current)
+
+
+@pytest.mark.sim
+def test_steps_with_vanishing_rotations_are_steps_without(env):
+    states = []
+    for rotation in ((0.0, 0.0, 0.0), (1e-170, 0.0, 1e-300)):
+        env.reset(seed=0)
+        env.step([0.1, 0.0, 0.0, *rotation, 1.0])
+        states.append(env.get_state())
+    np.testing.assert_allclose(*states, atol=1e-9)
