@@ -41,14 +41,14 @@ def checked_actions(actions: object, num: int | None = None, size: int = ACTION_
 
 
 def checked_numbers(
-    value: object, name: str, shapes: Sequence[Shape], error: type[LiberoError] = InvalidInputError
+    value: object, name: str, shapes: Sequence[Shape | str], error: type[LiberoError] = InvalidInputError
 ) -> np.ndarray:
     """Return an array of finite numbers as float64.
 
     Args:
         value: Array, or what NumPy makes one of.
         name: Name of the value in messages.
-        shapes: Shapes that are valid.
+        shapes: Shapes that are valid; where they are texts, the caller checks the shape.
         error: Type of the error.
 
     Raises:
@@ -60,7 +60,7 @@ def checked_numbers(
     except (TypeError, ValueError, RuntimeError, OverflowError) as reason:  # the last but one is of tensors
         text = " ".join(str(reason).split())
         raise error(f"{expected}, got {type(value).__name__}: {text[:200]}") from None
-    if array.shape not in shapes:
+    if array.shape not in shapes and not isinstance(shapes[0], str):
         raise error(f"{expected}, got {array.shape}")
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -202,8 +202,11 @@ class ResetRequest:
             init_states = whole_numbers(options["init_state"], "init_state", ((), (1,), (num_envs,)))
             init_states = np.broadcast_to(init_states, (num_envs,))
         if "start" in options:
-            width = np.shape(options["start"])[-1:] if hasattr(options["start"], "__len__") else (1,)
-            starts = checked_numbers(options["start"], "start", ((num_envs, *width),))
+            starts = checked_numbers(options["start"], "start", (f"({num_envs}, n)",))
+            if starts.ndim != 2 or len(starts) != num_envs:
+                raise InvalidInputError(
+                    f"start: expected {num_envs} rows of numbers, got shape {starts.shape}"
+                )
         return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts)
 
 
