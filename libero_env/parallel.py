@@ -1,7 +1,8 @@
-"""Worker processes, and the progress of long work."""
+"""Worker processes, the progress of long work, and what the machine has for it."""
 
 import multiprocessing
 import os
+import re
 import signal
 import sys
 import threading
@@ -85,11 +86,25 @@ def available_memory() -> int | None:
         ("/sys/fs/cgroup", "memory.max", "memory.current"),
         ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
     ):
-        texts = [Path(folder, name) for name in (limit, used)]
+        texts = [Path(folder, name) for name in (limit, used, "memory.stat")]
         if all(path.is_file() for path in texts):
-            most, now = (path.read_text().strip() for path in texts)
-            found += [int(most) - int(now)] if most.isdecimal() else []
+            most, now, parts = (path.read_text().strip() for path in texts)
+            cached = re.search(r"^(?:total_)?inactive_file (\d+)$", parts, re.MULTILINE)
+            spare = (
+                int(cached.group(1)) if cached else 0
+            )  # files that were read, which the system drops first
+            found += [int(most) - int(now) + spare] if most.isdecimal() else []
     return max(0, min(found)) if found else None
+
+
+def host_memory() -> tuple[int, int]:
+    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limit = Path("/sys/fs/cgroup/memory.max")
+    if limit.is_file() and (text := limit.read_text().strip()).isdecimal():
+        total = min(total, int(text))
+    free = available_memory()
+    return total // 2 if free is None else min(free, total), total
 
 
 def require_memory(needed: float, what: str, remedy: str) -> None:

@@ -12,7 +12,9 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset, Subset
 
 from libero._adapters.lifelong.observations import image_tensor
-from libero_env.demos.read import demo_files, demo_names, open_demo_file, read_demos
+from libero_env.demos.contents import check_demo, demo_names, subset_names
+from libero_env.demos.hdf5 import open_demo_file
+from libero_env.demos.read import demo_files, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import SequenceVLDataset as Windows
 from lifelong.types import PolicySpec
@@ -136,7 +138,9 @@ def get_dataset(
     if filter_key is None:
         windows = Windows.from_file(path, spec=spec, language=torch.zeros(1), **reading)
     else:
-        names, demos = _subset(path, filter_key), read_demos(path, [*views, *proprio], **reading)
+        with open_demo_file(path) as handle:
+            names = set(subset_names(handle, path, filter_key))
+        demos = read_demos(path, [*views, *proprio], **reading)
         kept = [demo for demo in demos if demo.name in names]
         windows = Windows.from_demos(kept, spec=spec, language=torch.zeros(1), source=str(path))
     all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in proprio}
@@ -161,19 +165,11 @@ def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
     file = next(iter(demo_files(path)), path)
     with open_demo_file(file) as handle:
         names = demo_names(handle, file)
-        obs = handle["data"][names[0]]["obs"] if names else {}
+        obs = handle["data"][names[0]].get("obs", {}) if names else {}
         missing = [key for key in keys if key not in obs]
         if missing:
             raise DemoError(
                 f"{file}: {', '.join(missing)} missing from obs; it has {', '.join(obs) or 'nothing'}"
             )
+        check_demo(handle["data"][names[0]], file, names[0], keys)
         return {key: tuple(obs[key].shape[1:]) for key in keys}
-
-
-def _subset(path: Path, filter_key: str) -> set[str]:
-    """Return the names of the demonstrations in a subset of a file."""
-    with open_demo_file(path) as handle:
-        if filter_key not in handle.get("mask", {}):
-            known = ", ".join(handle.get("mask", {})) or "none"
-            raise DemoError(f"{path}: no subset {filter_key!r}; there is {known}")
-        return {name.decode() for name in handle["mask"][filter_key][()]}

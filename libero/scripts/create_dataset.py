@@ -1,6 +1,7 @@
 """Make a data set of collected demonstrations: pictures and proprioception of each state."""
 
 import argparse
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -8,10 +9,11 @@ import h5py
 
 from libero.libero.utils.dataset_utils import get_dataset_info
 from libero.scripts.command import option, script
+from libero_env.demos.contents import LOW_DIM_KEYS
 from libero_env.demos.curate import recorded_task
 from libero_env.demos.observe import RenderConfig
-from libero_env.demos.read import LOW_DIM_KEYS
 from libero_env.demos.replay import rerender, rerun_actions
+from libero_env.storage import atomic_path
 
 
 @script(
@@ -44,10 +46,12 @@ def main(args: argparse.Namespace) -> None:
 
 
 def drop_proprioception(file: Path) -> None:
-    """Remove everything but pictures and states from a file."""
-    with h5py.File(file, "r+") as handle:
-        for demo in handle["data"].values():
-            for key in [key for key in LOW_DIM_KEYS if key in demo["obs"]]:
-                del demo["obs"][key]
-            if "robot_states" in demo:
-                del demo["robot_states"]
+    """Remove everything but pictures and states from a file, in one step."""
+    with atomic_path(file, fsync=True) as copy:
+        shutil.copyfile(file, copy)
+        with h5py.File(copy, "r+") as handle:
+            for demo in handle["data"].values():
+                for key in [key for key in LOW_DIM_KEYS if key in demo["obs"]]:
+                    del demo["obs"][key]
+                if "robot_states" in demo:
+                    del demo["robot_states"]

@@ -6,21 +6,24 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+from pydantic import Field
 
 from libero_env.assets.pack import select_pack
-from libero_env.assets.robot import DEFAULT_ROBOT, robosuite_version
+from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS, robosuite_version
+from libero_env.demos.contents import Pairing
 from libero_env.demos.observe import RenderConfig
-from libero_env.demos.read import Pairing
 from libero_env.demos.write import DemoWriter, make_header
+from libero_env.errors import UnknownNameError
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.scene import FAST, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
+from libero_env.validation import validate, validate_arguments
 
 GENERATOR = "scripted-expert-9"  # change it when the same seed yields different demonstrations
 
@@ -38,9 +41,12 @@ class Variation:
     """
 
     style: bool = True
-    noise: float = 0.12
-    push_rate: float = 0.02
+    noise: Annotated[float, Field(ge=0, le=10)] = 0.12
+    push_rate: Annotated[float, Field(ge=0, le=1)] = 0.02
     reserved: bool = False
+
+    def __post_init__(self) -> None:
+        validate_arguments(Variation, vars(self))
 
     def header(self) -> dict[str, str]:
         """Return the attributes of a file: the values that are not the defaults."""
@@ -75,6 +81,12 @@ class DemoConfig:
     modalities: tuple[str, ...] = ("rgb",)
     drawing: str | None = None
     robot: str = DEFAULT_ROBOT
+
+    def __post_init__(self) -> None:
+        validate(Annotated[int, Field(ge=0)], self.seed, prefix=("seed",))
+        validate(Pairing, self.pairing, prefix=("pairing",))
+        if self.robot not in ROBOTS:
+            raise UnknownNameError("robot", self.robot, ROBOTS)
 
     @cached_property
     def drawn(self) -> str:

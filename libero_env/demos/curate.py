@@ -1,6 +1,5 @@
 """Demonstration files as a whole: which task they are of, what is in them, and files made of parts of them."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,14 +8,18 @@ from typing import Any
 import h5py
 import numpy as np
 
-from libero_env.demos.read import (
+from libero_env.demos.contents import (
     LOW_DIM_KEYS,
-    BrokenDemoError,
     check_demo,
     demo_names,
     is_image,
-    open_demo_file,
+    reached_goal,
+    read_values,
+    value_fault,
 )
+from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file
+from libero_env.demos.header import demo_attributes, file_attributes, json_attribute, read_header
+from libero_env.demos.read import demo_lengths
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.paths import demos_dir
@@ -26,7 +29,6 @@ from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.problem import same_meaning
 
 NOOP_THRESHOLD = 1e-3  # [action units] largest motion that counts as none
-_COUNTS = ("num_demos", "total", "num_failed_attempts")  # attributes that follow from the demonstrations
 _DERIVED = (
     "num_samples",
     "init_state",
@@ -55,17 +57,6 @@ class DemoStats:
         steps, n = sum(self.lengths), len(self.lengths)
         length = f"{min(self.lengths)}-{max(self.lengths)} steps (mean {steps / n:.0f})"
         return f"{length}, {self.successes} of {n} successful, {100 * self.noops / steps:.1f} % no-ops"
-
-
-def read_header(file: Path) -> dict[str, Any]:
-    """Return the attributes of a file's group `data`, without those that count its demonstrations.
-
-    Raises:
-        DemoError: It is not a demonstration file.
-    """
-    with open_demo_file(file) as handle:
-        demo_names(handle, file)
-        return {key: value for key, value in handle["data"].attrs.items() if key not in _COUNTS}
 
 
 def recorded_robot(file: Path) -> str:
@@ -108,8 +99,12 @@ def recorded_task(file: Path) -> Task:
     return Task("file", 0, name.stem, language_from_name(name.stem), problem.language, problem)
 
 
-def read_episodes(file: Path) -> Iterator[tuple[str, Episode]]:
+def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[tuple[str, Episode]]:
     """Yield the name of each demonstration with all that is recorded of it; images are upright.
+
+    Args:
+        file: Demonstration file.
+        check_values: Whether numbers that are not finite or absurd are refused.
 
     Raises:
         DemoError: A demonstration is broken, or has no states; those before it have been returned.
@@ -117,35 +112,33 @@ def read_episodes(file: Path) -> Iterator[tuple[str, Episode]]:
     with open_demo_file(file) as handle:
         for name in demo_names(handle, file):
             group = handle["data"][name]
-            check_demo(group, file, name, group.get("obs", ()) if isinstance(group, h5py.Group) else ())
+            obs = group.get("obs") if isinstance(group, h5py.Group) else None
+            keys = _known(obs) if isinstance(obs, h5py.Group) else []
+            size = check_demo(group, file, name, keys)
+            check_memory(size, f"{file}: {name}", "record shorter ones or smaller images")
             if "states" not in group:
                 raise BrokenDemoError(f"{file}: {name}/states is missing; expected (T, 1 + nq + nv)")
-            yield name, _read_episode(group, file, name)
+            yield name, _read_episode(group, file, name, keys, check_values)
 
 
-def _read_episode(group: h5py.Group, file: Path, name: str) -> Episode:
-    try:
-        obs = {
-            key: np.ascontiguousarray(values[()][:, ::-1]) if is_image(key) else values[()]
-            for key, values in group.get("obs", {}).items()
-            if is_image(key) or key in LOW_DIM_KEYS
-        }
-        optional = {
-            key: group[key][()] if key in group else None
-            for key in ("robot_states", "expert_actions", "rewards")
-        }
-        actions, states = group["actions"][()], group["states"][()]
-    except OSError as error:
-        raise BrokenDemoError(f"{file}: {name} cannot be read ({error}); the file is damaged") from error
-    rewards, attrs = optional.pop("rewards"), dict(group.attrs)
+def _known(obs: h5py.Group) -> list[str]:
+    return [key for key in obs if is_image(key) or key in LOW_DIM_KEYS]
+
+
+def _read_episode(group: h5py.Group, file: Path, name: str, keys: list[str], check: bool) -> Episode:
+    def read(key: str) -> Any:
+        return read_values(group, key, file, name, check=check)
+
+    attrs, rewards = demo_attributes(group, f"{file}: {name}"), read("rewards")
     return Episode(
-        actions,
-        states,
-        obs=obs,
-        success=bool(attrs.get("success", rewards is None or rewards[-1] > 0)),
-        fixtures=np.asarray(attrs["fixtures"], np.float64) if "fixtures" in attrs else None,
+        read("actions"),
+        read("states"),
+        robot_states=read("robot_states"),
+        obs={key: read(f"obs/{key}") for key in keys},
+        expert_actions=read("expert_actions"),
+        success=reached_goal(group, f"{file}: {name}", (rewards,)),
+        fixtures=attrs.get("fixtures"),
         attrs={key: value for key, value in attrs.items() if key not in _DERIVED},
-        **optional,
     )
 
 
@@ -176,7 +169,7 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     """
     lengths, successes, noops, faults = [], 0, 0, []
     shapes: dict[str, tuple[int, ...]] = {}
-    for name, episode in read_episodes(file):
+    for name, episode in read_episodes(file, check_values=False):
         lengths.append(len(episode))
         successes += episode.success
         noops += int(noop_steps(episode.labels, threshold).sum())
@@ -184,20 +177,22 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     if not lengths:
         raise DemoError(f"{file}: no demonstrations; expected at least data/demo_0. Record them again")
     with open_demo_file(file) as handle:
-        counted = {key: handle["data"].attrs.get(key) for key in ("num_demos", "total")}
-    for key, value in zip(counted, (len(lengths), sum(lengths)), strict=True):
-        if counted[key] is not None and int(counted[key]) != value:
-            faults.append(f"attribute {key} is {counted[key]}; expected {value}")
+        attributes = file_attributes(handle, file)
+    for key, value in (("num_demos", len(lengths)), ("total", sum(lengths))):
+        if (stated := attributes.get(key, value)) != value:
+            faults.append(f"attribute {key} is {stated}; expected {value}")
     return DemoStats(tuple(lengths), successes, noops, tuple(faults))
 
 
 def _faults(episode: Episode, shapes: dict[str, tuple[int, ...]]) -> Iterator[str]:
     """Yield what is wrong with an episode; `shapes` are those of the first ones, and new keys are added to them."""
     arrays = {"actions": episode.actions, "states": episode.states}
+    for key in ("expert_actions", "robot_states"):
+        arrays |= {} if (values := getattr(episode, key)) is None else {key: values}
     arrays |= {f"obs/{key}": values for key, values in episode.obs.items()}
     for key, values in arrays.items():
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            yield f"/{key} has values that are not finite"
+        if fault := value_fault(key.removeprefix("obs/"), values):
+            yield f"/{key} {fault}"
         if shapes.setdefault(key, values.shape[1:]) != values.shape[1:]:
             yield f"/{key} holds {values.shape[1:]}; expected {shapes[key]} as in the others"
     if missing := sorted(shapes.keys() - arrays.keys()):
@@ -238,6 +233,7 @@ def filter_demos(
     writer = DemoWriter(
         target, {**read_header(file), "filter": f"without {' and '.join(dropped) or 'nothing'}"}
     )
+    writer.discard_parts()  # of an interrupted call, perhaps with another file
     count = 0
     for name, episode in read_episodes(file):
         if success_only and not episode.success:
@@ -299,18 +295,15 @@ def describe(file: Path) -> str:
     Raises:
         DemoError: It is not a demonstration file.
     """
-    if not file.is_file():
-        raise DemoError(f"{file}: no such file")
     with open_demo_file(file) as handle:
-        names = demo_names(handle, file)
-        data = handle["data"]
-        steps = [len(data[name]["actions"]) if "actions" in data[name] else 0 for name in names]
-        obs = data[names[0]].get("obs", {}) if names else {}
-        colours = [key for key in obs if key.endswith("_rgb")]
-        images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3]) if colours else "no images"
-        failed = data.attrs.get("num_failed_attempts", "unknown")
-        pairing = data.attrs.get("pairing", "libero")
-        models = json.loads(data.attrs.get("models", "{}")).get("pack", "unknown")
-    parts = (f"{len(names)} demonstrations", f"{sum(steps)} steps", images, f"failed attempts: {failed}")
+        names, header = demo_names(handle, file), file_attributes(handle, file)
+        obs = handle["data"][names[0]].get("obs", {}) if names else {}
+        colours = [obs[key].shape[1:3] for key in obs if key.endswith("_rgb")]
+    steps = sum(demo_lengths(file))
+    images = "x".join(map(str, colours[0])) + " pixels" if colours else "no images"
+    models = json_attribute(header, "models", file).get("pack", "unknown")
+    failed = header.get("num_failed_attempts", "unknown")
+    parts = (f"{len(names)} demonstrations", f"{steps} steps", images, f"failed attempts: {failed}")
+    pairing = header.get("pairing", "libero")
     more = f"pairing: {pairing}, models: {models}, {show_bytes(file.stat().st_size)}"
     return f"{file}: {', '.join(parts)}, {more}"

@@ -4,7 +4,6 @@ Demonstration k of a task depends on its configuration and on k alone: not on th
 recorded before, or on how often the recording was interrupted.
 """
 
-import shutil
 import sys
 import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -18,7 +17,8 @@ from tqdm import tqdm
 
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import GENERATOR, DemoConfig, RecordingJob
-from libero_env.demos.read import Pairing
+from libero_env.demos.contents import Pairing
+from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import (
     BATCH,
     RecorderCache,
@@ -27,11 +27,14 @@ from libero_env.demos.record import (
     record_chunk,
     record_chunk_in_worker,
 )
-from libero_env.errors import DemoError
+from libero_env.demos.write import OtherRecordingError
+from libero_env.errors import DemoError, InvalidInputError
 from libero_env.parallel import cpu_count, progress_bar, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.sim.scene import FAST
 from libero_env.tasks import Task, get_suite
+
+_WAIT_SECONDS = 600.0  # between two lines about the process that is waited for
 
 # A chunk is the position of a job, and the demonstrations of it to record together; a report on it begins likewise.
 _Chunk = tuple[int, list[int]]
@@ -145,6 +148,10 @@ def make_demos(
     Raises:
         DemoError: An existing file was recorded with another configuration, or a file cannot be written.
     """
+    if workers < 0:
+        raise InvalidInputError(
+            f"workers is {workers}; expected a number of processes, or 0 for one per core"
+        )
     reports = {job.path: RecordingReport(n) for job in jobs}
     missing = [job for job in jobs if not _is_complete(job, n)]
     with ExitStack() as locks:
@@ -254,27 +261,44 @@ def _is_complete(job: RecordingJob, n: int) -> bool:
 
 
 def _remove_outdated(job: RecordingJob) -> None:
-    """Remove a file or parts that are broken, or were recorded with an older version of the scene or the expert."""
+    """Remove a file or parts that are broken, or were recorded with an older version of the scene or the expert.
+
+    One that merely cannot be opened now stays.
+    """
     writer = job.writer()
     try:
         writer.recorded()
-    except DemoError as error:
-        tqdm.write(f"recording again: {error}")
+    except (BrokenDemoError, OtherRecordingError) as error:
+        tqdm.write(f"recording again: {error}", file=sys.stderr)
         job.path.unlink(missing_ok=True)
-        shutil.rmtree(writer.parts, ignore_errors=True)
+        writer.discard_parts()
 
 
 @contextmanager
 def _recording_lock(folder: Path) -> Iterator[None]:
     """Let one process at a time record in a folder; the lock of a process that was killed is free."""
-    folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / ".recording.lock")
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0.1)
     except Timeout:
-        tqdm.write(f"another process records demonstrations in {folder}; waiting for it")
-        lock.acquire()
+        _wait_for(lock, folder)
+    except OSError as error:
+        raise DemoError(
+            f"{folder}: demonstrations cannot be recorded there ({error.strerror or error}); choose another folder"
+        ) from error
     try:
         yield
     finally:
         lock.release()
+
+
+def _wait_for(lock: FileLock, folder: Path) -> None:
+    """Wait while another process records, as long as that takes; say so now and every ten minutes."""
+    while True:
+        tqdm.write(f"another process records demonstrations in {folder}; waiting for it", file=sys.stderr)
+        try:
+            lock.acquire(timeout=_WAIT_SECONDS)
+            return
+        except Timeout:
+            continue

@@ -16,11 +16,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from libero_env.demos.curate import read_episodes, read_header, recorded_task
+from libero_env.demos.curate import read_episodes, recorded_task
+from libero_env.demos.hdf5 import BrokenDemoError
+from libero_env.demos.header import json_attribute, read_header
 from libero_env.demos.lerobot_layout import OWN, PUBLISHED, ExportedEpisode, Layout
 from libero_env.demos.lerobot_v2 import ImageDatasetWriter
 from libero_env.demos.lerobot_v3 import DatasetWriter, write_json
-from libero_env.demos.read import BrokenDemoError
 from libero_env.demos.regenerate import Regeneration, regenerate
 from libero_env.demos.write import Episode
 from libero_env.errors import DemoError, UnknownNameError
@@ -132,11 +133,8 @@ def _check_absent(root: Path) -> None:
 
 
 def _language(file: Path) -> str:
-    header = read_header(file)
-    try:
-        return json.loads(header["problem_info"])["language_instruction"]
-    except (KeyError, ValueError):
-        return recorded_task(file).language
+    stated = json_attribute(read_header(file), "problem_info", file).get("language_instruction")
+    return stated if isinstance(stated, str) else recorded_task(file).language
 
 
 def _exported(where: str, episode: Episode, pairing: str, labels: str) -> ExportedEpisode:
@@ -156,8 +154,9 @@ def _exported(where: str, episode: Episode, pairing: str, labels: str) -> Export
 
 def _recorded_models(files: Sequence[Path]) -> list[Any]:
     """Return the models that the files state, each once; older files do not."""
-    found = {str(read_header(file).get("models", "")) for file in files} - {""}
-    return [json.loads(text) for text in sorted(found)]
+    found = [json_attribute(read_header(file), "models", file) for file in files]
+    texts = {json.dumps(models, sort_keys=True): models for models in found if models}
+    return [texts[text] for text in sorted(texts)]
 
 
 def _write_origin(root: Path, layout: Layout, how: dict[str, Any]) -> None:

@@ -18,7 +18,8 @@ from typing import Any, Literal
 import numpy as np
 
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
-from libero_env.demos.curate import read_episodes, read_header, recorded_robot, recorded_task
+from libero_env.demos.curate import read_episodes, recorded_robot, recorded_task
+from libero_env.demos.header import read_header
 from libero_env.demos.lerobot_layout import ExportedEpisode
 from libero_env.demos.replay import checked_fixtures
 from libero_env.demos.write import Episode

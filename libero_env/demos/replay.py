@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.curate import read_episodes, read_header, recorded_robot, recorded_task
+from libero_env.demos.contents import demo_number
+from libero_env.demos.curate import read_episodes, recorded_robot, recorded_task
+from libero_env.demos.hdf5 import BrokenDemoError
+from libero_env.demos.header import read_header
 from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
-from libero_env.demos.read import BrokenDemoError, demo_number
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
@@ -171,10 +173,13 @@ def rerun_actions(file: Path, target: Path) -> Path:
         The new file.
 
     Raises:
-        DemoError: The file is broken or does not fit its task's scene.
+        DemoError: The file is broken or does not fit its task's scene, or the target exists.
     """
+    if target.exists():
+        raise DemoError(f"{target} exists; choose another name or remove it")
     renderer = _renderer(file, RenderConfig(()))
     writer, world = DemoWriter(target, read_header(file)), renderer.env.world
+    writer.discard_parts()  # of an interrupted call, perhaps with another file
     try:
         for name, episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
             renderer.place_fixtures(checked_fixtures(file, name, episode, renderer.scene))

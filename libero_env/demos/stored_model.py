@@ -33,6 +33,9 @@ _TEXTURE_FIELDS = (
 )
 
 
+MAX_POSITION = 1e6  # [m] of a body in a stored model
+
+
 def spec_without_textures(
     problem: Problem, pack: Pack | None = None, drawing: str | None = None, robot: str = DEFAULT_ROBOT
 ) -> mujoco.MjSpec:
@@ -110,7 +113,7 @@ def read_fixture_poses(xml: str, scene: Scene, where: str = "the stored model") 
         Fixture -> pose (7,), pos and quat wxyz; without the fixtures that are missing.
 
     Raises:
-        DemoError: The text is not XML.
+        DemoError: The text is not XML, or a pose is no pose.
     """
     try:
         root = ElementTree.fromstring(xml)
@@ -120,6 +123,21 @@ def read_fixture_poses(xml: str, scene: Scene, where: str = "the stored model") 
     for body in root.iter("body"):
         name = body.get("name", "").removesuffix(f"_{ROOT_BODY}")
         if name in scene.fixtures:
-            numbers = f"{body.get('pos', '0 0 0')} {body.get('quat', '1 0 0 0')}".split()
-            poses[name] = np.array([float(number) for number in numbers])
+            poses[name] = _pose(body, f"{where}, body {body.get('name')}")
     return poses
+
+
+def _pose(body: ElementTree.Element, where: str) -> np.ndarray:
+    """Return the pose of a body, (7,) pos and quat wxyz."""
+    texts = body.get("pos", "0 0 0").split(), body.get("quat", "1 0 0 0").split()
+    try:
+        pose = np.array([float(number) for number in sum(texts, [])])
+    except ValueError as error:
+        raise DemoError(f"{where}: {error}; expected numbers in pos and quat") from None
+    if [len(numbers) for numbers in texts] != [3, 4] or not (np.abs(pose) <= MAX_POSITION).all():
+        raise DemoError(
+            f"{where}: pos and quat are {texts}; expected 3 and 4 numbers of at most {MAX_POSITION:g}"
+        )
+    if np.linalg.norm(pose[3:]) < 1e-6:
+        raise DemoError(f"{where}: quat is zero; expected a rotation")
+    return pose

@@ -16,16 +16,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from libero_env.demos.read import (
-    LOW_DIM_KEYS,
-    BrokenDemoError,
-    check_demo,
-    demo_files,
-    demo_names,
-    demo_number,
-    is_image,
-    open_demo_file,
-)
+from libero_env.demos.contents import LOW_DIM_KEYS, check_demo, demo_names, demo_number, is_image, value_fault
+from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
+from libero_env.demos.header import file_attributes
+from libero_env.demos.read import demo_files
 from libero_env.errors import DemoError
 from libero_env.storage import atomic_path
 
@@ -82,6 +76,10 @@ class Episode:
         return self.actions if self.expert_actions is None else self.expert_actions
 
 
+class OtherRecordingError(DemoError):
+    """A file that was recorded with another configuration."""
+
+
 class DemoWriter:
     """Writes one demonstration file.
 
@@ -105,12 +103,19 @@ class DemoWriter:
         """
         return {demo_number(name) for _, name in self._sources()}
 
+    def discard_parts(self) -> None:
+        """Remove the parts that an interrupted recording left."""
+        if self.parts.is_dir() and not self.parts.is_symlink():
+            shutil.rmtree(self.parts)
+
     def write(self, index: int, episode: Episode) -> Path:
         """Write demonstration number `index`; it is complete on the disk when this returns.
 
         Raises:
-            DemoError: It cannot be written (disk full, no permission); earlier demonstrations are intact.
+            DemoError: It cannot be written (disk full, no permission), or has values that no reader would take;
+                earlier demonstrations are intact.
         """
+        _check_values(episode, f"{self.path}: demo_{index}")
         target = self.parts / f"demo_{index:05d}.hdf5"
         try:
             with atomic_path(target, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
@@ -118,7 +123,7 @@ class DemoWriter:
                 data.attrs.update(self.header)
                 self._write_demo(data.create_group(f"demo_{index}"), episode)
                 _write_counts(data)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # h5py raises either where the disk is full
             raise DemoError(
                 f"{target}: demonstration {index} cannot be written ({error}); earlier ones stay readable in "
                 f"{self.parts}. Free some space and start again: recording resumes from there"
@@ -142,7 +147,9 @@ class DemoWriter:
                     with h5py.File(file, "r") as part:
                         part.copy(f"data/{name}", data)  # copies compressed bytes as they are
                 _write_counts(data)
-        except OSError as error:
+                if self.path.exists():
+                    shutil.copymode(self.path, temporary)
+        except (OSError, RuntimeError) as error:
             raise DemoError(
                 f"{self.path}: cannot be written ({error}); all demonstrations are still in {self.parts}"
             ) from error
@@ -168,7 +175,7 @@ class DemoWriter:
             names = demo_names(handle, file)
             for name in names:
                 check_demo(handle["data"][name], file, name, handle["data"][name].get("obs", ()))
-            self._check_header(file, dict(handle["data"].attrs))
+            self._check_header(file, file_attributes(handle, file))
         for name in names:
             if name not in seen:
                 seen.add(name)
@@ -178,7 +185,7 @@ class DemoWriter:
         for key in _CONFIG_KEYS if self.header else ():
             here, expected = (_plain(values.get(key)) for values in (found, self.header))
             if here != expected:
-                raise DemoError(
+                raise OtherRecordingError(
                     f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not "
                     f"{shorten(repr(expected), 80)}; choose another file or remove this one"
                 )
@@ -260,10 +267,17 @@ def make_header(
 
 
 def _write_counts(data: h5py.Group) -> None:
-    demos = [group for name, group in data.items() if name.startswith("demo_")]
+    demos = list(data.values())
     data.attrs["num_demos"] = len(demos)
     data.attrs["total"] = int(sum(group.attrs["num_samples"] for group in demos))
     data.attrs["num_failed_attempts"] = int(sum(group.attrs.get("failed_attempts", 0) for group in demos))
+
+
+def _check_values(episode: Episode, where: str) -> None:
+    arrays = {"actions": episode.actions, "expert_actions": episode.expert_actions, "states": episode.states}
+    for key, values in {**arrays, "robot_states": episode.robot_states, **episode.obs}.items():
+        if values is not None and (fault := value_fault(key, np.asarray(values))):
+            raise DemoError(f"{where}/{key} {fault}; it is not written")
 
 
 def _with_ee_states(obs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -130,16 +130,22 @@ class SequenceVLDataset:
         cls, demos: Iterable[Demo], lengths: list[int], spec: PolicySpec, language: Tensor, task_id: int
     ) -> "SequenceVLDataset":
         """Return a dataset whose tensors are filled one demonstration after the other."""
-        frames, end = sum(lengths), 0
+        frames, end, rows = sum(lengths), 0, slice(0, 0)
         images = torch.empty(frames, len(spec.views), *spec.image_size, 3, dtype=torch.uint8)
         proprio = {name: torch.empty(frames, size) for name, size in spec.proprio.items()}
         actions = torch.empty(frames, spec.action_dim)
         for demo in demos:
             rows = slice(end, end + len(demo))
+            if rows.stop > frames:
+                break
             images[rows], readings, actions[rows] = demo_tensors(demo, spec)
             for name, reading in readings.items():
                 proprio[name][rows] = reading
             end = rows.stop
+        if rows.stop != frames:
+            raise DataError(
+                f"{rows.stop} frames were read where {frames} were counted: a file was changed meanwhile"
+            )
         return cls(images, proprio, actions, last_frames(lengths), language, task_id, spec.seq_len)
 
     def __len__(self) -> int:

@@ -11,12 +11,11 @@ The batches are bitwise the same. `auto` decides for each task when its windows 
 rehearsal fill the GPU first, then host memory, then the disk.
 """
 
-import os
-from pathlib import Path
-
 import torch
 from torch import Tensor
 
+from libero_env.parallel import host_memory
+from libero_env.storage import show_bytes
 from lifelong.data import frame_cache
 from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.robomimic_backend import RobomimicWindows
@@ -53,7 +52,7 @@ def open_windows(
 
     Raises:
         DemoError: The file is broken.
-        DataError: The file does not fit the spec, or the memory or backend is unknown or not available.
+        DataError: The file does not fit the spec or the memory, or the memory or backend is unknown or not available.
     """
     device = torch.device(device)
     for key, value, valid in (("memory", memory, MEMORY), ("backend", backend, BACKENDS)):
@@ -65,6 +64,8 @@ def open_windows(
         memory = choose_memory(source.nbytes(), device)
     if memory == "pinned" and device.type != "cuda":
         raise DataError(f"data.memory=pinned needs a GPU, and device={device}; valid: auto, host, mmap")
+    if memory != "mmap":
+        _check_fits(source, memory, device)
     if memory == "mmap":
         dataset = frame_cache.open_mapped(source, language=language, task_id=task_id)
     else:
@@ -73,6 +74,20 @@ def open_windows(
         return dataset.to(device)
     pin = device.type == "cuda" and memory in ("pinned", "mmap")
     return dataset.with_batches_on(device, pin_memory=pin) if device.type != "cpu" else dataset
+
+
+def _check_fits(source: DemoSource, memory: str, device: torch.device) -> None:
+    """Raise DataError if the frames are more than what is free; they go through host memory to the GPU."""
+    places = {"host memory": host_memory()[0]}
+    if memory == "device" and device.type == "cuda":
+        places["GPU memory"] = torch.cuda.mem_get_info(device)[0]
+    needed = source.nbytes()
+    for place, free in places.items():
+        if needed > free:
+            raise DataError(
+                f"{source.path} needs {show_bytes(needed)} of {place} and {show_bytes(free)} are free; set "
+                "data.memory=mmap, a smaller data.image_size or fewer data.demos"
+            )
 
 
 def choose_memory(nbytes: int, device: torch.device) -> str:
@@ -85,26 +100,3 @@ def choose_memory(nbytes: int, device: torch.device) -> str:
     if nbytes > free - max(_HOST_RESERVE * total, _HOST_RESERVE_BYTES):
         return "mmap"
     return "pinned" if device.type == "cuda" else "host"
-
-
-def host_memory() -> tuple[int, int]:
-    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    free = total // 2  # where the system does not report it
-    meminfo = Path("/proc/meminfo")
-    if meminfo.exists():
-        lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
-        free = int(lines["MemAvailable"].split()[0]) * 1024
-    limit, used = (_cgroup_value(name) for name in ("memory.max", "memory.current"))
-    if limit is not None and used is not None and limit < total:
-        return min(free, max(limit - used, 0)), limit
-    return free, total
-
-
-def _cgroup_value(name: str) -> int | None:
-    """Return a value of this process's container (cgroup v2); None where there is none."""
-    try:
-        text = (Path("/sys/fs/cgroup") / name).read_text().strip()
-    except OSError:
-        return None
-    return int(text) if text.isdecimal() else None

@@ -7,11 +7,14 @@ import contextlib
 import io
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 from torch import Tensor
 
-from libero_env.demos.read import demo_files, demo_names, open_demo_file
+from libero_env.demos.contents import check_demo, demo_names, read_pairing
+from libero_env.demos.hdf5 import open_demo_file, read_attribute
+from libero_env.demos.read import demo_files
 from lifelong.data.source import DemoSource, check_indices, check_language
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation
@@ -49,7 +52,10 @@ class RobomimicWindows:
         self.source, self.task_id, self.seq_len = source, task_id, source.spec.seq_len
         self.device = torch.device(device)
         self.language = check_language(language, source.spec)
-        next(source.demos())  # raises DataError if the file does not fit
+        for demo in source.demos():  # raises DataError if one does not fit
+            last = demo
+        if not sum(source.lengths()):
+            raise DataError(f"{source.path}: {last.name} and all others have one step; expected two or more")
         self._labels, self._shift = self._layout()
         self._windows = _sequence_dataset(source, self._labels, self.seq_len + self._shift)
         lengths = torch.tensor(source.lengths())
@@ -66,7 +72,9 @@ class RobomimicWindows:
         if files != [self.source.path]:
             raise DataError(f"{self.source.path}: robomimic reads single files; use data.backend=native")
         with open_demo_file(files[0]) as file:
-            names = demo_names(file, files[0])[: self.source.limit]
+            names = demo_names(file, files[0])
+            self._check_all(file, names)
+            names = names[: self.source.limit]
             labelled = {"expert_actions" in file["data"][name] for name in names}
             if self.source.labels == "expert" and len(labelled) > 1:
                 raise DataError(
@@ -74,10 +82,25 @@ class RobomimicWindows:
                     "use data.labels=executed or data.backend=native"
                 )
             expert = self.source.labels == "expert" and True in labelled
-            shifted = (
-                self.source.pairing == "aligned" and file["data"].attrs.get("pairing", "libero") == "libero"
-            )
+            shifted = self.source.pairing == "aligned" and read_pairing(file, files[0]) == "libero"
         return ("expert_actions" if expert else "actions"), int(shifted)
+
+    def _check_all(self, file: h5py.File, names: list[str]) -> None:
+        """Check what robomimic takes as it is: all demonstrations of the file, and the lengths that they state."""
+        path = self.source.path
+        if other := sorted(set(file["data"]) - set(names)):
+            raise DataError(
+                f"{path}: robomimic takes data/{other[0]} for a demonstration; use data.backend=native"
+            )
+        for name in names:
+            group = file["data"][name]
+            check_demo(group, path, name, [*self.source.spec.views, *self.source.spec.proprio])
+            stated, steps = read_attribute(group, "num_samples", f"{path}: {name}"), len(group["actions"])
+            if stated != steps:
+                raise DataError(
+                    f"{path}: {name} has {steps} steps and the attribute num_samples {stated}, which robomimic relies "
+                    "on; use data.backend=native"
+                )
 
     def __len__(self) -> int:
         """Return the number of windows, W."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
-from libero_env.demos.read import LOW_DIM_KEYS
+from libero_env.demos.contents import LOW_DIM_KEYS
 from libero_env.validation import OneOf, validate_arguments
 from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.errors import ConfigError

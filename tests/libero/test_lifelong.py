@@ -110,7 +110,7 @@ def test_filter_key_selects_demonstrations(file, tmp_path):
         stored["mask/valid"] = np.array([b"demo_1"])
     dataset, _ = get_dataset(path, MODALITY, seq_len=2, filter_key="valid")
     assert (dataset.n_demos, len(dataset)) == (1, 4)
-    with pytest.raises(LiberoError, match="there is valid"):
+    with pytest.raises(LiberoError, match="valid: valid"):
         get_dataset(path, MODALITY, filter_key="train")
 
 

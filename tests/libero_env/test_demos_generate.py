@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from libero_env.demos.config import DemoConfig, RecordingJob, Variation
+from libero_env.demos.contents import demo_number
 from libero_env.demos.curate import read_episodes, read_header
 from libero_env.demos.generate import demo_path, ensure_demos, generate, make_demos
-from libero_env.demos.read import demo_number, read_demos
+from libero_env.demos.read import read_demos
 from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv

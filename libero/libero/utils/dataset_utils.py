@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.demos.read import demo_names, open_demo_file
+from libero_env.demos.contents import check_demo, demo_names, read_values, subset_names
+from libero_env.demos.hdf5 import check_memory, open_demo_file
+from libero_env.demos.header import file_attributes
 from libero_env.errors import DemoError
 
 
@@ -27,34 +29,33 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
     with open_demo_file(path) as file:
         names, data = demo_names(file, path), file["data"]
         if filter_key is not None:
-            names = _subset(file, filter_key)
-        lengths = np.array([len(data[name]["actions"]) for name in names])
-        actions = np.concatenate([data[name]["actions"][()] for name in names])
-        info = {
-            "demos": len(names),
-            "transitions": int(lengths.sum()),
-            "length_mean": float(lengths.mean()),
-            "length_std": float(lengths.std()),
-            "length_min": int(lengths.min()),
-            "length_max": int(lengths.max()),
-            "action_min": float(actions.min()),
-            "action_max": float(actions.max()),
-            "observations": {key: rows.shape[1:] for key, rows in data[names[0]].get("obs", {}).items()},
-            "attributes": {key: value for key, value in data.attrs.items() if key != "bddl_file_content"},
-            "structure": {name: _shapes(data[name]) for name in names},
-        }
+            names = subset_names(file, path, filter_key)
+        if not names:
+            raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0")
+        check_memory(
+            sum(check_demo(data[name], path, name, ()) for name in names), str(path), "choose a subset"
+        )
+        rows = [np.asarray(read_values(data[name], "actions", path, name, check=False)) for name in names]
+        lengths, actions = np.array([len(row) for row in rows]), np.concatenate(rows)
+        structure = {name: _shapes(data[name]) for name in names}
+        found, first = file_attributes(file, path), structure[names[0]]
+    info = {
+        "demos": len(names),
+        "transitions": int(lengths.sum()),
+        "length_mean": float(lengths.mean()),
+        "length_std": float(lengths.std()),
+        "length_min": int(lengths.min()),
+        "length_max": int(lengths.max()),
+        "action_min": float(actions.min()),
+        "action_max": float(actions.max()),
+        "observations": {key[4:]: shape[1:] for key, shape in first.items() if key.startswith("obs/")},
+        "attributes": {key: value for key, value in found.items() if key != "bddl_file_content"},
+        "structure": structure,
+    }
     for key, value in info.items() if verbose else ():
         if key != "structure":
             print(f"{key}: {value}")
     return info
-
-
-def _subset(file: Any, filter_key: str) -> list[str]:
-    """Return the names of the demonstrations in a subset."""
-    if (masks := file.get("mask")) is None or filter_key not in masks:
-        known = ", ".join(masks or ()) or "none"
-        raise DemoError(f"{file.filename}: no subset {filter_key!r} in mask; valid: {known}")
-    return [name.decode() for name in masks[filter_key][()]]
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:

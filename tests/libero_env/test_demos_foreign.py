@@ -1,0 +1,436 @@
+"""Demonstration files of strangers: what refers elsewhere, claims too much, or is no number is refused in one line."""
+
+import json
+import resource
+import shutil
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from libero_env.demos import hdf5
+from libero_env.demos.curate import (
+    describe,
+    examine,
+    filter_demos,
+    read_episodes,
+    recorded_robot,
+    recorded_task,
+)
+from libero_env.demos.generate import generate, make_demos
+from libero_env.demos.header import read_header
+from libero_env.demos.lerobot import export_lerobot
+from libero_env.demos.read import demo_lengths, iter_demos, read_demos
+from libero_env.demos.replay import rerun_actions
+from libero_env.demos.stored_model import read_fixture_poses
+from libero_env.demos.write import DemoWriter
+from libero_env.errors import DemoError, InvalidInputError
+from tests.harness.demos import episode, header, write
+
+pytestmark = pytest.mark.unit
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "foreign.hdf5", [episode(k, steps=4, size=8) for k in range(2)])
+
+
+def damaged(path, change):
+    with h5py.File(path, "r+") as handle:
+        change(handle)
+    return path
+
+
+def refused(path, *words, read=read_demos):
+    with pytest.raises(DemoError) as caught:
+        list(read(path) or ())
+    message = str(caught.value)
+    assert "\n" not in message and all(word in message for word in (path.name, *words)), message
+
+
+def put(key, value, **options):
+    def change(handle):
+        if key in handle:
+            del handle[key]
+        if isinstance(value, np.ndarray):
+            handle.create_dataset(key, data=value, **options)
+        else:
+            handle[key] = value
+
+    return change
+
+
+def attribute(key, value, group="data"):
+    def change(handle):
+        handle[group].attrs[key] = value
+
+    return change
+
+
+def external_storage(handle):
+    del handle["data/demo_0/obs/agentview_rgb"]
+    handle["data/demo_0/obs"].create_dataset(
+        "agentview_rgb", (4, 8, 8, 3), np.uint8, external=[("/etc/passwd", 0, 768)]
+    )
+
+
+def virtual(handle):
+    layout = h5py.VirtualLayout((4, 7), np.float64)
+    layout[:] = h5py.VirtualSource("elsewhere.hdf5", "x", (4, 7))
+    del handle["data/demo_0/actions"]
+    handle.create_virtual_dataset("data/demo_0/actions", layout)
+
+
+def loop(handle):
+    handle["data/demo_0/obs/again"] = handle["data"]
+
+
+def deep(handle):
+    handle.create_group("/".join(["x"] * 40))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            put("data/demo_1/actions", h5py.SoftLink("/data/demo_0/actions")),
+            ("data/demo_1/actions", "soft link"),
+        ),
+        (put("data/demo_1", h5py.SoftLink("/nowhere")), ("data/demo_1", "soft link")),
+        (put("data/demo_1", h5py.ExternalLink("/etc/passwd", "/data")), ("data/demo_1", "another file")),
+        (put("mask", h5py.ExternalLink("other.hdf5", "/data")), ("mask", "another file")),
+        (external_storage, ("data/demo_0/obs/agentview_rgb", "other files")),
+        (virtual, ("data/demo_0/actions", "other files")),
+        (loop, ("data/demo_0/obs/again", "within itself")),
+        (deep, ("too deep",)),
+        (put("data/demo_0/kind", np.dtype("f8")), ("data/demo_0/kind", "named type")),
+    ],
+)
+def test_a_file_stands_for_itself(path, change, words):
+    damaged(path, change)
+    for read in (read_demos, demo_lengths, read_header, read_episodes, describe):
+        refused(path, *words, read=read)
+
+
+def huge(handle):
+    del handle["data/demo_0/obs/agentview_rgb"]
+    handle["data/demo_0/obs"].create_dataset(
+        "agentview_rgb", (4, 1 << 19, 1 << 19, 3), np.uint8, chunks=(1, 64, 64, 3)
+    )
+
+
+def huge_fill(handle):
+    del handle["data/demo_0/states"]
+    handle.create_dataset("data/demo_0/states", (4, 1 << 40), np.float64, chunks=(4, 16), fillvalue=7.0)
+
+
+def huge_chunks(handle):
+    del handle["data/demo_0/states"]
+    handle.create_dataset("data/demo_0/states", (4, 9), np.float64, maxshape=(4, None), chunks=(4, 1 << 26))
+
+
+def references(handle):
+    put("data/demo_0/actions", np.full((4, 7), handle["data"].ref, h5py.ref_dtype))(handle)
+
+
+def ragged(handle):
+    del handle["data/demo_0/actions"]
+    handle.create_dataset("data/demo_0/actions", (4, 7), h5py.vlen_dtype(float))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (huge, ("obs/agentview_rgb", "3.3 TB", "not complete")),
+        (huge_fill, ("demo_0/states", "35.2 TB", "not complete")),
+        (huge_chunks, ("demo_0/states", "chunks of 2.1 GB")),
+        (references, ("demo_0/actions", "float")),
+        (ragged, ("demo_0/actions", "float")),
+        (put("data/demo_0/actions", np.zeros((4, 7), [("x", float)])), ("demo_0/actions", "float")),
+        (put("data/demo_0/actions", np.zeros((4, 7), complex)), ("demo_0/actions", "float")),
+        (put("data/demo_0/actions", np.zeros((4, 7), np.longdouble)), ("demo_0/actions", "64 bits")),
+        (put("data/demo_0/actions", np.zeros((4, 7), np.int64)), ("demo_0/actions", "float")),
+        (put("data/demo_0/actions", np.zeros((0, 7))), ("demo_0/actions", "empty")),
+        (put("data/demo_0/actions", 1.0), ("demo_0/actions", "empty")),
+        (put("data/demo_0/actions", h5py.Empty("f8")), ("demo_0/actions", "empty")),
+        (
+            put("data/demo_0/obs/agentview_rgb", np.zeros((4, 8, 8, 3), np.uint16)),
+            ("agentview_rgb", "8 bits"),
+        ),
+        (put("data/demo_01", h5py.Empty("f8")), ("demo_01", "demo_1", "same number")),
+    ],
+)
+def test_shapes_types_and_sizes_are_checked_before_memory_is_asked_for(path, change, words):
+    damaged(path, change)
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), hard))
+    try:
+        refused(path, *words)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def test_a_filter_of_a_plugin_is_refused(path):
+    def change(handle):
+        del handle["data/demo_0/actions"]
+        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plist.set_chunk((4, 7))
+        plist.set_filter(32001, h5py.h5z.FLAG_OPTIONAL, ())  # blosc
+        space = h5py.h5s.create_simple((4, 7))
+        h5py.h5d.create(handle["data/demo_0"].id, b"actions", h5py.h5t.NATIVE_DOUBLE, space, plist)
+
+    refused(damaged(path, change), "demo_0/actions", "filter 32001", "h5repack")
+
+
+@pytest.mark.parametrize("name", ["demo_\u00b2", "demo_x", "demo_", "demo_1_", "demo_" + "9" * 5000, "other"])
+def test_groups_of_other_names_are_no_demonstrations(path, name):
+    damaged(path, lambda handle: handle["data"].create_group(name))
+    assert [demo.name for demo in read_demos(path)] == ["demo_0", "demo_1"] and demo_lengths(path) == [4, 4]
+
+
+def test_thousands_of_demonstrations_are_read_in_the_order_of_their_numbers(tmp_path):
+    path = tmp_path / "many.hdf5"
+    with h5py.File(path, "w") as handle:
+        for k in reversed(range(3000)):
+            handle[f"data/demo_{k}/actions"] = np.zeros((1 + k % 3, 7))
+    start = time.monotonic()
+    assert demo_lengths(path) == [1 + k % 3 for k in range(3000)] and time.monotonic() - start < 10
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize(
+    "key", ["actions", "expert_actions", "states", "obs/ee_pos", "obs/joint_states", "obs/ee_states"]
+)
+def test_values_that_are_no_measurements_name_file_demonstration_key_and_step(path, key, bad):
+    damaged(path, lambda handle: handle[f"data/demo_1/{key}"].__setitem__((2, 1), bad))
+    labels = "executed" if key == "actions" else "expert"
+    refused(path, f"demo_1/{key}", "step 2", "expected", read=lambda p: read_demos(p, labels=labels))
+    refused(path, f"demo_1/{key}", "step 2", read=read_episodes)
+    assert any(f"demo_1/{key}" in fault and "step 2" in fault for fault in examine(path).faults)
+
+
+@pytest.mark.parametrize("dtype", [">f8", "<f4", ">f4", "<f2"])
+def test_floats_of_other_widths_and_byte_orders_are_the_same_numbers(path, dtype):
+    values = np.linspace(-1, 1, 28).reshape(4, 7).astype(dtype)
+    for key in ("actions", "expert_actions", "obs/joint_states"):
+        damaged(path, put(f"data/demo_0/{key}", values))
+    demo = read_demos(path)[0]
+    for found in (demo.actions, demo.obs["joint_states"]):
+        assert found.dtype.isnative
+        np.testing.assert_array_equal(found, values.astype(float))
+
+
+@pytest.mark.parametrize("stated", ["aligned", b"aligned", np.bytes_(b"libero"), "libero"])
+def test_a_pairing_may_be_stored_as_bytes(path, stated):
+    damaged(path, attribute("pairing", stated))
+    expected = stated if isinstance(stated, str) else stated.decode()
+    assert {demo.pairing for demo in read_demos(path)} == {expected}
+
+
+@pytest.mark.parametrize(
+    "stated", ["bogus", b"bogus", "", b"\xff\xfe", 1, [1.0, 2.0], ["aligned"], h5py.Empty("f8")]
+)
+def test_an_unknown_pairing_is_refused(path, stated):
+    damaged(path, attribute("pairing", stated))
+    for read in (read_demos, iter_demos, read_header, lambda p: demo_lengths(p, pairing="aligned")):
+        refused(path, "pairing", read=read)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("robot", "sawyer", ("robot", "sawyer", "libero")),
+        ("robot", 3, ("robot",)),
+        ("drawing", "crayon", ("drawing", "crayon")),
+        ("total", "many", ("total", "many")),
+        ("bddl_file_content", 7, ("bddl_file_content",)),
+        ("models", np.zeros(3), ("models",)),
+        ("anything", h5py.Reference(), ("anything", "neither text nor numbers")),
+        ("anything", b"\xff\xfe", ("anything", "damaged")),
+    ],
+)
+def test_attributes_of_other_types_are_named(path, key, value, words):
+    damaged(path, attribute(key, value))
+    for read in (read_header, examine, recorded_robot, describe):
+        refused(path, *words, read=lambda p, read=read: [read(p)])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "[" * 100_000, "7"])
+def test_attributes_of_json_are_checked(path, text, tmp_path):
+    pytest.importorskip("pyarrow"), pytest.importorskip("av")
+    damaged(path, attribute("problem_info", text))
+    refused(path, "problem_info", "JSON", read=lambda p: export_lerobot([p], tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+    damaged(path, attribute("models", text))
+    refused(path, "models", "JSON", read=describe)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("success", "no"),
+        ("success", 2),
+        ("success", np.nan),
+        ("fixtures", np.full((2, 7), np.nan)),
+        ("fixtures", np.zeros((2, 7))),
+        ("fixtures", np.zeros(7)),
+        ("fixtures", "there"),
+        ("failed_attempts", "many"),
+        ("failed_attempts", -1),
+        ("model_file", 3.0),
+    ],
+)
+def test_attributes_of_a_demonstration_are_checked(path, key, value):
+    damaged(path, attribute(key, value, "data/demo_1"))
+    refused(path, "demo_1", key, read=read_episodes)
+
+
+class _Scene:
+    fixtures = ("stove",)
+
+
+@pytest.mark.parametrize(
+    ("xml", "words"),
+    [
+        ("<mujoco", "not XML"),
+        ('<x><body name="stove_main" pos="a b c"/></x>', "expected numbers"),
+        ('<x><body name="stove_main" pos="1 2"/></x>', "3 and 4 numbers"),
+        ('<x><body name="stove_main" pos="nan 2 3"/></x>', "3 and 4 numbers"),
+        ('<x><body name="stove_main" quat="0 0 0 0"/></x>', "expected a rotation"),
+    ],
+)
+def test_fixtures_of_a_stored_model_are_poses(xml, words):
+    with pytest.raises(DemoError, match=words):
+        read_fixture_poses(xml, _Scene(), "x.hdf5: demo_0/model_file")
+
+
+def heap_zeroed(path):
+    """Zero the first object of the heap of texts, on which the HDF5 library would run for ever."""
+    content = bytearray(path.read_bytes())
+    start = content.index(b"GCOL")
+    content[start + 16 : start + 48] = bytes(32)
+    path.write_bytes(content)
+    return path
+
+
+def test_a_damaged_heap_of_texts_is_refused_instead_of_read_for_ever(path):
+    refused(heap_zeroed(path), "texts", "damaged")
+
+
+def test_a_heap_within_data_is_no_heap(path):
+    damaged(path, lambda handle: handle["data/demo_0/obs/agentview_rgb"].attrs.create("x", "text"))
+    values = np.frombuffer((b"GCOL\x01\0\0\0" + bytes(40)) * 16, np.uint8).reshape(4, 8, 8, 3)
+    damaged(path, put("data/demo_0/obs/agentview_rgb", values))
+    assert (read_demos(path)[0].obs["agentview_rgb"][:, ::-1] == values).all()
+
+
+def test_bytes_at_random_are_read_or_refused(path, tmp_path):
+    whole, rng = path.read_bytes(), np.random.default_rng(3)
+    for k in range(60):
+        content = np.frombuffer(whole, np.uint8).copy()
+        places = rng.integers(0, min(len(content), 8000), 6)
+        content[places] = rng.integers(0, 256, 6)
+        other = tmp_path / f"{k}.hdf5"
+        other.write_bytes(content.tobytes())
+        for read in (read_demos, demo_lengths, read_episodes, describe):
+            try:
+                list(read(other))
+            except DemoError as error:
+                assert other.name in str(error)
+
+
+def test_a_file_is_checked_once_and_again_when_it_changes(path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(hdf5, "_check_tree", lambda *args: calls.append(args) or [])
+    monkeypatch.setattr(hdf5, "_SETTLED", -60.0)
+    for _ in range(3):
+        read_demos(path)
+    assert len(calls) == 1
+    damaged(path, attribute("x", "y"))
+    read_demos(path)
+    assert len(calls) == 2
+
+
+def test_more_than_the_free_memory_is_refused(path, monkeypatch):
+    monkeypatch.setattr(hdf5, "host_memory", lambda: (3000, 10_000))
+    monkeypatch.setattr(hdf5, "FREE_BYTES", 0)
+    refused(path, "2 demonstrations", "3.0 kB are free")
+    refused(path, "longest demonstration", "are free", read=iter_demos)
+    refused(path, "demo_0", "are free", read=read_episodes)
+
+
+def test_a_file_that_cannot_be_opened_now_is_not_called_broken(path, monkeypatch):
+    def busy(*args):
+        raise BlockingIOError(11, "unable to lock file")
+
+    monkeypatch.setattr(h5py, "File", busy)
+    with pytest.raises(DemoError, match="being written") as caught:
+        read_demos(path)
+    assert not isinstance(caught.value, hdf5.BrokenDemoError)
+
+
+def test_a_part_that_cannot_be_opened_now_is_kept(tmp_path, monkeypatch):
+    writer = DemoWriter(tmp_path / "x.hdf5", header())
+    part = writer.write(0, episode(0))
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py, "File", lambda *args: (_ for _ in ()).throw(PermissionError(13, "denied")))
+        with pytest.raises(DemoError, match="denied"):
+            writer.recorded()
+    assert part.exists() and writer.recorded() == {0}
+
+
+def test_parts_of_another_file_do_not_get_into_a_filtered_one(path, tmp_path):
+    target = tmp_path / "filtered.hdf5"
+    stale = DemoWriter(target, {**read_header(path), "filter": "without nothing"})
+    for k in range(5):
+        stale.write(k, episode(10 + k))
+    assert len(filter_demos(path, target).lengths) == 2
+    with pytest.raises(DemoError, match="exists"):
+        rerun_actions(path, target)
+
+
+def test_what_no_reader_would_take_is_not_written(tmp_path):
+    bad = episode(0)
+    bad.states[3, 2] = np.nan
+    with pytest.raises(DemoError, match=r"demo_7/states .*step 3.*not written"):
+        DemoWriter(tmp_path / "x.hdf5", header()).write(7, bad)
+    assert not (tmp_path / "x.hdf5.parts").exists()
+
+
+def test_a_file_that_is_joined_again_keeps_its_permissions(path):
+    path.chmod(0o640)
+    writer = DemoWriter(path, header())
+    writer.write(2, episode(2, steps=4, size=8))
+    assert len(read_demos(writer.finish())) == 3 and path.stat().st_mode & 0o777 == 0o640
+
+
+def test_folders_that_cannot_be_written_are_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere" / "deeper")
+    for folder in ("file", "file/x", "link"):
+        with pytest.raises(DemoError, match="cannot be recorded there"):
+            generate("libero_object/0", 1, path=tmp_path / folder / "x.hdf5", workers=1, progress=False)
+
+
+@pytest.mark.parametrize("settings", [{"seed": -1}, {"pairing": "bogus"}, {"seed": True}])
+def test_settings_of_a_recording_are_checked(tmp_path, settings):
+    with pytest.raises(InvalidInputError, match=f"{next(iter(settings))} is"):
+        generate("libero_object/0", 1, path=tmp_path / "x.hdf5", **settings)
+    with pytest.raises(InvalidInputError, match="workers is -1"):
+        make_demos([], 1, workers=-1)
+
+
+def test_the_task_of_a_stranger_may_be_named_anything(path):
+    for name in ("../../../etc/passwd", "\u202e", "x" * 10_000, "/", "libero_object/none.bddl"):
+        damaged(path, attribute("bddl_file_name", name))
+        damaged(path, attribute("bddl_file_content", ""))
+        refused(path, "bddl", read=recorded_task)
+
+
+def test_a_copy_has_the_same_header(path, tmp_path):
+    shutil.copy(path, tmp_path / "copy.hdf5")
+    found = read_header(tmp_path / "copy.hdf5")
+    assert found == read_header(path) and json.loads(found["problem_info"])["domain_name"] == "robosuite"
