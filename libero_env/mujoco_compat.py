@@ -1,9 +1,30 @@
-"""Differences between versions of MuJoCo."""
+"""Differences between versions of MuJoCo, and where its warnings go."""
 
+import logging
+import re
 from typing import Any
 
 import mujoco
 import numpy as np
+
+_warned: set[str] = set()
+
+
+def log_warnings() -> None:
+    """Pass MuJoCo's warnings to the logger `libero_env.mujoco`, each kind once, unless a user receives them already.
+
+    By default MuJoCo writes them to the file MUJOCO_LOG.TXT in the working directory.
+    """
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_log_warning)
+
+
+def _log_warning(text: str) -> None:
+    """Log a warning; MuJoCo calls it from any thread, and an exception would end the process."""
+    kind = re.sub(r"[-+]?\d+(\.\d+)?|nan|inf", "N", text)
+    if kind not in _warned:
+        _warned.add(kind)
+        logging.getLogger("libero_env.mujoco").warning("MuJoCo: %s", " ".join(text.split()))
 
 
 def delete(spec: mujoco.MjSpec, element: Any) -> None:

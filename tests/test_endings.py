@@ -5,13 +5,16 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 
-from libero_env import parallel
+from libero_env import mujoco_compat, parallel
 from libero_env.cli import ending
 from libero_env.errors import LiberoError, code_of
 from libero_env.parallel import spawn_pool
@@ -269,6 +272,48 @@ def test_names_that_are_none(words, message, here, capsys):
     found = capsys.readouterr().err
     assert found.startswith("error: ") and message in found and found.count("\n") == 1
     assert not list(here.parent.glob("*.yaml"))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    "address",
+    [
+        "ws://",
+        "ws://host:99999",
+        "ws://[::1",
+        "ws://host:0x",
+        "ws://a b:1",
+        "vla-eval://",
+        "gr00t://",
+        "gr00t://host",
+    ],
+)
+def test_what_is_no_address_is_refused_at_once(address, here, capsys):
+    assert cli.main(["eval", address, "--suite", "libero_goal/0"]) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert found.startswith(f"error: {address} is no address; write ") and found.count("\n") == 1
+
+
+@pytest.mark.sim
+def test_warnings_of_mujoco_are_logged_once_and_make_no_file(here, caplog):
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    mujoco_compat.log_warnings()
+
+    def break_down() -> None:
+        data = mujoco.MjData(model)
+        data.qvel[3] = np.nan
+        mujoco.mj_step(model, data)
+
+    mujoco_compat._warned.clear()
+    break_down()
+    thread = threading.Thread(target=break_down)
+    thread.start()
+    thread.join()
+    assert [record.name for record in caplog.records] == ["libero_env.mujoco"]
+    assert "Nan, Inf or huge value in QVEL at DOF 3" in caplog.text
+    assert not (here / "MUJOCO_LOG.TXT").exists()
 
 
 @pytest.mark.unit

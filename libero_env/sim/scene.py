@@ -19,7 +19,7 @@ from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.mujoco_compat import set_damping
+from libero_env.mujoco_compat import log_warnings, set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.sim.model_checks import check_models
 from libero_env.tasks.checks import check_problem
@@ -144,6 +144,7 @@ def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Sc
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
     spec = scene_spec(problem, pack, entities, drawing=drawing, robot=robot)
+    log_warnings()
     try:
         model = spec.compile()
     except ValueError as error:  # such as `repeated name 'table_visual' in geom`

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import ClosedEnvironmentError, LiberoError
-from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD
+from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnings
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.osc import REST, ArmIndex
 from libero_env.timing import SUBSTEPS
@@ -81,6 +81,7 @@ class Simulations(ABC):
     """
 
     def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = ()):
+        log_warnings()
         self.model, self.num = copy(model), num
         self.fixture_bodies = np.asarray(fixture_bodies, np.int64)
         poses = np.concatenate([model.body_pos, model.body_quat], axis=1)[self.fixture_bodies]

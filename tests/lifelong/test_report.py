@@ -464,7 +464,7 @@ def test_lines_of_many_methods_are_distinguishable():
 
 
 HOSTILE = [
-    r"$\frac{",
+    r"$\frac{$",
     "a $ b $ c_1^{",
     "\\",
     "<script>alert(1)</script>",

@@ -12,7 +12,7 @@ from libero_env.errors import LiberoError
 from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
 from libero_env.geometry import surface_points
-from libero_env.mujoco_compat import set_damping
+from libero_env.mujoco_compat import log_warnings, set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.sim.render import Renderer, RenderTarget
 
@@ -133,6 +133,7 @@ def _scene(item: ObjectModel) -> mujoco.MjModel:
     joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
     set_damping(joint, item.joint_damping)
     spec.attach(item.spec, frame=spec.worldbody.add_frame(), prefix=_PREFIX)
+    log_warnings()
     try:
         return spec.compile()
     except ValueError as error:

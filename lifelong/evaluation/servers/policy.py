@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Task, get_task
@@ -41,6 +42,28 @@ SCHEMES = {
     "vla-eval": ("ws", vla_eval_fields),
     "gr00t": ("tcp", groot_fields),
 }
+
+
+def checked_address(url: str, given: str) -> str:
+    """Return the URL of a server, if it is one.
+
+    Args:
+        url: URL with the scheme of the transport.
+        given: The address as the user has written it.
+
+    Raises:
+        ServerError: It has no host, or a port that cannot be.
+    """
+    try:
+        parts = urlsplit(url)
+        valid = bool(parts.hostname) and parts.port != 0 and not re.search(r"[\s\x00-\x1f]", url)
+        valid = valid and (parts.scheme != "tcp" or parts.port is not None)
+    except ValueError:  # a port out of range, half of an IPv6 address
+        valid = False
+    if not valid:
+        scheme = given.partition("://")[0]
+        raise ServerError(f"{given} is no address; write {scheme}://host:port, the port from 1 to 65535")
+    return url
 
 
 class ServerPolicy(PolicyUnderTest):
@@ -146,7 +169,7 @@ class ServerPolicy(PolicyUnderTest):
         scheme, found, rest = self.args.policy.partition("://")
         if not found or scheme not in SCHEMES:
             raise UnknownNameError("kind of server", scheme, SCHEMES)
-        address = f"{SCHEMES[scheme][0]}://{rest}"
+        address = checked_address(f"{SCHEMES[scheme][0]}://{rest}", self.args.policy)
         if scheme == "gr00t":
             return GrootWire(address, self.limits)
         dialect = VlaEvalDialect() if scheme == "vla-eval" else OpenpiDialect()
