@@ -7,13 +7,13 @@ needs no network.
 import errno
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from libero_env.assets.hub import DownloadError, Remote, broken_files, check_free_space
+from libero_env.assets.hub import DownloadError, Remote, broken_files, check_free_space, listed_files
 from libero_env.errors import MissingPackageError
 from libero_env.paths import cache_dir
 from libero_env.storage import atomic_write_text
@@ -48,17 +48,20 @@ def download(dest: Path | None = None, revision: str = REVISION) -> Path:
         endpoint = os.environ.get("HF_ENDPOINT")
         remote = _listing(hub.HfApi(endpoint=endpoint), revision)
         wrong = broken_files(folder, remote)
+        _check_own(folder, wrong)
         for _ in range(2):  # the second time for files that arrived broken
             if not wrong:
                 break
             check_free_space(folder, sum(remote[name].size for name in wrong))
             for name in wrong:
                 (folder / name).unlink(missing_ok=True)
-            hub.snapshot_download(
-                REPO, repo_type="dataset", revision=revision, local_dir=folder, endpoint=endpoint
-            )
+            # names of the checked listing: the library asks the server for another one
+            options = {"local_dir": folder, "endpoint": endpoint, "allow_patterns": wrong}
+            hub.snapshot_download(REPO, repo_type="dataset", revision=revision, **options)
             wrong = broken_files(folder, remote)
         if wrong:
+            for name in wrong:
+                (folder / name).unlink(missing_ok=True)
             raise DownloadError(
                 f"{len(wrong)} files in {folder} differ from what the Hub lists, such as {wrong[0]}: the server or "
                 "a proxy changes them, or the disk is failing; try again, or set HF_ENDPOINT to another server"
@@ -76,6 +79,15 @@ def read_manifest(folder: Path) -> tuple[str, dict[str, Remote]] | None:
         return None
 
 
+def _check_own(folder: Path, wrong: Sequence[str]) -> None:
+    """Check that no file of somebody else would be replaced: only those of an earlier download are."""
+    own = folder == default_folder().absolute() or read_manifest(folder) is not None
+    if not own and (existing := [name for name in wrong if (folder / name).exists()]):
+        raise DownloadError(
+            f"{folder / existing[0]} exists with other contents; name another folder with --dest, or remove the file"
+        )
+
+
 def _write_manifest(folder: Path, revision: str, remote: Mapping[str, Remote]) -> None:
     record = {
         "repo": REPO,
@@ -86,14 +98,25 @@ def _write_manifest(folder: Path, revision: str, remote: Mapping[str, Remote]) -
 
 
 def _listing(api: Any, revision: str) -> dict[str, Remote]:
-    entries = api.list_repo_tree(REPO, recursive=True, revision=revision, repo_type="dataset")
-    files = [entry for entry in entries if hasattr(entry, "blob_id")]  # entries without a blob are folders
-    if bad := [f.path for f in files if Path(f.path).is_absolute() or ".." in Path(f.path).parts]:
-        raise DownloadError(f"the server lists files outside the folder, such as {bad[0]}: do not trust it")
-    return {
-        f.path: Remote(f.lfs.size, "sha256", f.lfs.sha256) if f.lfs else Remote(f.size, "git", f.blob_id)
-        for f in files
-    }
+    source = f"{api.endpoint}: {REPO}"
+    try:
+        found = api.list_repo_tree(REPO, recursive=True, revision=revision, repo_type="dataset")
+        files = [entry for entry in found if hasattr(entry, "blob_id")]  # entries without a blob are folders
+        entries = [
+            {
+                "type": "file",
+                "path": file.path,
+                "size": file.size,
+                "oid": file.blob_id,
+                "lfs": file.lfs and {"oid": file.lfs.sha256, "size": file.lfs.size},
+            }
+            for file in files
+        ]
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        if isinstance(error, OSError):
+            raise  # some errors of the network are ValueErrors too
+        raise DownloadError(f"{source}: the server's listing cannot be read ({error!r})") from error
+    return listed_files(entries, source)
 
 
 @contextmanager

@@ -1,15 +1,12 @@
 """Download of the human demonstrations of the original benchmark: HDF5 files, pinned and verified."""
 
-import json
 import os
-import urllib.error
-import urllib.request
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 from urllib.parse import quote
 
-from libero_env.assets.http import TIMEOUT, fetch
-from libero_env.assets.hub import DownloadError, Remote, check_free_space
+from libero_env.assets.http import fetch, read_json
+from libero_env.assets.hub import DownloadError, Remote, check_free_space, listed_files
 from libero_env.paths import demos_dir
 from libero_env.tasks import get_suite, get_task
 
@@ -65,7 +62,7 @@ def download_demos(
     files = remote_files(names)
     remote: dict[str, Remote] = {}
     for suite in dict.fromkeys(file.partition("/")[0] for file in files):
-        remote |= dict(_list_suite(suite, revision))
+        remote |= _list_suite(suite, revision)
     if absent := [file for file in files if file not in remote]:
         raise DownloadError(f"{REPO} at revision {revision} has no {absent[0]}")
     missing = [file for file in files if not remote[file].matches(folder / file)]
@@ -92,21 +89,7 @@ def _partial_size(path: Path) -> int:
     return partial.stat().st_size if partial.is_file() else 0
 
 
-def _list_suite(suite: str, revision: str) -> Iterator[tuple[str, Remote]]:
-    """Yield the files that the server has of a suite, with their sizes and digests."""
+def _list_suite(suite: str, revision: str) -> dict[str, Remote]:
+    """Return the files that the server has of a suite, with their sizes and digests."""
     url = f"{_endpoint()}/api/datasets/{REPO}/tree/{quote(revision, safe='')}/{suite}?recursive=true"
-    try:
-        with urllib.request.urlopen(url, timeout=TIMEOUT) as response:
-            entries = json.load(response)
-    except urllib.error.HTTPError as error:
-        raise DownloadError(f"{url}: the server answers {error.code} {error.reason}") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "reason", error)
-        raise DownloadError(f"{url}: {reason}; no network? HF_ENDPOINT names another server") from error
-    for entry in entries:
-        path, lfs = PurePosixPath(entry["path"]), entry.get("lfs")
-        if path.is_absolute() or ".." in path.parts:
-            raise DownloadError(f"the server lists a file outside the folder, {path}: do not trust it")
-        if entry["type"] == "file":
-            digest = ("sha256", lfs["oid"]) if lfs else ("git", entry["oid"])
-            yield str(path), Remote(entry["size"], *digest)
+    return listed_files(read_json(url), url)

@@ -2,18 +2,18 @@
 
 import http.client
 import os
-import urllib.request
-import zipfile
+import urllib.error
 from pathlib import Path
 
 from tqdm import tqdm
 
 from libero.libero import get_path_dict
 from libero.libero.benchmark import get_benchmark
+from libero_env.assets.archive import unpack
 from libero_env.assets.download import REPO as HF_ASSETS_REPO_ID  # noqa: F401 - name of the original
 from libero_env.assets.download import download as _download_assets
-from libero_env.assets.http import fetch
-from libero_env.assets.hub import DownloadError
+from libero_env.assets.http import check_url, fetch, open_url
+from libero_env.assets.hub import DownloadError, check_names
 from libero_env.demos.download import REPO as HF_REPO_ID  # noqa: F401 - name of the original
 from libero_env.demos.download import download_demos
 from libero_env.errors import UnknownNameError
@@ -43,31 +43,40 @@ class DownloadProgressBar(tqdm):
 def url_is_alive(url: str) -> bool:
     """Return whether a server answers for an address."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=30):
+        with open_url(url, method="HEAD"):
             return True
-    except (http.client.HTTPException, OSError, ValueError):
+    except urllib.error.HTTPError as error:
+        error.close()
+        return False
+    except (http.client.HTTPException, OSError, ValueError, DownloadError):
         return False
 
 
 def download_url(url: str, download_dir: Dir, check_overwrite: bool = True, is_zipfile: bool = True) -> Path:
     """Download a file into a folder, see `libero_env.assets.http.fetch`, and return it.
 
-    With `is_zipfile` the archive is unpacked and removed, and the folder is returned; a DownloadError states that it
-    is not an archive. With `check_overwrite` a file that exists is kept.
+    With `is_zipfile` the archive is unpacked, see `libero_env.assets.archive.unpack`, and removed, and the folder is
+    returned. With `check_overwrite` files that exist are kept, also those that the archive has too.
     """
-    folder = Path(download_dir)
-    file = folder / url.rpartition("/")[2]
-    if not (check_overwrite and file.is_file()):
+    folder, name = Path(download_dir), check_url(url)
+    check_names([name], url)
+    file = folder / name
+    exists = check_overwrite and file.is_file()
+    if not exists:
         fetch(url, file)
     if not is_zipfile:
         return file
     try:
-        with zipfile.ZipFile(file) as archive:
-            archive.extractall(folder)
-    except zipfile.BadZipFile as error:
+        kept = unpack(file, folder, overwrite=not check_overwrite)
+    except DownloadError as error:
+        if exists:
+            raise DownloadError(f"{error}; it was there before: remove it, and try again") from error
         file.unlink()
-        raise DownloadError(f"{url}: the archive is damaged and was removed ({error}); try again") from error
-    file.unlink()
+        raise DownloadError(f"{url}: {error}; it was removed, try again") from error
+    if kept:
+        print(f"kept are {len(kept)} files that exist, such as {kept[0]}")
+    if not exists:
+        file.unlink()
     return folder
 
 
