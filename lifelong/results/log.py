@@ -1,12 +1,16 @@
 """The append-only file of a run's records."""
 
+import hashlib
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
 from lifelong.errors import ResultsError
-from lifelong.results.records import Record, from_line, to_line
+from lifelong.results.records import Record, RunRecord, from_line, to_line
 from lifelong.results.results import Results
+
+MAX_LINE = 4 << 20  # [bytes]
 
 _Stamp = tuple[int, int, int]  # inode, size, time of the last change
 
@@ -40,6 +44,7 @@ class ResultLog:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "a+b", buffering=0) as file:
                 size, separator = _end_of_records(file)
+                known = known and not separator  # else what is before it is read again
                 try:
                     file.truncate(size)
                     if file.write(separator + line) != len(separator + line):
@@ -66,22 +71,30 @@ class ResultLog:
         return self._results
 
     def _parse(self) -> Results:
+        records: list[tuple[int, Record]] = []
+        problems: list[tuple[int, str]] = []
+        lines: dict[bytes, int] = {}  # digest of each line -> its number
         try:
-            raw = self.path.read_bytes()
+            with open(self.path, "rb") as file:
+                for number, line in _lines(file):
+                    try:
+                        record = from_line(_whole(line))
+                        first = lines.setdefault(
+                            hashlib.blake2b(line.strip(), digest_size=16).digest(), number
+                        )
+                        if first != number and not isinstance(
+                            record, RunRecord
+                        ):  # of two starts in one second
+                            raise ValueError(f"repeats line {first}")
+                        records.append((number, record))
+                    except ValueError as error:
+                        if line.endswith(b"\n"):  # else the last line is incomplete, not invalid
+                            problems.append((number, str(error)))
         except OSError as error:
             raise ResultsError(f"{self.path}: cannot be read ({error})") from error
-        records: list[Record] = []
-        problems: list[str] = []
-        lines = raw.split(b"\n")
-        for number, line in enumerate(lines, start=1):
-            if not line.strip():
-                continue
-            try:
-                records.append(from_line(line))
-            except ValueError as error:
-                if number < len(lines):  # the last line has no newline: it is incomplete, not invalid
-                    problems.append(f"{self.path}:{number}: {error}; the line is ignored")
-        return Results(tuple(records), tuple(problems))
+        kept, odd = _of_one_run(records)
+        found = (f"{self.path}:{n}: {text}; the line is ignored" for n, text in sorted(problems + odd))
+        return Results(tuple(kept), tuple(found))
 
     def _file_stamp(self) -> _Stamp | None:
         try:
@@ -93,16 +106,54 @@ class ResultLog:
         return found.st_ino, found.st_size, found.st_mtime_ns
 
 
+def _lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Yield each line that is not empty with its number; of one that is too long, a beginning that is too long too."""
+    number = 0
+    while line := file.readline(MAX_LINE + 1):
+        number += 1
+        rest = line
+        while rest and not rest.endswith(b"\n"):
+            rest = file.readline(MAX_LINE)
+        ended = rest.endswith(b"\n")
+        if len(line) > MAX_LINE and not line.endswith(b"\n") and ended:
+            line += b"\n"
+        if line.strip():
+            yield number, line
+
+
+def _whole(line: bytes) -> bytes:
+    if len(line) > MAX_LINE:
+        raise ValueError(f"longer than {MAX_LINE >> 20} MiB, which no record is")
+    return line
+
+
+def _of_one_run(records: Sequence[tuple[int, Record]]) -> tuple[list[Record], list[tuple[int, str]]]:
+    """Divide records into those of the run that the first of them names, and faults of the others by line."""
+    run = next((record for _, record in records if isinstance(record, RunRecord)), None)
+    kept: list[Record] = []
+    odd: list[tuple[int, str]] = []
+    for number, record in records:
+        highest = max(getattr(record, "task", 0), getattr(record, "learned", 0))
+        if run is not None and highest >= len(run.tasks):
+            odd.append((number, f"a {record.kind!r} record of task {highest}, of {len(run.tasks)} from 0 on"))
+        elif isinstance(record, RunRecord) and run is not None and record.tasks != run.tasks:
+            odd.append((number, "a 'run' record of other tasks than the first one's"))
+        else:
+            kept.append(record)
+    return kept, odd
+
+
 def _end_of_records(file: IO[bytes]) -> tuple[int, bytes]:
     """Return the size of the complete records, and a newline if only that is missing after them."""
     size = file.seek(0, os.SEEK_END)
     if size == 0:
         return 0, b""
-    file.seek(size - 1)
-    if file.read(1) == b"\n":
+    file.seek(max(0, size - MAX_LINE))
+    _, newline, fragment = file.read().rpartition(b"\n")
+    if not newline and size > MAX_LINE:
+        return size, b"\n"  # no record is as long: it is not removed, and reported as broken
+    if not fragment:
         return size, b""
-    file.seek(0)
-    fragment = file.read().rpartition(b"\n")[2]
     try:
         from_line(fragment)
     except ValueError:

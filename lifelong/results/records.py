@@ -6,12 +6,18 @@ import math
 import os
 import subprocess
 import sys
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, WrapValidator
+
+from libero_env.errors import InvalidInputError
+from libero_env.validation import validate
 
 VERSIONED_PACKAGES = (
     "libero-lifelong",
@@ -23,6 +29,10 @@ VERSIONED_PACKAGES = (
     "h5py",
     "transformers",
 )
+
+
+Count = Annotated[int, Field(ge=0, le=10**9)]
+Number = Annotated[float, WrapValidator(lambda value, parse: math.nan if value is None else parse(value))]
 
 
 @dataclass(frozen=True)
@@ -40,14 +50,16 @@ class RunRecord:
     config_digest: str
     versions: Mapping[str, str]
     commit: str | None
-    cpu_count: int
+    cpu_count: Count
     started: str  # ISO 8601, UTC
-    group_size: int = 1  # tasks learned together as one step of the sequence
+    group_size: Annotated[int, Field(ge=1, le=1000)] = 1  # tasks learned together as one step of the sequence
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.conditions`
 
     def __post_init__(self) -> None:
-        if len(self.tasks) != len(self.instructions):
+        if not len(self.tasks) == len(self.instructions) > 0:
             raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.instructions)} instructions")
+        if len(self.tasks) % self.group_size:
+            raise ValueError(f"{len(self.tasks)} tasks are no groups of {self.group_size}")
 
 
 @dataclass(frozen=True)
@@ -55,10 +67,10 @@ class LossRecord:
     """The mean training loss of one epoch (epochs count from 1) and its wall time."""
 
     kind: Literal["loss"] = field(default="loss", init=False)
-    task: int
-    epoch: int
-    loss: float
-    seconds: float
+    task: Count
+    epoch: Count
+    loss: Number
+    seconds: Number
 
 
 @dataclass(frozen=True)
@@ -72,13 +84,13 @@ class EvalRecord:
 
     kind: Literal["eval"] = field(default="eval", init=False)
     phase: Literal["curve", "matrix"]
-    learned: int
-    epoch: int
-    task: int
+    learned: Count
+    epoch: Count
+    task: Count
     successes: tuple[bool, ...]  # one per episode
-    lengths: tuple[int, ...]  # [control steps]
-    init_states: tuple[int, ...]
-    seconds: float
+    lengths: tuple[Count, ...]  # [control steps]
+    init_states: tuple[Count, ...]
+    seconds: Number
     atoms: tuple[str, ...] = ()  # of the goal, such as (On plate_1 stove_1)
     atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
@@ -111,7 +123,7 @@ class PhaseRecord:
 
     kind: Literal["phase"] = field(default="phase", init=False)
     phase: str
-    seconds: float
+    seconds: Number
 
 
 @dataclass(frozen=True)
@@ -122,8 +134,8 @@ class CostRecord:
     """
 
     kind: Literal["cost"] = field(default="cost", init=False)
-    task: int
-    costs: Mapping[str, float]
+    task: Count
+    costs: Mapping[str, Number]
 
 
 @dataclass(frozen=True)
@@ -131,9 +143,9 @@ class TaskEndRecord:
     """The end of a task: it is learned, and its row of the success matrix is complete."""
 
     kind: Literal["task_end"] = field(default="task_end", init=False)
-    task: int
-    best_epoch: int
-    seconds: float
+    task: Count
+    best_epoch: Count
+    seconds: Number
 
 
 @dataclass(frozen=True)
@@ -141,7 +153,7 @@ class RunEndRecord:
     """The end of the run: the whole sequence is learned."""
 
     kind: Literal["run_end"] = field(default="run_end", init=False)
-    seconds: float
+    seconds: Number
     finished: str
 
 
@@ -239,34 +251,35 @@ def source_commit() -> str | None:
 
 
 def to_line(record: Record) -> bytes:
-    """Return a record as one line of strict JSON with its newline; numbers that are not finite become null."""
-    values = {
-        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(record).items()
-    }
-    return (json.dumps(values, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    """Return a record as one line of strict JSON, with a checksum; numbers that are not finite become null."""
+    text = _text(_without_nan(asdict(record)))
+    return f'{text[:-1]}, "{_CHECKSUM}": "{_checksum(text)}"}}\n'.encode()
 
 
 def from_line(line: bytes) -> Record:
-    """Parse a line of the file.
+    """Parse a line of the file. Earlier versions wrote no checksum.
 
     Raises:
-        ValueError: The line is not a record; the message names the wrong key and what was expected.
+        ValueError: The line is not a record, or not as it was written; the message names the wrong key.
     """
     try:
         values = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"not JSON ({error})") from error
-    kind: Any = values.pop("kind", None) if isinstance(values, dict) else None
-    if kind not in RECORD_TYPES:
-        raise ValueError(f"unknown kind of record {kind!r}; valid: {', '.join(RECORD_TYPES)}")
-    known = [f for f in fields(RECORD_TYPES[kind]) if f.init]
-    expected = {f.name: f.type for f in known}
-    optional = {
-        f.name for f in known if (f.default, f.default_factory) != (MISSING, MISSING)
-    }  # of records that older versions wrote
-    if odd := sorted((expected.keys() ^ values.keys()) - (optional - values.keys())):
-        raise ValueError(f"a {kind!r} record has the keys {', '.join(expected)}; missing or unknown: {odd}")
-    return RECORD_TYPES[kind](**{k: _checked(kind, k, v, expected[k]) for k, v in values.items()})
+    kind = values.get("kind") if isinstance(values, dict) else None
+    if not isinstance(kind, str) or kind not in RECORD_TYPES:
+        raise ValueError(f"unknown kind of record {str(kind)[:40]!r}; valid: {', '.join(RECORD_TYPES)}")
+    stated = values.pop(_CHECKSUM, None)
+    if stated is not None and stated != _checksum(_text(values)):
+        raise ValueError(f"a {kind!r} record that was changed: it does not have its checksum")
+    del values["kind"]
+    try:
+        return validate(RECORD_TYPES[kind], values)
+    except InvalidInputError as error:
+        raise ValueError(f"a {kind!r} record: {error}") from error
+
+
+_CHECKSUM = "crc32"
 
 
 _SOURCE = Path(__file__).parents[2]
@@ -279,20 +292,15 @@ def _git(*args: str) -> str:
     return done.stdout.strip()
 
 
-def _checked(kind: str, key: str, value: Any, expected: Any) -> Any:
-    """Return the value in its field's type: lists become tuples, null among floats becomes NaN."""
-    origin = get_origin(expected)
-    if expected is float and value is None:
-        return math.nan
-    if origin is tuple and isinstance(value, list):
-        return tuple(_checked(kind, key, v, get_args(expected)[0]) for v in value)
-    if origin is Literal:
-        valid = value in get_args(expected)
-    elif origin is Mapping:
-        valid = isinstance(value, dict)
-    else:
-        accepted = (int, float) if expected is float else expected
-        valid = isinstance(value, accepted) and (expected is bool or not isinstance(value, bool))
-    if origin is tuple or not valid:
-        raise ValueError(f"{key!r} of a {kind!r} record should be {expected}, not {value!r}")
-    return value
+def _text(values: Mapping[str, Any]) -> str:
+    return json.dumps(values, ensure_ascii=False, allow_nan=False)
+
+
+def _checksum(text: str) -> str:
+    return f"{zlib.crc32(text.encode()):08x}"
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(part) for key, part in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -51,7 +51,8 @@ class Results:
         """
         runs = self.of(RunRecord)
         if not runs:
-            raise ResultsError("the results have no 'run' record: the run was stopped before it began")
+            found = self.problems[0] if self.problems else "the run was stopped before it began"
+            raise ResultsError(f"the results have no 'run' record: {found}. Give the run's command again")
         return runs[0]
 
     @property

@@ -97,7 +97,7 @@ def outcome(run: Path) -> dict[tuple, dict]:
     for line in (run / "results.jsonl").read_text().splitlines():
         record = json.loads(line)
         if record["kind"] in ("loss", "eval", "task_end"):
-            record = {name: value for name, value in record.items() if name != "seconds"}
+            record = {name: value for name, value in record.items() if name not in ("seconds", "crc32")}
             key = tuple(record.get(name) for name in ("kind", "phase", "learned", "task", "epoch"))
             assert found.setdefault(key, record) == record
     return found

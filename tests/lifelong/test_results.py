@@ -106,13 +106,14 @@ def test_each_line_is_parsed_once_however_often_it_is_read(log: ResultLog, monke
     parsed = []
     monkeypatch.setattr("lifelong.results.log.from_line", lambda line: parsed.append(line) or from_line(line))
     second = ResultLog(log.path)  # of another process, such as a report's
-    for record in RUN[3:6]:
+    more = [evaluation("matrix", 1, 1, 1, wins) for wins in range(4)]
+    for record in more[:3]:
         log.append(record)
         assert all(log.read().records[-1] == record for _ in range(5))
     assert len(parsed) == 3
     assert second.read() == log.read() and len(parsed) == 3 + len(RUN) + 3
-    second.append(RUN[6])
-    assert log.read().records == (*RUN, *RUN[3:7]) and second.read() == log.read()
+    second.append(more[3])
+    assert log.read().records == (*RUN, *more) and second.read() == log.read()
     log.path.unlink()
     assert log.read() == second.read() == Results(())
 
@@ -130,10 +131,37 @@ def test_a_process_killed_at_any_byte_loses_at_most_the_last_record(log: ResultL
         assert log.read() == Results((*found.records, RUN[-1]))
 
 
+def test_what_no_record_is_as_long_as_is_kept_and_named(log: ResultLog):
+    with open(log.path, "ab") as file:
+        file.write(b"z" * (9 << 20))
+    assert log.read() == Results(tuple(RUN))
+    log.append(START)
+    assert list(log.read().records) == [*RUN, START] and "longer than 4 MiB" in log.read().problems[0]
+    assert log.path.stat().st_size > 9 << 20
+
+
+def test_lines_of_earlier_versions_have_no_checksum(log: ResultLog):
+    lines = [json.loads(line) for line in log.path.read_text().splitlines()]
+    log.path.write_text(
+        "".join(json.dumps({k: v for k, v in r.items() if k != "crc32"}) + "\n" for r in lines)
+    )
+    assert log.read() == Results(tuple(RUN))
+
+
+def test_any_flipped_digit_is_found():
+    for record in RUN:
+        line = to_line(record)
+        for i, byte in enumerate(line):
+            if chr(byte).isdigit():
+                changed = line[:i] + (b"3" if byte != ord("3") else b"8") + line[i + 1 :]
+                with pytest.raises(ValueError, match="record"):
+                    from_line(changed)
+
+
 def test_only_a_missing_newline_loses_nothing(log: ResultLog):
     log.path.write_bytes(log.path.read_bytes()[:-1])
-    log.append(RUN[3])
-    assert list(log.read().records) == [*RUN, RUN[3]]
+    log.append(START)
+    assert list(log.read().records) == [*RUN, START]
 
 
 def test_reading_never_changes_the_file(log: ResultLog):
@@ -151,10 +179,29 @@ def test_reading_never_changes_the_file(log: ResultLog):
         ('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}', "seconds"),
         (
             '{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}',
-            "'task' of a 'loss' record",
+            "a 'loss' record: task is 'zero'; expected a whole number",
         ),
-        ('{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}', "'task' of a 'task_end'"),
+        (
+            '{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}',
+            "a 'task_end' record: task is True",
+        ),
         ("[1, 2]", "unknown kind"),
+        ('{"kind": [1]}', "unknown kind"),
+        ("[" * 50_000, "not JSON"),
+        ("\0" * 40, "not JSON"),
+        ('{"kind": "cost", "task": 0, "costs": {"bytes": "many"}}', "costs.bytes is 'many'"),
+        (
+            '{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}',
+            "task is -1; expected at least 0",
+        ),
+        ('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}', "task 2, of 2 from 0 on"),
+        (
+            '{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1, "seconds": 1e400}',
+            "expected a finite number",
+        ),
+        (to_line(RUN[3]).decode().strip().replace("-3.25", "-3.26"), "does not have its checksum"),
+        (to_line(RUN[2]).decode().strip(), "repeats line 3"),
+        ("x" * (9 << 20), "longer than 4 MiB"),
     ],
 )
 def test_an_invalid_line_is_named_and_the_others_are_read(log: ResultLog, line: str, message: str):
