@@ -1,13 +1,17 @@
-"""Worker processes, the progress of long work, and what the machine has for it."""
+"""Worker processes, functions compiled for threads, the progress of long work, and what the machine has for it."""
 
+import logging
 import multiprocessing
 import os
+import pickle
 import re
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import suppress
+from functools import lru_cache
 from multiprocessing import connection
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +21,8 @@ from tqdm import tqdm
 
 from libero_env.errors import LiberoError
 
+_log = logging.getLogger(__name__)
+_DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError, AttributeError, ImportError)
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
 
 
@@ -161,3 +167,53 @@ class _ProgressLines(tqdm):
         if not self.disable:
             self.disable = True
             self._decr_instances(self)
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function with numba when it is first called, such that threads may run it at the same time.
+
+    The machine code is cached where numba caches it, beside the function's file or in the user's cache folder; where
+    neither can be written, each process compiles it, and where a cached file is damaged, it is compiled again.
+
+    Args:
+        function: Function of numbers and arrays, as numba compiles it.
+    """
+    from numba import njit
+    from numba.core.caching import FunctionCache
+
+    name = function.__qualname__
+
+    class Cache(FunctionCache):
+        def load_overload(self, *args: Any) -> Any:
+            try:
+                return super().load_overload(*args)
+            except _DAMAGED as error:
+                what = f"{type(error).__name__}: {error}"
+                _log.warning(
+                    "a compiled %s in %s is damaged (%s); it is compiled again", name, self.cache_path, what
+                )
+                with suppress(OSError):
+                    self.flush()
+                return None
+
+        def save_overload(self, *args: Any) -> None:
+            try:
+                super().save_overload(*args)
+            except OSError as error:
+                _warn_uncached(f"{self.cache_path}: {error.strerror or error}")
+
+    dispatcher = njit(nogil=True)(function)
+    try:
+        dispatcher._cache = Cache(function)  # as `cache=True` does, with another class
+    except RuntimeError:
+        _warn_uncached("neither the package's folder nor the user's cache folder can be written")
+    return dispatcher
+
+
+@lru_cache(maxsize=1)
+def _warn_uncached(reason: str) -> None:
+    _log.warning(
+        "functions are compiled at each start, for some seconds: %s. Set NUMBA_CACHE_DIR to a folder that you can "
+        "write to",
+        reason,
+    )

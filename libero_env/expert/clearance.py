@@ -1,9 +1,9 @@
 """Collision checks: voxels of the scene, points on the hand, and the height of obstacles on a path."""
 
 import numpy as np
-from numba import njit
 
 from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.parallel import compiled
 
 _CELL, _COARSE_CELL = 0.006, 0.012  # [m] voxels for objects, and for the hand
 _WALL_HEIGHT = 0.01  # [m] above a limit, up to which the lowest point of a column is a wall and no overhang
@@ -104,7 +104,7 @@ class Voxels:
         return cells, ((cells >= 0) & (cells < self._shape)).all(axis=-1)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _count_hand_collisions(
     occupied: np.ndarray,
     low: np.ndarray,

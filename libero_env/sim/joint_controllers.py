@@ -4,8 +4,8 @@ Gains are those of robosuite 1.4.
 """
 
 import numpy as np
-from numba import njit
 
+from libero_env.parallel import compiled
 from libero_env.sim.osc import move_gripper
 
 VELOCITY_WINDOW = 5  # substeps over which the derivative is averaged
@@ -18,7 +18,7 @@ _VELOCITY_KP = 3.0  # of the width of the torque range, per rad/s
 _INTEGRAL, _DERIVATIVE = 0.005, 0.001  # of the proportional gain
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def joint_position_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal, memory, gripper, ctrl,
     mass_address, torque_limit, finger_range, rest,
@@ -40,7 +40,7 @@ def joint_position_torques(
         move_gripper(actions[i, 7], gripper[i], ctrl[i], finger_range)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def joint_velocity_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal, memory, gripper, ctrl,
     mass_address, torque_limit, finger_range, rest,

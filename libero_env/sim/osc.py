@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numba import njit
 
 from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_QPOS
 from libero_env.mujoco_compat import MASS_FIELD
+from libero_env.parallel import compiled
 
 ACTION_DIM = 7
 POSITION_SCALE = 0.05  # [m] at full action
@@ -76,7 +76,7 @@ class ArmIndex:
         return cls(joints, address, model.site(GRIP_SITE).id, limit, fingers, finger_range)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def goals_from_deltas(ids, actions, qpos, site_pos, site_mat, goal_pos, goal_mat):
     """Set the goals to the current pose plus the scaled action; see `libero_env.sim.controller.Controller.set_goals`.
 
@@ -94,7 +94,7 @@ def goals_from_deltas(ids, actions, qpos, site_pos, site_mat, goal_pos, goal_mat
             rotate(w, site_mat[i], goal_mat[i])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def goals_from_poses(ids, poses, goal_pos, goal_mat):
     """Set the goals to positions and rotation vectors, (n, 6) -> (n, 3), (n, 9) in place."""
     identity = np.eye(3).ravel()
@@ -107,7 +107,7 @@ def goals_from_poses(ids, poses, goal_pos, goal_mat):
             goal_mat[i] = identity
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rotate(w, current, out):
     """Write exp([w]x) current to `out`; (3,), (9,) -> (9,).
 
@@ -136,7 +136,7 @@ def rotate(w, current, out):
             out[3 * i + j] = r[i, 0] * current[j] + r[i, 1] * current[3 + j] + r[i, 2] * current[6 + j]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _solve(a, b, n):
     """Solve a x = b by Cholesky decomposition; x replaces b, the factor replaces a (n, n), symmetric positive definite."""
     for j in range(n):
@@ -150,7 +150,7 @@ def _solve(a, b, n):
     _substitute(a, b, n)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _substitute(a, b, n):
     """Solve l l^T x = b for the lower triangle l of a; x replaces b (n,)."""
     for i in range(n):
@@ -163,7 +163,7 @@ def _substitute(a, b, n):
         b[i] /= a[i, i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def osc_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal_pos, goal_mat, gripper, ctrl,
     mass_address, torque_limit, finger_range, rest,
@@ -242,7 +242,7 @@ def osc_torques(
         move_gripper(actions[i, actions.shape[1] - 1], gripper[i], ctrl[i], finger_range)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def move_gripper(action, command, ctrl, finger_range):
     """Change the command of both fingers by one ramp step and scale it to the actuators; -1 opens, +1 closes."""
     for f in range(2):

@@ -1,15 +1,18 @@
 """Caches: whatever has happened to a file, the arrays are the same, and nothing stops for it."""
 
+import importlib.util
 import logging
 import os
 import subprocess
 import sys
 import zipfile
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from libero_env import parallel
 from libero_env.assets import published, simplify
 from libero_env.errors import BrokenFileError, LiberoError
 from libero_env.init_states import store
@@ -342,6 +345,52 @@ def test_broken_initial_states_are_generated_again(tmp_path, monkeypatch, lines,
     assert (store.load_init_states(task, scene) == states).all()
     assert len(lines()) == 1
     assert (read_npz(path)["states"] == states).all()
+
+
+@pytest.fixture
+def function(tmp_path, monkeypatch):
+    """Return a function of a module of its own, whose machine code is cached in this test's folder."""
+    monkeypatch.setattr(parallel, "_warn_uncached", lru_cache(parallel._warn_uncached.__wrapped__))
+    (tmp_path / "module.py").write_text("def twice(x):\n    return 2 * x\n")
+    spec = importlib.util.spec_from_file_location("module", tmp_path / "module.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.twice
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+@pytest.mark.parametrize("size", [0, 10])
+def test_compiled_functions_that_are_damaged_are_compiled_again(tmp_path, function, lines, kind, size):
+    assert parallel.compiled(function)(2) == 4
+    (file,) = tmp_path.glob(f"__pycache__/*.{kind}")
+    file.write_bytes(file.read_bytes()[:size])
+    assert parallel.compiled(function)(3) == 6
+    (line,) = lines()
+    assert "twice" in line and line.endswith("compiled again")
+    again = parallel.compiled(function)
+    assert again(4) == 8 and sum(again.stats.cache_hits.values()) == 1
+
+
+@pytest.mark.unit
+def test_functions_are_compiled_where_nothing_can_be_cached(tmp_path, function, lines, monkeypatch):
+    (tmp_path / "__pycache__").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/1")
+    assert [parallel.compiled(function)(x) for x in (1, 2)] == [2, 4]
+    (line,) = lines()
+    assert "Set NUMBA_CACHE_DIR" in line
+
+
+@pytest.mark.unit
+def test_functions_are_compiled_where_the_disk_is_full(function, lines, monkeypatch):
+    made = parallel.compiled(function)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    assert made(1) == 2
+    assert "No space left on device" in lines()[0]
 
 
 PROGRAM = """

@@ -1,12 +1,13 @@
 """Compiled inner loops of collision checks: how deep points reach into the hand."""
 
 import numpy as np
-from numba import njit
+
+from libero_env.parallel import compiled
 
 _HAND_MARGIN = 0.002  # [m] around the hand
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def open_hand_collision_depth(
     points: np.ndarray,
     pos: np.ndarray,
@@ -57,7 +58,7 @@ def open_hand_collision_depth(
     return deepest
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def hand_collision_depth(
     points: np.ndarray,
     pos: np.ndarray,

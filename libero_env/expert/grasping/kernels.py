@@ -5,14 +5,15 @@ called u, those across it v. Sections are ground plans (N, 2), [m].
 """
 
 import numpy as np
-from numba import njit
+
+from libero_env.parallel import compiled
 
 _WALL_GAP = 0.012  # [m] between points of different walls
 _WALL_MARGIN = 0.008  # [m] around a wall that counts as the wall
 _FACE_BIN = 0.006  # [m] of a wall's length that is one point of its face
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def central_width(section: np.ndarray, c: float, s: float, finger_half: float) -> float:
     """Return the width between the fingers in the middle of a cross-section, [m]."""
     v = section[:, 1] * c - section[:, 0] * s
@@ -25,7 +26,7 @@ def central_width(section: np.ndarray, c: float, s: float, finger_half: float) -
     return high - low if high >= low else 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def body_grasps(
     section: np.ndarray,
     c: float,
@@ -73,7 +74,7 @@ def body_grasps(
     return found[:count]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def wall_grasps(
     section: np.ndarray,
     column: np.ndarray,
@@ -150,7 +151,7 @@ def wall_grasps(
     return found[:count]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _split_walls(u: np.ndarray, strip: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, end) of the parts of a sorted strip that are separated by gaps."""
     parts, start = [], 0
@@ -161,7 +162,7 @@ def _split_walls(u: np.ndarray, strip: np.ndarray) -> list[tuple[int, int]]:
     return parts
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _wall_top(column: np.ndarray, u: np.ndarray, beside: np.ndarray, low: float, high: float) -> float:
     """Return the height of the highest point of a column with u in (low, high), [m]."""
     top = -np.inf
@@ -171,7 +172,7 @@ def _wall_top(column: np.ndarray, u: np.ndarray, beside: np.ndarray, low: float,
     return top
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _has_room(
     u: np.ndarray, beside: np.ndarray, centre: float, low: float, high: float, reach: float
 ) -> bool:
@@ -182,7 +183,7 @@ def _has_room(
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _face_slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> float:
     """Return the slope, against a pad, of the face of a wall at its smallest sign * u; 0 where they are parallel."""
     first = np.inf
@@ -204,7 +205,7 @@ def _face_slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> 
     return abs((along * out).sum()) / (along * along).sum()
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def highest_per_cell(points: np.ndarray, cell: float) -> np.ndarray:
     """Return the highest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
     x, y = np.rint(points[:, 0] / cell), np.rint(points[:, 1] / cell)
@@ -218,7 +219,7 @@ def highest_per_cell(points: np.ndarray, cell: float) -> np.ndarray:
     return points[best[best >= 0]]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def pads_meet_upright_faces(
     points: np.ndarray,
     pos: np.ndarray,
