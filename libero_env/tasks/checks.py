@@ -8,7 +8,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sized
 
-from libero_env.assets.arena import WORKSPACES
 from libero_env.errors import InvalidInputError
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, Region, atoms_of
 from libero_env.tasks.problem_types import Fault, type_faults
@@ -78,6 +77,10 @@ def check_problem(problem: Problem) -> None:
 
 def kind_of(problem: Problem, name: str) -> str:
     """Return `object`, `fixture`, `workspace` or `region`; a variable of a quantifier is an object."""
+    from libero_env.assets.arena import (
+        WORKSPACES,
+    )  # not with the module: `libero --help` need not wait for MuJoCo
+
     if category := problem.fixtures.get(name):
         return "workspace" if category in WORKSPACES else "fixture"
     return "region" if name not in problem.objects and problem.region(name) is not None else "object"
