@@ -30,6 +30,7 @@ MAX_ARRAYS_BYTES = 1 << 30  # of a file of arrays, and of its arrays in memory
 _MAX_RECORD_BYTES = 64 << 20
 _SEAL = b"sha256:"  # 64 hexadecimal digits follow: the comment of the zip, which is the end of the file
 _SEAL_BYTES = len(_SEAL) + 64
+_MAKING_SECONDS = 900.0  # that a process waits for another one
 _ARRAY_ERRORS = (
     *(zipfile.BadZipFile, zlib.error, struct.error),
     *(EOFError, KeyError, NotImplementedError, OverflowError, RuntimeError, ValueError, UserWarning),
@@ -264,6 +265,57 @@ def _write_cached(path: Path, write: Callable[[], None]) -> None:
             write()
     except OSError as error:
         _warn_once(path.parent, error.strerror or str(error))
+
+
+def cached_folder(directory: Path, make: Callable[[], object]) -> None:
+    """Make a folder of the cache, unless it is there with all files as they were when it was made.
+
+    Of several processes one makes it and the others wait; the lock of a process that is killed is free.
+
+    Args:
+        directory: Folder, two levels below the cache folder.
+        make: Function that makes it, in one step; a folder that is there has been removed.
+
+    Raises:
+        LiberoError: Other users can write there, it cannot be written, or another process takes longer than 15 minutes.
+    """
+    from filelock import FileLock, Timeout
+
+    check_trusted(directory.parent.parent)
+    record = directory.with_name(f"{directory.name}.json")
+    if _is_intact(directory, record):
+        return
+    try:
+        make_cache_folder(directory.parent)
+        with FileLock(directory.with_name(f".{directory.name}.lock"), timeout=_MAKING_SECONDS):
+            if _is_intact(directory, record):
+                return
+            if directory.exists():
+                _log.warning("%s has other files than when it was made; it is made again", directory)
+                shutil.rmtree(directory)
+            make()
+            write_record(record, {file.name: _file_digest(file) for file in directory.iterdir()})
+    except Timeout:
+        raise LiberoError(
+            f"{directory}: another process makes it and does not end; end that process"
+        ) from None
+    except OSError as error:
+        raise LiberoError(
+            f"{directory} cannot be made ({error.strerror or error}); set LIBERO_CACHE to another folder"
+        ) from error
+
+
+def _is_intact(directory: Path, record: Path) -> bool:
+    digests = read_record(record)
+    try:
+        return bool(digests) and all(_file_digest(directory / name) == sha for name, sha in digests.items())
+    except OSError:
+        return False
+
+
+def _file_digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def make_cache_folder(folder: Path) -> None:

@@ -180,6 +180,10 @@ def test_doctor_checks_folders(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "file" / "cache"))
     assert not doctor.check_cache().ok
+    (tmp_path / "open" / "meshes").mkdir(parents=True)
+    (tmp_path / "open" / "meshes").chmod(0o777)
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "open"))
+    assert "meshes is writable by every user: chmod" in doctor.check_cache().detail
 
 
 def test_folders_follow_the_environment(tmp_path, monkeypatch):

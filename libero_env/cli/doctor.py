@@ -21,7 +21,7 @@ from libero_env.assets.robot import (
 )
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir, demos_dir
-from libero_env.storage import show_bytes
+from libero_env.storage import check_trusted, show_bytes
 
 GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
 BACKENDS = ("egl", "osmesa", "glfw")
@@ -191,8 +191,13 @@ def check_gl() -> Finding:
 
 def check_cache() -> Finding:
     """Check that the cache folder can be written and has enough free space."""
-    path = cache_dir()
     remedy = "set LIBERO_CACHE to a folder that you can write to"
+    try:
+        path = cache_dir()
+        for folder in (one for one in path.glob("*") if one.is_dir()):
+            check_trusted(folder)
+    except LiberoError as error:
+        return Finding("cache", str(error), False, remedy)
     existing = next(parent for parent in [path, *path.parents] if parent.exists())
     free = shutil.disk_usage(existing).free
     detail = f"{path}, {show_bytes(folder_bytes(path))} used, {show_bytes(free)} free"

@@ -278,6 +278,22 @@ def test_registering_lasts_for_the_process_and_is_made_once(tmp_path):
     assert "block" in object_names() and folder.names() == ()
 
 
+@pytest.mark.parametrize("how", ["truncated", "missing", "extended"])
+def test_an_object_of_the_cache_that_is_damaged_is_made_again(tmp_path, caplog, how):
+    path = box(tmp_path / "block.stl")
+    register_object_file(path, mass=0.2)
+    (made,) = (tmp_path / "cache" / "objects").glob("*/block")
+    (model,) = made.glob("object.xml")
+    whole = model.read_bytes()
+    if how == "missing":
+        model.unlink()
+    else:
+        model.write_bytes(whole[:100] if how == "truncated" else whole + b"<!-- -->")
+    register_object_file(path, mass=0.2)
+    assert model.read_bytes() == whole
+    assert len(caplog.messages) == 1 and caplog.messages[0].endswith("made again")
+
+
 def test_nothing_is_made_by_asking(tmp_path):
     assert "milk" in object_names() and folder.find("milk") is None
     assert not (tmp_path / "objects").exists()

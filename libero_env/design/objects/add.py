@@ -26,6 +26,7 @@ from libero_env.objects import catalog, folder
 from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.model import ObjectModel
 from libero_env.paths import cache_dir, objects_dir
+from libero_env.storage import cached_folder
 
 DENSITY = 400.0  # [kg/m^3] of groceries; the original's objects have a few hundred
 _MIN_DEFAULT_MASS = 0.02  # [kg] the fingers push lighter objects away
@@ -152,9 +153,7 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
         raise LiberoError(f"{name!r} is not a valid category; use letters, digits and underscores")
     content = repr((_FORMAT, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), name))
     directory = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
-    if not (directory / folder.PROPERTIES).is_file():
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        _make(path, name, directory, chosen)
+    cached_folder(directory, lambda: _make(path, name, directory, chosen))
     catalog.register_object(name, lambda: folder.load(directory, name))
     return name
 
