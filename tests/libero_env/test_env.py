@@ -234,6 +234,7 @@ def test_a_user_defined_task_gets_initial_states(tmp_path, monkeypatch):
     monkeypatch.setattr(
         init_states, "generate_init_states", lambda task, scene: generate_init_states(task, scene, 2)
     )
+    monkeypatch.setattr(init_states, "NUM_INIT_STATES", 2)
     made = load_init_states(task, scene)
     monkeypatch.setattr(init_states, "generate_init_states", None)  # found again, not made again
     np.testing.assert_array_equal(load_init_states(task, scene), made)
