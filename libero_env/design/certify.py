@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +24,7 @@ from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.init_states.store import scene_digest
-from libero_env.parallel import progress_bar, spawn_pool
+from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.sim.scene import build_scene
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
@@ -204,7 +204,7 @@ def _run(
         futures: dict[Future[list[Outcome]], int] = {
             pool.submit(attempt, tasks[k], states, pack, disturb): k for k, states in chunks
         }
-        for future in as_completed(futures):
+        for future in as_finished(futures):
             yield futures[future], future.result()
 
 

@@ -56,7 +56,7 @@ def checked_numbers(
     """
     expected = f"{name}: expected finite numbers of shape {' or '.join(map(str, shapes))}"
     try:
-        array = _real_array(value)
+        array = real_array(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as reason:  # the last but one is of tensors
         text = " ".join(str(reason).split())
         raise error(f"{expected}, got {type(value).__name__}: {text[:200]}") from None
@@ -68,7 +68,7 @@ def checked_numbers(
     return array
 
 
-def _real_array(value: object) -> np.ndarray:
+def real_array(value: object) -> np.ndarray:
     """Return an array as float64; raise a TypeError for what is no real number, such as a text or a masked entry."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise TypeError("some of its entries are masked")

@@ -13,7 +13,7 @@ from libero_env.assets.pack import BUILTIN
 from libero_env.errors import BrokenFileError, LiberoError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import sample_settled
-from libero_env.parallel import progress_bar, spawn_pool
+from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
@@ -152,14 +152,17 @@ def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
         tasks: Tasks of a suite.
         jobs: Number of processes; the states do not depend on it.
     """
-    arrays: dict[str, np.ndarray] = {}
     path.parent.mkdir(parents=True, exist_ok=True)  # fails now, not after the work
     with spawn_pool(jobs) as pool:
-        generated = zip(tasks, pool.map(_generate, tasks), strict=True)
-        for task, (states, digest) in progress_bar(
-            generated, unit="task", desc="initial states", total=len(tasks)
+        futures = [pool.submit(_generate, task) for task in tasks]
+        for future in progress_bar(
+            as_finished(futures), unit="task", desc="initial states", total=len(tasks)
         ):
-            arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
+            future.result()  # an error ends the others
+    arrays: dict[str, np.ndarray] = {}
+    for task, future in zip(tasks, futures, strict=True):
+        states, digest = future.result()
+        arrays[task.name], arrays[f"{task.name}.digest"] = states, np.array(digest)
     atomic_write_npz(path, arrays)
 
 

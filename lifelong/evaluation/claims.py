@@ -131,7 +131,7 @@ class Claims:
             yield
         finally:
             stop.set()
-            thread.join()
+            thread.join(self._lease)  # longer only where the file server hangs
             with suppress(OSError):
                 self.release(claim)
 

@@ -67,7 +67,7 @@ class Crew:
         for process in self._processes:
             process.join(max(0.0, end - time.monotonic()))
             process.kill()
-            process.join()
+            process.join(PATIENCE)
 
     def _start(self) -> BaseProcess:
         process = self._context.Process(target=_call, args=(self._function, self._argument))

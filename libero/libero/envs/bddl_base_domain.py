@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
+from numbers import Real
 from operator import attrgetter
 from typing import Any
 
@@ -32,7 +33,14 @@ from libero_env.demos.stored_model import (
     read_fixture_poses,
     spec_without_textures,
 )
-from libero_env.errors import DemoError, LiberoError, UnknownNameError
+from libero_env.envs.checks import real_array
+from libero_env.errors import (
+    ClosedEnvironmentError,
+    DemoError,
+    InvalidInputError,
+    LiberoError,
+    UnknownNameError,
+)
 from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.placement import Start
 from libero_env.init_states.settle import sample_settled
@@ -125,6 +133,8 @@ class BDDLBaseDomain(RobosuiteMethods):
             raise UnknownNameError("argument", unknown[0], valid)
         if control_freq != CONTROL_FREQ:
             raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
+        if isinstance(horizon, bool) or not isinstance(horizon, Real) or not horizon > 0:
+            raise InvalidInputError(f"horizon is {horizon!r:.80}; expected at least 1")
         if drawing not in DRAWINGS:
             raise UnknownNameError("drawing", drawing, DRAWINGS)
         self.robot = robot or str(read_config().get("robot") or DEFAULT_ROBOT)
@@ -148,6 +158,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.rng = np.random.default_rng()
         self._resets: OriginalResets | None = None
         self.timestep, self.cur_time, self.done = 0, 0.0, False
+        self._closed = False
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
         self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
         self._load_model()
@@ -223,6 +234,7 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def reset(self) -> "OrderedDict[str, np.ndarray]":
         """Sample an initial state and observe it; raise a PlacementError if the objects do not fit."""
+        self._check_open()
         self._reset_internal()
         self.timestep, self.cur_time, self.done = 0, 0.0, False
         return self._get_observations(force_update=True)
@@ -253,13 +265,20 @@ class BDDLBaseDomain(RobosuiteMethods):
         """Start from [time, qpos, qvel], with or without the poses of the fixtures after it; the arm holds its pose.
 
         Raises:
-            LiberoError: The state has another length.
+            LiberoError: The state has another length, or numbers that no physics has; nothing has changed.
         """
+        self._check_open()
         nq, nv = self.scene.model.nq, self.scene.model.nv
-        state, short = np.asarray(state, np.float64).ravel(), 1 + nq + nv
+        short = 1 + nq + nv
         whole = short + 7 * len(self.scene.fixtures)
-        if state.size not in (short, whole) or not np.isfinite(state).all():
-            raise LiberoError(
+        try:
+            state = real_array(state).ravel()
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InvalidInputError(
+                f"{self.bddl_file_name}: a state is {short} finite numbers: {error}"
+            ) from None
+        if state.size not in (short, whole) or not (np.abs(state) <= mujoco.mjMAXVAL).all():
+            raise InvalidInputError(
                 f"{self.bddl_file_name}: a state is {short} finite numbers, or {whole} with the poses of the fixtures; "
                 f"got {state.size}. Is it a state of another task?"
             )
@@ -277,6 +296,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             EpisodeOverError: The horizon is reached.
             ActionError: The action has the wrong shape or is not finite; nothing has moved.
         """
+        self._check_open()
         if self.done:
             raise EpisodeOverError(
                 f"the horizon of {self.horizon} steps is reached: call reset(), or set horizon or ignore_done"
@@ -422,12 +442,25 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def close(self) -> None:
         """Free the simulation, its GL contexts and its window. Idempotent."""
+        if self._closed:
+            return
         if self.window is not None:
             self.window.close()
         self.sim.free()
+        self._closed = True
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ClosedEnvironmentError(f"this environment of {self.bddl_file_name} is closed; make another")
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise InvalidInputError(
+            "an environment cannot be copied or pickled: it holds a compiled simulation; make another"
+        )
 
     def render(self) -> None:
         """Show the present state in a window, with `has_renderer` and a screen."""
+        self._check_open()
         if self.window is not None:
             self.window.show(self.sim.model._model, self.sim.data._data)
 

@@ -14,6 +14,8 @@ from lifelong.evaluation.servers.packages import need
 T = TypeVar("T")
 
 API_KEY = "LIBERO_API_KEY"  # environment variable with the key that servers ask for
+MAX_MESSAGE_BYTES = 256 << 20  # of a message that is received; policies send less than 1 MiB
+_END_SECONDS = 10.0  # for the thread of connections to end
 _FIRST_DELAY, _LONGEST_DELAY = 0.1, 5.0  # between attempts to connect, [s]
 
 
@@ -54,7 +56,7 @@ class LoopThread:
         if not self._loop.is_closed():
             self.run(_cancel_others())
             self._loop.call_soon_threadsafe(self._loop.stop)
-            self._thread.join()
+            self._thread.join(_END_SECONDS)
             self._loop.close()
 
 
@@ -76,11 +78,16 @@ class Connection:
 
         Raises:
             WireError: The protocol cannot carry it.
+            ServerError: The server takes nothing in time.
             ConnectionLost: The connection is broken.
         """
         data = self.codec.pack(message)
         try:
-            await self._socket.send(data)
+            await asyncio.wait_for(self._socket.send(data), self.limits.answer)
+        except TimeoutError as error:
+            raise ServerError(
+                f"{self.address} took no request within {self.limits.answer:g} s; --timeout sets the limit"
+            ) from error
         except need("websockets").exceptions.ConnectionClosed as error:
             raise self._lost(error) from error
 
@@ -132,7 +139,7 @@ async def connect(address: str, codec: Codec, limits: Limits) -> Connection:
     options = {
         "additional_headers": {"Authorization": f"Api-Key {key}"} if key else None,
         "compression": None,
-        "max_size": None,
+        "max_size": MAX_MESSAGE_BYTES,
         "ping_interval": None,  # a server that computes may not answer pings; the time limits decide
         "open_timeout": limits.connect,
     }

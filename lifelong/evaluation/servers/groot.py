@@ -151,7 +151,8 @@ class GrootWire:
         if key := os.environ.get(API_KEY):
             request["api_token"] = key
         socket = self._connected()
-        socket.setsockopt(self._zmq.RCVTIMEO, max(1, round(1000 * seconds)))
+        for limit in (self._zmq.RCVTIMEO, self._zmq.SNDTIMEO):
+            socket.setsockopt(limit, max(1, round(1000 * seconds)))
         try:
             socket.send(GROOT.pack(request))
             answer = GROOT.unpack(socket.recv())
