@@ -306,7 +306,7 @@ def cached_folder(directory: Path, make: Callable[[], object]) -> None:
 
 
 def _is_intact(directory: Path, record: Path) -> bool:
-    digests = read_record(record)
+    digests = read_record(record) or {}
     try:
         return bool(digests) and all(_file_digest(directory / name) == sha for name, sha in digests.items())
     except OSError:
