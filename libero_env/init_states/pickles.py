@@ -30,7 +30,10 @@ _ZIP_ERRORS = (
 )
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # date of all parts, so that equal states give equal files
 _CODES = ("f8", "f4", "i8", "i4")
-_STORAGES: dict[str, np.dtype] = {"torch.DoubleStorage": np.dtype("<f8"), "torch.FloatStorage": np.dtype("<f4")}
+_STORAGES: dict[str, np.dtype] = {
+    "torch.DoubleStorage": np.dtype("<f8"),
+    "torch.FloatStorage": np.dtype("<f4"),
+}
 _RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _FROM_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
 _TENSOR = "torch._utils._rebuild_tensor_v2"
