@@ -205,10 +205,18 @@ def summary(reports: "Mapping[Path, RecordingReport]", n: int) -> str:
     return f"{done} of {len(reports)} tasks complete{share}"
 
 
-def run_info(args: argparse.Namespace) -> None:
-    """Print one line about each file."""
+def run_info(args: argparse.Namespace) -> int:
+    """Print one line about each file; return 1 if one cannot be read."""
+    from libero_env.errors import DemoError
+
+    broken = 0
     for path in find_demo_files(args.paths):
-        print(describe(path))
+        try:
+            print(describe(path))
+        except DemoError as error:
+            broken += 1
+            print(f"FAIL  {error}")
+    return int(broken > 0)
 
 
 def run_check(args: argparse.Namespace) -> int:

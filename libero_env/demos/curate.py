@@ -11,6 +11,7 @@ import numpy as np
 from libero_env.demos.contents import (
     LOW_DIM_KEYS,
     check_demo,
+    count_steps,
     demo_names,
     is_image,
     reached_goal,
@@ -19,7 +20,6 @@ from libero_env.demos.contents import (
 )
 from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file
 from libero_env.demos.header import demo_attributes, file_attributes, json_attribute, read_header
-from libero_env.demos.read import demo_lengths
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.paths import demos_dir
@@ -297,9 +297,12 @@ def describe(file: Path) -> str:
     """
     with open_demo_file(file) as handle:
         names, header = demo_names(handle, file), file_attributes(handle, file)
-        obs = handle["data"][names[0]].get("obs", {}) if names else {}
-        colours = [obs[key].shape[1:3] for key in obs if key.endswith("_rgb")]
-    steps = sum(demo_lengths(file))
+        steps = sum(count_steps(handle["data"][name], file, name) for name in names)
+        obs = handle["data"][names[0]].get("obs") if names else None
+        keys = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
+        for name in names[:1]:
+            check_demo(handle["data"][name], file, name, keys)
+        colours = [obs[key].shape[1:3] for key in keys]
     images = "x".join(map(str, colours[0])) + " pixels" if colours else "no images"
     models = json_attribute(header, "models", file).get("pack", "unknown")
     failed = header.get("num_failed_attempts", "unknown")

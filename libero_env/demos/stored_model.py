@@ -1,16 +1,17 @@
 """The scene as MJCF in demonstration files, and the poses of the fixtures in it."""
 
 from collections.abc import Mapping
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT
-from libero_env.errors import DemoError
+from libero_env.errors import DemoError, InvalidInputError
 from libero_env.mujoco_compat import delete
 from libero_env.objects.model import ROOT_BODY
+from libero_env.objects.xml_file import Node, parse_xml_text
 from libero_env.sim.scene import Scene, scene_spec
 from libero_env.tasks.problem import Problem
 
@@ -33,6 +34,7 @@ _TEXTURE_FIELDS = (
 )
 
 
+_GROWING = {"include", "replicate", "composite", "flexcomp", "attach", "model", "extension", "plugin"}
 MAX_POSITION = 1e6  # [m] of a body in a stored model
 
 
@@ -57,8 +59,10 @@ def compile_stored(xml: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
         spec: Scene of the same task, complete. It is not changed.
 
     Raises:
-        DemoError: MuJoCo cannot compile the model, as when its files are elsewhere; the message is MuJoCo's.
+        DemoError: The text is no XML or has elements that grow without bound, or MuJoCo cannot compile the model, as
+            when its files are elsewhere; the message is MuJoCo's.
     """
+    _parse(xml, "the stored model")
     try:
         stored = mujoco.MjSpec.from_string(xml)
         stored.assets = {**spec.assets, **stored.assets}  # contents of files that are not on disk
@@ -115,10 +119,7 @@ def read_fixture_poses(xml: str, scene: Scene, where: str = "the stored model") 
     Raises:
         DemoError: The text is not XML, or a pose is no pose.
     """
-    try:
-        root = ElementTree.fromstring(xml)
-    except ElementTree.ParseError as error:
-        raise DemoError(f"{where} is not XML ({error}); expected the scene as MJCF") from error
+    root = _parse(xml, where)
     poses = {}
     for body in root.iter("body"):
         name = body.get("name", "").removesuffix(f"_{ROOT_BODY}")
@@ -127,7 +128,21 @@ def read_fixture_poses(xml: str, scene: Scene, where: str = "the stored model") 
     return poses
 
 
-def _pose(body: ElementTree.Element, where: str) -> np.ndarray:
+def _parse(xml: str, where: str) -> Node:
+    """Return the root of a stored model, which is complete: it includes no files and makes no elements of others."""
+    try:
+        root = parse_xml_text(xml.encode("utf-8", "replace"), where)
+    except InvalidInputError as error:
+        raise DemoError(f"{where} is not XML ({error}); expected the scene as MJCF") from error
+    for node in root.iter():
+        if node.tag in _GROWING:
+            raise DemoError(
+                f"{where} has the element <{node.tag}>; expected a complete model, as recordings have it"
+            )
+    return root
+
+
+def _pose(body: Element, where: str) -> np.ndarray:
     """Return the pose of a body, (7,) pos and quat wxyz."""
     texts = body.get("pos", "0 0 0").split(), body.get("quat", "1 0 0 0").split()
     try:

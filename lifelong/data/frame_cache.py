@@ -71,8 +71,6 @@ def open_mapped(source: DemoSource, *, language: Tensor, task_id: int = 0) -> Se
         DataError: The file does not fit the spec, or there is not enough space on the disk.
     """
     language = check_language(language, source.spec)
-    if not sum(source.lengths()):
-        raise DataError(f"{source.path} has no demonstration with two steps; pairing=aligned needs one")
     folder, shape = _ensure_folder(source)
     arrays = {name: torch.from_numpy(array) for name, array in read_npz(folder / "arrays.npz").items()}
     proprio = {name: arrays[f"proprio/{name}"] for name in source.spec.proprio}

@@ -52,10 +52,8 @@ class RobomimicWindows:
         self.source, self.task_id, self.seq_len = source, task_id, source.spec.seq_len
         self.device = torch.device(device)
         self.language = check_language(language, source.spec)
-        for demo in source.demos():  # raises DataError if one does not fit
-            last = demo
-        if not sum(source.lengths()):
-            raise DataError(f"{source.path}: {last.name} and all others have one step; expected two or more")
+        for _ in source.demos():  # raises DataError if one does not fit
+            pass
         self._labels, self._shift = self._layout()
         self._windows = _sequence_dataset(source, self._labels, self.seq_len + self._shift)
         lengths = torch.tensor(source.lengths())

@@ -37,8 +37,16 @@ class DemoSource:
     labels: Literal["expert", "executed"] = "expert"
 
     def lengths(self) -> list[int]:
-        """Return the number of frames of each demonstration; only shapes are read."""
-        return demo_lengths(self.path, self.limit, pairing=self.pairing)
+        """Return the number of frames of each demonstration; only shapes are read.
+
+        Raises:
+            DemoError: The file is broken.
+            DataError: There are no frames.
+        """
+        lengths = demo_lengths(self.path, self.limit, pairing=self.pairing)
+        if not sum(lengths):
+            raise DataError(f"{self.path} has no demonstration with two steps; pairing=aligned needs one")
+        return lengths
 
     def nbytes(self) -> int:
         """Return the number of bytes of the images in memory."""
