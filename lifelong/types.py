@@ -30,6 +30,13 @@ PathText = Annotated[str, AfterValidator(_check_path)]
 
 
 @dataclass(frozen=True)
+class CompletedWith:
+    """Annotation of a component that is not built yet: names of the arguments with which it is called."""
+
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class PolicySpec:
     """Inputs and outputs of a policy; enough to build one and to make fake data for it.
 

@@ -3,7 +3,7 @@
 Shape legend: B batch, T time, F features of a frame, A action, L language embedding.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor, nn
@@ -13,8 +13,8 @@ from lifelong.nn.heads import GMMHead
 from lifelong.nn.recurrent import TemporalLSTM
 from lifelong.nn.tokens import LanguageToken, ProprioScaling, standardise
 from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Component, HistoryPolicy
-from lifelong.types import Observation, PolicySpec, Share, Width
+from lifelong.policies.history import Component, Head, HistoryPolicy, ImageEncoder
+from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
 
 class BCRNN(HistoryPolicy):
@@ -51,9 +51,9 @@ class BCRNN(HistoryPolicy):
         spec: PolicySpec,
         image_embed: Width = 64,
         text_embed: Width = 32,
-        encoder: Component = ResNetFiLMEncoder,
-        temporal: Component = TemporalLSTM,
-        head: Component = GMMHead,
+        encoder: ImageEncoder = ResNetFiLMEncoder,
+        temporal: Annotated[Component, CompletedWith(("in_dim",))] = TemporalLSTM,
+        head: Head = GMMHead,
         memory: Literal["reset", "window"] = "reset",
         stochastic: bool = False,
         normalise_proprio: bool = True,

@@ -10,7 +10,7 @@ from lifelong.nn.heads import GMMHead
 from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Component, HistoryPolicy
+from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder, OverTime
 from lifelong.types import Observation, PolicySpec, Share, Width
 
 
@@ -44,9 +44,9 @@ class BCTransformer(HistoryPolicy):
         *,
         spec: PolicySpec,
         embed_dim: Width = 64,
-        encoder: Component = ResNetFiLMEncoder,
-        temporal: Component = TemporalTransformer,
-        head: Component = GMMHead,
+        encoder: ImageEncoder = ResNetFiLMEncoder,
+        temporal: OverTime = TemporalTransformer,
+        head: Head = GMMHead,
         stochastic: bool = False,
         normalise_proprio: bool = True,
         proprio_dropout: Share = 0.0,

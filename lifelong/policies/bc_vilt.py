@@ -3,6 +3,8 @@
 Shape legend: B batch, T time, V views, P patches, M tokens per step, S token of a patch, E token of a step.
 """
 
+from typing import Annotated
+
 import torch
 from torch import Tensor, nn
 
@@ -11,8 +13,8 @@ from lifelong.nn.heads import GMMHead
 from lifelong.nn.patches import PatchEncoder, SpatialTransformer
 from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
 from lifelong.nn.transformer import TemporalTransformer
-from lifelong.policies.history import Component, HistoryPolicy
-from lifelong.types import Observation, PolicySpec, Share, Width
+from lifelong.policies.history import Component, Head, HistoryPolicy, OverTime
+from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
 
 class BCViLT(HistoryPolicy):
@@ -48,10 +50,12 @@ class BCViLT(HistoryPolicy):
         spec: PolicySpec,
         patch_embed: Width = 128,
         embed_dim: Width = 64,
-        encoder: Component = PatchEncoder,
-        spatial: Component = SpatialTransformer,
-        temporal: Component = TemporalTransformer,
-        head: Component = GMMHead,
+        encoder: Annotated[Component, CompletedWith(("image_size", "dim"))] = PatchEncoder,
+        spatial: Annotated[
+            Component, CompletedWith(("views", "patches", "dim", "out_dim"))
+        ] = SpatialTransformer,
+        temporal: OverTime = TemporalTransformer,
+        head: Head = GMMHead,
         stochastic: bool = False,
         normalise_proprio: bool = True,
         proprio_dropout: Share = 0.0,

@@ -5,7 +5,7 @@ Shape legend: B batch, T time, E latent, A action.
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -13,10 +13,13 @@ from torch import Tensor
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead
 from lifelong.policies.base import Policy
-from lifelong.types import Batch, Observation, PolicySpec
+from lifelong.types import Batch, CompletedWith, Observation, PolicySpec
 
 # A class of `lifelong.nn`, or a `functools.partial` of one; the policy calls it with the sizes that only it knows.
 Component = Callable[..., Any]
+Head = Annotated[Component, CompletedWith(("in_dim", "action_dim"))]
+ImageEncoder = Annotated[Component, CompletedWith(("image_size", "language_dim", "latent_dim"))]
+OverTime = Annotated[Component, CompletedWith(("dim", "max_length"))]
 
 
 class HistoryPolicy(Policy):

@@ -18,6 +18,7 @@ from libero_env.errors import InvalidInputError
 from libero_env.validation import is_plain, parameters_of, suggest, validate_arguments
 from lifelong.errors import ConfigError
 from lifelong.settings.targets import find_target
+from lifelong.types import CompletedWith
 
 Path = tuple[str | int, ...]
 
@@ -74,6 +75,7 @@ def node_faults(
     at: Path,
     *,
     given: Sequence[str] = (),
+    completed: Sequence[str] = (),
     kind: type | None = None,
     strict: bool = False,
     allowed: Sequence[str] | None = None,
@@ -84,6 +86,7 @@ def node_faults(
         node: Plain data.
         at: Path of the node in the configuration.
         given: Names of the arguments that whoever builds the node adds.
+        completed: Names of the arguments that whoever gets what is built calls it with: `_partial_` must be true.
         kind: Class of what it builds; None for any.
         strict: Whether a user's own class must be of that class too, or may only resemble it.
         allowed: See `find_target`.
@@ -117,7 +120,17 @@ def node_faults(
     arguments = dict(zip(names, positional, strict=False))
     arguments |= {str(key): value for key, value in node.items() if key not in _SPECIAL}
     yield from _argument_faults(target, arguments, at, allowed)
-    if known and not node.get("_partial_"):
+    if completed and _is_own(target) and not node.get("_partial_"):
+        yield f"{name}._partial_ is {node.get('_partial_', 'missing')}; expected true"
+        return
+    if completed and known and not known.any_key and (lacking := set(completed) - set(known.types)):
+        yield (
+            f"{name}._target_ is {node['_target_']}, which does not take {', '.join(sorted(lacking))}: "
+            f"{name} is called with {', '.join(completed)}"
+        )
+        return
+    if known and (completed or not node.get("_partial_")):
+        given = (*given, *completed)
         for missing in sorted(known.required - {*arguments, *given}):
             yield f"{'.'.join(map(str, (*at, missing)))} is missing"
 
@@ -158,7 +171,9 @@ def _argument_faults(
     """Yield what is wrong with the arguments of a target: names, values, and nodes."""
     known = parameters_of(target)
     types = known.types if known else {}
-    values = {key: value for key, value in arguments.items() if not _has_node(value)}
+    own = _is_own(target)  # a user's class may take what resembles its types
+    plain = {key for key, hint in types.items() if own and hint is not Any and is_plain(hint)}
+    values = {key: value for key, value in arguments.items() if key in plain or not _has_node(value)}
     try:
         validate_arguments(target, {k: as_truth(v, types.get(k)) for k, v in values.items()}, prefix=at)
     except InvalidInputError as error:
@@ -168,21 +183,21 @@ def _argument_faults(
             if key not in values:
                 full = ".".join(map(str, (*at, key)))
                 yield f"{full} is an unknown key.{suggest(key, types)} Valid: {', '.join(types)}"
-            continue
-        hint = (
-            types.get(key, Any) if _is_own(target) else Any
-        )  # a user's class may take what resembles its types
-        yield from _value_faults(value, hint, (*at, key), allowed)
+        elif key not in plain:
+            yield from _value_faults(value, types.get(key, Any) if own else Any, (*at, key), allowed)
 
 
 def _value_faults(value: Any, hint: Any, at: Path, allowed: Sequence[str] | None) -> Iterator[str]:
     """Yield what is wrong with a value that is a node or has nodes, or is no node where one belongs."""
-    hint = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    completed: Sequence[str] = ()
+    if get_origin(hint) is Annotated:
+        hint, *notes = get_args(hint)
+        completed = next((note.names for note in notes if isinstance(note, CompletedWith)), ())
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if isinstance(value, Mapping) and "_target_" in value:
         classes = [one for one in options if isclass(one) and one not in (NoneType, object)]
         kind = classes[0] if len(classes) == 1 and len(options) - (NoneType in options) == 1 else None
-        yield from node_faults(value, at, kind=kind, allowed=allowed)
+        yield from node_faults(value, at, completed=completed, kind=kind, allowed=allowed)
         if kind and value.get("_partial_") is True:
             yield f"{'.'.join(map(str, at))}._partial_ is True; expected a whole {kind.__name__}"
     elif isinstance(value, list | tuple):
