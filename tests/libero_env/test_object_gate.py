@@ -1,12 +1,15 @@
 """Object files from others: nothing is read or written outside of their folder, and nothing grows without bound."""
 
+import json
 import struct
 import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import trimesh
+from PIL import Image
 
 from libero_env.design.objects import add_object
 from libero_env.errors import LiberoError
@@ -200,3 +203,159 @@ def test_geoms_get_names_that_are_free(home):
     added = add_object(mjcf(home, inside='<geom name="g0" size=".01"/><geom size=".01"/>'))
     assert added.properties["collision"]["pieces"] == 3
     assert {geom.name for geom in get_object("thing").spec.geoms if geom.group == 0} == {"g0", "g1", "g2"}
+
+
+# --- meshes ---------------------------------------------------------------------------------------------------------
+
+
+def obj(home: Path, *lines: str, materials: str = "") -> Path:
+    """An OBJ file of a box, with these lines before it."""
+    path = home / "own" / "box.obj"
+    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+    text = [
+        *lines,
+        *(f"v {x} {y} {z}" for x, y, z in mesh.vertices),
+        "vt 0 0",
+        "vt 1 0",
+        "vt 1 1",
+        "usemtl q",
+    ]
+    text += [f"f {a}/1 {b}/2 {c}/3" for a, b, c in mesh.faces + 1]
+    path.write_text("\n".join(text) + "\n")
+    path.with_name("box.mtl").write_text(f"newmtl q\n{materials}\n")
+    return path
+
+
+def gltf(home: Path, change: Callable[[dict], object]) -> Path:
+    """A glTF file of a box, changed."""
+    exported = trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box((0.04, 0.05, 0.06))))
+    for name, data in exported.items():
+        (home / "own" / name).write_bytes(data)
+    path = home / "own" / "model.gltf"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_gltf_file_with_its_files_is_read(home):
+    assert add_object(gltf(home, lambda content: None), name="thing").properties["watertight"]
+
+
+@pytest.mark.parametrize(
+    ("line", "materials", "message"),
+    [
+        ("mtllib ../secret/s.mtl", "", r"box\.obj:1: .*outside of the folder"),
+        ("mtllib {home}/secret/s.mtl", "", "outside of the folder"),
+        ("mtllib box.mtl", "map_Kd ../secret/s.png", r"box\.mtl:2: .*outside of the folder"),
+        ("mtllib box.mtl", "map_Kd {home}/secret/s.png", "outside of the folder"),
+        ("mtllib box.mtl", "map_Kd linked.png", "outside of the folder"),
+        ("mtllib box.mtl", "map_Kd -s 1 1 1 nothing.png", "its texture nothing.png is missing"),
+        ("mtllib box.mtl", "map_Kd noise.png", "no picture that can be read"),
+        ("mtllib box.mtl", "map_Kd big.png", "400000000 pixels"),
+        ("mtllib box.mtl", "map_Kd short.png", "image file is truncated"),
+        ("mtllib box.mtl", "map_Kd script.eps", "no picture that can be read"),
+        ('mtllib a"b', "", 'material file a"b is missing'),
+        ("v nan 0 0", "", r"box\.obj:1: 'v nan 0 0' is not finite"),
+        ("v 1e400 0 0", "", "is not finite"),
+        ("f 1 2 99999", "", "cannot be read"),
+        ("f" + " 1" * 5000, "", "a line has more than 4096"),
+        ("f 1 2 3\n" * 1_000_001, "", "1000013 triangles; simplify it to 1000000"),
+    ],
+)
+def test_meshes_name_files_of_their_folder_and_hold_what_is_usual(home, line, materials, message):
+    own, secret = home / "own", home / "secret"
+    for place in (own / "short.png", secret / "s.png"):
+        Image.new("RGB", (64, 64)).save(place)
+    (own / "short.png").write_bytes((own / "short.png").read_bytes()[:60])
+    (secret / "s.mtl").write_text("newmtl q\nKd 1 0 0\n")
+    (own / "linked.png").symlink_to(secret / "s.png")
+    (own / "noise.png").write_bytes(b"noise")
+    (own / "script.eps").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+    (own / "big.png").write_bytes(png(20000, 20000, zlib.compress(b"")))
+    path = obj(home, line.format(home=home), materials=materials.format(home=home))
+    with pytest.raises(LiberoError, match=message) as caught:
+        add_object(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: g["buffers"][0].update(uri="../secret/x.bin"), r"buffers\[0\]: .*outside of the folder"),
+        (lambda g: g["buffers"][0].update(uri="%2e%2e/secret/x.bin"), "outside of the folder"),
+        (lambda g: g["buffers"][0].update(uri="http://127.0.0.1/x.bin"), "outside of the folder"),
+        (lambda g: g.update(images=[{"uri": "file:///etc/passwd"}]), r"images\[0\]: .*outside of the folder"),
+        (lambda g: g.update(images=[{"uri": "/etc/passwd"}]), "outside of the folder"),
+        (lambda g: g.update(images=[{"uri": "nothing.png"}]), "nothing.png is missing"),
+        (lambda g: g.update(images=[{"uri": 3}]), "uri is 3"),
+        (lambda g: g.update(images=3), "images is no list"),
+        (lambda g: g["accessors"][0].update(count=10**9), "1000000024 elements|elements; at most"),
+        (lambda g: g["accessors"][0].update(count=-1), "expected at least 0"),
+        (lambda g: g["nodes"].extend({"mesh": 0} for _ in range(20_000)), "its nodes are no tree"),
+        (lambda g: g["nodes"][0].update(children=[1, 1]), "its nodes are no tree"),
+        (lambda g: g.clear(), "cannot be read|no triangles"),
+    ],
+)
+def test_gltf_files_likewise(home, change, message):
+    with pytest.raises(LiberoError, match=message) as caught:
+        add_object(gltf(home, change), name="thing")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("a.stl", bytes(80) + struct.pack("<I", 2**31) + bytes(50), "no triangles|cannot be read"),
+        ("a.stl", bytes(80) + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), "not finite"),
+        ("a.stl", b"solid x\nfacet normal 0 0 1\nouter loop\nvertex nan 0 0\n", "not finite"),
+        ("a.stl", b"", "is empty"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 2000000000\nend_header\n",
+            "2000000000 elements vertex",
+        ),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\ncomment TextureFile ../secret/s.png\nend_header\n",
+            "outside of the folder",
+        ),
+        ("a.glb", b"glTF" + bytes(60), "no GLB file"),
+        ("a.glb", b"glTF", "no GLB file"),
+        ("a.gltf", b"[" * 100_000, "no glTF"),
+        ("a.gltf", b"\xff\xfe", "no glTF"),
+    ],
+)
+def test_other_formats_likewise(home, name, data, message):
+    (home / "own" / name).write_bytes(data)
+    with pytest.raises(LiberoError, match=message) as caught:
+        add_object(home / "own" / name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": float("nan")}, "size is nan"),
+        ({"size": float("inf")}, "size is inf"),
+        ({"size": 1e-300}, "size is 1e-300; expected at least 0.001"),
+        ({"size": "big"}, "size is 'big'; expected a number"),
+        ({"mass": 1e300}, "mass is 1e[+]300; expected at most 10000"),
+        ({"density": -1.0}, "density is -1.0; expected above 0"),
+        ({"faces": 0}, "faces is 0; expected at least 1"),
+        ({"faces": 1.5}, "faces is 1.5; expected a whole number"),
+        ({"container": "no"}, "container is 'no'; expected true or false"),
+        ({"siz": 0.1}, "siz is an unknown key. Did you mean 'size'"),
+        ({"name": "../x"}, "not a valid name"),
+        ({"name": "class"}, "reserved word"),
+    ],
+)
+def test_options_are_checked_before_anything_is_made(home, options, message):
+    with pytest.raises(LiberoError, match=message):
+        add_object(home / "own" / "m.stl", **options)
+    assert not (home / "objects").exists() or not list((home / "objects").iterdir())
+
+
+def test_an_objects_folder_that_is_a_file_is_named(home):
+    with pytest.raises(LiberoError, match=r"m\.stl.*not a folder|m\.stl.*exists"):
+        add_object(home / "own" / "m.stl", out=home / "own" / "m.stl")

@@ -6,32 +6,37 @@ parameters of the original's objects.
 """
 
 import hashlib
+import keyword
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from dataclasses import replace as changed
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from libero_env.design.objects.collision import Mass, collision_pieces, hull_mass, solid_mass
 from libero_env.design.objects.mesh_file import bounds, is_closed, merge_vertices, read_mesh, signed_volume
 from libero_env.design.objects.mjcf_file import INSIDE, store_mjcf
 from libero_env.design.objects.mjcf_write import Body, store_mesh
 from libero_env.design.objects.trial import try_object
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects import catalog, folder
 from libero_env.objects.builtin import BUILDERS
 from libero_env.objects.model import ObjectModel
+from libero_env.objects.references import MAX_FACES
 from libero_env.paths import cache_dir, objects_dir
 from libero_env.storage import cached_folder
+from libero_env.validation import validate_arguments
 
 DENSITY = 400.0  # [kg/m^3] of groceries; the original's objects have a few hundred
 _MIN_DEFAULT_MASS = 0.02  # [kg] the fingers push lighter objects away
 _FORMAT = 1  # version of stored folders; increase it when the same file gives another object
 _LARGEST = 0.6  # [m] longest side
+_LONGEST_NAME = 60  # characters
 
 
 @dataclass(frozen=True)
@@ -49,23 +54,28 @@ class Options:
             `In x box_1_contain_region`.
     """
 
-    size: float | None = None
-    mass: float | None = None
-    density: float | None = None
-    up: str | None = None
-    collision: str = "decompose"
-    faces: int = 3000
+    size: Annotated[float, Field(ge=1e-3, le=100)] | None = None
+    mass: Annotated[float, Field(gt=0, le=1e4)] | None = None
+    density: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    up: Literal["y", "z"] | None = None
+    collision: Literal["decompose", "hull", "boxes"] = "decompose"
+    faces: Annotated[int, Field(ge=1, le=MAX_FACES)] = 3000
     container: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("size", "mass", "density"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise LiberoError(f"{name} is {value}; it must be above 0")
+        validate_arguments(Options, {one.name: getattr(self, one.name) for one in fields(self)})
         if self.mass is not None and self.density is not None:
-            raise LiberoError("mass and density are both given; give only one of them")
-        if self.up not in (None, "y", "z"):
-            raise LiberoError(f"up is {self.up!r}; valid: y, z")
+            raise InvalidInputError("mass and density are both given; give only one of them")
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> "Options":
+        """Return options by their names.
+
+        Raises:
+            InvalidInputError: A name is unknown, or a value is not valid.
+        """
+        validate_arguments(cls, options)
+        return cls(**options)
 
     @property
     def mesh_options(self) -> tuple[str, ...]:
@@ -118,15 +128,20 @@ def add_object(
     Raises:
         LiberoError: The file cannot be used, or the name is taken; the message states the remedy.
     """
-    path = Path(path)
+    path, chosen = Path(path), Options.of(options)
     name = check_name(name or _name_of(path), reject_existing=not replace)
     directory = (Path(out) if out else objects_dir()) / name
     if directory.exists() and not replace:
         raise LiberoError(
             f"{directory} exists already; choose another name (--name), or replace it (--replace)"
         )
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    return _make(path, name, directory, Options(**options))
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(
+            f"{directory.parent} is not a folder that can be written ({error})"
+        ) from error
+    return _make(path, name, directory, chosen)
 
 
 def register_object_file(path: str | Path, name: str | None = None, **options: Any) -> str:
@@ -145,12 +160,12 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
     Raises:
         LiberoError: The file cannot be used.
     """
-    path, chosen = Path(path), Options(**options)
+    path, chosen = Path(path), Options.of(options)
     if not path.is_file():
         raise LiberoError(f"{path}: no such file")
     name = name or _name_of(path)
-    if not name.isidentifier():
-        raise LiberoError(f"{name!r} is not a valid category; use letters, digits and underscores")
+    if not name.isidentifier() or len(name) > _LONGEST_NAME:
+        raise LiberoError(f"{name[:80]!r} is not a valid category; use letters, digits and underscores")
     content = repr((_FORMAT, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), name))
     directory = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
     cached_folder(directory, lambda: _make(path, name, directory, chosen))
@@ -168,10 +183,12 @@ def check_name(name: str, *, reject_existing: bool = True) -> str:
     Raises:
         LiberoError: The name is not valid in task files, or another object has it.
     """
-    if not name.isidentifier() or not name.isascii() or name != name.lower():
+    if not name.isidentifier() or not name.isascii() or name != name.lower() or len(name) > _LONGEST_NAME:
         raise LiberoError(
-            f"{name!r} is not a valid name; use lower-case letters, digits and underscores, such as red_cup"
+            f"{name[:80]!r} is not a valid name; use lower-case letters, digits and underscores, such as red_cup"
         )
+    if keyword.iskeyword(name):
+        raise InvalidInputError(f"{name} is a reserved word of Python; choose another (--name my_{name})")
     if name in BUILDERS:
         raise LiberoError(f"{name} is the name of a builtin object; choose another (--name my_{name})")
     if reject_existing and name in folder.names():

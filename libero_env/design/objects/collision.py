@@ -7,6 +7,7 @@ from itertools import permutations
 import mujoco
 import numpy as np
 
+from libero_env.assets.simplify import decimate
 from libero_env.design.objects.mesh_file import Notify, is_closed, signed_volume
 from libero_env.errors import LiberoError
 from libero_env.geometry import quat_to_mat
@@ -15,6 +16,7 @@ METHODS = ("decompose", "hull", "boxes")
 INSTALL = "pip install 'libero-lifelong[objects]'"
 _CONCAVITY = 0.05  # CoACD's threshold: deviation of a piece from its hull
 _MAX_PIECES = 24
+_MAX_FACES = 100_000  # that CoACD takes apart within minutes
 _CONVEX = 0.95  # share of its hull that a convex mesh fills
 _CELLS = 16  # grid cells along the longest side, from which boxes are made
 _MAX_BOXES = 60
@@ -64,6 +66,12 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notif
                 f"CoACD is not installed: boxes are used for collisions; for a finer shape: {INSTALL}, and add it again"
             )
             return Pieces("boxes", boxes=boxes_of(vertices, faces))
+        if len(faces) > _MAX_FACES:
+            notify(f"its {len(faces)} triangles are simplified to {_MAX_FACES} for the decomposition")
+            empty = np.zeros((0, 2)), np.zeros((0, 3), np.int64)
+            scale = np.ptp(vertices, axis=0).max()
+            found, faces, *_ = decimate(vertices / scale, faces, *empty, _MAX_FACES)
+            vertices = found * scale
         return Pieces("decompose", _decomposed(coacd, vertices, faces))
     return Pieces("boxes", boxes=boxes_of(vertices, faces))
 
@@ -181,7 +189,13 @@ def _inside(vertices, faces, low, extent, count) -> np.ndarray:
         low[k] + step[k] * (np.arange(count[k]) + 0.5013) for k in range(3)
     )  # off-centre, so as not to meet vertices
     below = np.zeros(count, int)
-    for a, b, c in vertices[faces]:
+    corners = vertices[faces]
+    for axis, lines in enumerate((x, y)):  # most triangles of a fine mesh are between the lines
+        first, last = corners[:, :, axis].min(axis=1), corners[:, :, axis].max(axis=1)
+        pad = 1e-6 * step[axis]
+        met = np.searchsorted(lines, last + pad, "right") > np.searchsorted(lines, first - pad)
+        corners = corners[met]
+    for a, b, c in corners:
         (ux, uy), (vx, vy) = b[:2] - a[:2], c[:2] - a[:2]
         area = ux * vy - uy * vx
         if abs(area) < 1e-18:

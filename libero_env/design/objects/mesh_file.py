@@ -1,7 +1,8 @@
 """Reading of mesh files (OBJ, GLB, glTF, STL, PLY) as surfaces: upright, in metres, centred at the origin."""
 
-import shlex
-from collections.abc import Callable, Iterator
+import struct
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import log
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from libero_env.errors import LiberoError
+from libero_env.design.objects.mesh_gate import Folder, check_finite, check_mesh_file, check_picture
+from libero_env.errors import InvalidInputError
+from libero_env.objects.references import check_faces
 
 FORMATS = (".obj", ".glb", ".gltf", ".stl", ".ply")
 _Y_UP = (".glb", ".gltf")  # formats whose specification says so
@@ -51,24 +54,28 @@ def read_mesh(path: Path, *, size: float | None, up: str | None, notify: Notify)
         notify: Function that receives a message about each assumption.
 
     Raises:
-        LiberoError: The format is not supported, there are no triangles, or a texture is missing; the message names the
-            file.
+        InvalidInputError: The format is not supported, there are no triangles, too many or broken ones, or a texture is
+            missing or elsewhere; the message names the file.
     """
     if path.suffix.lower() not in FORMATS:
-        raise LiberoError(f"{path}: unknown format {path.suffix!r}; valid: .xml (MJCF), {', '.join(FORMATS)}")
+        raise InvalidInputError(
+            f"{path}: unknown format {path.suffix!r}; valid: .xml (MJCF), {', '.join(FORMATS)}"
+        )
     if not path.is_file():
-        raise LiberoError(f"{path}: no such file")
-    _check_textures(path)
-    surfaces = [_surface(part) for part in _parts(path)]
+        raise InvalidInputError(f"{path}: no such file")
+    check_mesh_file(path)
+    parts = _parts(path)
+    check_faces(sum(len(part.faces) for part in parts), str(path))
+    surfaces = [_surface(part, path) for part in parts]
     if not surfaces:
-        raise LiberoError(f"{path}: it contains no triangles; export the object as a mesh")
+        raise InvalidInputError(f"{path}: it contains no triangles; export the object as a mesh")
     if up is None:
         up = "y" if path.suffix.lower() in _Y_UP else "z"
     if up == "y":
         surfaces = [replace(s, vertices=s.vertices[:, [0, 2, 1]] * (1, -1, 1)) for s in surfaces]
     low, high = bounds(surfaces)
-    if min(high - low) <= 1e-4 * max(high - low):
-        raise LiberoError(f"{path}: it is flat and cannot be grasped; give it a thickness")
+    if not min(high - low) > 1e-4 * max(high - low):
+        raise InvalidInputError(f"{path}: it is flat and cannot be grasped; give it a thickness")
     scale = size / max(high - low) if size else _unit(float(max(high - low)), path, notify)
     centre = (low + high) / 2
     return [replace(s, vertices=(s.vertices - centre) * scale) for s in surfaces]
@@ -93,8 +100,9 @@ def merge_vertices(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
 
 def is_closed(faces: np.ndarray) -> bool:
     """Return whether every edge of the triangles (f, 3) belongs to two triangles of consistent orientation."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there, back = np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    base = int(edges.max(initial=0)) + 1  # an edge as one number, which sorts faster than two
+    there, back = np.unique(edges @ (base, 1)), np.unique(edges @ (1, base))
     return len(there) == len(edges) and np.array_equal(there, back)
 
 
@@ -109,23 +117,37 @@ def _parts(path: Path) -> list[Any]:
     import trimesh
 
     try:
-        found = trimesh.load(str(path), force="scene").dump()
+        found = trimesh.load(str(path), resolver=Folder(path), force="scene").dump()
     except Exception as error:  # noqa: BLE001 - readers of formats raise errors of many types
-        raise LiberoError(f"{path}: it cannot be read ({error}); export it again") from error
+        if isinstance(error, InvalidInputError):
+            raise
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InvalidInputError(f"{path}: it cannot be read ({reason}); export it again") from error
     return [part for part in found if len(getattr(part, "faces", ()))]
 
 
-def _surface(part: Any) -> Surface:
+def _surface(part: Any, path: Path) -> Surface:
     vertices, faces = np.array(part.vertices, float), np.array(part.faces, np.int64)
+    check_finite(vertices, path)
     material = getattr(part.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     texcoords = getattr(part.visual, "uv", None)
     if image is not None and texcoords is not None:
-        return Surface(vertices, faces, np.array(texcoords, float)[:, :2], image.convert("RGB"), (1.0,) * 4)
+        points = np.array(texcoords, float)[:, :2]
+        check_finite(points, path)
+        return Surface(vertices, faces, points, _picture(image, path), (1.0,) * 4)
     known = getattr(part.visual, "defined", False) or material is not None
     colour = getattr(material if material is not None else part.visual, "main_color", None) if known else None
     rgba = _GREY if colour is None else tuple(round(float(value) / 255, 4) for value in colour)
     return Surface(vertices, faces, rgba=rgba)
+
+
+def _picture(image: Image.Image, path: Path) -> Image.Image:
+    check_picture(image, str(path))
+    try:
+        return image.convert("RGB")
+    except (OSError, SyntaxError, ValueError, struct.error, zlib.error) as error:
+        raise InvalidInputError(f"{path}: a texture is damaged ({error}); save it again") from error
 
 
 def _unit(longest: float, path: Path, notify: Notify) -> float:
@@ -141,28 +163,3 @@ def _unit(longest: float, path: Path, notify: Notify) -> float:
         "if that is wrong, give --size (m)"
     )
     return unit
-
-
-def _check_textures(path: Path) -> None:
-    """Check that the textures of an OBJ file's materials exist; trimesh would omit them silently."""
-    if path.suffix.lower() != ".obj":
-        return
-    for library in _referenced_files(path, ("mtllib",)):
-        if not library.is_file():
-            raise LiberoError(
-                f"{path}: its material file {library.name} is missing; put it beside it, or remove the line mtllib"
-            )
-        for texture in _referenced_files(library, ("map_Kd",)):
-            if not texture.is_file():
-                raise LiberoError(
-                    f"{library}: its texture {texture.name} is missing; put it at {texture}, or remove the line map_Kd"
-                )
-
-
-def _referenced_files(path: Path, keys: tuple[str, ...]) -> Iterator[Path]:
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        word, _, rest = line.strip().partition(" ")
-        if word in keys and rest.strip():
-            whole = path.parent / rest.strip()
-            # options may come before the name, and names may contain blanks
-            yield whole if whole.is_file() else path.parent / shlex.split(rest)[-1].replace("\\", "/")
