@@ -73,11 +73,6 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         DamagedCheckpointError: The file is damaged, or was not written by `save`.
         CheckpointError: The file is missing.
     """
-    return read(path, device)[0]
-
-
-def read(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Any], bool]:
-    """Return the tree in a file, and whether a checksum confirms it (earlier versions wrote none); see `load`."""
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
     try:
@@ -94,9 +89,15 @@ def read(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Any]
         tree = _decode(head["tree"], placed, 0)
         if not isinstance(tree, dict):
             raise ValueError("it holds no dictionary")
-        return tree, head["format"] == FORMAT
+        return tree
     except (OSError, SafetensorError, ValueError, RecursionError) as error:
         raise DamagedCheckpointError(f"{path} is broken, or is no checkpoint ({error})") from error
+
+
+def is_sealed(path: Path) -> bool:
+    """Return whether a readable file has a checksum; those of earlier versions have none."""
+    with safe_open(path, framework="pt", device="cpu") as file:
+        return _ENTRY in (file.metadata() or {})
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 from libero_env.cli import arguments, assets, demos, ending, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
-from lifelong.cli import compare, evaluate, protocols, serve
+from lifelong.cli import check, compare, evaluate, protocols, serve
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -171,4 +171,5 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     serve.register,
     compare.register,
     register_report,
+    check.register,
 )

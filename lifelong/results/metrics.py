@@ -118,9 +118,11 @@ def negative_backward_transfer(matrix: ArrayLike) -> Floats:
     """Return (K,) NBT_k = mean over t > k of (c[k,k] - c[t,k]) (eq. 3): how much of task k is forgotten.
 
     No task follows the last one; its empty mean is 0 and still counts among the K terms of the average,
-    as in the authors' own evaluation notebook.
+    as in the authors' own evaluation notebook. Of a single task it is undefined (NaN): nothing could be forgotten.
     """
     c = np.asarray(matrix, dtype=float)
+    if len(c) == 1:
+        return np.array([np.nan])
     drops = [(c[k, k] - c[k + 1 :, k]).mean() for k in range(len(c) - 1)]
     return np.array([*drops, 0.0][: len(c)], dtype=float)
 
@@ -241,6 +243,8 @@ def cells(scores: Scores) -> Cells:
     none = [np.zeros_like(h) for h in held]
     curve_weights = {"fwt": held, "auc": [h / (size - k) for k, h in enumerate(held)]}
     weights = {n: np.concatenate([w, *curve_weights.get(n, none)]) for n, w in matrix_weights.items()}
+    if size == 1:  # nothing follows the only task
+        weights["nbt"] = np.full(len(rates), np.nan)
     if any(len(c.rates) == 0 for c in scores.curves):  # a task without a learning curve
         weights["fwt"] = weights["auc"] = np.full(len(rates), np.nan)
     return Cells(rates, episodes, weights)

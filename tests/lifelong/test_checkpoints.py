@@ -121,8 +121,8 @@ def test_files_of_earlier_versions_are_read_without_a_checksum(tmp_path):
     tree = {"dict": [["task", {"value": 1}], ["w", {"tensor": "/w"}]]}
     entries = {"format": "lifelong-1", "tree": json.dumps(tree)}
     save_file({"": torch.zeros(0), "/w": torch.ones(2)}, path, entries)
-    found, checked = checkpoints.read(path)
-    assert found["task"] == 1 and found["w"].tolist() == [1, 1] and not checked
+    found = checkpoints.load(path)
+    assert found["task"] == 1 and found["w"].tolist() == [1, 1] and not checkpoints.is_sealed(path)
 
 
 @pytest.mark.parametrize(

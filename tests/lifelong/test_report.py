@@ -28,6 +28,7 @@ from lifelong.results.records import (
     TaskEndRecord,
     start_record,
 )
+from lifelong.results.summary import json_safe, summarize
 
 GROCERIES = [
     "alphabet soup",
@@ -488,3 +489,18 @@ def test_any_text_is_shown_as_it_is(text, tmp_path):
     for page in (write_report([run]), write_report([run, make_run(tmp_path / "two", tasks=2)], tmp_path)):
         html = page.read_text(encoding="utf-8")
         assert "<script>alert" not in html and "title>49" not in html
+
+
+def test_nothing_is_forgotten_in_a_sequence_of_one_task(tmp_path: Path):
+    """NBT is undefined, not 0 with an interval of no width."""
+    runs = [make_run(tmp_path / f"{seed}", tasks=1, seed=seed) for seed in (1, 2)]
+    run = load_run(runs[0])
+    assert run.metrics is not None and np.isnan(run.metrics.nbt.value) and np.isnan(run.metrics.nbt.high)
+    summary = json.loads(json.dumps(json_safe(summarize(run.results))))
+    assert summary["metrics"]["nbt"] == {"value": None, "low": None, "high": None}
+    assert summary["metrics"]["by_task"]["nbt"] == [None]
+    assert "nan" not in Page(write_report([runs[0]]).read_text()).text.lower()
+    page = write_report(runs, tmp_path / "out")
+    assert "nan" not in Page(page.read_text()).text.lower()
+    (group,) = json.loads((page.parent / "comparison.json").read_text())["groups"].values()
+    assert group["metrics"]["nbt"]["mean"] is None and group["metrics"]["final_success"]["mean"] is not None
