@@ -1,9 +1,11 @@
 """Errors of the package; all derive from `LiberoError`."""
 
 import difflib
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+DEBUG_VARIABLE = "LIBERO_DEBUG"  # environment variable that asks for every traceback
 RAISED_BY = "raised by "  # a note on an error from code of the user begins so; then follows whose code it is
 
 
@@ -76,6 +78,11 @@ class RenderError(LiberoError):
 
 class DemoError(LiberoError, ValueError):
     """A demonstration file that is broken; the message names file, demonstration, key, and what was expected."""
+
+
+def is_debugging() -> bool:
+    """Return whether the user wants to see every traceback, also those of errors that say everything."""
+    return os.environ.get(DEBUG_VARIABLE, "0") not in ("", "0")
 
 
 def printable(text: str) -> str:

@@ -16,7 +16,7 @@ import pytest
 
 from libero_env import mujoco_compat, parallel
 from libero_env.cli import ending
-from libero_env.errors import LiberoError, code_of
+from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
 from libero_env.tasks import read_task
 from lifelong import launch
@@ -79,7 +79,7 @@ number = 5
 @pytest.fixture
 def here(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv(ending.VARIABLE, raising=False)
+    monkeypatch.delenv(DEBUG_VARIABLE, raising=False)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     Path("ending_policy.py").write_text(POLICY)
     Path("ending_broken.py").write_text("def make(:\n")
@@ -169,7 +169,7 @@ def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
     assert "lifelong/" not in found and "fault of libero-lifelong" not in found and "\x1b" not in found
     assert cli.main(["--debug", *command, "--again"]) == ending.MISTAKE
     assert "lifelong/evaluation/actors.py" in capsys.readouterr().err
-    assert ending.VARIABLE not in os.environ
+    assert DEBUG_VARIABLE not in os.environ
     command[1] = "ending_policy:texts"
     assert cli.main(command) == ending.MISTAKE
     assert "error: Policy.predict returned a list that is no array of numbers" in capsys.readouterr().err
@@ -202,7 +202,7 @@ def test_debug_reaches_train(here, monkeypatch, capsys):
     assert launch.main(["preset=smoke", "--debug", "algo=evc"]) == ending.MISTAKE
     found = capsys.readouterr().err
     assert found.startswith("Traceback") and "\nerror: unknown algo 'evc'" in found
-    monkeypatch.setenv(ending.VARIABLE, "1")
+    monkeypatch.setenv(DEBUG_VARIABLE, "1")
     assert launch.main(["preset=smoke", "algo=evc"]) == ending.MISTAKE
     assert capsys.readouterr().err.startswith("Traceback")
 

@@ -45,17 +45,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Evaluate the checkpoint that the arguments name.
 
     Returns:
-        Exit status: 0, or 1 after an error, which is printed on one line.
+        The exit status, see `libero_env.cli.ending`.
     """
     from libero.lifelong.run_evaluation import evaluate
-    from libero_env.errors import LiberoError
+    from libero_env.cli import ending
 
-    args = parse_args(argv)
-    try:
-        evaluate(args)
-    except (LiberoError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+    with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+        args = parse_args(words)
+        try:
+            with ending.interruptible():
+                evaluate(args)
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - told by kind
+            return ending.report(error)
     return 0
 
 

@@ -8,7 +8,7 @@ def main() -> int:
     """Run the configuration of the command line, with the keys of `libero/configs`.
 
     Returns:
-        Exit status: 0, 1 after an error, which is printed on one line, or 130 if interrupted.
+        The exit status, see `libero_env.cli.ending`.
     """
     import hydra
     from hydra.errors import HydraException
@@ -16,29 +16,30 @@ def main() -> int:
 
     from libero._adapters.lifelong.config import CONFIGS
     from libero.lifelong.run import run
-    from libero_env.errors import LiberoError
+    from libero_env.cli import ending
     from lifelong.launch import check_choices
 
-    failed = False
+    status, mistakes = 0, (HydraException, OmegaConfBaseException)
 
     def job(config: object) -> None:
-        nonlocal failed
+        nonlocal status
         try:
             run(config)
-        except (LiberoError, HydraException, OmegaConfBaseException, OSError) as error:
-            failed = True
-            print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        except Exception as error:  # noqa: BLE001 - told by kind
+            status = max(status, ending.report(error, mistakes=mistakes))
 
-    try:
-        check_choices(sys.argv[1:], [CONFIGS])
-        hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")(job)()
-    except LiberoError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; train.resume=true resumes after the last finished task", file=sys.stderr)
-        return 130
-    return int(failed)
+    with ending.debugging(sys.argv[1:]) as words:
+        sys.argv[1:] = words  # where Hydra reads them
+        try:
+            with ending.interruptible():
+                check_choices(words, [CONFIGS])
+                hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")(job)()
+        except KeyboardInterrupt as error:
+            error.add_note("train.resume=true resumes after the last finished task")
+            return ending.report(error)
+        except Exception as error:  # noqa: BLE001 - told by kind
+            return ending.report(error, mistakes=mistakes)
+    return status
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from libero_env.errors import LiberoError
+from libero_env.cli import ending
 
 Option = Callable[[argparse.ArgumentParser], Any]
 Main = Callable[[Sequence[str] | None], int]
@@ -19,7 +19,8 @@ def option(*flags: str, **settings: Any) -> Option:
 def script(*options: Option, prog: str = "") -> Callable[[Callable[[argparse.Namespace], int | None]], Any]:
     """Turn a function of parsed arguments into the `main(argv)` of a script.
 
-    It returns the exit status: that of the function (None for 0), or 2 for an error, which is printed in one line.
+    It returns the exit status: that of the function (None for 0), or that of an error, see
+    `libero_env.cli.ending`.
 
     Args:
         options: Functions that add options to the parser, see `option`.
@@ -33,14 +34,13 @@ def script(*options: Option, prog: str = "") -> Callable[[Callable[[argparse.Nam
             parser = argparse.ArgumentParser(prog=name, description=sys.modules[work.__module__].__doc__)
             for add in options:
                 add(parser)
-            try:
-                return work(parser.parse_args(argv)) or 0
-            except (LiberoError, OSError) as error:
-                print(f"{name}: error: {error}", file=sys.stderr)
-                return 2
-            except KeyboardInterrupt:
-                print(f"{name}: interrupted", file=sys.stderr)
-                return 130
+            with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+                arguments = parser.parse_args(words)
+                try:
+                    with ending.interruptible():
+                        return work(arguments) or 0
+                except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - told by kind
+                    return ending.report(error, who=f"{name}: ")
 
         main.__doc__ = work.__doc__
         return main

@@ -24,10 +24,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from libero_env.errors import RAISED_BY, LiberoError, printable
+from libero_env.errors import DEBUG_VARIABLE, RAISED_BY, LiberoError, is_debugging, printable
 
 MISTAKE, DEFECT, SIGNALLED = 2, 70, 128
-DEBUG, VARIABLE = "--debug", "LIBERO_DEBUG"
+DEBUG = "--debug"
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _MAX_FRAMES = 12  # of the user's code in a message
 _ROOTS = [str(Path(__file__).parents[2] / name) + os.sep for name in ("libero_env", "lifelong", "libero")]
@@ -87,21 +87,16 @@ def interruptible() -> Iterator[None]:
 def debugging(words: Sequence[str]) -> Iterator[list[str]]:
     """Yield the words of a command line without `--debug`, which counts for this command and its processes."""
     rest = [word for word in words if word != DEBUG]
-    before = os.environ.get(VARIABLE)
+    before = os.environ.get(DEBUG_VARIABLE)
     if len(rest) < len(words):
-        os.environ[VARIABLE] = "1"
+        os.environ[DEBUG_VARIABLE] = "1"
     try:
         yield rest
     finally:
         if before is None:
-            os.environ.pop(VARIABLE, None)
+            os.environ.pop(DEBUG_VARIABLE, None)
         else:
-            os.environ[VARIABLE] = before
-
-
-def is_debugging() -> bool:
-    """Return whether every traceback is shown."""
-    return os.environ.get(VARIABLE, "0") not in ("", "0")
+            os.environ[DEBUG_VARIABLE] = before
 
 
 def report(error: BaseException, *, who: str = "", mistakes: tuple[type[BaseException], ...] = ()) -> int:

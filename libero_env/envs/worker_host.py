@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, is_debugging
 from libero_env.parallel import end_with_parent
 
 
@@ -105,7 +105,9 @@ def serve(
             try:
                 answer = ForkingPickler.dumps((number, True, getattr(host, command)(*args)))
             except LiberoError as error:  # its text says it all
-                answer = ForkingPickler.dumps((number, False, f"it raised {type(error).__name__}: {error}"))
+                text = f"{type(error).__name__}: {error}"
+                said = f"it raised {text}" if not is_debugging() else f"it raised\n{traceback.format_exc()}"
+                answer = ForkingPickler.dumps((number, False, said))
             except Exception:  # noqa: BLE001 - the other end raises it
                 answer = ForkingPickler.dumps((number, False, f"it raised\n{traceback.format_exc()}"))
             pipe.send_bytes(answer)

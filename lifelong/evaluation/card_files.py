@@ -8,9 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from libero_env.errors import UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.validation import read_yaml_file
 from lifelong.errors import EvaluationFileError, ProtocolError
 from lifelong.evaluation.card import SECTIONS, Card
 from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult
@@ -100,9 +99,9 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise ProtocolError(f"{path}: extends: the cards extend each other in a circle")
     try:
-        own = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ProtocolError(f"{path} is not valid YAML: {error}") from error
+        own = read_yaml_file(path).data
+    except InvalidInputError as error:
+        raise ProtocolError(str(error)) from error
     if not isinstance(own, dict):
         raise ProtocolError(f"{path} is not a protocol: expected sections such as `world:` and `episode:`")
     if "extends" not in own:

@@ -3,14 +3,29 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from libero_env.validation import validate
 from lifelong.errors import ConfigError, ResultsError
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.card_files import parse_card
 from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult
 
 POLICIES = ("run", "policy", "server")  # keys of `evaluated` that name a policy, one for each kind
+
+
+class _Evaluated(TypedDict, total=False):
+    """What of `evaluated` an evaluation is repeated by."""
+
+    run: Annotated[str, Field(min_length=1)]
+    policy: Annotated[str, Field(min_length=1)]
+    server: Annotated[str, Field(min_length=1)]
+    after: Annotated[int, Field(ge=0)] | None
+    names: Literal["native", "original", "protocol"] | None
+    seed: Annotated[int, Field(ge=0)]
 
 
 def is_result(text: str) -> bool:
@@ -33,6 +48,8 @@ def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Nam
         ConfigError: It is of a policy in a module that the user has not allowed.
     """
     evaluated = result.evaluated
+    known = {key: value for key, value in evaluated.items() if key in _Evaluated.__annotations__}
+    validate(_Evaluated, known, source=str(args.policy), prefix=("evaluated",), error=ResultsError)
     kind = next((name for name in POLICIES if evaluated.get(name)), None)
     if kind is None:
         raise ResultsError(f"{args.policy} does not say which policy it is of: {dict(evaluated)}")
@@ -112,4 +129,4 @@ def check_same(
 
 def _threads(result: EvaluationResult) -> int | None:
     found = result.environment.get("policy_threads") if result.evaluated.get("run") else None
-    return found if isinstance(found, int) else None
+    return found if isinstance(found, int) and 1 <= found <= 1024 else None

@@ -10,11 +10,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import TypedDict
 
 from libero_env.storage import atomic_write_text
+from libero_env.validation import validate
 from lifelong.errors import EvaluationFileError, ResultsError
 from lifelong.results.metrics import Estimate, combine_intervals, wilson_interval
 from lifelong.results.subgoals import predicate_of
@@ -26,6 +29,41 @@ FIRST_FORMAT = (
 )
 FILE_NAME = "eval.json"
 FIRST_KEYS = ("evaluated", "protocol", "init_states", "versions", "tasks")
+
+_Count = Annotated[int, Field(ge=0, le=2**31)]
+_Name = Annotated[str, Field(min_length=1, max_length=1000)]
+_Id = Annotated[
+    str, Field(pattern=r"^[^/\x00]+/[^\x00]+$", max_length=1000)
+]  # also part of the names of files
+
+
+class _TaskRow(TypedDict):
+    """A task in the file, without what follows from it."""
+
+    task: _Id
+    name: _Name
+    instruction: str
+    init_states: list[_Count]
+    successes: list[bool]
+    lengths: list[_Count]
+    atoms: NotRequired[list[str]]
+    atoms_ever: NotRequired[list[list[bool]]]
+    atoms_at_end: NotRequired[list[list[bool]]]
+    errors: NotRequired[list[str | None]]
+    actions: NotRequired[list[str]]
+
+
+class _Content(TypedDict):
+    """The file, without what follows from it."""
+
+    evaluated: dict[str, Any]
+    protocol: dict[str, Any]
+    init_states: list[_Count]
+    versions: dict[str, Any]
+    tasks: list[Any]
+    environment: NotRequired[dict[str, Any]]
+    unit_starts: NotRequired[Annotated[int, Field(ge=1)] | None]
+    times: NotRequired[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -98,15 +136,6 @@ class TaskResult:
             widths = {len(row) for row in getattr(self, name)}
             if widths - {len(self.atoms)}:
                 found.append(f"{name} needs a column for each of the {len(self.atoms)} atoms")
-        if not all(isinstance(won, bool) for won in self.successes):
-            found.append("successes are not all true or false")
-        for name in ("init_states", "lengths"):
-            if not all(type(n) is int and n >= 0 for n in getattr(self, name)):
-                found.append(f"{name} are not all whole numbers from 0 on")
-        if not all(text is None or isinstance(text, str) for text in self.errors):
-            found.append("errors are not all texts or null")
-        if not all(isinstance(text, str) for text in self.actions):
-            found.append("actions are not all digests")
         return found
 
 
@@ -180,13 +209,13 @@ class EvaluationResult:
         """
         path = Path(path)
         path = path / FILE_NAME if path.is_dir() else path
+        if not path.is_file():
+            raise EvaluationFileError(f"{path} does not exist; `libero eval` writes {FILE_NAME}")
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError as error:
-            raise EvaluationFileError(f"{path} does not exist; `libero eval` writes {FILE_NAME}") from error
         except OSError as error:
             raise EvaluationFileError(f"{path} cannot be read: {error}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise EvaluationFileError(f"{path} is not JSON ({error}): it is broken or incomplete") from error
         try:
             return _from_plain(values)
@@ -266,17 +295,10 @@ def task_result(values: Any, where: str = "a task") -> TaskResult:
     """
     if not isinstance(values, Mapping):
         raise EvaluationFileError(f"{where} is {type(values).__name__}; expected an object")
-    texts, rows = ("task", "name", "instruction"), ("init_states", "successes", "lengths")
-    if missing := [name for name in (*texts, *rows) if name not in values]:
-        raise EvaluationFileError(f"{where} lacks {', '.join(missing)}")
-    found = {f.name: values[f.name] for f in fields(TaskResult) if f.name in values}
-    for name, value in found.items():
-        expected = str if name in texts else list
-        if not isinstance(value, expected):
-            raise EvaluationFileError(f"{where}: {name} is {value!r}; expected {expected.__name__}")
-        if name.startswith("atoms_") and not all(isinstance(row, list) for row in value):
-            raise EvaluationFileError(f"{where}: {name} is not a list of rows")
-    return TaskResult(**{name: _tuples(value) for name, value in found.items()})
+    names = [f.name for f in fields(TaskResult)]
+    known = {name: values[name] for name in names if name in values}
+    row = validate(_TaskRow, known, prefix=(where,), error=EvaluationFileError)
+    return TaskResult(**{name: _tuples(value) for name, value in row.items()})
 
 
 def _from_plain(values: Any) -> EvaluationResult:
@@ -284,21 +306,17 @@ def _from_plain(values: Any) -> EvaluationResult:
         raise EvaluationFileError("this is not the result of an evaluation: expected a JSON object")
     written_as = values.get("format", FIRST_FORMAT if {*FIRST_KEYS} <= values.keys() else None)
     _check_format(written_as)
-    if missing := [key for key in FIRST_KEYS if key not in values]:
-        raise EvaluationFileError(f"the result lacks {', '.join(missing)}: it is incomplete")
-    kinds = {"evaluated": dict, "protocol": dict, "init_states": list, "versions": dict, "tasks": list}
-    for key, kind in kinds.items():
-        if not isinstance(values[key], kind):
-            raise EvaluationFileError(f"{key} is {type(values[key]).__name__}; expected {kind.__name__}")
+    known = {key: value for key, value in values.items() if key in _Content.__annotations__}
+    content = validate(_Content, known, error=EvaluationFileError)
     result = EvaluationResult(
-        evaluated=values["evaluated"],
-        protocol=values["protocol"],
-        init_states=tuple(values["init_states"]),
-        versions=values["versions"],
-        tasks=tuple(task_result(row, f"task {i}") for i, row in enumerate(values["tasks"])),
-        environment=values.get("environment", {}),
-        unit_starts=values.get("unit_starts"),
-        times=values.get("times", {"finished": values.get("finished")}),
+        evaluated=content["evaluated"],
+        protocol=content["protocol"],
+        init_states=tuple(content["init_states"]),
+        versions=content["versions"],
+        tasks=tuple(task_result(row, f"task {i}") for i, row in enumerate(content["tasks"])),
+        environment=content.get("environment", {}),
+        unit_starts=content.get("unit_starts"),
+        times=content.get("times", {"finished": values.get("finished")}),
         format=str(written_as),
     )
     if written_as == FORMAT and values.get("outcomes") != result.outcomes:

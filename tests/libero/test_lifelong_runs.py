@@ -96,7 +96,7 @@ def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
         "the same weights, the same masks"
     )
     assert len(list((path / "task1_model_on0_videos").iterdir())) == 2
-    assert evaluate.main([*arguments[:-1], "7"]) == 1
+    assert evaluate.main([*arguments[:-1], "7"]) == 2
     assert "task0_model.pth, task1_model.pth" in capsys.readouterr().err
 
 
@@ -187,7 +187,7 @@ def test_errors_are_printed_on_one_line(folder, monkeypatch, capsys):
         monkeypatch.setattr(
             sys, "argv", ["main", f"folder={folder}", "device=cpu", "benchmark_name=LIBERO_OBJECT", override]
         )
-        assert main.main() == 1
+        assert main.main() == 2
         error = capsys.readouterr().err
         assert re.search(message, error) and error.count("\n") == 1
 

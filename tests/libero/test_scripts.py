@@ -87,7 +87,7 @@ def test_a_script_as_a_process(tmp_path):
     command = [sys.executable, str(ROOT / "benchmark_scripts" / "shasum_files.py"), str(tmp_path / "nothing")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"shasum_files.py: error: no files in {tmp_path / 'nothing'}\n"
+    assert done.stderr == f"error: shasum_files.py: no files in {tmp_path / 'nothing'}\n"
 
 
 @pytest.mark.sim
@@ -115,7 +115,7 @@ def test_create_dataset(collected, tmp_path, capsys):
         # the first actions act from the recorded state: positions to the bit, the arm's goals are forgotten between
         assert np.allclose(acted["data/demo_1/states"], before["data/demo_1/states"], atol=1e-6)
     assert create_dataset.main(["--demo-file", str(tmp_path / "none.hdf5")]) == 2
-    assert "create_dataset.py: error: " in capsys.readouterr().err
+    assert "error: create_dataset.py: " in capsys.readouterr().err
 
 
 @pytest.mark.unit

@@ -144,7 +144,7 @@ BAD = {
     "state without source": ("extends: openpi\nproprioception: {source: none}", r"proprioception\.order is "),
     "source of nothing": ("extends: openpi\nsources: {worlds: x}", r"sources\.worlds is no key"),
     "no mapping": ("- 1", "is not a protocol"),
-    "no YAML": ("a: [", "is not valid YAML"),
+    "no YAML": ("a: [", "not valid YAML"),
     "circle": ("extends: mine.yaml", "extend each other in a circle"),
     "unknown base": ("extends: opennpi", "extends: unknown protocol 'opennpi'. Did you mean 'openpi'"),
 }

@@ -326,7 +326,7 @@ def test_commands(tmp_path, monkeypatch, capsys):
         (["compare", "a"], "needs two results"),
         (["compare", "a", "nothing"], "nothing does not exist"),
         (["compare", "a", "old"], "the format is libero-evaluation/99"),
-        (["compare", "a", "nan"], "successes are not all true or false"),
+        (["compare", "a", "nan"], "successes.3 is nan; expected true or false"),
         (["compare", "--group", "a"], "--group NAME RESULT"),
         (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
         (["power", "a"], "takes two results, not 1"),

@@ -1,0 +1,84 @@
+"""Results of evaluations and cards of protocols as others may have left them, through everything that reads them."""
+
+import argparse
+import contextlib
+import io
+import json
+
+import pytest
+import yaml
+from hypothesis import given
+
+from lifelong.cli.compare import _single_sides
+from lifelong.evaluation.card_files import load_card
+from lifelong.evaluation.protocols import PROTOCOLS
+from lifelong.evaluation.repeat import repeated, repeated_card
+from lifelong.report.judgement import judge, write_judgement
+from lifelong.report.judgement_text import render
+from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult, task_result
+from lifelong.results.exports import export_lerobot, export_vla_eval
+from lifelong.results.summary import json_safe
+from tests.harness.fuzz import examples, survive
+from tests.harness.mutations import changed_text, mutated
+from tests.harness.results import drawn_result
+
+pytestmark = pytest.mark.unit
+
+CARD = json_safe(PROTOCOLS["openpi"].resolved())
+VALID = [
+    drawn_result(0.7, 1, tasks=2, protocol=CARD).to_plain(),
+    drawn_result(
+        0.4, 2, tasks=1, evaluated={"run": "runs/a", "after": 1, "seed": 3}, unit_starts=10
+    ).to_plain(),
+    {
+        k: v for k, v in drawn_result(0.4, 2, tasks=1).to_plain().items() if k != "format"
+    },  # of the first version
+]
+ARGS = argparse.Namespace(policy="here", out=None, policy_threads=None, allow=[])
+
+
+def sealed(values: object) -> object:
+    """The same with the digest that its tasks have, where they are valid: the digest is no protection."""
+    if isinstance(values, dict):
+        with contextlib.suppress(Exception):
+            tasks = tuple(task_result(row) for row in values["tasks"])
+            values["outcomes"] = EvaluationResult({}, {}, (), {}, tasks).outcomes
+    return values
+
+
+@given(values=mutated(VALID).map(sealed))
+@examples(short=60, long=4000)
+def test_any_result_is_used_or_refused(values, tmp_path_factory):
+    folder = tmp_path_factory.getbasetemp() / "result"
+    folder.mkdir(exist_ok=True)
+    (folder / FILE_NAME).write_text(json.dumps(values))
+    survive("results of evaluations", lambda: EvaluationResult.read(folder))
+
+    def use() -> None:
+        result = EvaluationResult.read(folder)
+        repeated(ARGS, result)
+        export_lerobot(result, folder / "lerobot")
+        export_vla_eval(result, folder / "vla-eval")
+        found = judge(_single_sides([str(folder), str(folder)]), control=None, allow=[], alpha=0.05)
+        with contextlib.redirect_stdout(io.StringIO()):
+            print(render(found, tasks=True))
+        write_judgement(found, folder / "compare.json")
+
+    survive("results of evaluations", use)
+    survive("results of evaluations", lambda: repeated_card(EvaluationResult.read(folder), "here"))
+
+
+@given(text=changed_text(json.dumps(VALID[0])))
+@examples(short=20, long=1000)
+def test_any_text_of_a_result_is_read_or_refused(text, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "text.json"
+    path.write_text(text)
+    survive("results of evaluations", lambda: EvaluationResult.read(path))
+
+
+@given(values=mutated([{"extends": "openpi"} | {k: CARD[k] for k in ("episode", "pixels")}, {**CARD}]))
+@examples(short=40, long=2000)
+def test_any_card_is_read_or_refused(values, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "card.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8", errors="replace")
+    survive("cards of protocols", lambda: load_card(str(path)).require())
