@@ -176,14 +176,18 @@ def _expected(error: "ErrorDetails") -> str:
         case "literal_error":
             return f"one of {context['expected']}"
         case "too_short":
-            return f"at least {context['min_length']} entries"
+            return f"at least {_entries(context['min_length'])}"
         case "too_long":
-            return f"at most {context['max_length']} entries"
+            return f"at most {_entries(context['max_length'])}"
         case "string_pattern_mismatch":
             return f"a text that matches {context['pattern']}"
         case "string_too_short":
             return "a text that is not empty"
     return _WORDS.get(kind) or error["msg"]
+
+
+def _entries(count: int) -> str:
+    return f"{count} {'entry' if count == 1 else 'entries'}"
 
 
 def _number(value: float) -> str:
