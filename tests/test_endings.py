@@ -262,7 +262,7 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
     [
         (["tasks", "show", "a\0"], "null character"),
         (["tasks", "new", "../elsewhere"], "is not the name of a task"),
-        (["tasks", "new", "mine", "--goal", ""], "an atom of the goal is empty"),
+        (["tasks", "new", "mine", "--goal", ""], "'' is no atom"),
         (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
         (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
     ],

@@ -76,15 +76,17 @@ def run_new(args: argparse.Namespace) -> None:
     """Write the file and print commands for the next steps.
 
     Raises:
-        LiberoError: A name does not exist, or the file exists already.
+        LiberoError: A name does not exist or is none, or the file exists already.
     """
     from libero_env.design.template import task_template
     from libero_env.errors import LiberoError
     from libero_env.tasks import read_task
     from libero_env.tasks.files import write_task
+    from libero_env.tasks.task import check_name
 
     if args.name.startswith(".") or Path(args.name).name != args.name:
         raise LiberoError(f"{args.name!r} is not the name of a task, such as my_task; --out is the folder")
+    check_name(args.name)
     path = args.out / f"{args.name}.yaml"
     if path.exists():
         raise LiberoError(f"{path} exists already; choose another name, or remove it")

@@ -6,10 +6,11 @@ from math import hypot
 
 import yaml
 
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.tasks.authoring import EMPTY, make_task, model_regions
 from libero_env.tasks.builder import load_scene, scene_names
 from libero_env.tasks.task import Task
+from libero_env.validation import parse_yaml_text
 
 # Places of objects (x, y) [m] in the original's scenes, and of furniture (x, y, yaw).
 _SLOTS = ((-0.05, 0.0), (0.05, 0.2), (-0.2, 0.15), (0.1, -0.02), (-0.18, -0.12), (-0.05, 0.3))
@@ -51,7 +52,7 @@ def task_template(
     for name, (x, y) in _assign_slots(names, _SLOTS, taken, "objects"):
         places[name] = f"{{at: [{x}, {y}], half: 0.025}}"
     text = _text(scene, objects, furniture, places, goal, language)
-    return text, make_task(**yaml.safe_load(text))
+    return text, make_task(**parse_yaml_text(text).data)
 
 
 def _default_goal(names: Mapping[str, str]) -> list[str]:
@@ -66,9 +67,11 @@ def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
     """Return an instruction for a goal; it is correct for atoms like those of `_default_goal`."""
     phrases = []
     for atom in goal:
-        predicate, *args = atom.strip("()").split() or [""]
-        if not predicate:
-            raise LiberoError("an atom of the goal is empty; write for example 'On plate_1 stove_1'")
+        if len(words := atom.strip("() ").split()) < 2:
+            raise InvalidInputError(
+                f"--goal {atom!r:.80} is no atom; expected such as 'On red_coffee_mug_1 plate_1'"
+            )
+        predicate, *args = words
         plain = [names.get(arg, arg).replace("_", " ").replace(" 1", "") for arg in args]
         if predicate in ("On", "In") and len(plain) == 2:
             phrases.append(
@@ -121,8 +124,8 @@ def _text(
     language: str,
 ) -> str:
     lines = [f"language: {_scalar(language)}", f"scene: {_scalar(scene)}"]
-    lines += [f"furniture: [{', '.join(furniture)}]"] if furniture else []
-    lines += [f"objects: [{', '.join(objects)}]"] if objects else []
+    lines += [f"furniture: [{', '.join(map(_scalar, furniture))}]"] if furniture else []
+    lines += [f"objects: [{', '.join(map(_scalar, objects))}]"] if objects else []
     lines += [
         "# centre (x away from the robot, y to its left) and distance around it, m; angle of furniture, rad"
     ]

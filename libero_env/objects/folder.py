@@ -16,9 +16,9 @@ from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.objects.mjcf_gate import Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.paths import objects_dir
+from libero_env.validation import read_yaml_file, validate
 
 MODEL, PROPERTIES, PREVIEW = "object.xml", "object.yaml", "preview.png"
-_REQUIRED = ("bottom_offset", "top_offset", "horizontal_radius")
 _OPTIONAL = ("joint_damping", "rotation", "rotation_axis", "articulation")
 
 
@@ -61,16 +61,21 @@ def read_properties(directory: Path) -> dict[str, Any]:
     """Return the content of `object.yaml`.
 
     Raises:
-        LiberoError: The file is not valid YAML, or a required key is missing.
+        InvalidInputError: The file is not valid YAML, a key is missing or unknown, or a value is not valid; the message
+            has file and line.
     """
-    path = directory / PROPERTIES
-    try:
-        properties = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise LiberoError(f"{path}: {error}; fix it, or add the object again with --replace") from error
-    missing = [key for key in _REQUIRED if not isinstance(properties, dict) or key not in properties]
-    if missing:
-        raise LiberoError(f"{path} has no {', '.join(missing)}; add the object again with --replace")
+    from libero_env.objects.object_schema import Properties
+
+    file = read_yaml_file(directory / PROPERTIES)
+    properties = validate(Properties, file.data, source=file.source, line_of=file.line_of)
+    if (name := properties.get("name", directory.name)) != directory.name:
+        raise InvalidInputError(
+            f"{file.at(('name',))}: the name {name!r:.60} is not that of its folder {directory.name}; change one"
+        )
+    if properties["top_offset"][2] < properties["bottom_offset"][2]:
+        raise InvalidInputError(
+            f"{file.at(('top_offset',))}: its highest point is below its lowest, bottom_offset"
+        )
     return properties
 
 
@@ -88,13 +93,13 @@ def load(directory: Path, category: str) -> ObjectModel:
             f"{directory / MODEL}: expected one body {ROOT_BODY!r} in the world, found {bodies}"
         )
     optional: dict[str, Any] = {key: properties[key] for key in _OPTIONAL if key in properties}
-    bottom, top = (tuple(map(float, properties[key])) for key in ("bottom_offset", "top_offset"))
+    bottom, top = properties["bottom_offset"], properties["top_offset"]
     return ObjectModel(
         category,
         spec,
         bottom_offset=(bottom[0], bottom[1], bottom[2]),
         top_offset=(top[0], top[1], top[2]),
-        horizontal_radius=float(properties["horizontal_radius"]),
+        horizontal_radius=properties["horizontal_radius"],
         digest=digest(directory),
         **optional,
     )

@@ -178,8 +178,8 @@ def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
 def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
     """Return `node` with every `$parameter` replaced; a string that is only a parameter becomes its value."""
     if isinstance(node, Mapping):
-        return {_fill(key, values, where): _fill(value, values, where) for key, value in node.items()}
-    if isinstance(node, list):
+        return {_fill_key(key, values, where): _fill(value, values, where) for key, value in node.items()}
+    if isinstance(node, list | tuple):
         return [_fill(item, values, where) for item in node]
     if not isinstance(node, str) or "$" not in node:
         return node
@@ -189,6 +189,13 @@ def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
         return Template(node).substitute(values)
     except (KeyError, ValueError) as error:
         raise UnknownNameError(f"parameter of {where} in {node!r}", str(error), values) from error
+
+
+def _fill_key(key: Any, values: Mapping[str, Any], where: str) -> str:
+    filled = _fill(key, values, where)
+    if not isinstance(filled, str):
+        raise LiberoError(f"{where}: the key {key!r:.60} is {filled!r:.60}; expected a text")
+    return filled
 
 
 def _objects(entries: Sequence[str | Mapping[str, int]]):
@@ -213,12 +220,16 @@ def _region(name: str, target: str, region: Mapping[str, Any]) -> Region:
             )
     ranges = [(float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in region.get("ranges", [])]
     if "at" in region:
+        if "half" not in region:
+            raise LiberoError(
+                f"region {target}_{name}: it has at, but no half; add such as half: 0.02, metres"
+            )
         (x, y), half = region["at"], region["half"]
-        half_x, half_y = half if isinstance(half, list) else (half, half)
+        half_x, half_y = half if isinstance(half, list | tuple) else (half, half)
         ranges.append((x - half_x, y - half_y, x + half_x, y + half_y))
     yaw: tuple[tuple[float, float], ...] = ()
     if "yaw" in region:
-        angles = region["yaw"] if isinstance(region["yaw"], list) else [region["yaw"]] * 2
+        angles = region["yaw"] if isinstance(region["yaw"], list | tuple) else [region["yaw"]] * 2
         low, high = (number(str(angle)) for angle in angles)
         yaw = ((low, high),)
     return Region(name, target, tuple(ranges), yaw, tuple(map(float, region.get("rgba", ()))))

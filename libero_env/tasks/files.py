@@ -4,13 +4,15 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl
-from libero_env.tasks.authoring import FILE, read_definition, task_from_definition
+from libero_env.tasks.authoring import FILE, check_keys, task_from_definition
 from libero_env.tasks.builder import language_from_name
+from libero_env.tasks.source import merged_lines, read_definition
 from libero_env.tasks.suites import get_suite, suite_names
 from libero_env.tasks.task import Suite, Task
 
+MAX_TASKS = 1000  # of a file
 OWN = "own"  # suite of user-defined task files
 ENDINGS = (".bddl", ".yaml", ".yml")  # of the names of task files
 
@@ -22,14 +24,21 @@ def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
         LiberoError: The file is not valid YAML, or a task is not valid (see `make_task`); the message names the file.
     """
     path = Path(path)
-    definition = read_definition(path)
+    definition, source = read_definition(path)
+    check_keys(definition, source, "tasks")
     if "tasks" not in definition:
-        return (task_from_definition({"name": path.stem, **definition}, str(path), path.parent),)
+        return (task_from_definition({"name": path.stem, **definition}, source),)
     shared = {key: value for key, value in definition.items() if key != "tasks"}
-    return tuple(
-        task_from_definition({**shared, **own}, f"{path}, task {i}", path.parent)
-        for i, own in enumerate(definition["tasks"])
-    )
+    tasks = definition["tasks"]
+    if not isinstance(tasks, list) or len(tasks) > MAX_TASKS:
+        raise InvalidInputError(f"{source.at('tasks')}: expected a list of at most {MAX_TASKS} tasks")
+    found = []
+    for i, own in enumerate(tasks):
+        if not isinstance(own, dict) or not all(isinstance(key, str) for key in own):
+            raise InvalidInputError(f"{source.at('tasks', i)}: expected keys such as name, goal and language")
+        place = replace(source, line_of=merged_lines(source.line_of, list(own), i))
+        found.append(task_from_definition({**shared, **own}, place))
+    return tuple(found)
 
 
 def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
@@ -105,7 +114,7 @@ def get_task(key: str) -> Task:
         suite_name, found, index = key.rpartition(mark)
         if found:
             suite = get_suite(suite_name)
-            if not index.isdecimal() or int(index) >= len(suite):
+            if not index.isdecimal() or len(index) > 9 or int(index) >= len(suite):
                 raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))
             return suite.tasks[int(index)]
     named = {task.name: task for name in suite_names() for task in get_suite(name).tasks}

@@ -2,10 +2,32 @@
 
 from dataclasses import dataclass
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.tasks import bddl
 from libero_env.tasks.builder import load_data
 from libero_env.tasks.problem import Problem
+
+MAX_NAME_BYTES = 200  # of a task or suite; names of files made of them are a little longer
+
+
+def check_name(name: str, what: str = "task") -> str:
+    """Return the name of a task or suite, which becomes that of files and folders, if it can be.
+
+    Args:
+        name: Name to check.
+        what: What it names, for the message.
+
+    Raises:
+        InvalidInputError: The name is empty, too long, begins with a point, or has a slash or a character that cannot
+            be printed.
+    """
+    plain = isinstance(name, str) and name.isprintable() and name == name.strip()
+    if not plain or not name or name[0] == "." or {*name} & {*"/\\"} or len(name.encode()) > MAX_NAME_BYTES:
+        raise InvalidInputError(
+            f"{name!r:.60} is no valid name of a {what}; expected one line without / and \\ that does not begin with a "
+            f"point, at most {MAX_NAME_BYTES} bytes"
+        )
+    return name
 
 
 @dataclass(frozen=True)
@@ -20,6 +42,9 @@ class Task:
             the original.
         bddl_language: Instruction in `:language` of the task file.
         problem: Scene, initial conditions and goal.
+
+    Raises:
+        InvalidInputError: Suite or name cannot be that of a file.
     """
 
     suite: str
@@ -28,6 +53,10 @@ class Task:
     language: str
     bddl_language: str
     problem: Problem
+
+    def __post_init__(self) -> None:
+        check_name(self.suite, "suite")
+        check_name(self.name)
 
     @property
     def id(self) -> str:

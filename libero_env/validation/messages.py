@@ -50,7 +50,12 @@ def find_faults(errors: Sequence["ErrorDetails"], kind: Any, value: Any) -> list
     found: dict[tuple[Key, ...], list[ErrorDetails]] = {}
     for error in errors:
         found.setdefault(_real_path(error, value), []).append(error)
-    return [Fault(path, _describe(path, group, kind)) for path, group in found.items()]
+    exact: dict[tuple[Key, ...], list[ErrorDetails]] = {}
+    for path, group in found.items():
+        one_branch = len({error["loc"][: len(path) + 1] for error in group}) == 1
+        for error in group:
+            exact.setdefault(_real_path(error, value, skip=True) if one_branch else path, []).append(error)
+    return [Fault(path, _describe(path, group, kind)) for path, group in exact.items()]
 
 
 def in_words(schema: Mapping[str, Any]) -> str:
@@ -102,8 +107,14 @@ def children(kind: Any) -> dict[Any, Any]:
         return {}
 
 
-def _real_path(error: "ErrorDetails", value: Any) -> tuple[Key, ...]:
-    """Return the part of a location that consists of keys; pydantic adds the names of branches of unions."""
+def _real_path(error: "ErrorDetails", value: Any, skip: bool = False) -> tuple[Key, ...]:
+    """Return the part of a location that consists of keys; pydantic adds the names of branches of unions.
+
+    Args:
+        error: Error of pydantic.
+        value: Value that was validated.
+        skip: Whether to go on behind the name of a branch, which is right where there is only one.
+    """
     path: list[Key] = []
     for key in error["loc"]:
         listed = isinstance(value, list | tuple) and isinstance(key, int) and key < len(value)
@@ -111,6 +122,8 @@ def _real_path(error: "ErrorDetails", value: Any) -> tuple[Key, ...]:
             value = value[key]
         elif isinstance(value, Mapping) and error["type"] == "missing" and key == error["loc"][-1]:
             value = None
+        elif skip:
+            continue
         else:
             break
         path.append(key)

@@ -300,7 +300,7 @@ class Card:
     def prompt(self, task: Task) -> str:
         """Return the instruction of a task that a policy receives."""
         text = task.problem.language if self.language.source == "bddl" else task.language
-        return self.language.template.format(instruction=text)
+        return self.language.template.replace("{instruction}", text)
 
     def env_seed(self, task: Task, start: int) -> int | None:
         """Return the seed that the environment gets for an initial state; None where the poses are stored."""

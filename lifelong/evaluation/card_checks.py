@@ -1,12 +1,22 @@
 """Checks of protocol cards: the type of each value, and values that contradict each other."""
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 ACTION_DIM = 7
+_MOST = {  # what no protocol means, and no machine does in a life
+    "episode.settle_steps": 10_000,
+    "episode.horizon": 1_000_000,
+    "pixels.render_size": 1024,
+    "pixels.resize_size": 4096,
+    "counting.trials": 1_000_000,
+    "world.env_seed": 2**32 - 1,
+    "world.loads": 10_000,
+}
 
 
 def type_errors(card: Any) -> list[str]:
@@ -39,7 +49,7 @@ def _matches(value: Any, hint: Any) -> bool:
             _matches(k, args[0]) and _matches(v, args[1]) for k, v in value.items()
         )
     if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
+        return isinstance(value, int | float) and not isinstance(value, bool) and -math.inf < value < math.inf
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     return value is None if hint is type(None) else isinstance(value, hint)
@@ -77,6 +87,11 @@ def contradictions(v: Mapping[str, Any]) -> list[str]:
     ):
         if v[name] is not None and v[name] < 1:
             found.append(f"{name} is {v[name]}; it must be at least 1")
+    for name, most in _MOST.items():
+        given = v[name].values() if isinstance(v[name], Mapping) else v[name]
+        for value in given if isinstance(given, Iterable) else (given,):
+            if value is not None and value > most:
+                found.append(f"{name} is {value}; it must be at most {most}")
     if "{instruction}" not in v["language.template"]:
         found.append(f"language.template is {v['language.template']!r}; it must have {{instruction}}")
     return found

@@ -82,9 +82,12 @@ def parse_card(values: Mapping[str, Any], name: str, where: str) -> Card:
 def _path(protocol: str, folder: Path) -> Path:
     """Return the file of a name or path; relative paths are relative to the folder."""
     packaged = _FOLDER / f"{protocol}.yaml"
-    if packaged.is_file() and "/" not in protocol:
-        return packaged
-    path = (folder / Path(protocol).expanduser()).resolve()
+    try:
+        if "/" not in protocol and packaged.is_file():
+            return packaged
+        path = (folder / Path(protocol).expanduser()).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # too long, of an unknown user, with NUL
+        raise ProtocolError(f"{protocol!r:.80} is no name of a protocol or file: {error!s:.80}") from None
     if path.is_dir() and (path / FILE_NAME).is_file():
         path = path / FILE_NAME
     if path.suffix in (".yaml", ".yml", ".json"):
@@ -109,19 +112,29 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(own["extends"], str):
         raise ProtocolError(f"{path}: extends is {own['extends']!r}; expected the name or path of a card")
     try:
-        base = _read(_path(own["extends"], path.parent), (*seen, path))
+        extended = _path(own["extends"], path.parent)
     except UnknownNameError as error:
         raise ProtocolError(f"{path}: extends: {error}") from error
-    base["sources"] = {
-        key: text
-        for key, text in (base.get("sources") or {}).items()
-        if not ("." in key and key.partition(".")[2] in (own.get(key.partition(".")[0]) or {}))
-    }
+    if extended.parent != _FOLDER and not extended.is_relative_to(path.parent.resolve()):
+        raise ProtocolError(
+            f"{path}: extends: {own['extends']} is not in its folder; put a copy there, and give its name"
+        )
+    base = _read(extended, (*seen, path))
+    sources = base.get("sources") or {}
+    if isinstance(sources, dict):
+        base["sources"] = {key: text for key, text in sources.items() if not _is_replaced(str(key), own)}
     merged = dict(base)
     for key, value in own.items():
         inner = base.get(key)
         merged[key] = {**inner, **value} if isinstance(inner, dict) and isinstance(value, dict) else value
     return merged
+
+
+def _is_replaced(source: str, own: Mapping[str, Any]) -> bool:
+    """Return whether a card has a value of its own for the field that a source is about."""
+    section, _, field = source.partition(".")
+    values = own.get(section)
+    return bool(field) and isinstance(values, Mapping) and field in values
 
 
 def _key_problems(values: Mapping[str, Any]) -> Iterator[str]:

@@ -184,7 +184,7 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
         ({"objects": ["akita_black_bowl", "plat"]}, "Did you mean 'plate'"),
         ({"objects": ["akita_black_bowl", "plate", "milk"]}, "milk_1 has no place.*`milk_1: \\[0, 0\\]`"),
         ({"place": {"cup_1": [0, 0]}}, "object or fixture to place of task 'cup_1'"),
-        ({"place": {**FACTS["place"], "plate": 0.1}}, "place of plate_1 is 0.1; expected \\[x, y\\]"),
+        ({"place": {**FACTS["place"], "plate": 0.1}}, "place.plate is 0.1; expected \\[x, y\\]"),
         ({"goal": "Open wooden_cabinet_1_top_regio"}, "Did you mean 'top_region'"),
         ({"goal": "In plate_1 akita_black_bowl_1_inside"}, "Valid: none"),
         ({"goal": "On plate_1 cup_1"}, "cup_1"),

@@ -380,7 +380,7 @@ def test_a_stored_object_that_is_broken_is_named(tmp_path):
     (tmp_path / "brick.xml").write_text(ORIGINAL)
     place = add_object(tmp_path / "brick.xml").folder
     (place / "object.yaml").write_text("name: brick\n")
-    with pytest.raises(LiberoError, match="has no bottom_offset"):
+    with pytest.raises(LiberoError, match="bottom_offset is missing"):
         get_object("brick")
 
 
