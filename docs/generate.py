@@ -85,11 +85,11 @@ def configuration_reference() -> str:
     comments = _comments(CONFIGS / "config.yaml")
     top = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))
     rows = [
-        f"| `{k}` | {_value(v)} | {_cell(comments.get(k, ''))} |"
+        f"| `{k}` | {_value(v)} | {_valid('lifelong.settings.RunSettings', k)} | {_cell(comments.get(k, ''))} |"
         for k, v in top.items()
         if k in RunSettings.__dataclass_fields__
     ]
-    text = ["## At the top", "", "| key | default | what |", "|---|---|---|", *rows, ""]
+    text = ["## At the top", "", "| key | default | valid | what |", "|---|---|---|---|", *rows, ""]
     chosen = {k: v for d in top["defaults"] if isinstance(d, dict) for k, v in d.items()}
     for name, files in groups().items():
         text += [f"## {name}", "", _group(name, files, chosen.get(name)), ""]
@@ -128,11 +128,22 @@ def _table(group: str, target: str, files: list[Path]) -> str:
         return f"{title} has no keys."
     rows = [
         f"| `{group.replace('/', '.')}.{dotted}` | {' | '.join(_value(v.get(dotted)) for v in values.values())} "
-        f"| {_cell(meaning(built, key, files))} |"
+        f"| {_valid(built, key)} | {_cell(meaning(built, key, files))} |"
         for dotted, (built, key) in sources.items()
     ]
-    head = "| key | " + " | ".join(f"`{stem}`" for stem in values) + " | what |"
-    return "\n".join([title, "", head, "|---" * (len(values) + 2) + "|", *rows])
+    head = "| key | " + " | ".join(f"`{stem}`" for stem in values) + " | valid | what |"
+    return "\n".join([title, "", head, "|---" * (len(values) + 3) + "|", *rows])
+
+
+def _valid(target: str, key: str) -> str:
+    """The values that a key takes, by its annotation; upper ends beyond what any machine can do are left out."""
+    from hydra.utils import get_object
+
+    from libero_env.validation import accepted, parameters_of
+
+    known = parameters_of(get_object(target))
+    words = accepted(known.types[key]) if known and key in known.types else ""
+    return _cell(re.sub(r", (at most 1000000(000)?|below 9223372036854775808)\b", "", words))
 
 
 def meaning(target: str, key: str, files: list[Path]) -> str:
