@@ -208,7 +208,8 @@ def _arguments_kind(target: Callable[..., Any]) -> Any:
     if found is None:
         return None
     hints = {n: t if is_plain(t) else Any for n, t in found.types.items() if not n.startswith("_")}
-    kind: Any = TypedDict("Arguments", hints, total=False)  # type: ignore[misc]
+    make: Any = TypedDict  # its fields are known at run time only
+    kind = make("Arguments", hints, total=False)
     kind.__pydantic_config__ = _config("allow" if found.any_key else "forbid")
     return kind
 
