@@ -6,7 +6,6 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
-from numbers import Real
 from operator import attrgetter
 from typing import Any
 
@@ -71,6 +70,13 @@ def register_problem(target_class: type["BDDLBaseDomain"]) -> type["BDDLBaseDoma
     return target_class
 
 
+def _check_horizon(horizon: Any) -> None:
+    """Raise unless a horizon is above 0; robosuite takes infinity, too."""
+    number = isinstance(horizon, int | float | np.integer | np.floating) and not isinstance(horizon, bool)
+    if not number or not horizon > 0:
+        raise InvalidInputError(f"horizon is {horizon!r:.80}; expected at least 1")
+
+
 class BDDLBaseDomain(RobosuiteMethods):
     """One simulation of a task file.
 
@@ -133,8 +139,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             raise UnknownNameError("argument", unknown[0], valid)
         if control_freq != CONTROL_FREQ:
             raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
-        if isinstance(horizon, bool) or not isinstance(horizon, Real) or not horizon > 0:
-            raise InvalidInputError(f"horizon is {horizon!r:.80}; expected at least 1")
+        _check_horizon(horizon)
         if drawing not in DRAWINGS:
             raise UnknownNameError("drawing", drawing, DRAWINGS)
         self.robot = robot or str(read_config().get("robot") or DEFAULT_ROBOT)
