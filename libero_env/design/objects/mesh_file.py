@@ -129,12 +129,18 @@ def _parts(path: Path) -> list[Any]:
 def _surface(part: Any, path: Path) -> Surface:
     vertices, faces = np.array(part.vertices, float), np.array(part.faces, np.int64)
     check_finite(vertices, path)
+    if not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InvalidInputError(f"{path}: a triangle names a vertex that it does not have; export it again")
     material = getattr(part.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     texcoords = getattr(part.visual, "uv", None)
     if image is not None and texcoords is not None:
         points = np.array(texcoords, float)[:, :2]
         check_finite(points, path)
+        if len(points) != len(vertices):
+            raise InvalidInputError(
+                f"{path}: {len(vertices)} vertices have {len(points)} texture coordinates"
+            )
         return Surface(vertices, faces, points, _picture(image, path), (1.0,) * 4)
     known = getattr(part.visual, "defined", False) or material is not None
     colour = getattr(material if material is not None else part.visual, "main_color", None) if known else None
