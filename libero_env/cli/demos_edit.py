@@ -87,9 +87,11 @@ def _register_export(commands: Subparsers) -> None:
 def run_replay(args: argparse.Namespace) -> int:
     """Print one line about each demonstration and one about all; return 1 if one that succeeded does not any more."""
     from libero_env.demos.replay import replay
-    from libero_env.demos.video import write_video
+    from libero_env.demos.video import check_video_path, write_video
     from libero_env.timing import CONTROL_HZ
 
+    if args.video:
+        check_video_path(args.video)
     demos = [f"demo_{number}" for number in args.demo] if args.demo else None
     cameras = tuple(args.cameras) if args.video else ()
     results, lost = [], 0

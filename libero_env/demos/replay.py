@@ -141,7 +141,7 @@ def rerender(
 
     Raises:
         DemoError: The file is broken or does not fit its task's scene, or the target was recorded with another
-            configuration.
+            configuration, or made of another file.
     """
     if target.exists() and target.samefile(file):
         raise DemoError(f"{target} is the file to read; choose another name")
@@ -149,11 +149,16 @@ def rerender(
     pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
     config = replace(config, drawing=config.drawing or default_drawing(pack))
     writer = DemoWriter(target, {**header, **config.header(), "pairing": "aligned"})
-    recorded = writer.recorded()
+    recorded = writer.recorded_states()
     renderer = _renderer(file, config, assets)
     try:
         for name, episode in progress_bar(read_episodes(file), desc="render", unit="demo", progress=progress):
-            if (index := demo_number(name)) not in recorded:
+            if (index := demo_number(name)) in recorded:
+                if not np.array_equal(recorded[index], episode.states):
+                    raise DemoError(
+                        f"{target} has another {name} than {file}; choose another name or remove it"
+                    )
+            else:
                 fixtures = checked_fixtures(file, name, episode, renderer.scene)
                 obs, robot_states = renderer.render_states(episode.states, fixtures)
                 writer.write(index, replace(episode, obs=obs, robot_states=robot_states))

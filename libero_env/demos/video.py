@@ -13,7 +13,9 @@ import numpy as np
 from PIL import Image
 
 from libero_env.errors import LiberoError
+from libero_env.storage import atomic_path
 
+_SUFFIXES = (".mp4", ".webp", ".gif")
 PIXEL_FORMAT = "yuv420p"  # every player and data set library can decode it
 
 
@@ -65,7 +67,7 @@ class Mp4Writer:
     def __init__(self, path: Path, fps: int, codec: Codec = H264):
         self._av, self.path, self.frames = import_av(), path, 0
         self._fps, self._codec = fps, codec
-        self._container = self._av.open(str(path), "w")
+        self._container = self._av.open(str(path), "w", format="mp4")
         self._stream: Any = None
 
     def add(self, frames: np.ndarray) -> None:
@@ -128,19 +130,44 @@ def _quiet_encoder() -> Iterator[None]:
             del os.environ["SVT_LOG"]
 
 
+def check_video_path(path: Path) -> None:
+    """Raise LiberoError unless a video can have this name: before the work of making its frames.
+
+    Args:
+        path: File to write, .webp, .gif or .mp4.
+    """
+    if path.suffix not in _SUFFIXES:
+        raise LiberoError(f"{path}: videos are .mp4, .webp or .gif")
+    if path.suffix == ".mp4":
+        import_av()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LiberoError(
+            f"{path} cannot be written ({error.strerror or error}); choose another folder"
+        ) from error
+
+
 def write_video(path: Path, frames: np.ndarray, fps: int) -> Path:
-    """Write frames (T, H, W, 3) uint8 as .webp, .gif or .mp4.
+    """Write frames (T, H, W, 3) uint8 as .webp, .gif or .mp4, in one step.
 
     Raises:
-        LiberoError: The path has another suffix, or PyAV is not installed.
+        LiberoError: The path has another suffix or cannot be written, or PyAV is not installed.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix in (".gif", ".webp"):
-        images = [Image.fromarray(frame) for frame in frames]
-        images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
-    elif path.suffix == ".mp4":
-        with Mp4Writer(path, fps) as video:
-            video.add(frames)
-    else:
-        raise LiberoError(f"{path}: videos are .mp4, .webp or .gif")
+    check_video_path(path)
+    try:
+        with atomic_path(path) as temporary:
+            if path.suffix == ".mp4":
+                with Mp4Writer(temporary, fps) as video:
+                    video.add(frames)
+            else:
+                images = [Image.fromarray(frame) for frame in frames]
+                form, duration = path.suffix[1:], round(1000 / fps)
+                images[0].save(
+                    temporary, form, save_all=True, append_images=images[1:], duration=duration, loop=0
+                )
+    except OSError as error:  # those of FFmpeg too
+        raise LiberoError(
+            f"{path} cannot be written ({error.strerror or error}); choose another folder"
+        ) from error
     return path

@@ -16,7 +16,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from libero_env.demos.contents import LOW_DIM_KEYS, check_demo, demo_names, demo_number, is_image, value_fault
+from libero_env.demos.contents import (
+    LOW_DIM_KEYS,
+    check_demo,
+    demo_names,
+    demo_number,
+    is_image,
+    read_values,
+    value_fault,
+)
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.header import file_attributes
 from libero_env.demos.read import demo_files
@@ -103,6 +111,15 @@ class DemoWriter:
         """
         return {demo_number(name) for _, name in self._sources()}
 
+    def recorded_states(self) -> dict[int, np.ndarray]:
+        """Return the states (T, 1 + nq + nv) of each recorded demonstration, by its number."""
+        found = {}
+        for file, name in list(self._sources()):
+            with open_demo_file(file) as handle:
+                states = read_values(handle["data"][name], "states", file, name)
+            found[demo_number(name)] = np.zeros(0) if states is None else states
+        return found
+
     def discard_parts(self) -> None:
         """Remove the parts that an interrupted recording left."""
         if self.parts.is_dir() and not self.parts.is_symlink():
@@ -174,7 +191,8 @@ class DemoWriter:
         with open_demo_file(file) as handle:
             names = demo_names(handle, file)
             for name in names:
-                check_demo(handle["data"][name], file, name, handle["data"][name].get("obs", ()))
+                group = handle["data"][name]
+                check_demo(group, file, name, group.get("obs", ()) if isinstance(group, h5py.Group) else ())
             self._check_header(file, file_attributes(handle, file))
         for name in names:
             if name not in seen:

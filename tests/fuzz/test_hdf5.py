@@ -159,7 +159,7 @@ def changes(draw):
 def test_other_structures_are_read_or_refused(tmp_path_factory, kind, applied):
     path = tmp_path_factory.mktemp("fuzz") / "x.hdf5"
     path.write_bytes(valid(*kind))
-    with h5py.File(path, "r+") as handle:
+    with h5py.File(path, "r+") as handle, np.errstate(all="ignore"):
         for change in applied:
             try:
                 change(handle)

@@ -24,8 +24,9 @@ from libero_env.demos.lerobot import export_lerobot
 from libero_env.demos.read import demo_lengths, iter_demos, read_demos
 from libero_env.demos.replay import rerun_actions
 from libero_env.demos.stored_model import read_fixture_poses
+from libero_env.demos.video import check_video_path, write_video
 from libero_env.demos.write import DemoWriter
-from libero_env.errors import DemoError, InvalidInputError
+from libero_env.errors import DemoError, InvalidInputError, LiberoError
 from tests.harness.demos import episode, header, write
 
 pytestmark = pytest.mark.unit
@@ -390,6 +391,26 @@ def test_parts_of_another_file_do_not_get_into_a_filtered_one(path, tmp_path):
     assert len(filter_demos(path, target).lengths) == 2
     with pytest.raises(DemoError, match="exists"):
         rerun_actions(path, target)
+
+
+def test_a_demonstration_that_is_no_group_is_named_by_the_writer(path):
+    damaged(path, put("data/demo_1", 1.0))
+    with pytest.raises(DemoError, match="demo_1 is not a group"):
+        DemoWriter(path, {}).recorded()
+
+
+def test_states_tell_of_which_file_a_demonstration_is(path):
+    found = DemoWriter(path, {}).recorded_states()
+    assert all((found[k] == episode(k, steps=4, size=8).states).all() for k in range(2))
+
+
+@pytest.mark.parametrize("name", ["file/x.gif", "x.mp3", "x.hdf5"])
+def test_videos_that_cannot_be_written_are_one_line_before_the_work(tmp_path, name):
+    (tmp_path / "file").touch()
+    with pytest.raises(LiberoError, match=r"x\.(gif cannot be written|(mp3|hdf5): videos are)"):
+        check_video_path(tmp_path / name)
+    with pytest.raises(LiberoError):
+        write_video(tmp_path / name, np.zeros((2, 8, 8, 3), np.uint8), 20)
 
 
 def test_what_no_reader_would_take_is_not_written(tmp_path):
