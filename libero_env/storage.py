@@ -1,5 +1,6 @@
 """Reading and writing of files: YAML, files that are replaced in one step, arrays and caches of them with checksums."""
 
+import glob
 import hashlib
 import io
 import json
@@ -10,6 +11,7 @@ import secrets
 import shutil
 import stat
 import struct
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -30,7 +32,7 @@ MAX_ARRAYS_BYTES = 1 << 30  # of a file of arrays, and of its arrays in memory
 _MAX_RECORD_BYTES = 64 << 20
 _SEAL = b"sha256:"  # 64 hexadecimal digits follow: the comment of the zip, which is the end of the file
 _SEAL_BYTES = len(_SEAL) + 64
-_MAKING_SECONDS = 900.0  # that a process waits for another one
+_MAKING_SECONDS = 900.0  # that a process waits for another one, and after which a part of a file is left over
 _ARRAY_ERRORS = (
     *(zipfile.BadZipFile, zlib.error, struct.error),
     *(EOFError, KeyError, NotImplementedError, OverflowError, RuntimeError, ValueError, UserWarning),
@@ -159,6 +161,26 @@ def read_npz(path: Path) -> Arrays:
     return _read_npz(path)[0]
 
 
+def read_packaged_npz(path: Path) -> Arrays:
+    """Read the arrays of a file of this package.
+
+    Raises:
+        BrokenFileError: The file is damaged, missing, or has numbers that are not finite.
+    """
+    try:
+        arrays = read_npz(path)
+        if not _are_finite(arrays):
+            raise BrokenFileError(f"{path} has numbers that are not finite")
+        return arrays
+    except (BrokenFileError, OSError) as error:
+        what = str(error) if isinstance(error, BrokenFileError) else f"{path}: {error.strerror or error}"
+        raise BrokenFileError(f"{what}; it is a file of this package: install the package again") from None
+
+
+def _are_finite(arrays: Arrays) -> bool:
+    return all(np.isfinite(array).all() for array in arrays.values() if array.dtype.kind == "f")
+
+
 def _read_npz(path: Path) -> tuple[Arrays, bool]:
     """Return the arrays of a file and whether it has the checksum at its end."""
     found = path.stat()
@@ -235,7 +257,7 @@ def read_cache(path: Path, fits: Callable[[Arrays], bool]) -> Arrays | None:
         return None
     except OSError:
         return None
-    if not fits(arrays) or not all(np.isfinite(a).all() for a in arrays.values() if a.dtype.kind == "f"):
+    if not fits(arrays) or not _are_finite(arrays):
         _log.warning("%s has other arrays than expected; it is made again", path)
         return None
     if not sealed:
@@ -246,6 +268,14 @@ def read_cache(path: Path, fits: Callable[[Arrays], bool]) -> Arrays | None:
 def write_cache(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays to a cache file; where that is not possible, one line of the log says so."""
     _write_cached(path, lambda: atomic_write_npz(path, arrays, fsync=True))
+
+
+def _remove_parts(path: Path) -> None:
+    """Remove what processes that were killed have left of a file; those that write it now are younger."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART_SUFFIX}"):
+        with suppress(OSError):
+            if time.time() - part.stat().st_mtime > _MAKING_SECONDS:
+                part.unlink()
 
 
 def read_cached_record(path: Path) -> dict[str, Any] | None:
@@ -262,6 +292,7 @@ def _write_cached(path: Path, write: Callable[[], None]) -> None:
     try:
         make_cache_folder(path.parent)
         if _is_trusted(path.parent):
+            _remove_parts(path)
             write()
     except OSError as error:
         _warn_once(path.parent, error.strerror or str(error))

@@ -17,7 +17,7 @@ from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
-from libero_env.storage import atomic_write_npz, cached_arrays, read_npz
+from libero_env.storage import atomic_write_npz, cached_arrays, read_packaged_npz
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50
@@ -202,14 +202,10 @@ def packaged_states(suite: str) -> dict[str, tuple[str, np.ndarray]]:
     path = shipped_path(suite)
     if not path.exists():
         return {}
-    try:
-        stored = read_npz(path)
-        names = [name for name in stored if not name.endswith(".digest")]
-        if not all(np.isfinite(stored[name]).all() for name in names):
-            raise BrokenFileError(f"{path} has numbers that are not finite")
-        return {name: (str(stored[f"{name}.digest"]), stored[name]) for name in names}
-    except (BrokenFileError, KeyError, OSError) as error:
-        what = f"{path} has no {error}" if isinstance(error, KeyError) else str(error)
+    stored = read_packaged_npz(path)
+    names = [name for name in stored if not name.endswith(".digest")]
+    if missing := [name for name in names if f"{name}.digest" not in stored]:
         raise BrokenFileError(
-            f"{what}; it is a file of this package: install the package again, or restore the file"
-        ) from None
+            f"{path} has no digest of {missing[0]}; generate it again: libero tasks init-states {suite}"
+        )
+    return {name: (str(stored[f"{name}.digest"]), stored[name]) for name in names}

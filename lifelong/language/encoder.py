@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from libero_env import paths
-from libero_env.storage import read_cache, write_cache
+from libero_env.storage import read_cache, read_packaged_npz, write_cache
 from lifelong.errors import LanguageError
 from lifelong.types import PathText, Width
 
@@ -93,10 +93,9 @@ def embed(
 @cache
 def shipped() -> dict[str, Tensor]:
     """Return the embeddings that are part of the package, by `normal_form` of the text; each (384,) float32."""
-    packed = resources.files("lifelong.language") / "minilm.npz"
-    with packed.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        vectors = torch.from_numpy(file["embeddings"].astype(np.float32))
-        return {normal_form(text): v for text, v in zip(file["texts"].tolist(), vectors, strict=True)}
+    stored = read_packaged_npz(Path(str(resources.files("lifelong.language") / "minilm.npz")))
+    vectors = torch.from_numpy(stored["embeddings"].astype(np.float32))
+    return {normal_form(text): v for text, v in zip(stored["texts"].tolist(), vectors, strict=True)}
 
 
 def normal_form(text: str) -> str:
