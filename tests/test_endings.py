@@ -18,9 +18,11 @@ from libero_env import mujoco_compat, parallel
 from libero_env.cli import ending
 from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
-from libero_env.tasks import read_task
+from libero_env.tasks import get_task, read_task
 from lifelong import launch
 from lifelong.cli import main as cli
+from lifelong.evaluation.protocols import PROTOCOLS
+from lifelong.evaluation.suite import SuiteEvaluation
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 60.0  # s; for a process to start or to end
@@ -207,6 +209,31 @@ def test_debug_reaches_train(here, monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("Traceback")
 
 
+OWN_ALGORITHM = """
+from lifelong import Algorithm
+
+class Own(Algorithm):
+    def __init__(self, *, strength: float):
+        self.strength = strength / 0
+"""
+
+
+@pytest.mark.unit
+def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys):
+    Path("ending_algorithm.py").write_text(OWN_ALGORITHM)
+    Path("algo").mkdir()
+    Path("algo/own.yaml").write_text("_target_: ending_algorithm.Own\nstrength: 1.0\n")
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.syspath_prepend(str(here))
+    words = ["--config-dir", str(here), "preset=smoke", "algo=own", "wandb.mode=disabled"]
+    assert launch.main([*words, f"runs_dir={here}/runs"]) == ending.MISTAKE
+    found = capsys.readouterr().err
+    assert found.startswith("error: code of yours raised ZeroDivisionError: float division by zero\n")
+    assert f'File "{here}/ending_algorithm.py", line 6, in __init__' in found and "lifelong/" not in found
+    assert not Path("runs").exists()
+
+
 @pytest.mark.unit
 def test_mistyped_options_are_one_line(capsys):
     for words in (["eval", "--sise", "3"], ["tasks", "list", "--order", "x"], ["nope"]):
@@ -227,9 +254,10 @@ def test_mistyped_options_are_one_line(capsys):
         ["eval", "m:f", "--horizon", "0"],
         ["eval", "m:f", "--policy-threads", "1000000000"],
         ["eval", "m:f", "--episodes", "1.5"],
-        ["eval", "m:f", "--out", ""],
+        ["eval", "m:f", "--out", " "],
         ["eval", "m:f", "--after", "-1"],
         ["eval", "m:f", "--in-flight", "0"],
+        ["eval", "m:f", "--device", "zz"],
         ["serve", "run", "--port", "99999"],
         ["saliency", "run", "--stride", "nan"],
         ["power", "--tests", "1" + 400 * "0"],
@@ -261,8 +289,14 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
     ("words", "message"),
     [
         (["tasks", "show", "a\0"], "null character"),
+        (["tasks", "show", ""], "the word after show is empty"),
+        (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--after", "9"], "--after is of runs"),
+        (
+            ["eval", "ending_policy:make", "--suite", "libero_goal/0", "--despite", "x"],
+            "--despite is of results",
+        ),
         (["tasks", "new", "../elsewhere"], "is not the name of a task"),
-        (["tasks", "new", "mine", "--goal", ""], "'' is no atom"),
+        (["tasks", "new", "mine", "--goal", "()"], "is no atom"),
         (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
         (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
     ],
@@ -321,6 +355,16 @@ def test_a_new_task_may_have_any_instruction(here, capsys):
     language = "put: [the 'bowl'] #1 on\nthe plate"
     assert cli.main(["tasks", "new", "mine", "--language", language]) == 0
     assert read_task("mine.yaml").language.split() == language.split()
+
+
+@pytest.mark.unit
+def test_every_protocol_has_an_estimate_of_memory(tmp_path):
+    task = get_task("libero_goal/0")
+    for name in PROTOCOLS:
+        plan = SuiteEvaluation(
+            {}, [task], (0, 1), PROTOCOLS[name], tmp_path, None, None, videos=2, versions={}
+        )
+        assert 6e8 < plan.memory(1) < 2e9 and plan.memory(3) == 3 * plan.memory(1), name
 
 
 @pytest.mark.unit

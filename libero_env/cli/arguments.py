@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,13 @@ side = whole(1, MAX_SIDE)
 share = number(0, 1)
 probability = number(0, 1, open_ends=True)
 seconds = number(0, 1e6, open_ends=True)
+
+
+def device(text: str) -> str:
+    """Return the name of a device of PyTorch; whether this machine has it is seen when it is used."""
+    if not re.fullmatch(r"auto|cpu|mps|xpu|cuda(:\d{1,3})?", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is none of auto, cpu, cuda, cuda:1, ..., mps, xpu")
+    return text
 
 
 def path(text: str) -> Path:

@@ -1,4 +1,4 @@
-"""`libero eval` and `libero saliency`: the success of a policy, and where it looks."""
+"""`libero eval`: the success of a policy."""
 
 import argparse
 import io
@@ -29,12 +29,7 @@ ALLOW_HELP = (
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
-    """Add the commands `libero eval POLICY` and `libero saliency RUN`."""
-    _add_eval(subparsers)
-    _add_saliency(subparsers)
-
-
-def _add_eval(subparsers: "argparse._SubParsersAction") -> None:
+    """Add the command `libero eval POLICY`."""
     parser = subparsers.add_parser("eval", help="success of a policy on tasks; resumes where it was stopped")
     parser.add_argument("policy", nargs="?", help=POLICY_HELP)
     _add_episode_options(parser.add_argument_group("what is measured"))
@@ -119,7 +114,7 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="further attempts after an error (default: 1)",
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument("--device", type=arguments.device, default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
     parser.add_argument(
         "--threads",
@@ -153,40 +148,6 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         metavar="OUT",
         help="only say how far the evaluation in this folder is",
     )
-
-
-def _add_saliency(subparsers: "argparse._SubParsersAction") -> None:
-    parser = subparsers.add_parser("saliency", help="images of where a policy looks during a rollout")
-    parser.add_argument(
-        "policy", type=arguments.path, metavar="RUN", help="a run's directory, or one of its checkpoints"
-    )
-    parser.add_argument(
-        "--task", type=arguments.whole(0), default=0, help="position in the run's sequence (default: 0)"
-    )
-    parser.add_argument(
-        "--after", type=arguments.whole(0), help="the policy after this task, from 0 (default: the last)"
-    )
-    parser.add_argument(
-        "--start", type=arguments.whole(0, 49), default=0, help="initial state of the rollout (default: 0)"
-    )
-    parser.add_argument(
-        "--moments", type=arguments.whole(1, 100), default=6, help="number of images (default: 6)"
-    )
-    parser.add_argument(
-        "--stride",
-        type=arguments.number(1, 128),
-        default=8.0,
-        help="distance of two places in pixels of a 128-pixel image (default: 8)",
-    )
-    parser.add_argument(
-        "--horizon",
-        type=arguments.horizon,
-        default=200,
-        help="maximum number of control steps (default: 200)",
-    )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
-    parser.set_defaults(run=run_saliency)
 
 
 def run_eval(args: argparse.Namespace) -> None:
@@ -272,6 +233,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
         args, card = repeated(args, earlier), repeated_card(earlier, where)
     else:
         card = load_card(args.protocol)
+    _check_idle(args, earlier)
     policy: PolicyUnderTest
     if "://" in args.policy:
         from lifelong.evaluation.servers.policy import ServerPolicy
@@ -314,6 +276,19 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     )
 
 
+def _check_idle(args: argparse.Namespace, earlier: "EvaluationResult | None") -> None:
+    """Check that no option is given that means nothing for this kind of policy.
+
+    Raises:
+        ConfigError: One is; the message says what it is of.
+    """
+    own_run = "://" not in args.policy and not _is_callable(args.policy)
+    if args.after is not None and not own_run:
+        raise ConfigError(f"--after is of runs, and {args.policy} is none")
+    if args.despite and earlier is None:
+        raise ConfigError(f"--despite is of results that are run again, and {args.policy} is none")
+
+
 @contextmanager
 def policy_threads(plan: "SuiteEvaluation") -> Iterator[None]:
     """Give PyTorch the number of threads that the evaluation names; their number changes the bits of a policy."""
@@ -335,24 +310,3 @@ def _print_progress(progress: object) -> None:
 
 def _is_callable(text: str) -> bool:
     return ":" in text and not Path(text).exists()
-
-
-def run_saliency(args: argparse.Namespace) -> None:
-    """Draw a contact sheet in the run's folder `saliency`, and write the run's report again."""
-    from lifelong.evaluation.saliency import SaliencySettings
-    from lifelong.evaluation.saliency_sheet import draw_saliency
-    from lifelong.report.page import write_report
-
-    path = draw_saliency(
-        args.policy,
-        task=args.task,
-        after=args.after,
-        start=args.start,
-        moments=args.moments,
-        horizon=args.horizon,
-        settings=SaliencySettings(stride=args.stride),
-        device=args.device,
-        allow=args.allow,
-    )
-    print(path)
-    print(write_report([path.parents[1]]))

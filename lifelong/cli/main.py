@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 from libero_env.cli import arguments, assets, demos, ending, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
-from lifelong.cli import check, compare, evaluate, protocols, serve
+from lifelong.cli import check, compare, evaluate, protocols, saliency, serve
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -49,6 +49,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(words: list[str]) -> int:
     if any("\0" in word for word in words):  # from Python only: a system passes none
         raise InvalidInputError("a word of the command line has a null character, which no name can have")
+    if "" in words:
+        before = words[words.index("") - 1] if words[0] else "libero"
+        raise InvalidInputError(
+            f"the word after {before} is empty, as from a variable of the shell that is not set"
+        )
     if words[:1] == ["train"] and not {"-h", "--help"} & set(words):
         return run_train(words[1:])  # Hydra reads the rest: options in any place, overrides
     args = build_parser().parse_args(words)
@@ -167,6 +172,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     objects.register,
     teleop.register,
     evaluate.register,
+    saliency.register,
     protocols.register,
     serve.register,
     compare.register,

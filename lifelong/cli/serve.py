@@ -30,7 +30,7 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
         default=0,
         help="seed of stochastic policies, for clients that send none (default: 0)",
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument("--device", type=arguments.device, default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
     parser.add_argument(
         "--policy-threads",

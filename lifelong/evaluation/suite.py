@@ -107,7 +107,8 @@ class SuiteEvaluation:
         height, width = self.protocol.pixels.render_size or (128, 128)
         image = 3 * height * width * len(self.protocol.pixels.cameras)
         batch = min(self.unit_starts, len(self.init_states))
-        frames = min(self.videos, batch) * -(-(self.protocol.episode.horizon or 0) // self.record_every)
+        steps = max((self.protocol.steps(task) for task in self.tasks), default=0) if self.videos else 0
+        frames = min(self.videos, batch) * -(-steps // self.record_every)
         return workers * (PROCESS_BYTES + batch * (SIMULATION_BYTES + IMAGE_COPIES * image) + frames * image)
 
     def pool(self) -> EnvPool:
