@@ -16,7 +16,7 @@ from lifelong.evaluation.inputs import PolicyInput
 from lifelong.evaluation.rollout import run_episodes
 from lifelong.evaluation.servers.actor import RemoteActor, checked_actions
 from lifelong.evaluation.servers.codecs import GROOT, OPENPI, VLA_EVAL
-from lifelong.evaluation.servers.connections import Limits
+from lifelong.evaluation.servers.connections import Connection, Limits
 from lifelong.evaluation.servers.groot import GrootWire
 from lifelong.evaluation.servers.packages import need
 from lifelong.evaluation.servers.wires import EpisodeStart, OpenpiDialect, VlaEvalDialect, WebSocketWire
@@ -293,6 +293,21 @@ def test_a_connection_that_breaks(code):
     with (
         policy_servers.web_socket(handler) as address,
         pytest.raises(ConnectionLost, match=f"{address} was closed with {code} going away"),
+    ):
+        ask(address)
+
+
+def test_a_server_that_takes_no_request_and_one_that_sends_too_much(monkeypatch):
+    class Full:
+        async def send(self, data):
+            await asyncio.sleep(60)
+
+    with pytest.raises(ServerError, match=r"ws://it took no request within 0\.1 s; --timeout"):
+        asyncio.run(Connection(Full(), "ws://it", OPENPI, Limits(1, 0.1)).send({}))
+    monkeypatch.setattr("lifelong.evaluation.servers.connections.MAX_MESSAGE_BYTES", 1000)
+    with (
+        policy_servers.openpi(lambda _: {"actions": np.zeros((100, 7))}) as address,
+        pytest.raises(ConnectionLost, match="closed with 1009"),
     ):
         ask(address)
 
