@@ -9,13 +9,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import connection
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import utils
 
+from libero._adapters.envs.vector_host import Layout, VectorHost, arrays_of, observation_of
 from libero_env.envs.worker import Worker, shut_down, wait_for
-from libero_env.envs.worker_host import CallHost, Shared
+from libero_env.envs.worker_host import Shared
 from libero_env.errors import ClosedEnvironmentError, LiberoError
 
 CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes
@@ -254,7 +255,7 @@ class SubprocEnvWorker(_HostWorker):
             self._answer("making the environment", self._opening)
             self._opening, self._worker.opened, self._since = None, True, time.monotonic()
         result = self._answer(self._request, request)
-        if self.share_memory and (observation := _observation(result)):
+        if self.share_memory and (observation := observation_of(result)):
             self._unshare(observation)
         return result
 
@@ -298,8 +299,8 @@ class SubprocEnvWorker(_HostWorker):
         if shared is not None:
             absent = [key for key in shared.views if observation.get(key, 0) is None]
             observation.update({key: shared.views[key].copy() for key in absent})
-        elif arrays := _arrays(observation):
-            layout = {key: _Layout(array.shape, array.dtype) for key, array in arrays.items()}
+        elif arrays := arrays_of(observation):
+            layout = {key: Layout(array.shape, array.dtype) for key, array in arrays.items()}
             self._worker.shared = shared = Shared(layout)
             self._answer("attach", self._worker.send("attach", shared.name, layout))
 
@@ -322,59 +323,3 @@ class SubprocEnvWorker(_HostWorker):
             if not found and time.monotonic() >= end:
                 break
         return ready
-
-
-class _Layout(NamedTuple):
-    """Shape and type of an array in shared memory."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-
-
-class VectorHost(CallHost):
-    """The commands of a worker, with observations in shared memory."""
-
-    def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-        """Call a method; None stands for arrays of an observation that are in shared memory."""
-        if method == "seed" and not hasattr(
-            self.env, "seed"
-        ):  # Gymnasium's environments are seeded by a reset
-            self.env.reset(seed=args[0])
-            return [args[0]]
-        result = super().call(method, args, kwargs)
-        if observation := _observation(result):
-            arrays = _arrays(observation)
-            for key, view in self.shared.views.items() if self.shared else ():
-                if key in arrays and (arrays[key].shape, arrays[key].dtype) == (view.shape, view.dtype):
-                    view[...] = arrays[key]
-                    observation[key] = None
-        return result
-
-    def get(self, key: str) -> Any:
-        """Return an attribute of the environment, of its wrappers first."""
-        return getattr(self.env if hasattr(self.env, key) else getattr(self.env, "unwrapped", self.env), key)
-
-    def set(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment: of Gymnasium's interface of the one in the wrappers."""
-        if hasattr(self.env, "unwrapped"):
-            setattr(self.env.unwrapped, key, value)
-        else:
-            super().set(key, value)
-
-    def attach(self, name: str, layout: Mapping[str, _Layout]) -> None:
-        """Write observations to shared memory, where they fit its layout."""
-        self.shared = Shared(layout, name)
-
-
-def _observation(result: Any) -> dict[str, Any] | None:
-    """Return the observation in the result of `reset` or `step`; None where there is none."""
-    observation = result[0] if isinstance(result, tuple) else result
-    return observation if isinstance(observation, dict) else None
-
-
-def _arrays(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    return {
-        key: value
-        for key, value in observation.items()
-        if isinstance(value, np.ndarray) and not value.dtype.hasobject
-    }
