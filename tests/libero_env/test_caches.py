@@ -426,3 +426,37 @@ def test_processes_that_start_together_share_an_empty_cache(path):
         out, errors = process.communicate(timeout=120)
         assert (process.returncode, float(out), errors) == (0, 200_000 * 199_999 / 2, "")
     assert [file.name for file in path.parent.iterdir()] == ["file.npz"]
+
+
+MAKER = """
+import sys, time
+from libero_env.storage import cached_folder
+from pathlib import Path
+folder, log, kill = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] == "kill"
+
+def make():
+    with log.open("a") as file:
+        file.write("made\\n")
+    if kill:
+        print("making", flush=True)
+        time.sleep(600)
+    time.sleep(0.2)
+    folder.mkdir()
+    (folder / "file").write_text("content")
+
+cached_folder(folder, make)
+"""
+
+
+@pytest.mark.unit
+def test_one_process_makes_a_folder_and_one_that_is_killed_holds_nobody_up(tmp_path):
+    folder, log = tmp_path / "cache" / "kind" / "folder", tmp_path / "log"
+    command = [sys.executable, "-c", MAKER, str(folder), str(log)]
+    killed = subprocess.Popen([*command, "kill"], stdout=subprocess.PIPE)
+    assert killed.stdout.readline() == b"making\n"
+    killed.kill()
+    killed.communicate()
+    processes = [subprocess.Popen([*command, "go on"]) for _ in range(4)]
+    assert [process.wait(timeout=120) for process in processes] == [0] * 4
+    assert log.read_text() == "made\n" * 2
+    assert (folder / "file").read_text() == "content"
