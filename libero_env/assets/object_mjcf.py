@@ -47,16 +47,16 @@ def _read_object(path: Path, category: str, duplicate: bool, _: int) -> tuple[st
     for asset in assets:
         if asset.tag == "mesh" and asset.get("name") in collision_meshes:
             asset.attrib.setdefault("inertia", "convex")  # mass by volume; the mesh may be open
-    offsets = {
-        name: tuple(map(float, site.get("pos", "0 0 0").split()))
-        for name in OFFSETS
-        if (site := world.find(f"body/site[@name='{name}_site']")) is not None
-    }
-    xml = attachable_xml(category, assets, body)
     try:
+        offsets = {
+            name: tuple(map(float, site.get("pos", "0 0 0").split()))
+            for name in OFFSETS
+            if (site := world.find(f"body/site[@name='{name}_site']")) is not None
+        }
+        xml = attachable_xml(category, assets, body)
         return xml, offsets if len(offsets) == len(OFFSETS) else {**_measured(xml), **offsets}
     except ValueError as error:
-        raise LiberoError(f"{path}: MuJoCo cannot read it: {error}") from error
+        raise LiberoError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}") from error
 
 
 def arrange_body(world: Element, path: Path) -> Element:

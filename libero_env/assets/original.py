@@ -16,7 +16,7 @@ import mujoco
 from libero_env.assets.arena import Workspace, add_cameras_and_lights
 from libero_env.assets.original_arena import arena_spec, scene_file
 from libero_env.assets.original_drawing import restore_drawing
-from libero_env.assets.original_mjcf import object_xml
+from libero_env.assets.original_mjcf import object_xml, read_spec
 from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import simplify_visuals
 from libero_env.errors import LiberoError, UnknownNameError
@@ -95,7 +95,8 @@ class OriginalPack:
                 f"the original assets contain no model of {category!r}, only its name; add one with "
                 "libero_env.objects.register_object, or use the builtin pack where it has one (LIBERO_ASSETS=builtin)"
             )
-        spec = mujoco.MjSpec.from_string(object_xml(self.file(category), category, Path(self.root)))
+        file = self.file(category)
+        spec = read_spec(object_xml(file, category, Path(self.root)), file)
         self._simplify(spec)
         physics = load_physics(category)
         fields: dict[str, Any] = {name: getattr(physics, name) for name in _PHYSICS_FIELDS}

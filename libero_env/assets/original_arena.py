@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 import mujoco
 
 from libero_env.assets.arena import Workspace
-from libero_env.assets.original_mjcf import read_file, to_xml, used_assets
+from libero_env.assets.original_mjcf import read_file, read_spec, to_xml, used_assets
 from libero_env.assets.styles import load_styles, styles_of
 
 # Workspace -> beginning of the names of its scene files.
@@ -73,7 +73,8 @@ def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, 
     chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
     scene = chosen.pop("scene", "base")
     textures = {**own, **load_styles()["scene"][scene], **chosen}
-    assets, world = read_file(scene_file(root, workspace.name, scene), root)
+    file = scene_file(root, workspace.name, scene)
+    assets, world = read_file(file, root)
     for element in assets:
         for kind, name in _TEXTURE_NAMES.items():
             if element.tag == "texture" and element.get("name") == name:
@@ -82,7 +83,7 @@ def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, 
         if element.tag in _EXCLUDED:
             world.remove(element)
     _fit_table(world, workspace.parameters.get("table", {}))
-    spec = mujoco.MjSpec.from_string(to_xml(workspace.name, used_assets(assets, world), world))
+    spec = read_spec(to_xml(workspace.name, used_assets(assets, world), world), file)
     if _FULL_BOX_DEPTH:
         _soften_tables(spec)
     return spec

@@ -11,10 +11,12 @@ from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import mujoco
+
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects.builtin.assemble import GLOWING_SITES, HIDDEN_GROUP
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
-from libero_env.objects.xml_file import parse_xml
+from libero_env.objects.xml_file import explain, parse_xml
 
 REMEDY = "`libero assets check` lists what is missing, `libero assets download` downloads it"
 _BODY_TAGS = ("body", "geom", "inertial", "joint", "site")
@@ -116,6 +118,18 @@ def attachable_xml(category: str, assets: Iterable[ET.Element], body: ET.Element
     for element in (*assets, *body.iter()):
         _prefix(element, f"{category}_")
     return to_xml(category, assets, [body])
+
+
+def read_spec(text: str, path: Path) -> mujoco.MjSpec:
+    """Return what MuJoCo reads from an MJCF text that was made from a file.
+
+    Raises:
+        LiberoError: MuJoCo cannot read it.
+    """
+    try:
+        return mujoco.MjSpec.from_string(text)
+    except ValueError as error:
+        raise LiberoError(f"{explain(error, path)}; {REMEDY}") from error
 
 
 def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Element]:

@@ -39,7 +39,7 @@ def run_install(args: argparse.Namespace) -> None:
     from libero_env.assets.pack import ORIGINAL
 
     folder = install(args.dest)
-    print(f"{folder}: complete and verified")
+    print(f"{folder}: complete; all files are the published ones")
     _print_use(ORIGINAL if args.dest is None else str(folder))
 
 
@@ -48,7 +48,7 @@ def run_download(args: argparse.Namespace) -> None:
     from libero_env.assets.download import REVISION, download
 
     folder = download(args.dest, args.revision or REVISION)
-    print(f"{folder}: complete and verified")
+    print(f"{folder}: complete; all files have the digests that the server lists")
     _print_use(str(folder))
 
 

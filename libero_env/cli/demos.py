@@ -121,7 +121,7 @@ def run_download(args: argparse.Namespace) -> None:
     for path in download_demos(
         args.names, args.dest, revision=args.revision or REVISION, overwrite=args.overwrite
     ):
-        print(f"{path}: complete and verified")
+        print(f"{path}: complete; it has the digest that the server lists")
 
 
 def run_generate(args: argparse.Namespace) -> int:

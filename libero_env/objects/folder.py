@@ -25,7 +25,8 @@ _OPTIONAL = ("joint_damping", "rotation", "rotation_axis", "articulation")
 def names() -> tuple[str, ...]:
     """Return the names of the user-defined objects, sorted; empty where the folder does not exist."""
     root = objects_dir()
-    return tuple(sorted(path.parent.name for path in root.glob(f"*/{PROPERTIES}"))) if root.is_dir() else ()
+    found = (path.parent.name for path in root.glob(f"*/{PROPERTIES}")) if root.is_dir() else ()
+    return tuple(sorted(name for name in found if name.isidentifier()))
 
 
 def find(name: str) -> Path | None:
@@ -53,7 +54,10 @@ def remove(name: str) -> Path:
         UnknownNameError: The object does not exist; the message lists the existing ones.
     """
     directory = folder_of(name)
-    shutil.rmtree(directory)
+    if directory.is_symlink():
+        directory.unlink()  # the link, not what it leads to
+    else:
+        shutil.rmtree(directory)
     return directory
 
 

@@ -24,7 +24,7 @@ LIMITS = MappingProxyType(
 )
 _MAX_INCLUDES = 50
 _LARGEST_NUMBER = 1e10  # as in MuJoCo
-_LARGEST_LENGTH = 100.0  # [m] of sizes and positions
+_LARGEST_LENGTH = MappingProxyType({"size": 10.0, "fromto": 10.0, "pos": 1000.0, "offset": 1000.0})  # [m]
 _LARGEST_RESOLUTION = 8192  # [pixels] of a generated texture; its other counts are below it too
 
 _IN_BODY = frozenset({"body", "frame", "geom", "site", "joint", "freejoint", "inertial", "replicate"})
@@ -68,7 +68,6 @@ _NAME_KEYS = (
 )
 _REALS, _WHOLE = frozenset(_REAL_KEYS.split()), frozenset(_WHOLE_KEYS.split())
 _NAMES = _FILES | frozenset(_NAME_KEYS.split())
-_LENGTHS = frozenset({"pos", "size", "fromto", "offset"})
 _LONGEST = 4096  # characters of a name or of another short value
 
 
@@ -184,11 +183,7 @@ def _check_values(node: Node) -> None:
 
 
 def _check_numbers(node: Node, key: str, numbers: np.ndarray) -> None:
-    largest = _LARGEST_NUMBER
-    if key in _LENGTHS and node.tag != "light":
-        largest = _LARGEST_LENGTH
-    elif node.tag == "texture":
-        largest = _LARGEST_RESOLUTION
+    largest = _LARGEST_RESOLUTION if node.tag == "texture" else _LARGEST_LENGTH.get(key, _LARGEST_NUMBER)
     if not np.isfinite(numbers).all() or np.abs(numbers).max(initial=0.0) > largest:
         wrong = next(value for value in numbers if not abs(value) <= largest)
         _refuse(node, f"{key} of <{node.tag}> has the value {wrong:g}; expected numbers up to {largest:g}")

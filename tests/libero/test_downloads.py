@@ -135,7 +135,9 @@ def test_demonstrations_are_verified(server, tmp_path, capsys):
     server.breaks = 1
     assert main(["demos", "download", "libero_object/0", "--dest", str(tmp_path)]) == 0
     assert (tmp_path / FILE).read_bytes() == CONTENT
-    assert capsys.readouterr().out == f"{tmp_path / FILE}: complete and verified\n"
+    assert (
+        capsys.readouterr().out == f"{tmp_path / FILE}: complete; it has the digest that the server lists\n"
+    )
     requests = len(server.requests)
     assert download_demos(["libero_object/0"], tmp_path) == [tmp_path / FILE]
     assert len(server.requests) == requests + 1, "only the listing: the file is there"

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import SubElement
 
-import mujoco
-
 from libero_env.assets.object_mjcf import OFFSETS, arrange_body, read_object
+from libero_env.assets.original_mjcf import read_spec
 from libero_env.objects import ObjectModel
 
 STATES = ("open", "close", "turnon", "turnoff")
@@ -34,7 +33,7 @@ def model_of(item: Any, category: str) -> ObjectModel:
     place: dict[str, Any] = {name: offsets[name] for name in OFFSETS}
     return ObjectModel(
         category=category,
-        spec=mujoco.MjSpec.from_string(xml),
+        spec=read_spec(xml, Path(item.file)),
         joint_damping=float(free[0].get("damping", _DAMPING)) if free else _DAMPING,
         rotation={axis: (float(low), float(high)) for axis, (low, high) in (rotation or {}).items()},
         rotation_axis=axis,

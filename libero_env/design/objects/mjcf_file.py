@@ -23,7 +23,7 @@ from libero_env.objects.xml_file import explain
 INSIDE = 0.8  # size of `contain_region`, as a share of the bounds
 _HIDDEN = 3  # first geom group that viewers hide by default
 _INNER = "worldbody/body/body[@name='object']"  # the object in files made for the original
-_LARGEST, _SMALLEST = 10.0, 1e-3  # [m] longest side
+_LARGEST, _SMALLEST = 3.0, 1e-3  # [m] reach, and longest side
 _HEAVIEST = 1e4  # [kg]
 
 

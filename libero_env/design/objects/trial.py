@@ -153,6 +153,11 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
     """Return whether the object stays where it is put down; `data` ends in the state at rest."""
     for _ in range(round(_SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
+    if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all():
+        notify("its simulation is unstable; check its masses, inertias and joints")
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_forward(model, data)
+        return False
     body = data.body(_BODY)
     tilt = float(np.degrees(np.arccos(np.clip(body.xmat.reshape(3, 3)[2, 2], -1.0, 1.0))))
     slid = float(np.linalg.norm(body.xpos[:2]))
