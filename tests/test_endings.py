@@ -358,13 +358,11 @@ def test_a_new_task_may_have_any_instruction(here, capsys):
 
 
 @pytest.mark.unit
-def test_every_protocol_has_an_estimate_of_memory(tmp_path):
+@pytest.mark.parametrize("name", ["libero", "openpi"])  # one horizon, and one for each suite
+def test_the_memory_of_an_evaluation_is_estimated(name, tmp_path):
     task = get_task("libero_goal/0")
-    for name in PROTOCOLS:
-        plan = SuiteEvaluation(
-            {}, [task], (0, 1), PROTOCOLS[name], tmp_path, None, None, videos=2, versions={}
-        )
-        assert 6e8 < plan.memory(1) < 2e9 and plan.memory(3) == 3 * plan.memory(1), name
+    plan = SuiteEvaluation({}, [task], (0, 1), PROTOCOLS[name], tmp_path, None, None, videos=2, versions={})
+    assert 6e8 < plan.memory(1) < 2e9 and plan.memory(3) == 3 * plan.memory(1)
 
 
 @pytest.mark.unit
