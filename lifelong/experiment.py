@@ -33,7 +33,7 @@ from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord, start
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded
-from lifelong.sequence import TaskSequence
+from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, RunSettings, plain_data
 from lifelong.streams import StreamSettings
 from lifelong.training.distributed import Ranks
@@ -74,7 +74,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
         context, pretraining = _build_contexts(checked, names, settings, ranks)
         directory = context.directory
         with _opened(context, plain, settings.resume):
-            finished = ranks.broadcast(lambda: directory.log.read().finished)
+            finished = ranks.broadcast(_is_finished, context)
             if finished and ranks.first:
                 print(
                     f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
@@ -88,6 +88,12 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                 context.tracker.finish()
                 _write_results(directory, plain)
     return directory.path
+
+
+def _is_finished(context: RunContext) -> bool:
+    """Return whether nothing is left to do, also where lines of the records are broken."""
+    results = context.directory.log.read()
+    return results.finished and (not results.problems or is_measured(context, results))
 
 
 def _set_threads(settings: RunSettings, directory: Path) -> None:

@@ -13,7 +13,7 @@ from torch.utils.hooks import RemovableHandle
 
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
-from lifelong.errors import ConfigError
+from lifelong.errors import CheckpointError, ConfigError
 from lifelong.nn.adapters import freeze_statistics, initial_pair
 from lifelong.nn.experts import Router, expert_output, expert_shape, routed_layers
 from lifelong.nn.tokens import standardise
@@ -319,7 +319,12 @@ class DMPEL(Algorithm):
         return {**place, "library": library, "router": router, **kept}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned.
+
+        Raises:
+            CheckpointError: The shapes of the router, the experts or the stored contexts do not go together.
+        """
+        _check_shapes(state)
         self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
         self._seed = int(state["seed"])
         self._memory, self._episodes = _copied(state["memory"]), dict(state["episodes"])
@@ -328,6 +333,24 @@ class DMPEL(Algorithm):
             task: {name: {k: nn.Parameter(t) for k, t in pair.items()} for name, pair in of_task.items()}
             for task, of_task in state["library"].items()
         }
+
+
+def _check_shapes(state: Mapping[str, Any]) -> None:
+    """Raise CheckpointError where parts of a state do not go together."""
+    library, router = list(state["library"].values()), state["router"]
+    pairs = [pair for of_task in library for pair in of_task.values()]
+    fits = all(p["a"].dim() == p["b"].dim() == 2 and len(p["a"]) == p["b"].shape[1] for p in pairs)
+    fits &= all(of_task.keys() == library[0].keys() for of_task in library)
+    kept = state["memory"].values()
+    fits &= all(m["queries"].dim() == 2 and m["coefficients"].dim() == 3 for m in kept)
+    fits &= all(len(m["queries"]) == len(m["coefficients"]) for m in kept)
+    if router:
+        enter, keys, bias = router["enter"], router["keys"], router["bias"]
+        fits &= enter.dim() == 2 and keys.dim() == 3 and keys.shape[:2] == bias.shape
+        fits = fits and keys.shape[2] == len(enter)
+        fits = fits and all(m["queries"].shape[1] == enter.shape[1] for m in kept)
+    if not fits or (library and not router):
+        raise CheckpointError("the router, the experts and the stored contexts do not go together")
 
 
 class _Routed(Policy):

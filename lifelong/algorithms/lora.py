@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.errors import ConfigError
+from lifelong.errors import CheckpointError, ConfigError
 from lifelong.nn.adapters import check_matches, freeze_statistics, initial_pair, matches
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
@@ -174,7 +174,16 @@ class LoRA(Algorithm):
         return {**place, "seed": self._seed, **state}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned.
+
+        Raises:
+            CheckpointError: An adapter does not fit its weight.
+        """
+        for name, pair in ((n, pair) for of_task in state["pairs"].values() for n, pair in of_task.items()):
+            a, b, base = pair["a"], pair["b"], state["base"].get(name)
+            fits = base is not None and a.dim() == b.dim() == 2 and len(a) == b.shape[1]
+            if not fits or (len(b), a.shape[1]) != base.flatten(1).shape:
+                raise CheckpointError(f"the adapter of {name} does not fit a weight of the base")
         self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
         self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])
         self._base, self._kept = dict(state["base"]), dict(state["own"])

@@ -121,6 +121,10 @@ def restore(
     check_memory([Need(f"the policy's weights ({path / 'config.yaml'})", weights or 0)])
     policy, algorithm = config.build("policy", spec=spec).to(where), config.build("algo")
     state = RunDirectory(path).checkpoints.load_task(checkpoint, where)
+    if state["task"] not in range(len(tasks)):
+        raise CheckpointError(
+            f"{checkpoint} was written after task {state['task']}; the run has {len(tasks)}"
+        )
     checkpoints.load_weights(policy, state["policy"], checkpoint)
     if type(algorithm).policy_for is not Algorithm.policy_for:
         load_algorithm(algorithm, state["algorithm"], _NoWindows(path), policy, checkpoint)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -92,7 +93,7 @@ class _Examiner:
             self._check_records(results)
         self._check_checkpoints(results)
         for file in sorted(self.path.glob(f"**/{FILE_NAME}")):
-            if self._try(lambda file=file: EvaluationResult.read(file)) is not None:
+            if self._try(partial(EvaluationResult.read, file)) is not None:
                 self.counts["evaluations"] += 1
         for file in sorted({*self.path.rglob(".*.part"), *self.path.rglob(".tmp*")}):
             self._note(f"{file} was left by a process that was killed; a resume removes it")

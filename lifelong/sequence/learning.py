@@ -26,7 +26,7 @@ from lifelong.errors import CheckpointError, DamagedCheckpointError
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import generator, seeded
-from lifelong.sequence.stages import TrainingPhase, mean_rate, training_phases
+from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missing_points, training_phases
 from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
 from lifelong.training.fit import EpochEnd, fit
@@ -84,9 +84,8 @@ class TaskSequence:
         learned = self.checkpoints.tasks()
         if not any(stage[-1] in learned for stage in self.stages[number:]):
             return True
-        stage, results = self.stages[number], self.log.read()
-        lost = [e for phase in training_phases(self.context, stage) for e in phase.missing_points(results)]
-        if lost:
+        stage = self.stages[number]
+        if lost := missing_points(self.context, stage, self.log.read()):
             self._log(
                 f"{self.log.path} lacks points of the learning curve of task {stage[-1] + 1} (epochs "
                 f"{', '.join(map(str, lost[:5]))}): it is learned again to measure them"
@@ -94,10 +93,7 @@ class TaskSequence:
         return bool(lost)
 
     def _to_evaluate(self, stage: Sequence[int]) -> bool:
-        """Return whether the stage's row of the success matrix is incomplete."""
-        results, task = self.log.read(), stage[-1]
-        row = [results.evaluation("matrix", task, seen) for seen in range(task + 1)]
-        return None in row or results.task_end(task) is None
+        return lacks_row(stage, self.log.read())
 
     def _restore(self, number: int) -> None:
         """Bring the policy and the algorithm to where they were after a stage, or before the first one (-1)."""

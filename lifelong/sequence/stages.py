@@ -8,6 +8,7 @@ from lifelong.algorithms.base import Phase
 from lifelong.context import RunContext
 from lifelong.results.records import EvalRecord
 from lifelong.results.results import Results
+from lifelong.streams import learning_stages
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,23 @@ def training_phases(context: RunContext, stage: Sequence[int]) -> list[TrainingP
             zip(phases, epochs, accumulate(epochs, initial=0), strict=False)
         )
     ]
+
+
+def missing_points(context: RunContext, stage: Sequence[int], results: Results) -> list[int]:
+    """Return the epochs whose points of the learning curve on a stage are not recorded."""
+    return [epoch for phase in training_phases(context, stage) for epoch in phase.missing_points(results)]
+
+
+def lacks_row(stage: Sequence[int], results: Results) -> bool:
+    """Return whether a stage's row of the success matrix is incomplete."""
+    row = [results.evaluation("matrix", stage[-1], seen) for seen in range(stage[-1] + 1)]
+    return None in row or results.task_end(stage[-1]) is None
+
+
+def is_measured(context: RunContext, results: Results) -> bool:
+    """Return whether all learning curves and the success matrix of a run are recorded."""
+    stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
+    return not any(missing_points(context, stage, results) or lacks_row(stage, results) for stage in stages)
 
 
 def mean_rate(records: Sequence[EvalRecord]) -> float:

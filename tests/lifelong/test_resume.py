@@ -10,6 +10,7 @@ from lifelong import checkpoints
 from lifelong.errors import CheckpointError
 from lifelong.results.records import EvalRecord, LossRecord, from_line
 from lifelong.results.run_directory import RunDirectory, run_digest
+from lifelong.sequence import TaskSequence, is_measured
 from tests.harness import sequences
 from tests.harness.sequences import ALGORITHMS, Killed, Killer, assert_same, outcome, run_context, sequence
 
@@ -130,6 +131,36 @@ def test_a_lost_loss_costs_that_loss(tmp_path, whole):
     again = run_context(tmp_path, "sequential")
     sequence(again).run()
     assert len(again.directory.log.read().of(LossRecord)) == len(losses) - 1
+
+
+def test_a_run_that_is_finished_but_lost_a_line_is_measured_again(tmp_path, whole):
+    context = run_context(tmp_path, "sequential")
+    sequence(context).run()
+    assert is_measured(context, context.directory.log.read())
+    content = context.directory.log.path.read_bytes()
+    curve = next(line for line in content.splitlines() if b'"curve", "learned": 1, "epoch": 1' in line)
+    context.directory.log.path.write_bytes(content.replace(curve, curve.replace(b"1", b"2")))
+    again = run_context(tmp_path, "sequential")
+    assert (
+        not is_measured(again, again.directory.log.read()) and len(again.directory.log.read().problems) == 1
+    )
+    assert_resumes(tmp_path, "sequential", whole)
+    assert is_measured(again, again.directory.log.read())
+
+
+@pytest.mark.parametrize("damaged", [(), ("progress",), ("progress", "progress.previous")])
+def test_what_comes_before_the_first_task_is_prepared_when_it_is_learned_from_its_start(
+    tmp_path, damaged, monkeypatch
+):
+    """Such as pretraining: without it, a first task that is learned again would begin elsewhere."""
+    folder = killed_run(tmp_path, "sequential", monkeypatch, 8).checkpoints
+    for name in damaged:
+        flip(folder.path / f"{name}.safetensors")
+    prepared = []
+    context = run_context(tmp_path, "sequential")
+    data = {task: sequences.dataset(task) for task in range(3)}
+    TaskSequence(context, data, prepare=lambda: prepared.append(1)).run()
+    assert len(prepared) == (len(damaged) == 2)
 
 
 def test_exchanged_checkpoints_are_named(tmp_path, monkeypatch):

@@ -34,6 +34,21 @@ def test_another_configuration_is_refused_with_the_difference_and_the_remedy(tmp
         pass
 
 
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xfe\x00", b"- 1\n", b"a: [", b"7", b"!!python/object:os.x {}"]
+)
+def test_a_broken_configuration_is_one_line_with_its_file(tmp_path, content):
+    directory = RunDirectory(tmp_path / "run")
+    with directory.opened(CONFIG, resume=True):
+        pass
+    (directory.path / "config.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"config\.yaml") as found, directory.opened(CONFIG, resume=True):
+        pass
+    assert "\n" not in str(found.value)
+    with directory.opened(CONFIG, resume=False):
+        assert (directory.path / "config.yaml").read_bytes() != content
+
+
 def test_starting_again_keeps_the_old_run(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     for lr in (0.1, 0.2, 0.3):
@@ -55,5 +70,5 @@ def test_the_tracker_is_silent_by_default_and_names_its_modes():
     tracker.start("run", ".", {})
     tracker.log({"loss": 1.0})
     tracker.finish()
-    with pytest.raises(ConfigError, match="disabled, offline, online"):
+    with pytest.raises(ConfigError, match="'disabled', 'offline' or 'online'"):
         Tracker(mode="on")
