@@ -1,6 +1,7 @@
 """YAML files with the line of each value; nothing in them is executed, and none grows beyond what a person writes."""
 
 import math
+import stat
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,11 +49,14 @@ def read_yaml_file(path: str | Path) -> YamlFile:
     """Read a YAML file; see `parse_yaml_text`.
 
     Raises:
-        InvalidInputError: The file is missing, too large, not UTF-8, or not valid YAML.
+        InvalidInputError: The file is missing, a device, too large, not UTF-8, or not valid YAML.
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_YAML_BYTES:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):  # a pipe has no end, and a device no size
+            raise InvalidInputError(f"{path} is a folder, a pipe or a device; expected a YAML file")
+        if found.st_size > MAX_YAML_BYTES:
             raise InvalidInputError(
                 f"{path} is larger than {MAX_YAML_BYTES >> 20} MiB; expected a short YAML file"
             )

@@ -1,5 +1,7 @@
 """config.yaml of a run is read as plain data; whatever else it holds is told in one line."""
 
+import os
+
 import pytest
 
 from lifelong.errors import ConfigError
@@ -32,6 +34,15 @@ def test_what_is_no_configuration_is_told_in_one_line(content, said, tmp_path):
     with pytest.raises(ConfigError, match=said) as error:
         read_saved_config(file)
     assert str(file) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.unit
+def test_pipes_and_devices_are_not_read(tmp_path):
+    (tmp_path / "endless.yaml").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for name in ("endless.yaml", "pipe.yaml", "."):
+        with pytest.raises(ConfigError, match="is a folder, a pipe or a device"):
+            read_saved_config(tmp_path / name)
 
 
 @pytest.mark.unit
