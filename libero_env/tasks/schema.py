@@ -118,7 +118,7 @@ def _are_texts(values: Sequence[Any]) -> bool:
 
 
 def _form(value: Any) -> str | None:
-    return {str: "text", dict: "fields"}.get(type(value))
+    return "text" if isinstance(value, str) else "fields" if isinstance(value, dict) else None
 
 
 Name = Annotated[str, AfterValidator(_name)]

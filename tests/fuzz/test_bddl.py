@@ -50,9 +50,16 @@ def test_any_text_has_findings(text):
     survive("BDDL, linter", lambda: lint_text(text, "fuzz.bddl", starts=0))
 
 
+@pytest.fixture(scope="module")
+def warm() -> None:
+    """Compile what is compiled at first use, which takes longer than an input may."""
+    run(SMALL)
+
+
 @pytest.mark.sim
+@pytest.mark.usefixtures("warm")
 @given(text=changed_bddl())
-@examples(short=6, long=1500)
+@examples(short=12, long=1500)
 def test_any_text_makes_an_environment_or_is_refused(text):
     survive("BDDL, environment", lambda: run(text))
 
