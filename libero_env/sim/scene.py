@@ -150,7 +150,9 @@ def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Sc
     except ValueError as error:  # such as `repeated name 'table_visual' in geom`
         text = " ".join(str(error).split())
         remedy = "; rename the object that it begins with" if "repeated name" in text else ""
-        raise LiberoError(f"task {problem.language!r}: MuJoCo cannot build its scene: {text}{remedy}") from error
+        raise LiberoError(
+            f"task {problem.language!r}: MuJoCo cannot build its scene: {text}{remedy}"
+        ) from error
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
     scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot)

@@ -1,5 +1,7 @@
 """BDDL texts through the parser, and through environment, reset and steps."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,12 +26,88 @@ SMALL = """(define (problem LIBERO_Floor_Manipulation) (:domain robosuite) (:lan
 """
 
 
+NUMBER = re.compile(r"[-+]?\d[\w.+-]*")
+TOKEN = re.compile(r"[()]|[^\s()]+|\s+")
+EXTREMES = (
+    "0",
+    "1",
+    "-1",
+    "5",
+    "100",
+    "1e5",
+    "1e308",
+    "-1e308",
+    "1e-300",
+    "pi",
+    "-pi/2",
+    "nan",
+    "1e999",
+    "x",
+)
+NAMES = (
+    "robot0_base",
+    "robot",
+    "world",
+    "ee",
+    "table",
+    "floor",
+    "plate_1_lid",
+    "milk_1",
+    "basket_1_main",
+    "a/b",
+    "?x",
+)
+PREDICATES = (
+    "On",
+    "In",
+    "Stack",
+    "Up",
+    "Open",
+    "Close",
+    "Turnon",
+    "Turnoff",
+    "Incontact",
+    "True",
+    "Near",
+    "And",
+    "Or",
+)
+
+
 @st.composite
 def changed_bddl(draw, texts=(*TEXTS, SMALL, SMALL)):
+    """Draw the text of a task with changes of its meaning: numbers, names, predicates, atoms that come and go."""
     text = draw(st.sampled_from(texts))
-    for _ in range(draw(st.integers(1, 3))):
-        text = draw(changed_text(text))
-    return text
+    if draw(st.integers(0, 9)) == 0:
+        return draw(changed_text(text))
+    tokens = TOKEN.findall(text)
+    words = [i for i, token in enumerate(tokens) if token[0] not in "() \n" and token[0] != ":"]
+    numbers = [i for i in words if NUMBER.fullmatch(tokens[i])]
+    names = [i for i in words if "_" in tokens[i] and i not in numbers]
+    heads = [i for i in words if tokens[i] in PREDICATES]
+    for _ in range(draw(st.integers(1, 2))):
+        match draw(st.integers(0, 7)):
+            case 0:  # swapped corners, or angles
+                k = draw(st.integers(0, len(numbers) - 3))
+                i, j = numbers[k], numbers[k + draw(st.integers(1, 2))]
+                tokens[i], tokens[j] = tokens[j], tokens[i]
+            case 1:
+                tokens[draw(st.sampled_from(numbers))] = draw(st.sampled_from(EXTREMES))
+            case 2:
+                tokens[draw(st.sampled_from(names))] = tokens[draw(st.sampled_from(names))]
+            case 3:  # everywhere, so that it stays declared
+                old, new = tokens[draw(st.sampled_from(names))], draw(st.sampled_from(NAMES))
+                tokens = [re.sub(rf"\b{re.escape(old)}\b", lambda _, new=new: new, token) for token in tokens]
+            case 4:
+                tokens[draw(st.sampled_from(heads))] = draw(st.sampled_from(PREDICATES))
+            case 5:  # an argument less or more
+                i = draw(st.sampled_from(heads)) + 2
+                tokens[i] = draw(st.sampled_from(["", f"{tokens[i]} {tokens[i]}"]))
+            case 6:
+                tokens[draw(st.sampled_from(words))] = ""
+            case _:
+                tokens[draw(st.sampled_from(words))] = tokens[draw(st.sampled_from(words))]
+    return "".join(tokens)
 
 
 @pytest.mark.unit
