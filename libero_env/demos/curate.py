@@ -299,12 +299,11 @@ def describe(file: Path) -> str:
         names, header = demo_names(handle, file), file_attributes(handle, file)
         steps = sum(count_steps(handle["data"][name], file, name) for name in names)
         obs = handle["data"][names[0]].get("obs") if names else None
-        colours = {}
-        for key in obs if isinstance(obs, h5py.Group) else ():
-            if key.endswith("_rgb"):
-                check_demo(handle["data"][names[0]], file, names[0], [key])
-                colours[key] = "x".join(map(str, obs[key].shape[1:3]))
-    images = f"{next(iter(colours.values()))} pixels" if colours else "no images"
+        colours = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
+        images = "no images"
+        if colours and isinstance(obs, h5py.Group):
+            check_demo(handle["data"][names[0]], file, names[0], colours)
+            images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3])
     models = json_attribute(header, "models", file).get("pack", "unknown")
     failed = header.get("num_failed_attempts", "unknown")
     parts = (f"{len(names)} demonstrations", f"{steps} steps", images, f"failed attempts: {failed}")

@@ -62,10 +62,10 @@ def open_windows(
         return RobomimicWindows(source, language=language, task_id=task_id, device=device)
     if memory == "auto":
         memory = choose_memory(source.nbytes(), device)
+    elif memory != "mmap":
+        _check_fits(source, memory, device)
     if memory == "pinned" and device.type != "cuda":
         raise DataError(f"data.memory=pinned needs a GPU, and device={device}; valid: auto, host, mmap")
-    if memory != "mmap":
-        _check_fits(source, memory, device)
     if memory == "mmap":
         dataset = frame_cache.open_mapped(source, language=language, task_id=task_id)
     else:
