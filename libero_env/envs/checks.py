@@ -1,7 +1,7 @@
 """Checks of what callers pass to environments; nothing has changed when one of them fails."""
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -17,6 +17,7 @@ from libero_env.errors import (
     UnknownNameError,
 )
 from libero_env.sim.osc import ACTION_DIM
+from libero_env.validation.messages import shown
 
 Shape = tuple[int, ...]
 _MAX_SEED_BITS = 4096
@@ -97,7 +98,7 @@ def checked_index(i: object, count: int, name: str = "index") -> int:
             index = -1
         if 0 <= index < count:
             return index
-    raise InvalidInputError(f"{name} {i!r:.80}: expected a whole number from 0 to {count - 1}")
+    raise InvalidInputError(f"{name} {shown(i)}: expected a whole number from 0 to {count - 1}")
 
 
 def checked_indices(ids: object, count: int) -> np.ndarray:
@@ -108,8 +109,8 @@ def checked_indices(ids: object, count: int) -> np.ndarray:
     """
     if ids is None:
         return np.arange(count)
-    if isinstance(ids, str) or not hasattr(ids, "__iter__"):
-        raise InvalidInputError(f"ids={ids!r:.80}: expected a list of indices from 0 to {count - 1}")
+    if isinstance(ids, str) or not isinstance(ids, Iterable) or not getattr(ids, "ndim", 1):
+        raise InvalidInputError(f"ids={shown(ids)}: expected a list of indices from 0 to {count - 1}")
     return np.array([checked_index(i, count) for i in ids], np.int64)
 
 
@@ -128,7 +129,7 @@ def checked_seed(seed: object) -> int | None:
             number = -1
         if number >= 0 and number.bit_length() <= _MAX_SEED_BITS:
             return number
-    raise InvalidInputError(f"seed={seed!r:.80}: expected a whole number from 0, or None")
+    raise InvalidInputError(f"seed={shown(seed)}: expected a whole number from 0, or None")
 
 
 def checked_options(options: object, valid: Sequence[str] | None = None) -> dict[str, Any]:
@@ -145,10 +146,10 @@ def checked_options(options: object, valid: Sequence[str] | None = None) -> dict
     if options is None:
         return {}
     if not isinstance(options, Mapping):
-        raise InvalidInputError(f"options={options!r:.80}: expected a dictionary")
+        raise InvalidInputError(f"options={shown(options)}: expected a dictionary")
     for name in options:
         if valid is not None and name not in valid:
-            raise UnknownNameError("reset option", name, valid)
+            raise UnknownNameError("reset option", name if isinstance(name, str) else shown(name), valid)
     return dict(options)
 
 
@@ -160,7 +161,7 @@ def checked_truth(options: Mapping[str, Any], name: str) -> bool:
     """
     value = options.get(name, False)
     if not isinstance(value, bool | np.bool_):
-        raise InvalidInputError(f"{name}={value!r:.80}: expected true or false")
+        raise InvalidInputError(f"{name}={shown(value)}: expected true or false")
     return bool(value)
 
 
@@ -218,13 +219,13 @@ def whole_numbers(value: object, name: str, shapes: Sequence[Shape]) -> np.ndarr
     """
     array = checked_numbers(value, name, shapes)
     if np.asarray(value).dtype.kind not in "iu":
-        raise InvalidInputError(f"{name}={value!r:.80}: expected whole numbers")
+        raise InvalidInputError(f"{name}={shown(value)}: expected whole numbers")
     return array.astype(np.int64)
 
 
 def _seeds(num_envs: int, seed: object) -> list[int | None]:
     """Return one seed for each environment."""
-    if isinstance(seed, list | tuple | np.ndarray) and np.ndim(seed):
+    if isinstance(seed, list | tuple) or (isinstance(seed, np.ndarray) and seed.ndim):
         if len(seed) != num_envs:
             raise InvalidInputError(f"seed: expected one or {num_envs} seeds, got {len(seed)}")
         return [checked_seed(one) for one in seed]

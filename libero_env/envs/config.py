@@ -16,6 +16,7 @@ from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
 from libero_env.validation import validate_arguments
+from libero_env.validation.messages import shown
 
 AFTER, SUBSTEP = OBSERVED = ("after", "substep")
 Pixels = Annotated[int, Field(ge=1)]  # the renderer knows the largest size
@@ -74,7 +75,7 @@ class EnvConfig:
         assets = values["assets"]
         if not (assets is None or isinstance(assets, str | Path) or hasattr(assets, "add_arena")):
             raise InvalidInputError(
-                f"assets is {assets!r:.80}; expected builtin, original, a folder, or a Pack"
+                f"assets is {shown(assets)}; expected builtin, original, a folder, or a Pack"
             )
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -100,7 +101,7 @@ class EnvConfig:
             UnknownNameError: An option is not a field; the message lists the fields and names the nearest.
         """
         if not (config is None or isinstance(config, cls)):
-            raise InvalidInputError(f"config is {config!r:.80}; expected an EnvConfig or None")
+            raise InvalidInputError(f"config is {shown(config)}; expected an EnvConfig or None")
         names = [field.name for field in fields(cls)]
         for name in options:
             if name not in names:

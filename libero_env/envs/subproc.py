@@ -28,6 +28,7 @@ from libero_env.envs.worker import Failure, Worker, checked_space, shut_down, wa
 from libero_env.envs.worker_host import open_libero
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.validation import validate
+from libero_env.validation.messages import shown
 
 EnvSpec = Mapping[str, Any] | Callable[[], gymnasium.Env]
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
@@ -114,7 +115,7 @@ class SubprocEnv(LiberoVectorEnv):
         for spec in specs:
             if not (callable(spec) or isinstance(spec, Mapping)):
                 raise InvalidInputError(
-                    f"{spec!r:.80} describes no environment; expected a dictionary or a function"
+                    f"{shown(spec)} describes no environment; expected a dictionary or a function"
                 )
         common = {"config": EnvConfig.from_options(config, options)}
         factories = [spec if callable(spec) else _factory({**common, **spec}) for spec in specs]

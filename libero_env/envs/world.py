@@ -28,6 +28,7 @@ from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.problem import And, atoms_of
 from libero_env.validation import validate
+from libero_env.validation.messages import shown
 
 Count = Annotated[int, Field(ge=1)]
 Threads = Annotated[int, Field(ge=0, le=4096)]
@@ -71,7 +72,7 @@ class World:
         )
         if not isinstance(task, Task | str):
             raise InvalidInputError(
-                f"task is {task!r:.80}; expected a Task, or a text such as libero_object/3"
+                f"task is {shown(task)}; expected a Task, or a text such as libero_object/3"
             )
         self.controller = get_controller(config.controller, config.control_delta)
         self.task = get_task(task) if isinstance(task, str) else task

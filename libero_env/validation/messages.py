@@ -89,7 +89,10 @@ def suggest(name: object, valid: Iterable[object]) -> str:
 
 def shown(value: Any) -> str:
     """Return a value as it is shown in a message: shortened."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a whole number of more than 4300 digits
+        return f"a value of type {type(value).__name__} that is too large to be shown"
     return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
 
 

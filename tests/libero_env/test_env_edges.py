@@ -122,7 +122,7 @@ def interrupted(*_: object):
     raise KeyboardInterrupt
 
 
-SEEDS = (-1, 1.5, "abc", True, float("nan"), [1], np.float64(3), 1j, 2**5000)
+SEEDS = (-1, 1.5, "abc", True, float("nan"), [1], np.float64(3), 1j, 2**5000, 10**5000, [[1], 0.5])
 INIT_STATES = (99, -1, 1.0, "a", None, [1, 2], True, [], 10**30, {}, 1j, np.nan, [[1], [2, 3]])
 
 
@@ -141,7 +141,7 @@ def test_refused_resets_change_nothing(env, batch):
         for options in ([1], "abc", 3, [("init_state", 0)]):
             with pytest.raises(InvalidInputError, match="expected a dictionary"):
                 one.reset(seed=5, options=options)
-        for options in ({"int_state": 1}, {1: 2}, {None: 1}):
+        for options in ({"int_state": 1}, {1: 2}, {None: 1}, {10**5000: 1}):
             with pytest.raises(UnknownNameError):
                 one.reset(seed=5, options=options)
         assert digest(one) == before

@@ -48,6 +48,7 @@ from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
 from libero_env.sim.state import StateView
+from libero_env.validation.messages import shown
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz
@@ -74,7 +75,7 @@ def _check_horizon(horizon: Any) -> None:
     """Raise unless a horizon is above 0; robosuite takes infinity, too."""
     number = isinstance(horizon, int | float | np.integer | np.floating) and not isinstance(horizon, bool)
     if not number or not horizon > 0:
-        raise InvalidInputError(f"horizon is {horizon!r:.80}; expected at least 1")
+        raise InvalidInputError(f"horizon is {shown(horizon)}; expected at least 1")
 
 
 class BDDLBaseDomain(RobosuiteMethods):

@@ -22,6 +22,7 @@ from libero._adapters.envs.workers import (  # noqa: F401 - names of the origina
 )
 from libero_env.errors import ClosedEnvironmentError, InvalidInputError, LiberoError
 from libero_env.validation import validate
+from libero_env.validation.messages import shown
 
 # Attributes of a vector that are those of its environments, in a list.
 GYM_RESERVED_KEYS = ["metadata", "reward_range", "spec", "action_space", "observation_space"]
@@ -59,7 +60,7 @@ class BaseVectorEnv:
         env_fns = list(env_fns)
         if not env_fns or not all(map(callable, env_fns)):
             raise InvalidInputError(
-                f"env_fns={env_fns!r}: expected at least one function that makes an environment"
+                f"env_fns={shown(env_fns)}: expected at least one function that makes an environment"
             )
         self.env_num = len(env_fns)
         self.wait_num = validate(_Count | None, wait_num, prefix=("wait_num",)) or self.env_num
@@ -225,10 +226,10 @@ class BaseVectorEnv:
         ids = np.atleast_1d(id)
         whole = ids.ndim == 1 and (not ids.size or ids.dtype.kind in "iu")
         if not whole or any(not -self.env_num <= i < self.env_num for i in ids):
-            raise InvalidInputError(f"id={id!r}: expected indices from 0 to {self.env_num - 1}")
+            raise InvalidInputError(f"id={shown(id)}: expected indices from 0 to {self.env_num - 1}")
         chosen = [int(i) % self.env_num for i in ids]
         if len(set(chosen)) < len(chosen):
-            raise InvalidInputError(f"id={id!r}: an environment occurs twice")
+            raise InvalidInputError(f"id={shown(id)}: an environment occurs twice")
         return chosen
 
     def _assert_id(self, id: Sequence[int]) -> None:
