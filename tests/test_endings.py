@@ -351,10 +351,12 @@ def test_warnings_of_mujoco_are_logged_once_and_make_no_file(here, caplog):
 
 
 @pytest.mark.unit
-def test_a_new_task_may_have_any_instruction(here, capsys):
-    language = "put: [the 'bowl'] #1 on\nthe plate"
+def test_a_new_task_may_have_any_instruction_of_one_line(here, capsys):
+    language = "put: [the 'bowl'] #1 on the plate"
     assert cli.main(["tasks", "new", "mine", "--language", language]) == 0
-    assert read_task("mine.yaml").language.split() == language.split()
+    assert read_task("mine.yaml").language == language
+    assert cli.main(["tasks", "new", "two", "--language", "put it\nthere"]) == 2
+    assert "expected one line without ( ) and ;" in capsys.readouterr().err
 
 
 @pytest.mark.unit
