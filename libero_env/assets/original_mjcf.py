@@ -16,7 +16,7 @@ import mujoco
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects.builtin.assemble import GLOWING_SITES, HIDDEN_GROUP
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
-from libero_env.objects.xml_file import explain, parse_xml
+from libero_env.objects.xml_file import explain, parse_xml, place_of
 
 REMEDY = "`libero assets check` lists what is missing, `libero assets download` downloads it"
 _BODY_TAGS = ("body", "geom", "inertial", "joint", "site")
@@ -41,7 +41,7 @@ def read_file(path: Path, within: Path | None = None) -> tuple[list[ET.Element],
     for element in root.iterfind("asset/*[@file]"):
         file = path.parent.absolute() / element.get("file", "")
         if within is not None and not Path(os.path.normpath(file)).is_relative_to(within.absolute()):
-            raise LiberoError(f"{element.at}: {file} is outside of {within}; {REMEDY}")
+            raise LiberoError(f"{place_of(element)}: {file} is outside of {within}; {REMEDY}")
         element.set("file", str(file))
     return written_out(root, path)
 

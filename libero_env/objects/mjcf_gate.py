@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from types import MappingProxyType
 from typing import NoReturn
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from libero_env.errors import InvalidInputError
 from libero_env.objects.references import MAX_FACES, MAX_PIXELS, file_inside, mesh_faces, texture_pixels
-from libero_env.objects.xml_file import Node, explain, parse_xml, write_xml
+from libero_env.objects.xml_file import explain, parse_xml, place_of, write_xml
 from libero_env.validation import suggest
 
 # Largest number of elements, those that <replicate> makes included.
@@ -83,7 +84,7 @@ class Mjcf:
     """
 
     path: Path
-    root: Node
+    root: ET.Element
     text: str
     omitted: int
     _places: tuple[str, ...] = field(repr=False)
@@ -119,18 +120,18 @@ def read_mjcf(path: Path) -> Mjcf:
     return Mjcf(path, root, text, omitted, places)
 
 
-def _refuse(node: Node, text: str) -> NoReturn:
-    raise InvalidInputError(f"{node.at}: {text}")
+def _refuse(node: ET.Element, text: str) -> NoReturn:
+    raise InvalidInputError(f"{place_of(node)}: {text}")
 
 
-def _include(node: Node, folder: Path, seen: set[Path]) -> None:
+def _include(node: ET.Element, folder: Path, seen: set[Path]) -> None:
     """Put the content of included files in the place of <include>, each once."""
     for index in range(len(node) - 1, -1, -1):
         child = node[index]
         if child.tag != "include":
             _include(child, folder, seen)
             continue
-        file = file_inside(folder, child.get("file", ""), child.at, "included file")
+        file = file_inside(folder, child.get("file", ""), place_of(child), "included file")
         if file in seen or len(seen) == _MAX_INCLUDES:
             _refuse(child, f"{file.name} is included twice, or more than {_MAX_INCLUDES} files are included")
         seen.add(file)
@@ -139,7 +140,7 @@ def _include(node: Node, folder: Path, seen: set[Path]) -> None:
         node[index : index + 1] = list(content)
 
 
-def _omit(node: Node) -> int:
+def _omit(node: ET.Element) -> int:
     """Remove the elements that an object is used without; return the number of those that a note counts."""
     count = 0
     for child in list(node):
@@ -153,7 +154,7 @@ def _omit(node: Node) -> int:
     return count
 
 
-def _check_child(parent: Node, child: Node) -> None:
+def _check_child(parent: ET.Element, child: ET.Element) -> None:
     valid = _GRAMMAR.get(parent.tag, _NONE)
     if child.tag not in valid:
         listed = f"valid there: {', '.join(sorted(valid))}" if valid else "it has no elements in it"
@@ -163,7 +164,7 @@ def _check_child(parent: Node, child: Node) -> None:
         )
 
 
-def _check_values(node: Node) -> None:
+def _check_values(node: ET.Element) -> None:
     """Check that numbers are finite and of a usual size."""
     for key, text in node.attrib.items():
         if key not in _REALS and len(text) > _LONGEST:
@@ -182,14 +183,14 @@ def _check_values(node: Node) -> None:
             _refuse(node, f"{key} of <{node.tag}> is {text!r}; expected a whole number")
 
 
-def _check_numbers(node: Node, key: str, numbers: np.ndarray) -> None:
+def _check_numbers(node: ET.Element, key: str, numbers: np.ndarray) -> None:
     largest = _LARGEST_RESOLUTION if node.tag == "texture" else _LARGEST_LENGTH.get(key, _LARGEST_NUMBER)
     if not np.isfinite(numbers).all() or np.abs(numbers).max(initial=0.0) > largest:
         wrong = next(value for value in numbers if not abs(value) <= largest)
         _refuse(node, f"{key} of <{node.tag}> has the value {wrong:g}; expected numbers up to {largest:g}")
 
 
-def _check_counts(root: Node) -> None:
+def _check_counts(root: ET.Element) -> None:
     counts: Counter[str] = Counter()
     for tag, number in _counted(root, 1):
         counts[tag] += number
@@ -198,7 +199,7 @@ def _check_counts(root: Node) -> None:
             _refuse(root, f"it has {counts[tag]} elements <{tag}>; an object has at most {largest}")
 
 
-def _counted(node: Node, times: int) -> Iterator[tuple[str, int]]:
+def _counted(node: ET.Element, times: int) -> Iterator[tuple[str, int]]:
     """Yield tag and number of each element, with what <replicate> makes of it."""
     if node.tag == "replicate":
         count = node.get("count", "1")
@@ -208,7 +209,7 @@ def _counted(node: Node, times: int) -> Iterator[tuple[str, int]]:
         yield from _counted(child, times)
 
 
-def _check_joined(root: Node) -> None:
+def _check_joined(root: ET.Element) -> None:
     """Check that constraints join two parts of the object: with one, they would fix it to the world."""
     for node in (*root.iterfind("equality/connect"), *root.iterfind("equality/weld")):
         parts = [node.get("body1"), node.get("body2")]
@@ -217,7 +218,7 @@ def _check_joined(root: Node) -> None:
             _refuse(node, f"<{node.tag}> fixes the object to the world; name two of its own bodies")
 
 
-def _resolve_files(root: Node, folder: Path) -> None:
+def _resolve_files(root: ET.Element, folder: Path) -> None:
     """Replace the names of files by absolute paths, and remove the settings that say where to search them."""
     settings: dict[str, str] = {}
     for compiler in root.findall("compiler"):
@@ -238,8 +239,8 @@ def _resolve_files(root: Node, folder: Path) -> None:
             if settings.get("strippath") == "true":
                 name = PurePath(name.replace("\\", "/")).name
             within = f"{folders[node.tag]}/{name}" if folders[node.tag] else name
-            file = file_inside(folder, within, node.at, node.tag)
-            sizes[node.tag] += (mesh_faces if node.tag == "mesh" else texture_pixels)(file, node.at)
+            file = file_inside(folder, within, place_of(node), node.tag)
+            sizes[node.tag] += (mesh_faces if node.tag == "mesh" else texture_pixels)(file, place_of(node))
             node.set(key, str(file))
     for node in root.iterfind("asset/texture[@builtin]"):
         sides = [float(node.get(key, "1")) for key in ("width", "height", "nchannel")]

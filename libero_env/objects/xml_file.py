@@ -28,6 +28,11 @@ class Node(ET.Element):
     at: str = ""
 
 
+def place_of(node: ET.Element) -> str:
+    """Return `file:line` of an element; empty for one that was made."""
+    return getattr(node, "at", "")
+
+
 def parse_xml(path: Path) -> Node:
     """Return the root element of an XML file; comments and text between elements are left out.
 
@@ -97,7 +102,7 @@ def write_xml(root: ET.Element) -> tuple[str, tuple[str, ...]]:
     def write(node: ET.Element) -> None:
         attributes = "".join(f" {key}={quoteattr(value)}" for key, value in node.attrib.items())
         lines.append(f"<{node.tag}{attributes}{'>' if len(node) else '/>'}")
-        places.append(getattr(node, "at", ""))
+        places.append(place_of(node))
         for child in node:
             write(child)
         if len(node):

@@ -144,6 +144,8 @@ def test_files_in_the_folder_are_found_as_mujoco_finds_them(home):
         ({"geom": '<geom size="nan"/>'}, ":3: size of <geom> has the value nan"),
         ({"geom": '<geom size="1e30"/>'}, "value 1e[+]30; expected numbers up to 10"),
         ({"geom": '<geom size="5"/>'}, "it reaches 5 m"),
+        ({"geom": '<geom size="1.5" mass="1"/>' * 20}, "20 collision geoms have 45 m.2 in all"),
+        ({"geom": '<geom size=".01"/>' * 1500}, "3000 geoms with their copies for display"),
         ({"geom": '<geom size=".02" mass="1e308"/>'}, "mass of <geom> has the value 1e[+]308"),
         ({"geom": '<geom size=".02" mass="1e9"/>'}, "its mass is 1e[+]09 kg"),
         ({"geom": '<geom size=".02" rgba="red"/>'}, "rgba of <geom> is 'red'; expected numbers"),

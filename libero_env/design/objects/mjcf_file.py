@@ -16,7 +16,7 @@ from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import delete
 from libero_env.objects.folder import MODEL, spec_of
-from libero_env.objects.mjcf_gate import Mjcf, read_mjcf
+from libero_env.objects.mjcf_gate import LIMITS, Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY
 from libero_env.objects.xml_file import explain
 
@@ -25,6 +25,7 @@ _HIDDEN = 3  # first geom group that viewers hide by default
 _INNER = "worldbody/body/body[@name='object']"  # the object in files made for the original
 _LARGEST, _SMALLEST = 3.0, 1e-3  # [m] reach, and longest side
 _HEAVIEST = 1e4  # [kg]
+_WIDEST = 25.0  # [m^2] sum of the squared radii of collision geoms, whose surface is sampled
 
 
 def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
@@ -50,6 +51,10 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
     spec = _spec(file, name)
     root = _root(spec, file, notify)
     _sort_geoms(spec)
+    if len(spec.geoms) > LIMITS["geom"]:
+        raise InvalidInputError(
+            f"{path}: it has {len(spec.geoms)} geoms with their copies for display; at most {LIMITS['geom']} are used"
+        )
     names = _gather_files(spec, directory)
     model = _compiled(spec, path)
     _check_extent(model, path)
@@ -232,4 +237,8 @@ def _check_extent(model: mujoco.MjModel, path: Path) -> None:
         raise InvalidInputError(
             f"{path}: it reaches {reach.max():.3g} m, its largest part is {longest:.3g} m long; expected {_SMALLEST} "
             f"to {_LARGEST:.0f} m: MJCF files are in metres"
+        )
+    if (area := float((model.geom_rbound[solid] ** 2).sum())) > _WIDEST:
+        raise InvalidInputError(
+            f"{path}: its {len(solid)} collision geoms have {area:.0f} m^2 in all; expected at most {_WIDEST:.0f}"
         )
