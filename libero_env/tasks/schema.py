@@ -48,6 +48,10 @@ def _language(text: str) -> str:
     return text
 
 
+def _single_blanks(text: str) -> str:
+    return " ".join(text.split())
+
+
 def _number(value: Any) -> Any:
     """Return the value of a text such as `pi/2`, and anything else as it is."""
     if not isinstance(value, str):
@@ -194,7 +198,7 @@ class Definition(TypedDict, total=False):
     init: Atoms
     init_also: Atoms
     obj_of_interest: Annotated[list[Name], Field(max_length=MAX_PARTS)]
-    scene_properties: dict[Name, Annotated[str, Field(max_length=MAX_NAME)]]
+    scene_properties: dict[Name, Annotated[str, Field(max_length=MAX_NAME), AfterValidator(_single_blanks)]]
 
 
 def check_definition(definition: Any, source: Source) -> dict[str, Any]:
