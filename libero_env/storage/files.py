@@ -17,7 +17,11 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, 
 
 def parse_yaml(text: str) -> Any:
     """Return the content of a YAML text; nothing in it is executed."""
-    return yaml.load(text, Loader=_LOADER)
+    loader = _LOADER(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
 
 
 def read_yaml(path: str) -> Any:

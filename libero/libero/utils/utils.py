@@ -9,6 +9,7 @@ import numpy as np
 
 from libero._adapters.envs.models import assets_folder
 from libero_env.assets.robot import robosuite_assets
+from libero_env.objects.xml_file import parse_xml_text
 
 DIR = os.path.dirname(__file__)
 _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
@@ -16,7 +17,7 @@ _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
 
 def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """Return a stored model with the paths of this machine, and with new attributes of cameras by name."""
-    root = ElementTree.fromstring(xml_str)
+    root = parse_xml_text(xml_str.encode(), "the stored model")
     for element in root.iterfind("asset/*[@file]"):
         file = element.get("file", "")
         if _ROBOSUITE in file:

@@ -18,7 +18,7 @@ from libero_env.mujoco_compat import delete
 from libero_env.objects.folder import MODEL, spec_of
 from libero_env.objects.mjcf_gate import LIMITS, Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY
-from libero_env.objects.xml_file import explain
+from libero_env.objects.xml_file import explain, parse_xml_text
 
 INSIDE = 0.8  # size of `contain_region`, as a share of the bounds
 _HIDDEN = 3  # first geom group that viewers hide by default
@@ -210,7 +210,7 @@ def _gather_files(spec: mujoco.MjSpec, directory: Path) -> dict[str, str]:
 
 def _with_names(text: str, names: Mapping[str, str]) -> str:
     """Return an MJCF text with the names of files by their absolute paths replaced."""
-    root = ET.fromstring(text)
+    root = parse_xml_text(text.encode(), "the object's MJCF")
     for element in root.iterfind("asset/*[@file]"):
         element.set("file", names[element.attrib["file"]])
     ET.indent(root)
