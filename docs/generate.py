@@ -53,8 +53,7 @@ def command_reference() -> str:
 def _command(parser: argparse.ArgumentParser) -> str:
     about = (parser.description or "").strip()
     lines = [f"## {parser.prog}", "", f"{about[:1].upper()}{about[1:]}.", ""]
-    everywhere = {"--help", "--debug"}  # of which the page speaks above
-    rows = [_argument(a) for a in parser._actions if not everywhere & set(a.option_strings)]
+    rows = [_argument(a) for a in parser._actions if not isinstance(a, argparse._HelpAction)]
     if rows:
         lines += ["| argument | what |", "|---|---|", *rows, ""]
     return "\n".join(lines)
