@@ -35,6 +35,8 @@ _TEXTURE_FIELDS = (
 
 
 _GROWING = {"include", "replicate", "composite", "flexcomp", "attach", "model", "extension", "plugin"}
+_MAX_ELEMENTS = 20_000  # of a model; a kitchen has 3,000
+_MAX_COUNT = 10_000  # of key frames and the like, for which <size> reserves memory
 MAX_POSITION = 1e6  # [m] of a body in a stored model
 
 
@@ -134,11 +136,14 @@ def _parse(xml: str, where: str) -> Node:
         root = parse_xml_text(xml.encode("utf-8", "replace"), where)
     except InvalidInputError as error:
         raise DemoError(f"{where} is not XML ({error}); expected the scene as MJCF") from error
-    for node in root.iter():
-        if node.tag in _GROWING:
-            raise DemoError(
-                f"{where} has the element <{node.tag}>; expected a complete model, as recordings have it"
-            )
+    for number, node in enumerate(root.iter()):
+        if node.tag in _GROWING or number > _MAX_ELEMENTS:
+            what = f"the element <{node.tag}>" if node.tag in _GROWING else f"over {_MAX_ELEMENTS} elements"
+            raise DemoError(f"{where} has {what}; expected a complete model, as recordings have it")
+    for size in root.iter("size"):
+        for key, value in size.items():
+            if key != "memory" and not (value.lstrip("-").isdecimal() and int(value[:9]) <= _MAX_COUNT):
+                raise DemoError(f"{where} reserves {key}={value!r}; expected at most {_MAX_COUNT}")
     return root
 
 
