@@ -309,6 +309,9 @@ class _Scene:
         ('<x><body name="stove_main" pos="1 2"/></x>', "3 and 4 numbers"),
         ('<x><body name="stove_main" pos="nan 2 3"/></x>', "3 and 4 numbers"),
         ('<x><body name="stove_main" quat="0 0 0 0"/></x>', "expected a rotation"),
+        ('<x><replicate count="100000"/></x>', "element <replicate>"),
+        ("<x>" + "<geom/>" * 20_001 + "</x>", "over 20000 elements"),
+        ('<x><size nkey="1000000000"/></x>', "reserves nkey"),
     ],
 )
 def test_fixtures_of_a_stored_model_are_poses(xml, words):
