@@ -14,9 +14,9 @@ from libero_env.assets.pack import Pack, select_pack
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import start_faults
 from libero_env.init_states.store import load_init_states, split_row
+from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene
-from libero_env.sim.simulation import make_simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_suite
 

@@ -19,11 +19,12 @@ from libero_env.errors import InvalidInputError
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
 from libero_env.parallel import require_memory
+from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.observations import Observer, is_of_joints
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import build_scene
-from libero_env.sim.simulation import WATCHED, Indices, make_simulations
+from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.problem import And, atoms_of

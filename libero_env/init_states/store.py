@@ -15,8 +15,8 @@ from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import sample_settled
 from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
+from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.scene import Scene, build_scene
-from libero_env.sim.simulation import LoopSimulations
 from libero_env.storage import atomic_write_npz, cached_arrays, read_packaged_npz
 from libero_env.tasks.task import Task
 

@@ -7,9 +7,9 @@ import pytest
 
 from libero_env.envs.checks import checked_actions
 from libero_env.errors import ActionError
+from libero_env.sim.back_ends import Batch, BatchSimulations, LoopSimulations
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.scene import build_scene
-from libero_env.sim.simulation import Batch, BatchSimulations, LoopSimulations
 from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim
