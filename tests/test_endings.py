@@ -376,8 +376,16 @@ def test_memory_is_looked_at_before_it_is_asked_for(monkeypatch):
         parallel.require_memory(2e9, "this", "less of it")
 
 
+@pytest.fixture
+def heeded():
+    """SIGHUP, which is ignored where the tests run under nohup, ends processes."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.unit
-def test_signals_interrupt_once_and_keep_what_is_ignored():
+def test_signals_interrupt_once_and_keep_what_is_ignored(heeded):
     def handlers() -> list[object]:
         return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
@@ -480,7 +488,7 @@ def test_a_signal_ends_an_evaluation_and_its_workers(name, here):
 
 
 @pytest.mark.sim
-def test_sighup_ends_a_recording_and_its_workers(here):
+def test_sighup_ends_a_recording_and_its_workers(here, heeded):
     words = ["demos", "generate", "--task", "libero_goal/7", "--n", "40", "--workers", "2", "--size", "16"]
     process = started([*words, "--folder", "kept"], here, lambda pid: len(descendants(pid)) > 2)
     workers = descendants(process.pid)

@@ -155,7 +155,7 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
             "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, derpp, dmpel, er, ewc, lora, lwf, mas,",
         ),
         ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
-        ("eval.select=first", "valid: best, last"),
+        ("eval.select=first", "eval.select is 'first'; expected one of 'best' or 'last'"),
         ("device=tpu", "valid: auto, cpu, cuda"),
     ],
 )

@@ -1,5 +1,6 @@
 """Workers of vector environments that die, hang or are interrupted: what the others answer is never that of before."""
 
+import itertools
 import os
 import random
 import signal
@@ -8,6 +9,7 @@ import time
 
 import pytest
 
+from libero._adapters.envs import workers
 from libero._adapters.envs.workers import CALL_TIMEOUT, WorkerError
 from libero.libero.envs import DummyVectorEnv, SubprocVectorEnv
 from libero_env.errors import ClosedEnvironmentError, InvalidInputError
@@ -134,16 +136,30 @@ def test_kills_among_workers_that_are_not_waited_for(wait_num):
     env.close()
 
 
-def test_a_call_that_is_given_up_has_no_answer_later():
+def interrupt_answer(monkeypatch, number: int) -> None:
+    """Press Ctrl-C while an answer is waited for: the first one for 0."""
+    wait_for, count = workers.wait_for, itertools.count()
+
+    def interrupted(*args):
+        if next(count) == number:
+            raise KeyboardInterrupt
+        return wait_for(*args)
+
+    monkeypatch.setattr(workers, "wait_for", interrupted)
+
+
+def test_a_call_that_is_given_up_has_no_answer_later(monkeypatch):
     env = SubprocVectorEnv([echo(i) for i in range(3)])
     env.reset()
     with pytest.raises(InvalidInputError, match="cannot be sent to a worker process"):
         env.step([1.0, lambda: None, 1.0])  # environment 0 has its action
     assert [one["all"][2] for one in env.step([9.0, 9.0], id=[0, 2])[0]] == [9.0, 9.0]
-    threading.Timer(0.002, signal.raise_signal, (signal.SIGINT,)).start()
-    with pytest.raises(KeyboardInterrupt):
-        while True:
+    for interrupted in range(3):
+        interrupt_answer(monkeypatch, interrupted)
+        with pytest.raises(KeyboardInterrupt):
             env.step([5.0] * 3)
+        monkeypatch.undo()
+        assert [one["all"][2] for one in env.step([6.0] * 3)[0]] == [6.0] * 3
     assert [one["all"][2] for one in env.step([10.0] * 3)[0]] == [10.0] * 3
     env.close()
 

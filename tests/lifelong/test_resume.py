@@ -186,10 +186,10 @@ def test_checkpoints_of_another_run_are_named(tmp_path, monkeypatch):
         sequence(run_context(tmp_path / "run1", "sequential")).run()
 
 
-@pytest.mark.parametrize("other", sorted(ALGORITHMS.keys() - {"sequential"}))
+@pytest.mark.parametrize("other", ["er", "ewc", "packnet"])
 def test_the_state_of_another_algorithm_is_named(tmp_path, other):
     sequence(run_context(tmp_path, other, tasks=1)).run()
-    for algo in ALGORITHMS.keys() - {other}:
+    for algo in sorted({"sequential", "er", "ewc", "packnet"} - {other}):
         with pytest.raises(
             CheckpointError, match=r"task_0\.safetensors: the state of the algorithm does not fit"
         ):

@@ -154,7 +154,10 @@ def test_a_result_is_run_again_from_its_file(module, tmp_path, capsys):
     command = ["eval", f"{module}:make", "--suite", "libero_goal/3", "--episodes", "2", "--horizon", "3"]
     command += ["--protocol", "openpi", "--seed", "4", "--names", "original", "--threads", "1"]
     assert cli.main([*command, "--out", "found"]) == 0
-    assert cli.main(["eval", "found/eval.json", "--threads", "1"]) == 0
+    capsys.readouterr()
+    assert cli.main(["eval", "found/eval.json", "--threads", "1"]) == 2
+    assert f"--allow {module}" in capsys.readouterr().err, "a result may be somebody else's"
+    assert cli.main(["eval", "found/eval.json", "--threads", "1", "--allow", module]) == 0
     first, again = EvaluationResult.read("found"), EvaluationResult.read("found/again")
     assert (first.outcomes, first.actions) == (again.outcomes, again.actions)
     assert (first.evaluated, first.protocol, first.init_states) == (
@@ -165,9 +168,9 @@ def test_a_result_is_run_again_from_its_file(module, tmp_path, capsys):
     other = replace(first, versions={**first.versions, "mujoco": "3.0.0"})
     other.write(tmp_path / "other" / "eval.json")
     capsys.readouterr()
-    assert cli.main(["eval", "other/eval.json"]) == 2
+    assert cli.main(["eval", "other/eval.json", "--allow", module]) == 2
     assert "mujoco: 3.0.0 in the result" in (err := capsys.readouterr().err) and "--despite mujoco" in err
-    assert cli.main(["eval", "other", "--threads", "1", "--despite", "mujoco"]) == 0
+    assert cli.main(["eval", "other", "--threads", "1", "--allow", module, "--despite", "mujoco"]) == 0
     assert EvaluationResult.read("other/again").actions == first.actions
 
 
