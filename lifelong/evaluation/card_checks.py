@@ -116,7 +116,7 @@ def _episode(v: Mapping[str, Any]) -> Iterator[str]:
     order = v["episode.reset_order"]
     if "set_init_state" not in order or len(set(order)) != len(order):
         yield f"episode.reset_order is {list(order)}; it must have set_init_state, and each call once"
-    if "reset" in order and order.index("reset") > order.index("set_init_state"):
+    elif "reset" in order and order.index("reset") > order.index("set_init_state"):
         yield "episode.reset_order has reset after set_init_state, which would undo it"
 
 

@@ -129,6 +129,7 @@ BAD = {
     ),
     "replan": ("extends: openpi\naction: {chunk: 4}", r"action\.replan is 5, but action\.chunk is 4"),
     "stored and seeded": ("extends: libero\nworld: {env_seed: 7}", r"world\.env_seed is 7, but .* stored"),
+    "no start": ("extends: openpi\nepisode: {reset_order: [reset, settle]}", "must have set_init_state"),
     "order": (
         "extends: openpi\nepisode: {reset_order: [set_init_state, reset]}",
         "reset_order has reset after set_init_state",
