@@ -161,7 +161,6 @@ KEYS = sorted(
         "algo._args_",
         "policy._partial_",
         "a.b.c",
-        "hydra.run.dir",
         "hydra",
     }
 )
@@ -204,7 +203,7 @@ def launched(words):
 
 
 @given(st.lists(OVERRIDES, min_size=1, max_size=4))
-@examples(short=14, long=2000)
+@examples(short=14, long=400)
 def test_any_overrides_begin_a_run_or_are_refused(words):
     survive("configuration overrides", lambda: launched(words))
 
