@@ -378,10 +378,16 @@ def test_memory_is_looked_at_before_it_is_asked_for(monkeypatch):
 
 @pytest.fixture
 def heeded():
-    """SIGHUP, which is ignored where the tests run under nohup, ends processes."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    """Signals are heeded as in a terminal: under nohup, or in the background of a script, some are ignored."""
+    usual = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.unit
