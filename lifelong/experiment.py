@@ -250,6 +250,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             instructions=[t.language for t in context.tasks],
             config=OmegaConf.to_yaml(OmegaConf.create(plain)),
             group_size=context.group_size,
+            cells=context.eval.cells,
             conditions=present_conditions(
                 context.device, processes=context.ranks.size, renderer=renderer_name_or_none()
             ),

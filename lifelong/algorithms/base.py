@@ -15,6 +15,7 @@
     end_phase(phase, policy)                          after each phase, with the weights that are kept
     end_task(task_index, dataset, policy, generator)  after the last phase
     policy_for(task_index, policy) -> policy          around every rollout, as a context
+    acting_state(task_index, policy) -> state         before a rollout: whether it would repeat another one
     state_dict() -> state                             when a checkpoint is written
     load_state_dict(state, datasets)                  when a run resumes
 
@@ -177,6 +178,25 @@ class Algorithm:
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy that acts on a task; after the context the policy is as before."""
         yield policy
+
+    def acting_state(self, task_index: int, policy: Policy) -> Any:
+        """Return what decides how the policy acts on a task besides the tensors of `policy_for`.
+
+        Rollouts whose tensors, acting state and starts are those of earlier ones are not run again. By default nothing
+        else decides where `policy_for` is as here and no layer has hooks, and otherwise everything in `state_dict`,
+        which is always right. An algorithm whose `policy_for` changes values of the policy's parameters and buffers
+        only returns nothing, so that what is frozen is measured once.
+
+        Args:
+            task_index: Position of the task in the sequence.
+            policy: Policy that `policy_for` yields for the task.
+
+        Returns:
+            Nested dictionaries of tensors, numbers and strings.
+        """
+        hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
+        plain = type(self).policy_for is Algorithm.policy_for and not hooked
+        return {} if plain else self.state_dict()
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""

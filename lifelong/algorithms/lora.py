@@ -157,6 +157,10 @@ class LoRA(Algorithm):
         finally:
             _put(policy, present)
 
+    def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
+        """Return nothing: a task's policy is its weights."""
+        return {}
+
     def sizes(self) -> dict[int, int]:
         """Return the number of parameters learned by each task with an adapter, its own copies included."""
         small = sum(p.numel() for n, p in self._base.items() if matches(n, self.own))

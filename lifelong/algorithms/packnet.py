@@ -145,6 +145,10 @@ class PackNet(Algorithm):
                     if name in whole:
                         p.copy_(whole[name])
 
+    def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
+        """Return nothing: a task's policy is its weights."""
+        return {}
+
     def state_dict(self) -> dict[str, Any]:
         """Return the owners of all weights, and the position in the task."""
         return {"task_index": self.task_index, "pruned": self._pruned, "owner": dict(self._owner)}

@@ -52,6 +52,10 @@ class SingleTask(Algorithm):
         finally:
             policy.load_state_dict(present)
 
+    def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
+        """Return nothing: a task's policy is its weights."""
+        return {}
+
     def state_dict(self) -> dict[str, Any]:
         """Return the initial weights and those of every learned task."""
         return {"initial": self._initial, "learned": dict(self._learned)}

@@ -3,7 +3,7 @@
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +54,14 @@ class Rollouts:
         seconds: Wall time, [s].
         atoms: Atoms of the goal, in the order of the episodes' flags.
         recordings: Frames of each recorded simulation, (H, W, 3) uint8, upright.
+        random: Whether the policy drew random numbers.
     """
 
     episodes: tuple[Episode, ...]
     seconds: float
     atoms: tuple[str, ...] = ()
     recordings: tuple[tuple[np.ndarray, ...], ...] = field(default=(), repr=False)
+    random: bool = False
 
     @property
     def frames(self) -> tuple[np.ndarray, ...]:
@@ -107,10 +109,10 @@ def rollout(
         ConfigError: The numbers of simulations and of initial states differ.
     """
     draws = [generator(*seed, state) for state in init_states]
-    was_training = policy.training
+    was_training, before = policy.training, _states(draws)
     policy.eval()
     try:
-        return run_episodes(
+        done = run_episodes(
             PolicyActor(policy, language, torch.device(device), precision, draws),
             env,
             init_states,
@@ -122,6 +124,7 @@ def rollout(
         )
     finally:
         policy.train(was_training)
+    return replace(done, random=not torch.equal(before, _states(draws)))
 
 
 def run_episodes(
@@ -268,6 +271,11 @@ def _tell(actor: Actor, tracker: EpisodeTracker) -> None:
     """Tell an actor that wants to know which episodes are over."""
     if isinstance(actor, TakesNote):
         actor.note(tracker.over, tracker.success)
+
+
+def _states(draws: Sequence[torch.Generator]) -> Tensor:
+    """Return the states of generators and of the global one, (n, bytes) uint8."""
+    return torch.stack([*(draw.get_state() for draw in draws), torch.get_rng_state()])
 
 
 def _frame(obs: Obs, views: Sequence[str], i: int) -> np.ndarray:

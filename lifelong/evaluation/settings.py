@@ -1,11 +1,13 @@
 """Settings of the measurement of success."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
+from lifelong.results.coverage import MatrixCells, measured_tasks
 from lifelong.types import Count, Natural
 
 
@@ -17,6 +19,12 @@ class EvalSettings:
         episodes: Number of rollouts per cell of the success matrix; they start in the first initial states.
         curve_episodes: Number of rollouts per point of a learning curve.
         every: Number of epochs between two points of a learning curve; it also has epoch 0 and the last epoch.
+        curve: Points of a learning curve: `all`; `trained`, without epoch 0, so that forward transfer is the mean over
+            the other points; `none`, so that it is not defined.
+        cells: Cells of the success matrix: `all`; `diagonal`, each task just after learning it; `last_row`, all
+            tasks at the end; or both of these. Metrics that need other cells are not defined.
+        reuse: Whether rollouts that would repeat earlier ones to the bit are copied instead of run: same weights and
+            whatever else acts, same starts, nothing random.
         horizon: Maximum number of control steps per episode.
         settle_steps: Number of steps with a zero action before the policy acts.
         selection: Initial states of the learning curve, by which the best epoch is chosen. `apart`: the last
@@ -33,6 +41,9 @@ class EvalSettings:
     episodes: Count = 20
     curve_episodes: Count = 20
     every: Count = 5
+    curve: Literal["all", "trained", "none"] = "all"
+    cells: MatrixCells = "all"
+    reuse: bool = True
     horizon: Count = 600
     settle_steps: Natural = 5
     selection: Literal["apart", "reporting"] = "apart"
@@ -51,6 +62,10 @@ class EvalSettings:
                 f"initial states, a task has {NUM_INIT_STATES}: lower one of them, or set "
                 "eval.selection=reporting"
             )
+        if self.curve == "none" and self.select == "best":
+            raise ConfigError(
+                "eval.select=best needs a learning curve, and eval.curve=none has none: set eval.select=last"
+            )
 
     def init_states(self, phase: Literal["curve", "matrix"]) -> range:
         """Return the indices of the initial states of a learning curve, or of the success matrix."""
@@ -62,4 +77,11 @@ class EvalSettings:
 
     def curve_epochs(self, epochs: int) -> tuple[int, ...]:
         """Return the epochs at which a learning curve has points, given the number of epochs."""
-        return tuple(sorted({*range(0, epochs + 1, self.every), epochs}))
+        if self.curve == "none":
+            return ()
+        first = 0 if self.curve == "all" else self.every
+        return tuple(sorted({*range(first, epochs + 1, self.every), epochs}))
+
+    def row(self, stage: Sequence[int], tasks: int) -> range:
+        """Return the tasks that are measured after a stage of a run of so many tasks."""
+        return measured_tasks(self.cells, stage, tasks)

@@ -22,7 +22,7 @@ from lifelong.report.figures import (
 )
 from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
-from lifelong.report.tables import atom_rows, cost_table, duration, most_forgotten, task_costs
+from lifelong.report.tables import atom_rows, cost_table, duration, episodes_text, most_forgotten, task_costs
 from lifelong.report.templates import page_template
 from lifelong.results.metrics import METRIC_NAMES, average_success
 from lifelong.results.records import RunRecord
@@ -105,6 +105,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "tasks": _task_rows(run, rates),
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
         "total_time": duration(sum(times.values())),
+        "episodes": episodes_text(*run.results.episodes()),
         "subgoals": run.results.subgoals().predicates,
         "atoms": atom_rows(run.results.subgoals(), labels),
         "most_forgotten": most_forgotten(run.results.subgoals().atoms),

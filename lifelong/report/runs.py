@@ -152,7 +152,16 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
         k.removesuffix("._target_"): str(v).rpartition(".")[2] if k.endswith("._target_") else v
         for k, v in flat.items()  # a component goes by the name of its class
     }
-    ignored = ("seed", "_partial_", "dir", "path", "benchmark.order", "data.memory", "data.backend")
+    ignored = (
+        "seed",
+        "_partial_",
+        "dir",
+        "path",
+        "benchmark.order",
+        "data.memory",
+        "data.backend",
+        "eval.reuse",
+    )
     flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(ignored)}
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
         flat["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))

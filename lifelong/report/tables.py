@@ -11,6 +11,14 @@ from lifelong.report.runs import Run
 from lifelong.results.subgoals import AtomRates, Subgoals
 
 
+def episodes_text(run: int, copied: int) -> str:
+    """Return a sentence about the episodes of a run, with a blank before it; nothing without any."""
+    if not run + copied:
+        return ""
+    rest = f"; {copied} more would have repeated these to the bit and were copied" if copied else ""
+    return f" {run} episodes were run{rest}."
+
+
 def duration(seconds: float) -> str:
     """Format seconds for readers: 0.4 s, 42 s, 3 min 20 s, 2 h 05 min."""
     if seconds < 1:

@@ -11,9 +11,10 @@ from libero_env.errors import LiberoError
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError, LifelongError
 from lifelong.results.checkpoint_folder import BROKEN_SUFFIX, CheckpointFolder
+from lifelong.results.coverage import measured_tasks
 from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult
 from lifelong.results.log import ResultLog
-from lifelong.results.records import LossRecord, TaskEndRecord
+from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.saved_config import read_saved_config, upgrade_config
@@ -115,6 +116,8 @@ class _Examiner:
             self._note(f"the run is not finished: {learned} of {size} tasks are learned and evaluated")
         for text in _missing_records(results):
             self._fault(f"{self.path / 'results.jsonl'} lacks {text}; the run's command measures it again")
+        for text in _false_copies(results):
+            self._fault(f"{self.path / 'results.jsonl'}: {text}")
         self._check_summary(results)
 
     def _check_summary(self, results: Results) -> None:
@@ -185,8 +188,10 @@ class _Examiner:
 def _missing_records(results: Results) -> Iterator[str]:
     """Yield what the records of learned tasks lack, compared with each other."""
     ended = sorted({record.task for record in results.of(TaskEndRecord)})
+    size, tasks = results.run.group_size, len(results.run.tasks)
     for task in ended:
-        if absent := [seen for seen in range(task + 1) if results.evaluation("matrix", task, seen) is None]:
+        row = measured_tasks(results.run.cells, range(task + 1 - size, task + 1), tasks)
+        if absent := [seen for seen in row if results.evaluation("matrix", task, seen) is None]:
             yield f"evaluations after task {task} of tasks {_listed(absent)}"
     curves = {task: set(curve.epochs.tolist()) for task, curve in results.curves().items()}
     whole = {task: curves.get(task, set()) for task in range(max(ended, default=-1) + 1)}
@@ -195,6 +200,20 @@ def _missing_records(results: Results) -> Iterator[str]:
     losses = {task: {r.epoch for r in results.of(LossRecord) if r.task == task} for task in ended}
     for task, absent in _gaps(losses):
         yield f"losses of task {task}, epochs {_listed(absent)}"
+
+
+def _false_copies(results: Results) -> Iterator[str]:
+    """Yield the evaluations that are not what the rollouts came to that they say they would have repeated."""
+    for copy in results.of(EvalRecord):
+        if copy.same_as is None:
+            continue
+        phase, learned, epoch = copy.same_as
+        original = results.evaluation(phase, learned, copy.task, epoch)
+        name = f"the evaluation of task {copy.task} after task {copy.learned}"
+        if original is None:
+            yield f"{name} is a copy of one that is missing; the run's command measures that again"
+        elif original.decided_by == copy.decided_by and original.outcome != copy.outcome:
+            yield f"{name} is not what it is a copy of, that after task {learned}, epoch {epoch}"
 
 
 def _gaps(epochs: dict[int, set[int]]) -> Iterator[tuple[int, list[int]]]:

@@ -76,7 +76,7 @@ def recorded_threads(results: Results) -> int | None:
 
 def changed_conditions(first: RunRecord, later: RunRecord) -> list[str]:
     """Return what differs between two starts of a run that decides its bits, such as `torch 2.12.0 -> 2.13.0`."""
-    was, now = _all(first), _all(later)
+    was, now = all_conditions(first), all_conditions(later)
     if not first.conditions:  # of a version that did not record them
         return []
     return [
@@ -110,7 +110,8 @@ def source_digest() -> str:
     return digest.hexdigest()[:12]
 
 
-def _all(record: RunRecord) -> dict[str, str]:
+def all_conditions(record: RunRecord) -> dict[str, str]:
+    """Return everything besides the configuration that decides the bits of what a process does, by name."""
     versions = {name: record.versions[name] for name in _DECISIVE_VERSIONS if name in record.versions}
     return {**record.conditions, **versions}
 

@@ -18,6 +18,7 @@ from pydantic import Field, WrapValidator
 
 from libero_env.errors import InvalidInputError
 from libero_env.validation import validate
+from lifelong.results.coverage import MatrixCells
 
 VERSIONED_PACKAGES = (
     "libero-lifelong",
@@ -54,6 +55,7 @@ class RunRecord:
     started: str  # ISO 8601, UTC
     group_size: Annotated[int, Field(ge=1, le=1000)] = 1  # tasks learned together as one step of the sequence
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.conditions`
+    cells: MatrixCells = "all"  # of the success matrix, which are measured
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:
@@ -80,6 +82,9 @@ class EvalRecord:
     The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). For each
     episode the record states which atoms of the goal held before the policy acted, at any time from then on, and at
     the end; older records do not.
+
+    Rollouts that would repeat earlier ones to the bit are not run: their record is a copy, with the key of the one it
+    is a copy of, and takes 0 seconds.
     """
 
     kind: Literal["eval"] = field(default="eval", init=False)
@@ -95,6 +100,12 @@ class EvalRecord:
     atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
+    decided_by: str = (
+        ""  # digest of all that the rollouts depend on; empty where they also depend on random draws
+    )
+    same_as: tuple[Literal["curve", "matrix"], Count, Count] | None = (
+        None  # phase, learned, epoch of the original
+    )
 
     def __post_init__(self) -> None:
         if self.phase not in ("curve", "matrix"):
@@ -115,6 +126,12 @@ class EvalRecord:
     def rate(self) -> float:
         """Success rate of the episodes."""
         return sum(self.successes) / len(self.successes)
+
+    @property
+    def outcome(self) -> tuple[Any, ...]:
+        """What the rollouts came to, without where and when they were run."""
+        atoms = (self.atoms, self.atoms_at_start, self.atoms_ever, self.atoms_at_end)
+        return (self.successes, self.lengths, self.init_states, *atoms)
 
 
 @dataclass(frozen=True)
@@ -181,6 +198,7 @@ def start_record(
     config: str,
     group_size: int = 1,
     conditions: Mapping[str, str] | None = None,
+    cells: MatrixCells = "all",
 ) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
@@ -195,6 +213,7 @@ def start_record(
         config: Resolved configuration as text, of which the SHA-256 is recorded.
         group_size: Number of tasks learned together.
         conditions: What decides the bits of its results, see `lifelong.results.conditions`.
+        cells: Cells of the success matrix that are measured.
     """
     return RunRecord(
         algo=algo,
@@ -211,6 +230,7 @@ def start_record(
         started=utc_now(),
         group_size=group_size,
         conditions=conditions or {},
+        cells=cells,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong.errors import ResultsError
+from lifelong.results.coverage import measured_tasks
 from lifelong.results.metrics import Curve, Scores
 from lifelong.results.records import (
     CostRecord,
@@ -69,6 +70,19 @@ class Results:
         ]
         return found[-1] if found else None
 
+    def original(self, decided_by: str) -> EvalRecord | None:
+        """Return the rollouts that were run under the same digest of all they depend on; None without any."""
+        runs = (r for r in reversed(self.of(EvalRecord)) if r.same_as is None)
+        return next((r for r in runs if r.decided_by == decided_by != ""), None)
+
+    def episodes(self) -> tuple[int, int]:
+        """Return the numbers of episodes that were run, and that were copied from those they would have repeated."""
+        count = {
+            copied: sum(len(r.successes) for r in self.of(EvalRecord) if (r.same_as is not None) == copied)
+            for copied in (False, True)
+        }
+        return count[False], count[True]
+
     def has_loss(self, task: int, epoch: int) -> bool:
         """Return whether the loss of this epoch is recorded."""
         return any((r.task, r.epoch) == (task, epoch) for r in self.of(LossRecord))
@@ -86,8 +100,14 @@ class Results:
         """Count the tasks, from the first, with a complete row in the matrix; all count if the last row is complete."""
         rates, _ = self.success_matrix()
         size = self.run.group_size
-        full = [bool(np.isfinite(rates[i, : i + 1]).all()) for i in range(size - 1, len(rates), size)]
+        full = [self._is_complete(rates[row], row) for row in range(size - 1, len(rates), size)]
         return size * (full.index(False) if False in full and not full[-1] else len(full))
+
+    def _is_complete(self, rates: NDArray[np.float64], row: int) -> bool:
+        """Return whether a row of the matrix has all cells that the run measures; without any, whether it has ended."""
+        stage = range(row + 1 - self.run.group_size, row + 1)
+        columns = measured_tasks(self.run.cells, stage, len(self.run.tasks))
+        return bool(np.isfinite(rates[columns]).all()) if columns else self.task_end(row) is not None
 
     def curves(self) -> dict[int, Curve]:
         """Return the learning curve of each task that has one."""
@@ -115,7 +135,7 @@ class Results:
         Args:
             diagonal: Source of c[i,i]. "matrix": the evaluation after learning task i, like the rest of its
                 column, so that the choice of the best epoch does not bias the reported number; the best of
-                the learning curve where there is none. "curve": always the latter,
+                the learning curve where there is none, in a run that measures all cells. "curve": always the latter,
                 c[i,i] = max over e of c[i,i,e], as eq. 3 is written.
         """
         size = len(self.run.tasks)
@@ -128,7 +148,7 @@ class Results:
         for task, curve in curves.items():
             row = self.last_of_group(task)
             measured = not math.isnan(rates[row, task])
-            ended = self.task_end(row) is not None
+            ended = self.task_end(row) is not None and self.run.cells == "all"
             if row in best and ((diagonal == "curve" and measured) or (not measured and ended)):
                 point = curve.epochs.tolist().index(best[row])
                 rates[row, task], episodes[row, task] = curve.rates[point], curve.episodes[point]

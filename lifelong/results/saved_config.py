@@ -107,6 +107,7 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
         "data": upgrade_data,
         "policy": upgrade_policy,
         "algo": upgrade_algorithm,
+        "eval": upgrade_evaluation,
     }
     return {
         key: upgrades[key](node) if key in upgrades and isinstance(node, Mapping) else node
@@ -122,6 +123,15 @@ def upgrade_data(node: Mapping[str, Any]) -> Node:
         node: The `data` node; one of today comes back unchanged.
     """
     return {"drawing": "fast", "robot": "robosuite-1.4.1", **node}
+
+
+def upgrade_evaluation(node: Mapping[str, Any]) -> Node:
+    """Return the node of the evaluation with what was always so before it could be chosen.
+
+    Args:
+        node: The `eval` node; one of today comes back unchanged.
+    """
+    return {"curve": "all", "cells": "all", "reuse": True, **node}
 
 
 def upgrade_policy(node: Mapping[str, Any]) -> Node:

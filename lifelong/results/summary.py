@@ -80,6 +80,7 @@ def summarize(results: Results) -> dict[str, Any]:
             if results.costs(task)
         },
         "seconds_by_phase": results.seconds_by_phase(),
+        "episodes": dict(zip(("run", "copied"), results.episodes(), strict=True)),
         "problems": list(results.problems),
     }
 

@@ -7,25 +7,25 @@ Where several processes train together, all of them train, but only the first ev
 each other wherever one reads what another has written, or is about to overwrite.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from libero_env.timing import CONTROL_PERIOD
 from lifelong import checkpoints
 from lifelong.algorithms.base import load_algorithm
 from lifelong.context import RunContext
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, DamagedCheckpointError
-from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import generator, seeded
+from lifelong.sequence.measuring import Evaluator
 from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missing_points, training_phases
 from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
@@ -33,8 +33,9 @@ from lifelong.training.fit import EpochEnd, fit
 
 State = dict[str, Any]  # of a checkpoint
 
-# First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` has another.
-FIT, END_TASK, ROLLOUT = 1, 2, 3
+# First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` and
+# `lifelong.sequence.measuring` have others.
+FIT, END_TASK = 1, 2
 SAVE_EVERY = 60.0  # [s] between two saves during training, besides those at points of the learning curve
 
 
@@ -58,6 +59,7 @@ class TaskSequence:
         self.log, self.checkpoints = context.directory.log, context.directory.checkpoints
         self.stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
         self.data = StageData(datasets, self.stages, context.stream, context.seed)
+        self.evaluator = Evaluator(context, self.stages)
         self._reached = -1  # number of the stage after which the policy is; -1: before the first
         self._saved = time.monotonic()
         context.algorithm.set_augmentation(context.augment)
@@ -93,7 +95,7 @@ class TaskSequence:
         return bool(lost)
 
     def _to_evaluate(self, stage: Sequence[int]) -> bool:
-        return lacks_row(stage, self.log.read())
+        return lacks_row(self.context, stage, self.log.read())
 
     def _restore(self, number: int) -> None:
         """Bring the policy and the algorithm to where they were after a stage, or before the first one (-1)."""
@@ -237,7 +239,7 @@ class TaskSequence:
             self._save_progress(task, phase.number, end.state())
         if not (due and phase.kind.measures_transfer):
             return
-        success = mean_rate([self._evaluate("curve", task, member, epoch) for member in phase.stage])
+        success = mean_rate([self.evaluator.evaluate("curve", task, member, epoch) for member in phase.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
         self._log(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
         if phase.selects_best and phase.best_epoch(self.log.read(), end.epoch) == end.epoch:
@@ -291,11 +293,12 @@ class TaskSequence:
         self.checkpoints.save_task(task, policy.state_dict(), algorithm.state_dict())
 
     def _evaluate_seen_tasks(self, stage: Sequence[int]) -> None:
-        """Fill the stage's row of the success matrix: all tasks so far, as far as not recorded yet."""
+        """Fill the stage's row of the success matrix, as far as it is to be measured and not recorded yet."""
         task, results = stage[-1], self.log.read()
         first = training_phases(self.context, stage)[0]
         best = first.best_epoch(results, first.epochs)
-        row = [self._evaluate("matrix", task, seen, best) for seen in range(task + 1)]
+        columns = self.context.eval.row(stage, len(self.context.tasks))
+        row = [self.evaluator.evaluate("matrix", task, seen, best) for seen in columns]
         if results.task_end(task) is None:
             spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
             spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in row)
@@ -303,46 +306,9 @@ class TaskSequence:
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
         new, mean = mean_rate([r for r in row if r.task in stage]), mean_rate(row)
         values = {"success/just_learned": new, "success/mean": mean, "tasks": task + 1}
-        self.context.tracker.log(values)
-        self._log(f"  learned: success {new:.0%} on it, {mean:.0%} over {task + 1} so far{self._eta(task)}")
-
-    def _evaluate(self, phase: Literal["curve", "matrix"], learned: int, task: int, epoch: int) -> EvalRecord:
-        """Evaluate a task and record it, or return the record if there is one."""
-        context, settings = self.context, self.context.eval
-        found = self.log.read().evaluation(phase, learned, task, epoch if phase == "curve" else None)
-        if found is not None:
-            return found
-        states = settings.init_states(phase)
-        recorded = phase == "matrix" and (task == learned or learned == len(context.tasks) - 1)
-        stage = next(stage for stage in self.stages if task in stage)
-        with context.algorithm.policy_for(stage[-1], context.policy) as acting:
-            rollouts = rollout(
-                acting,
-                context.envs.get((task, len(states))),
-                states,
-                language=context.languages[task],
-                horizon=settings.horizon,
-                settle_steps=settings.settle_steps,
-                seed=(context.seed, ROLLOUT, learned, epoch, task),
-                device=context.device,
-                precision=settings.precision,
-                record_every=settings.record_every if recorded else 0,
-                label=f"rollouts on task {task + 1}",
-                progress=bool(context.progress),
-            )
-        if rollouts.frames:
-            self._save_video(learned, task, rollouts.frames, rollouts.episodes[0].success)
-        record = _eval_record(rollouts, phase, learned, epoch, task)
-        self.log.append(record)
-        return record
-
-    def _save_video(self, learned: int, task: int, frames: tuple, success: bool) -> None:
-        context = self.context
-        path = context.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"
-        save_animation(frames, path, seconds_per_frame=CONTROL_PERIOD * context.eval.record_every)
-        outcome = "success" if success else "failure"
-        caption = f"{context.tasks[task].language}: {outcome}, after learning {learned + 1} tasks"
-        path.with_suffix(".txt").write_text(caption + "\n", encoding="utf-8")
+        self.context.tracker.log({name: value for name, value in values.items() if not math.isnan(value)})
+        told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
+        self._log(f"  learned: {told}{self._eta(task)}")
 
     def _eta(self, task: int) -> str:
         """Return an estimate of the remaining time, from the time that training and evaluation took so far."""
@@ -354,29 +320,10 @@ class TaskSequence:
         cells = [r.seconds for r in evals if r.phase == "matrix"]
         training = sum(r.seconds for r in results.of(LossRecord))
         training += sum(r.seconds for r in evals if r.phase == "curve")
-        open_cells = sum(stage[-1] + 1 for stage in self.stages if stage[-1] > task)
-        seconds = remaining * training / learned + open_cells * sum(cells) / len(cells)
+        rows = [self.context.eval.row(stage, count) for stage in self.stages if stage[-1] > task]
+        seconds = remaining * training / learned + sum(map(len, rows)) * sum(cells) / max(1, len(cells))
         return f"; about {max(1, round(seconds / 60))} min left"
 
     def _log(self, text: str) -> None:
         if self.context.ranks.first:
             print(text, flush=True)
-
-
-def _eval_record(
-    rollouts: Rollouts, phase: Literal["curve", "matrix"], learned: int, epoch: int, task: int
-) -> EvalRecord:
-    return EvalRecord(
-        phase=phase,
-        learned=learned,
-        epoch=epoch,
-        task=task,
-        successes=tuple(e.success for e in rollouts.episodes),
-        lengths=tuple(e.length for e in rollouts.episodes),
-        init_states=tuple(e.init_state for e in rollouts.episodes),
-        seconds=rollouts.seconds,
-        atoms=rollouts.atoms,
-        atoms_at_start=tuple(e.at_start for e in rollouts.episodes),
-        atoms_ever=tuple(e.ever for e in rollouts.episodes),
-        atoms_at_end=tuple(e.at_end for e in rollouts.episodes),
-    )

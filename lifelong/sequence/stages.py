@@ -1,5 +1,6 @@
 """The phases of training on a stage, and what their learning curves have recorded so far."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -95,18 +96,21 @@ def missing_points(context: RunContext, stage: Sequence[int], results: Results) 
     return [epoch for phase in training_phases(context, stage) for epoch in phase.missing_points(results)]
 
 
-def lacks_row(stage: Sequence[int], results: Results) -> bool:
-    """Return whether a stage's row of the success matrix is incomplete."""
-    row = [results.evaluation("matrix", stage[-1], seen) for seen in range(stage[-1] + 1)]
+def lacks_row(context: RunContext, stage: Sequence[int], results: Results) -> bool:
+    """Return whether a stage's row of the success matrix is incomplete, of the cells that are measured."""
+    columns = context.eval.row(stage, len(context.tasks))
+    row = [results.evaluation("matrix", stage[-1], seen) for seen in columns]
     return None in row or results.task_end(stage[-1]) is None
 
 
 def is_measured(context: RunContext, results: Results) -> bool:
     """Return whether all learning curves and the success matrix of a run are recorded."""
     stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
-    return not any(missing_points(context, stage, results) or lacks_row(stage, results) for stage in stages)
+    return not any(
+        missing_points(context, stage, results) or lacks_row(context, stage, results) for stage in stages
+    )
 
 
 def mean_rate(records: Sequence[EvalRecord]) -> float:
-    """Return the mean success of evaluations."""
-    return sum(record.rate for record in records) / len(records)
+    """Return the mean success of evaluations; NaN without any."""
+    return sum(record.rate for record in records) / len(records) if records else math.nan

@@ -1,0 +1,183 @@
+"""Rollouts of a run: each evaluation is recorded once, and what would repeat another to the bit is copied.
+
+Columns of the success matrix are constant where an algorithm never changes what acts on a task: the rollouts of the
+first row that has it are those of all others.
+"""
+
+import hashlib
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from libero_env.timing import CONTROL_PERIOD
+from lifelong.context import RunContext
+from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
+from lifelong.policies.base import Policy
+from lifelong.results.conditions import all_conditions
+from lifelong.results.records import EvalRecord, RunRecord
+
+ROLLOUT = 3  # first word of the seeds of rollouts; `lifelong.sequence.learning` has the others
+Kind = Literal["curve", "matrix"]
+
+
+class Evaluator:
+    """Measures the success of the policy that acts on a task, and records it.
+
+    Args:
+        context: Everything the run consists of; its policy and algorithm are evaluated as they are.
+        stages: Tasks that are learned together, for each stage.
+    """
+
+    def __init__(self, context: RunContext, stages: Sequence[Sequence[int]]):
+        self._context, self._stages, self._log = context, stages, context.directory.log
+
+    def evaluate(self, phase: Kind, learned: int, task: int, epoch: int) -> EvalRecord:
+        """Evaluate a task and record it, or return the record if there is one.
+
+        Args:
+            phase: Whether the rollouts are a point of a learning curve, or a cell of the success matrix.
+            learned: Position of the task that was learned last.
+            task: Position of the task to act on.
+            epoch: Number of epochs trained on the task that was learned last.
+        """
+        found = self._log.read().evaluation(phase, learned, task, epoch if phase == "curve" else None)
+        if found is not None:
+            return found
+        context = self._context
+        stage = next(stage for stage in self._stages if task in stage)
+        with context.algorithm.policy_for(stage[-1], context.policy) as acting:
+            decided_by = ""
+            if context.eval.reuse:
+                more = context.algorithm.acting_state(stage[-1], acting)
+                decided_by = digest({**self._circumstances(phase, task), "more": more}, acting)
+            record = self._copied(decided_by, phase, learned, task, epoch)
+            if record is None:
+                record = self._measured(acting, decided_by, phase, learned, task, epoch)
+        self._log.append(record)
+        return record
+
+    def _circumstances(self, phase: Kind, task: int) -> dict[str, Any]:
+        """Return what rollouts depend on besides what acts, within one run."""
+        context, settings = self._context, self._context.eval
+        starts = self._log.read().of(RunRecord)
+        return {
+            "task": task,
+            "language": context.languages[task],
+            "init_states": str(list(settings.init_states(phase))),
+            "settings": f"{settings.horizon} {settings.settle_steps} {settings.precision}",
+            "conditions": all_conditions(starts[-1]) if starts else {},
+        }
+
+    def _copied(self, decided_by: str, phase: Kind, learned: int, task: int, epoch: int) -> EvalRecord | None:
+        """Return the record of rollouts that would repeat recorded ones; None where there are none."""
+        found = self._log.read().original(decided_by)
+        if found is None or found.task != task:
+            return None
+        if self._is_filmed(phase, learned, task) and not self._copy_video(found, learned):
+            return None
+        origin = (found.phase, found.learned, found.epoch)
+        return replace(found, phase=phase, learned=learned, epoch=epoch, seconds=0.0, same_as=origin)
+
+    def _measured(
+        self, acting: Policy, decided_by: str, phase: Kind, learned: int, task: int, epoch: int
+    ) -> EvalRecord:
+        """Run the rollouts and return their record."""
+        context, settings = self._context, self._context.eval
+        states = settings.init_states(phase)
+        done = rollout(
+            acting,
+            context.envs.get((task, len(states))),
+            states,
+            language=context.languages[task],
+            horizon=settings.horizon,
+            settle_steps=settings.settle_steps,
+            seed=(context.seed, ROLLOUT, learned, epoch, task),
+            device=context.device,
+            precision=settings.precision,
+            record_every=settings.record_every if self._is_filmed(phase, learned, task) else 0,
+            label=f"rollouts on task {task + 1}",
+            progress=bool(context.progress),
+        )
+        if done.frames:
+            path, success = self._video(learned, task), done.episodes[0].success
+            save_animation(done.frames, path, seconds_per_frame=CONTROL_PERIOD * context.eval.record_every)
+            self._write_caption(path, learned, task, success)
+        return _record(done, phase, learned, epoch, task, "" if done.random else decided_by)
+
+    def _is_filmed(self, phase: Kind, learned: int, task: int) -> bool:
+        last = len(self._context.tasks) - 1
+        return bool(self._context.eval.record_every) and phase == "matrix" and learned in (task, last)
+
+    def _video(self, learned: int, task: int) -> Path:
+        return self._context.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"
+
+    def _copy_video(self, original: EvalRecord, learned: int) -> bool:
+        """Copy the video of rollouts as that after learning another task; return whether there is one."""
+        source, path = self._video(original.learned, original.task), self._video(learned, original.task)
+        if original.phase != "matrix" or not source.is_file():
+            return False
+        if source != path:
+            shutil.copyfile(source, path)
+        self._write_caption(path, learned, original.task, original.successes[0])
+        return True
+
+    def _write_caption(self, path: Path, learned: int, task: int, success: bool) -> None:
+        outcome = "success" if success else "failure"
+        caption = f"{self._context.tasks[task].language}: {outcome}, after learning {learned + 1} tasks"
+        path.with_suffix(".txt").write_text(caption + "\n", encoding="utf-8")
+
+
+def digest(circumstances: Mapping[str, Any], acting: Policy) -> str:
+    """Return 32 hex digits that change with every parameter and buffer of a policy, and with the circumstances.
+
+    Args:
+        circumstances: Nested dictionaries, lists and tuples of tensors, numbers and strings.
+        acting: Policy that acts.
+    """
+    found = hashlib.sha256()
+    tensors = {"parameters": dict(acting.named_parameters()), "buffers": dict(acting.named_buffers())}
+    _feed(found, {**circumstances, **tensors})
+    return found.hexdigest()[:32]
+
+
+def _feed(found: Any, value: Any) -> None:
+    """Add nested plain data to a digest, with their structure."""
+    if isinstance(value, Tensor):
+        found.update(f"tensor {value.dtype} {tuple(value.shape)}\0".encode())
+        found.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    elif isinstance(value, Mapping):
+        found.update(f"mapping {len(value)}\0".encode())
+        for key, part in value.items():
+            found.update(f"{key!r}\0".encode())
+            _feed(found, part)
+    elif isinstance(value, list | tuple):
+        found.update(f"sequence {len(value)}\0".encode())
+        for part in value:
+            _feed(found, part)
+    else:
+        found.update(f"{value!r}\0".encode())
+
+
+def _record(
+    rollouts: Rollouts, phase: Kind, learned: int, epoch: int, task: int, decided_by: str
+) -> EvalRecord:
+    return EvalRecord(
+        phase=phase,
+        learned=learned,
+        epoch=epoch,
+        task=task,
+        successes=tuple(e.success for e in rollouts.episodes),
+        lengths=tuple(e.length for e in rollouts.episodes),
+        init_states=tuple(e.init_state for e in rollouts.episodes),
+        seconds=rollouts.seconds,
+        atoms=rollouts.atoms,
+        atoms_at_start=tuple(e.at_start for e in rollouts.episodes),
+        atoms_ever=tuple(e.ever for e in rollouts.episodes),
+        atoms_at_end=tuple(e.at_end for e in rollouts.episodes),
+        decided_by=decided_by,
+    )

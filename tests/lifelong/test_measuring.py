@@ -1,0 +1,273 @@
+"""Rollouts that would repeat others are copied, to the same records; and a run measures what it is told to."""
+
+import json
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+
+from lifelong.algorithms import Algorithm, LoRA, PackNet, Sequential, SingleTask
+from lifelong.errors import ConfigError
+from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.settings import EvalSettings
+from lifelong.report import write_report
+from lifelong.results.check import examine
+from lifelong.results.log import ResultLog
+from lifelong.results.metrics import lifelong_metrics
+from lifelong.results.records import EvalRecord, start_record
+from lifelong.results.summary import summarize
+from lifelong.seeding import seeded
+from lifelong.sequence import is_measured
+from lifelong.sequence.measuring import digest
+from tests.harness.policies import small_transformer
+from tests.harness.sequences import SPEC, TASKS, FakeEnv, run_context, sequence
+
+FROZEN = {"packnet": PackNet, "lora": lambda: LoRA(rank=2), "single_task": SingleTask}
+
+
+class Camera(FakeEnv):
+    """Counts the episodes that are run, by task."""
+
+    episodes: list[int]
+
+    def reset(self, **given):
+        self.episodes += [self.task] * self.num_envs
+        return super().reset(**given)
+
+
+def learn(path, algorithm, *, policy=None, tasks=TASKS, **settings):
+    """Learn the sequence; return its context and the tasks of the episodes that were run."""
+    episodes = []
+    env = type("Counted", (Camera,), {"episodes": episodes})
+    context = run_context(path, "sequential", tasks)
+    context = replace(
+        context,
+        algorithm=algorithm,
+        policy=policy or context.policy,
+        envs=EnvPool(lambda key: env(*key), 2),
+        eval=replace(context.eval, **settings),
+    )
+    if not context.directory.log.read().records:
+        names = [task.name for task in context.tasks]
+        given = {"algo": "own", "benchmark": "b", "policy": "p", "preset": "", "config": ""}
+        start = start_record(**given, seed=1, tasks=names, instructions=names, cells=context.eval.cells)
+        context.directory.log.append(start)
+    sequence(context).run()
+    return context, episodes
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that measures everything."""
+    return learn(tmp_path_factory.mktemp("whole"), Sequential())[0]
+
+
+def outcomes(context):
+    """Return what each evaluation came to, by its key."""
+    return {
+        (r.phase, r.learned, r.task, r.epoch): r.outcome for r in context.directory.log.read().of(EvalRecord)
+    }
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_what_is_frozen_is_run_once_and_recorded_as_without_reuse(tmp_path, name):
+    reusing, episodes = learn(tmp_path / "reusing", FROZEN[name](), curve="none", select="last")
+    whole, all_episodes = learn(tmp_path / "whole", FROZEN[name](), curve="none", select="last", reuse=False)
+    assert outcomes(reusing) == outcomes(whole)
+    assert sorted(all_episodes) == [0] * 9 + [1] * 6 + [2] * 3  # three episodes a cell
+    assert sorted(episodes) == [0] * 3 + [1] * 3 + [2] * 3
+    results = reusing.directory.log.read()
+    copies = [r for r in results.of(EvalRecord) if r.same_as]
+    assert [(r.learned, r.task, r.same_as[:2], r.seconds) for r in copies] == [
+        (row, task, ("matrix", task), 0.0) for row in range(TASKS) for task in range(row)
+    ]
+    assert results.episodes() == (9, 9) and summarize(results)["episodes"] == {"run": 9, "copied": 9}
+    metrics = [lifelong_metrics(c.directory.log.read().scores()) for c in (reusing, whole)]
+    np.testing.assert_equal(*(asdict(m) for m in metrics))
+
+
+def test_nothing_is_copied_where_the_weights_move(tmp_path):
+    context, episodes = learn(tmp_path, Sequential(), curve="none", select="last")
+    assert context.directory.log.read().episodes() == (18, 0) and len(episodes) == 18
+
+
+def test_the_last_point_of_a_curve_with_the_same_starts_is_the_cell_of_the_matrix(tmp_path):
+    settings = {"selection": "reporting", "curve_episodes": 3, "record_every": 0, "select": "last"}
+    context, _ = learn(tmp_path, Sequential(), **settings)
+    diagonal = [r for r in context.directory.log.read().of(EvalRecord) if r.same_as]
+    assert [(r.learned, r.task, r.same_as) for r in diagonal] == [(t, t, ("curve", t, 2)) for t in range(3)]
+
+
+def test_rollouts_with_random_draws_are_run_again(tmp_path):
+    with seeded(7):
+        policy = small_transformer(SPEC, stochastic=True)
+    context, _ = learn(tmp_path, SingleTask(), policy=policy, curve="none", select="last")
+    results = context.directory.log.read()
+    assert results.episodes() == (18, 0)
+    assert not any(r.decided_by for r in results.of(EvalRecord))
+
+
+class Shifted(SingleTask):
+    """Acts with the weights of the task, and a number of its own that moves with every task."""
+
+    moves = True
+
+    def __init__(self):
+        super().__init__()
+        self.shift = 0.0
+
+    acting_state = Algorithm.acting_state
+
+    def end_task(self, task_index, dataset, policy, generator):
+        super().end_task(task_index, dataset, policy, generator)
+        self.shift += self.moves
+
+    def state_dict(self):
+        return (
+            {"shift": self.shift}
+            if type(self) is not Shifted
+            else {**super().state_dict(), "shift": self.shift}
+        )
+
+    def load_state_dict(self, state, datasets):
+        pass
+
+    @contextmanager
+    def policy_for(self, task_index, policy):
+        with super().policy_for(task_index, policy) as acting:
+            yield acting
+
+
+class Still(Shifted):
+    """The same, with a number that stays."""
+
+    moves = False
+
+
+def test_an_algorithm_that_says_nothing_is_known_by_its_whole_state(tmp_path):
+    context, _ = learn(tmp_path / "moves", Shifted(), curve="none", select="last")
+    assert context.directory.log.read().episodes() == (18, 0)
+    context, _ = learn(tmp_path / "stays", Still(), curve="none", select="last")
+    assert context.directory.log.read().episodes() == (9, 9)
+
+
+def test_hooks_on_layers_are_not_overlooked():
+    policy, algorithm = small_transformer(SPEC), Still()
+    plain = Sequential()
+    assert plain.acting_state(0, policy) == {}
+    plain.state_dict = lambda: {"everything": 1}
+    assert plain.acting_state(0, policy) == {}
+    policy.head.register_forward_hook(lambda *_: None)
+    assert plain.acting_state(0, policy) == {"everything": 1}
+    assert algorithm.acting_state(0, policy) == {"shift": 0.0}
+
+
+def test_the_digest_sees_every_tensor_and_circumstance():
+    policy = small_transformer(SPEC)
+    policy.register_buffer("hidden", torch.zeros(()), persistent=False)
+    seen = {digest({"task": 0}, policy)}
+    assert digest({"task": 0}, policy) in seen
+    for tensor in (*policy.parameters(), *policy.buffers()):
+        with torch.no_grad():
+            tensor[(-1,) * tensor.dim()] += 1
+        assert len(seen) < len(seen := seen | {digest({"task": 0}, policy)})
+    for circumstances in ({"task": 1}, {"task": "0"}, {"task": [0]}, {"task": 0, "more": {}}):
+        assert len(seen) < len(seen := seen | {digest(circumstances, policy)})
+
+
+def test_a_lost_original_is_run_again_and_a_lost_copy_is_copied(tmp_path):
+    context, _ = learn(tmp_path, SingleTask(), curve="none", select="last")
+    before = outcomes(context)
+    file = context.directory.log.path
+    lines = file.read_text().splitlines(keepends=True)
+    keys = [json.loads(line) for line in lines]
+    for learned, run in ((0, 3), (2, 0)):
+        lost = [
+            line
+            for line, k in zip(lines, keys, strict=True)
+            if (k["kind"], k.get("learned"), k.get("task")) != ("eval", learned, 0)
+        ]
+        assert len(lost) == len(lines) - 1
+        file.write_text("".join(lost))
+        again, episodes = learn(tmp_path, SingleTask(), curve="none", select="last")
+        assert outcomes(again) == before and len(episodes) == run
+
+
+def test_a_copy_that_is_not_what_it_is_a_copy_of_is_a_fault(tmp_path):
+    context, _ = learn(tmp_path, SingleTask(), curve="none", select="last")
+    log = context.directory.log
+    assert not [f for f in examine(tmp_path).findings if "copy of" in f.text]
+    copy = next(r for r in log.read().of(EvalRecord) if r.same_as)
+    log.append(replace(copy, lengths=tuple(n + 1 for n in copy.lengths)))
+    assert [f.text for f in examine(tmp_path).findings if "is not what it is a copy of" in f.text]
+
+
+def test_videos_of_the_last_row_are_copied_and_measured_again_without_them(tmp_path):
+    context, _ = learn(tmp_path / "a", SingleTask(), tasks=2, curve="none", select="last")
+    names = {p.name for p in context.directory.videos.iterdir()}
+    assert {
+        f"task_0{t}_after_0{r}.{e}" for t, r in ((0, 0), (0, 1), (1, 1)) for e in ("txt", "webp")
+    } == names
+    first, last = (context.directory.videos / f"task_00_after_0{r}.webp" for r in (0, 1))
+    assert first.read_bytes() == last.read_bytes()
+    assert "after learning 2 tasks" in last.with_suffix(".txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("cells", "measured", "defined"),
+    [
+        ("diagonal", [(0, 0), (1, 1), (2, 2)], {"fwt", "just_learned"}),
+        ("last_row", [(2, 0), (2, 1), (2, 2)], {"fwt", "final_success"}),
+        (
+            "diagonal_and_last_row",
+            [(0, 0), (1, 1), (2, 0), (2, 1), (2, 2)],
+            {"fwt", "final_success", "just_learned"},
+        ),
+    ],
+)
+def test_only_the_cells_that_are_asked_for_are_measured(tmp_path, whole, cells, measured, defined, capsys):
+    context, _ = learn(tmp_path / "some", Sequential(), cells=cells)
+    expected = {k: v for k, v in outcomes(whole).items() if k[0] == "curve" or k[1:3] in measured}
+    assert outcomes(context) == expected
+    results = context.directory.log.read()
+    assert results.learned_tasks() == TASKS and is_measured(context, results)
+    found, of_whole = (lifelong_metrics(c.directory.log.read().scores()) for c in (context, whole))
+    names = ("fwt", "nbt", "auc", "final_success", "just_learned")
+    assert {name for name in names if not np.isnan(getattr(found, name).value)} == defined
+    for name in defined:
+        assert getattr(found, name) == getattr(of_whole, name)
+    assert not [f for f in examine(tmp_path / "some").findings if "lacks" in f.text]
+    assert f"{3 * len(measured) + 18} episodes were run." in write_report([tmp_path / "some"]).read_text()
+    _, again = learn(tmp_path / "some", Sequential(), cells=cells)
+    assert again == [] and "nan" not in capsys.readouterr().out
+
+
+def test_a_run_that_measures_the_end_only_counts_what_is_learned(tmp_path):
+    context, _ = learn(tmp_path, Sequential(), cells="last_row")
+    records = context.directory.log.read().records
+    log = ResultLog(tmp_path / "half.jsonl")
+    for record in records:
+        log.append(record)
+        if record.kind == "task_end" and record.task == 1:
+            break
+    assert log.read().learned_tasks() == 2
+    assert np.isnan(lifelong_metrics(log.read().scores()).final_success.value)
+
+
+def test_a_curve_without_its_start_and_no_curve():
+    assert EvalSettings(every=5).curve_epochs(12) == (0, 5, 10, 12)
+    assert EvalSettings(every=5, curve="trained").curve_epochs(12) == (5, 10, 12)
+    assert EvalSettings(every=50, curve="trained").curve_epochs(12) == (12,)
+    assert EvalSettings(every=5, curve="none", select="last").curve_epochs(12) == ()
+    with pytest.raises(ConfigError, match=r"eval\.select=best needs a learning curve"):
+        EvalSettings(curve="none")
+
+
+def test_forward_transfer_without_epoch_0_is_the_mean_of_the_others(tmp_path):
+    context, _ = learn(tmp_path, Sequential(), curve="trained", select="last")
+    results = context.directory.log.read()
+    assert {tuple(curve.epochs) for curve in results.curves().values()} == {(1, 2)}
+    held = [curve.held().mean() for curve in results.curves().values()]
+    assert lifelong_metrics(results.scores()).fwt.value == pytest.approx(np.mean(held))
