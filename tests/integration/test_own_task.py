@@ -23,7 +23,6 @@ ROOT = Path(__file__).parents[2]
 TINY = (
     "preset=smoke",
     "algo=er",
-    "language=onehot",
     "threads=1",
     "data.demos=2",
     "data.image_size=32",

