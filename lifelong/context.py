@@ -34,7 +34,7 @@ class RunContext:
         eval: Settings of evaluation.
         augment: Augmentation of training batches.
         stream: Settings of the order in which data arrive.
-        group_size: Number of tasks learned together as one step of the sequence.
+        group_size: Number of tasks learned together as one step of the sequence, after the base stage.
         envs: Environments by (position of the task, number of simulations).
         directory: Directory of checkpoints and records.
         tracker: Mirror of the metrics to Weights & Biases.
@@ -62,3 +62,8 @@ class RunContext:
     device: torch.device
     progress: bool | None
     ranks: Ranks = Ranks()
+
+    @property
+    def group_sizes(self) -> tuple[int, ...]:
+        """Number of tasks in each group that is one step of the sequence."""
+        return self.stream.group_sizes(len(self.tasks), self.group_size)

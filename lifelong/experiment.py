@@ -119,7 +119,8 @@ def _build_contexts(
     check_folder(data)
     pretrain: PretrainSettings = config.build("pretrain")
     first = pretrain.sequence()
-    demos, algorithm = stream.demos(data.demos, len(tasks), benchmark.group_size), config.build("algo")
+    groups = stream.group_sizes(len(tasks), benchmark.group_size)
+    demos, algorithm = stream.demos(data.demos, len(tasks), groups[0]), config.build("algo")
     fit: FitSettings = config.build("train")
     evaluation: EvalSettings = config.build("eval")
     augment, tracker = config.build("augmentation"), config.build("wandb")
@@ -249,7 +250,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             tasks=[t.name for t in context.tasks],
             instructions=[t.language for t in context.tasks],
             config=OmegaConf.to_yaml(OmegaConf.create(plain)),
-            group_size=context.group_size,
+            group_sizes=context.group_sizes,
             cells=context.eval.cells,
             conditions=present_conditions(
                 context.device, processes=context.ranks.size, renderer=renderer_name_or_none()

@@ -6,6 +6,7 @@ algorithms, in records and in the names of files.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Annotated
 
 import torch
@@ -29,6 +30,8 @@ class StreamSettings:
     """Settings of the order in which data arrive; by default all windows of one task at a time.
 
     Attributes:
+        base_tasks: Number of tasks, from the start of the sequence, that are learned together before the others (the
+            base stage). None: as many as in every group (`benchmark.group_size`), which is 1 by default.
         demos_later: Demonstrations of each task after the first one (or after the first group): a number, a share
             of `data.demos` (a float up to 1.0), or a list with one entry for each of these tasks. None: as many as
             of the first.
@@ -44,12 +47,39 @@ class StreamSettings:
     then no longer that on an unseen task.
     """
 
+    base_tasks: Count | None = None
     demos_later: Count | Annotated[float, Field(gt=0, le=1)] | Sequence[Count] | None = None
     blur: Annotated[float, Field(ge=0, lt=1)] = 0.0
     blur_reach: Count = 1
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("stream",), error=ConfigError)
+
+    def group_sizes(self, tasks: int, group_size: int = 1) -> tuple[int, ...]:
+        """Return the number of tasks in each group: those of the base stage, then `group_size` at a time.
+
+        Args:
+            tasks: Number of tasks, K.
+            group_size: Number of tasks of a group after the base stage.
+
+        Raises:
+            ConfigError: The base stage is larger than the sequence, or the rest cannot be divided into groups.
+        """
+        base = self.base_tasks or 0
+        if base > tasks:
+            raise ConfigError(
+                f"stream.base_tasks is {base}; the sequence has {tasks} tasks, of which 1 to {tasks} can be learned "
+                "together first"
+            )
+        rest = tasks - base
+        if rest % group_size:
+            valid = [n for n in range(1, rest + 1) if rest % n == 0]
+            after = f" after stream.base_tasks={base}" if base else ""
+            raise ConfigError(
+                f"benchmark.group_size is {group_size}; {rest} tasks{after} can be learned in groups of "
+                f"{', '.join(map(str, valid))}"
+            )
+        return (*([base] if base else []), *[group_size] * (rest // group_size))
 
     def demos(self, full: int, tasks: int, first: int = 1) -> tuple[int, ...]:
         """Return the number of demonstrations of each task.
@@ -76,15 +106,14 @@ class StreamSettings:
         return (*[full] * first, *counts)
 
 
-def learning_stages(algorithm: Algorithm, tasks: int, group_size: int = 1) -> Stages:
+def learning_stages(algorithm: Algorithm, sizes: Sequence[int]) -> Stages:
     """Return the tasks of each stage: the groups, or the groups that an algorithm learns together.
 
     Args:
         algorithm: Algorithm, which may learn several groups in one stage.
-        tasks: Number of tasks, K.
-        group_size: Number of tasks of a group, a divisor of K.
+        sizes: Number of tasks in each group, from `StreamSettings.group_sizes`.
     """
-    groups = [tuple(range(k, k + group_size)) for k in range(0, tasks, group_size)]
+    groups = [tuple(range(end - size, end)) for size, end in zip(sizes, accumulate(sizes), strict=True)]
     stages = algorithm.stages(len(groups))
     return tuple(tuple(task for group in stage for task in groups[group]) for stage in stages)
 

@@ -19,7 +19,7 @@ from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.saved_config import read_saved_config, upgrade_config
 from lifelong.settings import BenchmarkSettings, Configuration
-from lifelong.streams import learning_stages
+from lifelong.streams import StreamSettings, learning_stages
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import Need, check_memory, policy_bytes
 
@@ -41,7 +41,7 @@ class LoadedRun:
         language: Encoder of instructions; see `embed`.
         instructions: Instructions that are embedded together: those of the pretraining, then those of the run.
         robot: Model of the arm that the run was trained with.
-        group_size: Number of tasks learned together.
+        group_sizes: Number of tasks in each group that was learned together; () for one task at a time.
         drawing: How the images that it learned from were drawn.
     """
 
@@ -57,7 +57,7 @@ class LoadedRun:
     language: Any
     instructions: tuple[str, ...]
     robot: str
-    group_size: int = 1
+    group_sizes: tuple[int, ...] = ()
     drawing: str | None = None
 
     def embed(self, task: Task) -> torch.Tensor:
@@ -84,7 +84,7 @@ class LoadedRun:
         """Yield the policy that acts on a task; for a task that is not the run's, that of the last task learned."""
         names = [t.name for t in self.tasks]
         position = names.index(task.name) if task.name in names else self.learned
-        stages = learning_stages(self.algorithm, len(self.tasks), self.group_size)
+        stages = learning_stages(self.algorithm, self.group_sizes or (1,) * len(self.tasks))
         stage = next(stage for stage in stages if position in stage)
         with self.algorithm.policy_for(stage[-1], self.policy) as policy:
             yield policy
@@ -112,6 +112,7 @@ def restore(
     where = Ranks().device(device)
     benchmark: BenchmarkSettings = config.build("benchmark")
     tasks = benchmark.sequence()
+    stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
     data: DataSettings = config.build("data")
     language = config.build("language")
     before: tuple[Task, ...] = config.build("pretrain").sequence() if "pretrain" in config.values else ()
@@ -141,7 +142,7 @@ def restore(
         language=language,
         instructions=instructions,
         robot=data.robot,
-        group_size=benchmark.group_size,
+        group_sizes=stream.group_sizes(len(tasks), benchmark.group_size),
         drawing=data.drawing,
     )
 

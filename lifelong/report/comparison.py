@@ -99,7 +99,7 @@ def _forgetting(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
     found: dict[str, list[float]] = {}
     for run in runs:
         assert run.metrics is not None
-        followed = run.learned - run.record.group_size
+        followed = run.record.group(run.learned - 1).start
         for name, value in zip(run.record.tasks[:followed], run.metrics.nbt_by_task, strict=False):
             found.setdefault(name, []).append(float(value))
     return {name: _mean(values) for name, values in found.items()}

@@ -24,8 +24,9 @@ from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import atom_rows, cost_table, duration, episodes_text, most_forgotten, task_costs
 from lifelong.report.templates import page_template
-from lifelong.results.metrics import METRIC_NAMES, average_success
+from lifelong.results.metrics import METRIC_NAMES, Metrics, average_success
 from lifelong.results.records import RunRecord
+from lifelong.results.results import after_base_stage
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -97,8 +98,10 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "title": f"{record.algo} on {record.benchmark}",
         "facts": _facts(record),
         "notes": run.notes,
-        "metrics": _metric_rows(run),
-        "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run))]),
+        "metrics": _metric_rows(run.metrics),
+        "later_metrics": _metric_rows(after_base_stage(run.results)),
+        "base_tasks": len(record.groups[0]) if record.has_base_stage else 0,
+        "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run.metrics))]),
         "heatmaps": [run_heatmap(run.results, labels)],
         "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
         "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
@@ -176,10 +179,8 @@ def _facts(record: RunRecord) -> list[tuple[str, Any]]:
     return facts + [("CPUs", record.cpu_count)] + ([("commit", record.commit[:10])] if record.commit else [])
 
 
-def _metric_rows(run: Run) -> list[dict[str, Any]]:
-    if run.metrics is None:
-        return []
-    return [{"name": n, "estimate": getattr(run.metrics, n)} for n in METRIC_NAMES]
+def _metric_rows(metrics: Metrics | None) -> list[dict[str, Any]]:
+    return [] if metrics is None else [{"name": n, "estimate": getattr(metrics, n)} for n in METRIC_NAMES]
 
 
 def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:

@@ -135,7 +135,9 @@ class _Examiner:
             return self._fault(f"{file} is broken: expected an object; the run's command writes it again")
         now = json.loads(json.dumps(json_safe(summarize(results))))
         for summary in (written, now):
-            if now["tasks_learned"] <= results.run.group_size and isinstance(summary.get("metrics"), dict):
+            if now["tasks_learned"] <= len(results.run.groups[0]) and isinstance(
+                summary.get("metrics"), dict
+            ):
                 summary["metrics"].pop("nbt", None)  # of one task; earlier versions wrote 0
                 summary["metrics"].pop("by_task", None)
         differing = [key for key in _COMPARED if not _alike(written.get(key), now[key])]
@@ -188,9 +190,8 @@ class _Examiner:
 def _missing_records(results: Results) -> Iterator[str]:
     """Yield what the records of learned tasks lack, compared with each other."""
     ended = sorted({record.task for record in results.of(TaskEndRecord)})
-    size, tasks = results.run.group_size, len(results.run.tasks)
     for task in ended:
-        row = measured_tasks(results.run.cells, range(task + 1 - size, task + 1), tasks)
+        row = measured_tasks(results.run.cells, results.run.group(task), len(results.run.tasks))
         if absent := [seen for seen in row if results.evaluation("matrix", task, seen) is None]:
             yield f"evaluations after task {task} of tasks {_listed(absent)}"
     curves = {task: set(curve.epochs.tolist()) for task, curve in results.curves().items()}

@@ -49,14 +49,14 @@ class Scores:
         curves: K learning curves, one for each task; empty curves make FWT and AUC undefined (NaN).
         matrix: (K, K) c[i,j], success on task j after learning task i; NaN above the diagonal.
         episodes: (K, K) number of rollouts of each cell, 0 above the diagonal.
-        group_size: Number of tasks learned together. If above 1, K is the number of groups, and each group counts
-            as one task whose success is the mean over its tasks.
+        group_sizes: Number of tasks of each group that was learned together; () for one task at a time. K is then
+            the number of groups, and each group counts as one task whose success is the mean over its tasks.
     """
 
     curves: tuple[Curve, ...]
     matrix: Floats
     episodes: NDArray[np.int64]
-    group_size: int = 1
+    group_sizes: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         k = len(self.curves)
@@ -65,6 +65,16 @@ class Scores:
                 f"scores of {k} tasks need ({k}, {k}) matrices, got rates {self.matrix.shape} "
                 f"and episodes {self.episodes.shape}"
             )
+
+    def without_first(self) -> "Scores":
+        """Return the success rates without the first group's: those of the sequence after its base stage."""
+        later = slice(1, None)
+        return Scores(
+            self.curves[later],
+            self.matrix[later, later],
+            self.episodes[later, later],
+            self.group_sizes[later],
+        )
 
 
 @dataclass(frozen=True)
@@ -159,9 +169,8 @@ def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
     row = cells(scores)
     low, high = wilson_interval(row.rates * row.episodes, row.episodes, confidence)
     estimates = {name: combine_intervals(w, row.rates, low, high) for name, w in row.weights.items()}
-    fwt, nbt, auc = (
-        np.repeat(values, scores.group_size) for values in (fwt, nbt, auc)
-    )  # every task has the value of its group
+    if scores.group_sizes:  # every task has the value of its group
+        fwt, nbt, auc = (np.repeat(values, scores.group_sizes) for values in (fwt, nbt, auc))
     return Metrics(**estimates, fwt_by_task=fwt, nbt_by_task=nbt, auc_by_task=auc)
 
 

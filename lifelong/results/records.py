@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -56,12 +57,33 @@ class RunRecord:
     group_size: Annotated[int, Field(ge=1, le=1000)] = 1  # tasks learned together as one step of the sequence
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.conditions`
     cells: MatrixCells = "all"  # of the success matrix, which are measured
+    group_sizes: tuple[
+        Annotated[int, Field(ge=1)], ...
+    ] = ()  # of each group, where they are not all of group_size
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:
             raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.instructions)} instructions")
-        if len(self.tasks) % self.group_size:
-            raise ValueError(f"{len(self.tasks)} tasks are no groups of {self.group_size}")
+        sizes = self.group_sizes
+        if sum(sizes) != len(self.tasks) if sizes else len(self.tasks) % self.group_size:
+            raise ValueError(
+                f"{len(self.tasks)} tasks are no groups of {', '.join(map(str, sizes or [self.group_size]))}"
+            )
+
+    @property
+    def groups(self) -> tuple[range, ...]:
+        """Positions of the tasks in each group that is one step of the sequence."""
+        sizes = self.group_sizes or (self.group_size,) * (len(self.tasks) // self.group_size)
+        return tuple(range(end - size, end) for size, end in zip(sizes, accumulate(sizes), strict=True))
+
+    @property
+    def has_base_stage(self) -> bool:
+        """Whether more tasks were learned together first than in any later group."""
+        return bool(self.group_sizes) and self.group_sizes[0] > max(self.group_sizes[1:])
+
+    def group(self, task: int) -> range:
+        """Return the positions of the tasks in a task's group."""
+        return next(group for group in self.groups if task in group)
 
 
 @dataclass(frozen=True)
@@ -196,7 +218,7 @@ def start_record(
     tasks: Sequence[str],
     instructions: Sequence[str],
     config: str,
-    group_size: int = 1,
+    group_sizes: Sequence[int] = (),
     conditions: Mapping[str, str] | None = None,
     cells: MatrixCells = "all",
 ) -> RunRecord:
@@ -211,10 +233,11 @@ def start_record(
         tasks: Names of the tasks in learning order.
         instructions: Instructions of the tasks, in the same order.
         config: Resolved configuration as text, of which the SHA-256 is recorded.
-        group_size: Number of tasks learned together.
+        group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
         conditions: What decides the bits of its results, see `lifelong.results.conditions`.
         cells: Cells of the success matrix that are measured.
     """
+    equal = len(set(group_sizes)) < 2  # written as earlier versions did
     return RunRecord(
         algo=algo,
         benchmark=benchmark,
@@ -228,9 +251,10 @@ def start_record(
         commit=source_commit(),
         cpu_count=os.cpu_count() or 1,
         started=utc_now(),
-        group_size=group_size,
+        group_size=group_sizes[0] if group_sizes and equal else 1,
         conditions=conditions or {},
         cells=cells,
+        group_sizes=() if equal else tuple(group_sizes),
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lifelong.errors import ResultsError
 from lifelong.results.coverage import measured_tasks
-from lifelong.results.metrics import Curve, Scores
+from lifelong.results.metrics import Curve, Metrics, Scores, lifelong_metrics
 from lifelong.results.records import (
     CostRecord,
     EvalRecord,
@@ -93,21 +93,19 @@ class Results:
 
     def last_of_group(self, task: int) -> int:
         """Return the last task of a task's group, whose row of the matrix is the first after learning it."""
-        size = self.run.group_size
-        return (task // size + 1) * size - 1
+        return self.run.group(task)[-1]
 
     def learned_tasks(self) -> int:
         """Count the tasks, from the first, with a complete row in the matrix; all count if the last row is complete."""
         rates, _ = self.success_matrix()
-        size = self.run.group_size
-        full = [self._is_complete(rates[row], row) for row in range(size - 1, len(rates), size)]
-        return size * (full.index(False) if False in full and not full[-1] else len(full))
+        groups = self.run.groups
+        full = [self._is_complete(rates[group[-1]], group) for group in groups]
+        return groups[full.index(False)].start if False in full and not full[-1] else len(rates)
 
-    def _is_complete(self, rates: NDArray[np.float64], row: int) -> bool:
+    def _is_complete(self, rates: NDArray[np.float64], stage: range) -> bool:
         """Return whether a row of the matrix has all cells that the run measures; without any, whether it has ended."""
-        stage = range(row + 1 - self.run.group_size, row + 1)
         columns = measured_tasks(self.run.cells, stage, len(self.run.tasks))
-        return bool(np.isfinite(rates[columns]).all()) if columns else self.task_end(row) is not None
+        return bool(np.isfinite(rates[columns]).all()) if columns else self.task_end(stage[-1]) is not None
 
     def curves(self) -> dict[int, Curve]:
         """Return the learning curve of each task that has one."""
@@ -162,14 +160,17 @@ class Results:
         Args:
             diagonal: Source of c[i,i], see `success_matrix`.
         """
-        size, group = self.learned_tasks(), self.run.group_size
+        size = self.learned_tasks()
+        groups = [g for g in self.run.groups if g.stop <= size]
         rates, episodes = self.success_matrix(diagonal)
         curves, empty = self._group_curves(self.curves()), _curve([])
-        used = tuple(curves.get(task, empty) for task in range(group - 1, size, group))
-        cells = (slice(group - 1, size, group), slice(0, size))
-        shape = (size // group, size // group, group)
+        used = tuple(curves.get(g[-1], empty) for g in groups)
+        rows = [g[-1] for g in groups]
         return Scores(
-            used, rates[cells].reshape(shape).mean(-1), episodes[cells].reshape(shape).sum(-1), group
+            used,
+            np.stack([rates[rows, g.start : g.stop].mean(1) for g in groups], axis=1),
+            np.stack([episodes[rows, g.start : g.stop].sum(1) for g in groups], axis=1),
+            tuple(map(len, groups)),
         )
 
     def _group_curves(self, curves: Mapping[int, Curve]) -> dict[int, Curve]:
@@ -177,8 +178,8 @@ class Results:
         groups: dict[int, list[Curve]] = {}
         for task, curve in sorted(curves.items()):
             groups.setdefault(self.last_of_group(task), []).append(curve)
-        size = self.run.group_size
-        return {last: _mean_curve(found) for last, found in groups.items() if len(found) == size}
+        sizes = {group[-1]: len(group) for group in self.run.groups}
+        return {last: _mean_curve(found) for last, found in groups.items() if len(found) == sizes[last]}
 
     def costs(self, task: int) -> dict[str, float]:
         """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""
@@ -206,6 +207,21 @@ class Results:
         if between:
             times["between tasks"] = between
         return times
+
+
+def after_base_stage(results: Results) -> Metrics | None:
+    """Compute the metrics over the tasks after the base stage, as if the sequence began with them.
+
+    Args:
+        results: Records of a run.
+
+    Returns:
+        The metrics; None if the run has no base stage, or no later task is learned.
+    """
+    run = results.run
+    if not run.has_base_stage or results.learned_tasks() <= len(run.groups[0]):
+        return None
+    return lifelong_metrics(results.scores().without_first())
 
 
 def _curve(records: list[EvalRecord]) -> Curve:

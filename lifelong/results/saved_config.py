@@ -108,6 +108,7 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
         "policy": upgrade_policy,
         "algo": upgrade_algorithm,
         "eval": upgrade_evaluation,
+        "stream": upgrade_stream,
     }
     return {
         key: upgrades[key](node) if key in upgrades and isinstance(node, Mapping) else node
@@ -132,6 +133,15 @@ def upgrade_evaluation(node: Mapping[str, Any]) -> Node:
         node: The `eval` node; one of today comes back unchanged.
     """
     return {"curve": "all", "cells": "all", "reuse": True, **node}
+
+
+def upgrade_stream(node: Mapping[str, Any]) -> Node:
+    """Return the node of the stream with the base stage that there was none of before it had a key.
+
+    Args:
+        node: The `stream` node; one of today comes back unchanged.
+    """
+    return {"base_tasks": None, **node}
 
 
 def upgrade_policy(node: Mapping[str, Any]) -> Node:

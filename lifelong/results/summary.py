@@ -12,9 +12,9 @@ import numpy as np
 from libero_env.storage import atomic_write_text
 from lifelong.errors import ResultsError
 from lifelong.results.conditions import resume_notes
-from lifelong.results.metrics import METRIC_NAMES, lifelong_metrics, wilson_interval
+from lifelong.results.metrics import METRIC_NAMES, Metrics, lifelong_metrics, wilson_interval
 from lifelong.results.records import TaskEndRecord
-from lifelong.results.results import Results
+from lifelong.results.results import Results, after_base_stage
 
 
 def write_summary(path: Path | str, results: Results, config: Mapping[str, Any]) -> dict[str, Any]:
@@ -56,6 +56,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "finished": results.finished,
         "tasks_learned": size,
         "metrics": _metrics(results, "matrix") if size else None,
+        "metrics_after_base_stage": _metrics_after_base_stage(results),
         "metrics_diagonal_from_curve": _metrics(results, "curve") if size else None,
         "success_matrix": {
             "rates": rates.tolist(),
@@ -86,7 +87,16 @@ def summarize(results: Results) -> dict[str, Any]:
 
 
 def _metrics(results: Results, diagonal: Literal["matrix", "curve"]) -> dict[str, Any]:
-    found = lifelong_metrics(results.scores(diagonal))
+    return _as_data(lifelong_metrics(results.scores(diagonal)))
+
+
+def _metrics_after_base_stage(results: Results) -> dict[str, Any] | None:
+    """Return the metrics over the later tasks alone; None without a base stage, or before one of them is learned."""
+    found = after_base_stage(results)
+    return None if found is None else _as_data(found)
+
+
+def _as_data(found: Metrics) -> dict[str, Any]:
     by_task = {name: getattr(found, f"{name}_by_task").tolist() for name in ("fwt", "nbt", "auc")}
     return {name: asdict(getattr(found, name)) for name in METRIC_NAMES} | {"by_task": by_task}
 

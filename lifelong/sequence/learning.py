@@ -57,7 +57,7 @@ class TaskSequence:
     ):
         self.context, self.prepare = context, prepare
         self.log, self.checkpoints = context.directory.log, context.directory.checkpoints
-        self.stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
+        self.stages = learning_stages(context.algorithm, context.group_sizes)
         self.data = StageData(datasets, self.stages, context.stream, context.seed)
         self.evaluator = Evaluator(context, self.stages)
         self._reached = -1  # number of the stage after which the policy is; -1: before the first

@@ -105,7 +105,7 @@ def lacks_row(context: RunContext, stage: Sequence[int], results: Results) -> bo
 
 def is_measured(context: RunContext, results: Results) -> bool:
     """Return whether all learning curves and the success matrix of a run are recorded."""
-    stages = learning_stages(context.algorithm, len(context.tasks), context.group_size)
+    stages = learning_stages(context.algorithm, context.group_sizes)
     return not any(
         missing_points(context, stage, results) or lacks_row(context, stage, results) for stage in stages
     )

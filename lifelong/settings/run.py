@@ -72,31 +72,8 @@ class BenchmarkSettings:
 
         Raises:
             UnknownNameError: The suite, the order or a task does not exist.
-            ConfigError: The number of tasks is not a multiple of the group size, or the files do not make a suite.
+            ConfigError: The files do not make a suite, or it has fewer tasks than are asked for.
         """
-        tasks = self._chosen()
-        valid = [n for n in range(1, len(tasks) + 1) if len(tasks) % n == 0]
-        if self.group_size not in valid:
-            raise ConfigError(
-                f"benchmark.group_size is {self.group_size}; {len(tasks)} tasks can be learned in groups of "
-                f"{', '.join(map(str, valid))}"
-            )
-        return tasks
-
-    def _suite(self) -> Suite:
-        if self.files is None and self.suite != OWN:
-            return get_suite(self.suite)
-        if not self.files:
-            raise ConfigError(
-                f"benchmark.files is {self.files!r}; give a list of task files: '[a.yaml,b.bddl]'"
-            )
-        if self.suite in suite_names():
-            raise ConfigError(
-                f"benchmark.files are given, and {self.suite} has its own tasks; use benchmark=own"
-            )
-        return read_suite(self.files, self.suite)
-
-    def _chosen(self) -> tuple[Task, ...]:
         suite = self._suite()
         tasks = suite.order(self.order)
         if self.tasks is None:
@@ -110,6 +87,19 @@ class BenchmarkSettings:
             if str(name) not in known:
                 raise UnknownNameError(f"task of {self.suite}", name, [t.name for t in suite.tasks])
         return tuple(known[str(name)] for name in self.tasks)
+
+    def _suite(self) -> Suite:
+        if self.files is None and self.suite != OWN:
+            return get_suite(self.suite)
+        if not self.files:
+            raise ConfigError(
+                f"benchmark.files is {self.files!r}; give a list of task files: '[a.yaml,b.bddl]'"
+            )
+        if self.suite in suite_names():
+            raise ConfigError(
+                f"benchmark.files are given, and {self.suite} has its own tasks; use benchmark=own"
+            )
+        return read_suite(self.files, self.suite)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def stage_data(
     blur: float, *, sizes=(20, 30, 25, 40), group_size: int = 1, reach: int = 1, seed: int = 0
 ) -> StageData:
     datasets = {task: Windows(task, size) for task, size in enumerate(sizes)}
-    stages = learning_stages(Sequential(), len(sizes), group_size)
+    stages = learning_stages(Sequential(), StreamSettings().group_sizes(len(sizes), group_size))
     return StageData(datasets, stages, StreamSettings(blur=blur, blur_reach=reach), seed)
 
 
@@ -61,9 +61,18 @@ def rows(features: torch.Tensor) -> set[tuple[float, ...]]:
 
 
 def test_groups_are_consecutive_and_algorithms_join_groups() -> None:
-    assert learning_stages(Sequential(), 3) == ((0,), (1,), (2,))
-    assert learning_stages(Sequential(), 6, 2) == ((0, 1), (2, 3), (4, 5))
-    assert learning_stages(Multitask(), 6, 2) == ((0, 1, 2, 3, 4, 5),)
+    assert learning_stages(Sequential(), (1, 1, 1)) == ((0,), (1,), (2,))
+    assert learning_stages(Sequential(), (2, 2, 2)) == ((0, 1), (2, 3), (4, 5))
+    assert learning_stages(Sequential(), (3, 1, 2)) == ((0, 1, 2), (3,), (4, 5))
+    assert learning_stages(Multitask(), (3, 1, 2)) == ((0, 1, 2, 3, 4, 5),)
+
+
+@pytest.mark.parametrize(
+    ("base", "group_size", "expected"),
+    [(None, 1, (1,) * 10), (None, 5, (5, 5)), (6, 1, (6, 1, 1, 1, 1)), (4, 3, (4, 3, 3)), (10, 1, (10,))],
+)
+def test_the_base_stage_comes_before_groups_of_the_rest(base, group_size, expected) -> None:
+    assert StreamSettings(base_tasks=base).group_sizes(10, group_size) == expected
 
 
 def test_by_default_a_stage_is_the_task_itself() -> None:
@@ -168,10 +177,13 @@ def test_invalid_blur_is_refused(change) -> None:
 
 
 def test_group_sizes_must_divide_the_number_of_tasks() -> None:
-    assert len(BenchmarkSettings("libero_goal", group_size=5).sequence()) == 10
-    with pytest.raises(ConfigError, match="groups of 1, 2, 5, 10"):
-        BenchmarkSettings("libero_goal", group_size=3).sequence()
-    with pytest.raises(ConfigError, match="at least 1|groups of 1, 2, 4"):
+    with pytest.raises(ConfigError, match=r"10 tasks can be learned in groups of 1, 2, 5, 10"):
+        StreamSettings().group_sizes(10, 3)
+    with pytest.raises(ConfigError, match=r"4 tasks after stream.base_tasks=6 can be .* groups of 1, 2, 4"):
+        StreamSettings(base_tasks=6).group_sizes(10, 3)
+    with pytest.raises(ConfigError, match=r"stream.base_tasks is 6; .* 3 tasks, of which 1 to 3"):
+        StreamSettings(base_tasks=6).group_sizes(3)
+    with pytest.raises(ConfigError, match="at least 1"):
         BenchmarkSettings("libero_goal", tasks=4, group_size=0).sequence()
 
 
@@ -196,7 +208,7 @@ def four(path: Path, algorithm, **changes) -> RunContext:
         tasks="abcd",
         instructions="abcd",
         config="",
-        group_size=changes.get("group_size", 2),
+        group_sizes=changes.get("stream", context.stream).group_sizes(4, changes.get("group_size", 2)),
     )
     if not context.directory.log.read().records:
         context.directory.log.append(record)
@@ -259,7 +271,7 @@ def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
             tasks="abcd",
             instructions="abcd",
             config="",
-            group_size=2,
+            group_sizes=(2, 2),
         )
     )
 
@@ -417,5 +429,6 @@ def test_the_commands_of_the_guide_are_valid(overrides) -> None:
         instantiate(config[group], _convert_="all") for group in ("benchmark", "stream", "pretrain")
     )
     tasks = benchmark.sequence()
-    assert len(stream.demos(config.data.demos, len(tasks), benchmark.group_size)) == len(tasks)
+    groups = stream.group_sizes(len(tasks), benchmark.group_size)
+    assert len(stream.demos(config.data.demos, len(tasks), groups[0])) == len(tasks)
     assert bool(before.sequence()) == any(o.startswith("pretrain") for o in overrides)
