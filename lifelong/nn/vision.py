@@ -186,6 +186,8 @@ class ResNetFiLMEncoder(nn.Module):
         temperature: Temperature of the keypoints' softmax, see `SpatialSoftmax`.
         readout: How the feature map is read: `keypoints` (K of them), or `flat` with 2 K features.
         norm: Normalisation after convolutions: `group`, `batch` or `none`, see `make_norm`.
+        stem_film: Whether the instruction modulates the stem's features too, as it does those of every block. Without
+            blocks it is the only place where it can.
 
     Raises:
         PolicyError: An unknown readout, or an image too small for the number of stages.
@@ -206,6 +208,7 @@ class ResNetFiLMEncoder(nn.Module):
         temperature: Positive = 1.0,
         readout: Literal["keypoints", "flat"] = "keypoints",
         norm: Norm = "group",
+        stem_film: bool = False,
     ) -> None:
         super().__init__()
         stem = [
@@ -214,6 +217,7 @@ class ResNetFiLMEncoder(nn.Module):
             nn.ReLU(inplace=True),
         ]
         self.stem = nn.Sequential(*stem, *([nn.MaxPool2d(3, 2, padding=1)] if stem_pool else []))
+        self.stem_film = FiLM(language_dim=language_dim, channels=width) if stem_film else None
         self.blocks, self.films = nn.ModuleList(), nn.ModuleList()
         channels = width
         for stage, count in enumerate(stage_blocks):
@@ -257,6 +261,8 @@ class ResNetFiLMEncoder(nn.Module):
         """
         h = images.movedim(-1, 1)  # a view; already channels-last in memory
         h = self.stem(h.to(torch.float32).mul_(2.0 / 255.0).sub_(1.0))
+        if self.stem_film is not None:
+            h = self.stem_film(h, language)
         for block, film in zip(self.blocks, self.films, strict=True):
             h = film(block(h), language)
         return self.project(self.readout(h))

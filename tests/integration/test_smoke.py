@@ -134,7 +134,7 @@ def test_a_sweep_ends_with_a_comparison_report(home, tmp_path):
     assert len(list(tmp_path.rglob("results.json"))) == 2
 
 
-@pytest.mark.parametrize("policy", ["bc_transformer_small", "bc_rnn_small", "bc_vilt_small"])
+@pytest.mark.parametrize("policy", ["bc_mlp_small", "bc_transformer_small", "bc_rnn_small", "bc_vilt_small"])
 def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
     """Run preset=smoke with fewer and shorter steps and episodes."""
     tiny = (*(t for t in TINY if not t.startswith("algo")), "eval.episodes=1", f"policy={policy}")

@@ -20,7 +20,7 @@ from lifelong.nn import (
     TemporalLSTM,
     TemporalTransformer,
 )
-from lifelong.policies import BCRNN, BCTransformer, BCViLT, Policy
+from lifelong.policies import BCMLP, BCRNN, BCTransformer, BCViLT, Policy
 from lifelong.settings import build
 from lifelong.types import Batch, Observation, PolicySpec
 
@@ -40,6 +40,7 @@ SMALL = {
         BCTransformer,
         {"embed_dim": 16, "encoder": RESNET, "temporal": partial(TemporalTransformer, **TRANSFORMER)},
     ),
+    "mlp": (BCMLP, {"image_embed": 16, "text_embed": 8, "encoder": RESNET}),
     "rnn": (BCRNN, {"image_embed": 16, "text_embed": 8, "encoder": RESNET, "temporal": LSTM}),
     "rnn-window": (BCRNN, {"image_embed": 16, "encoder": RESNET, "temporal": LSTM, "memory": "window"}),
     "vilt": (
