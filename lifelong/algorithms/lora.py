@@ -11,7 +11,8 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, ConfigError
-from lifelong.nn.adapters import check_matches, freeze_statistics, initial_pair, matches
+from lifelong.nn.adapters import check_matches, freeze_statistics, matches
+from lifelong.nn.experts import ExpertLibrary, Pair
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
 
@@ -36,7 +37,7 @@ class LoRA(Algorithm):
     state_form = {
         **dict.fromkeys(("task_index", "base_left", "base_last", "seed"), int),
         "base": Weights(),
-        "pairs": {int: {str: {"a": Tensor, "b": Tensor}}},
+        "pairs": ExpertLibrary.form,
         "own": {int: Weights()},
     }
 
@@ -72,7 +73,7 @@ class LoRA(Algorithm):
         self.task_index, self._base_left, self._base_last = -1, base_tasks, -1
         self._seed = 0  # of the next task's A, drawn when a task ends
         self._base: dict[str, Tensor] = {}  # frozen values of all that a task may change
-        self._pairs: dict[int, dict[str, dict[str, Tensor]]] = {}  # task -> name -> a (r, in), b (out, r)
+        self._library = ExpertLibrary()
         self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
@@ -85,20 +86,15 @@ class LoRA(Algorithm):
         if not self._base:
             self._base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
         draws = torch.Generator().manual_seed(self._seed)
-        pairs = self._pairs[task_index] = {}
-        for name, base in self._base.items():
-            if not matches(name, self.own):
-                out, inputs = base.flatten(1).shape
-                rank = min(self.rank, out, inputs)
-                a, b = initial_pair(out, inputs, rank, draws)
-                pairs[name] = {"a": nn.Parameter(a.to(base.device)), "b": nn.Parameter(b.to(base.device))}
+        adapted = {name: base for name, base in self._base.items() if not matches(name, self.own)}
+        self._library.add(task_index, adapted, self.rank, draws)
         _put(policy, self._base)
         policy.zero_grad()  # the optimiser, which does it at each step, no longer has the matrices
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the task's A and B and its own copies; everything while the base is learned."""
-        pairs = self._pairs.get(self.task_index)
-        if pairs is None:
+        pairs = self._present()
+        if not pairs:
             return super().trained(policy)
         chosen: list[Any] = []
         for name, p in policy.named_parameters():
@@ -118,7 +114,7 @@ class LoRA(Algorithm):
     @torch.no_grad()
     def after_backward(self, policy: Policy) -> None:
         """Compute the gradients of A and B from those of the weights, which are then dropped."""
-        pairs = self._pairs.get(self.task_index, {})
+        pairs = self._present()
         for name, p in policy.named_parameters():
             if name in pairs and p.grad is not None:
                 a, b, g = pairs[name]["a"], pairs[name]["b"], p.grad.flatten(1)
@@ -128,7 +124,7 @@ class LoRA(Algorithm):
 
     def after_step(self, policy: Policy) -> None:
         """Compute the adapted weights again."""
-        pairs = self._pairs.get(self.task_index, {})
+        pairs = self._present()
         _put(policy, {name: self._sum(name, pair) for name, pair in pairs.items()})
 
     def end_task(
@@ -136,9 +132,9 @@ class LoRA(Algorithm):
     ) -> None:
         """Store the task's own copies; its A and B are stored already."""
         self._seed = int(torch.randint(2**62, (), generator=generator))
-        if task_index in self._pairs:
+        if task_index in self._library:
             params = dict(policy.named_parameters())
-            names = self._base.keys() - self._pairs[task_index].keys()
+            names = self._base.keys() - self._library[task_index].keys()
             self._kept[task_index] = {n: params[n].detach().clone() for n in sorted(names)}
 
     @contextmanager
@@ -150,7 +146,7 @@ class LoRA(Algorithm):
             return
         present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self._base}
         stage = min(learned)  # index of the last task of a stage
-        sums = {name: self._sum(name, pair) for name, pair in self._pairs.get(stage, {}).items()}
+        sums = {name: self._sum(name, pair) for name, pair in self._library.pairs.get(stage, {}).items()}
         _put(policy, self._base | sums | self._kept.get(stage, {}))
         try:
             yield policy
@@ -164,16 +160,11 @@ class LoRA(Algorithm):
     def sizes(self) -> dict[int, int]:
         """Return the number of parameters learned by each task with an adapter, its own copies included."""
         small = sum(p.numel() for n, p in self._base.items() if matches(n, self.own))
-        pairs = {task: [t for pair in p.values() for t in pair.values()] for task, p in self._pairs.items()}
-        return {task: small + sum(t.numel() for t in tensors) for task, tensors in pairs.items()}
+        return {task: small + size for task, size in self._library.sizes().items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the base, and every task's A, B and own copies."""
-        pairs = {
-            task: {name: {k: t.detach() for k, t in pair.items()} for name, pair in of_task.items()}
-            for task, of_task in self._pairs.items()
-        }
-        state = {"base": dict(self._base), "pairs": pairs, "own": dict(self._kept)}
+        state = {"base": dict(self._base), "pairs": self._library.state(), "own": dict(self._kept)}
         place = {"task_index": self.task_index, "base_left": self._base_left, "base_last": self._base_last}
         return {**place, "seed": self._seed, **state}
 
@@ -183,18 +174,18 @@ class LoRA(Algorithm):
         Raises:
             CheckpointError: An adapter does not fit its weight.
         """
-        for name, pair in ((n, pair) for of_task in state["pairs"].values() for n, pair in of_task.items()):
-            a, b, base = pair["a"], pair["b"], state["base"].get(name)
-            fits = base is not None and a.dim() == b.dim() == 2 and len(a) == b.shape[1]
-            if not fits or (len(b), a.shape[1]) != base.flatten(1).shape:
+        self._library.load(state["pairs"])
+        for name, pair in ((n, p) for of_task in state["pairs"].values() for n, p in of_task.items()):
+            base, shape = state["base"].get(name), (len(pair["b"]), pair["a"].shape[1])
+            if base is None or base.flatten(1).shape != shape:
                 raise CheckpointError(f"the adapter of {name} does not fit a weight of the base")
         self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
         self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])
         self._base, self._kept = dict(state["base"]), dict(state["own"])
-        self._pairs = {
-            task: {name: {k: nn.Parameter(t) for k, t in pair.items()} for name, pair in of_task.items()}
-            for task, of_task in state["pairs"].items()
-        }
+
+    def _present(self) -> Mapping[str, Mapping[str, nn.Parameter]]:
+        """Return the present task's pairs; none while the base is learned."""
+        return self._library.pairs.get(self.task_index, {})
 
     def _choose(self, policy: Policy) -> list[str]:
         """Return the names of all parameters that tasks may change."""
@@ -205,7 +196,7 @@ class LoRA(Algorithm):
         return [n for n in learned if n in found or matches(n, self.own)]
 
     @torch.no_grad()
-    def _sum(self, name: str, pair: Mapping[str, Tensor]) -> Tensor:
+    def _sum(self, name: str, pair: Pair) -> Tensor:
         """Return W + (alpha / rank) B A."""
         base = self._base[name]
         return base + (self.scale * (pair["b"] @ pair["a"])).view(base.shape)

@@ -1,13 +1,16 @@
 """Datasets of windows, whatever reads and holds them: what they have in common, parts and joins of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from lifelong.types import Batch
+
+_CHUNK = 8  # windows that are read at a time
 
 
 class WindowDataset(Protocol):
@@ -68,3 +71,30 @@ class WindowSubset:
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64 in [0, n)) as one batch."""
         return self.dataset.batch(self.chosen[indices])
+
+
+@torch.no_grad()
+def of_episodes(dataset: WindowDataset, read: Callable[[Batch], Tensor]) -> tuple[Tensor, Tensor]:
+    """Read something of every demonstration's first window.
+
+    A dataset that reads a file knows the last frame of each window's demonstration (`last`). Without it every window
+    counts as a demonstration.
+
+    Args:
+        dataset: Windows, which may be parts or joins of others.
+        read: Function from a batch of B windows to a tensor (B, ...).
+
+    Returns:
+        What was read of each of D demonstrations, (D, ...), and to which of them each window belongs, (W,) int64.
+    """
+    if isinstance(dataset, JoinedWindows):
+        parts = [of_episodes(part, read) for part in dataset.datasets]
+        offsets = torch.tensor([0] + [len(found) for found, _ in parts]).cumsum(0).tolist()
+        moved = [of_window + offset for (_, of_window), offset in zip(parts, offsets, strict=False)]
+        return torch.cat([found for found, _ in parts]), torch.cat(moved)
+    if isinstance(dataset, WindowSubset):
+        found, of_window = of_episodes(dataset.dataset, read)
+        return found, of_window[dataset.chosen.to(of_window.device)]
+    ends, of_window = getattr(dataset, "last", torch.arange(len(dataset))).unique(return_inverse=True)
+    starts = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
+    return torch.cat([read(dataset.batch(indices)) for indices in starts.split(_CHUNK)]), of_window

@@ -1,86 +1,186 @@
-"""Low-rank experts on the layers of a network, mixed differently for every row of a batch.
+"""Low-rank experts on the layers of a network: their parameters, their output, and how a policy gets them.
 
-Shape legend: B batch, G groups of layers, N choices (the base and every expert), Q query, r rank.
+Shape legend: B batch, r rank.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MethodType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.hooks import RemovableHandle
 
-from lifelong.errors import PolicyError
-from lifelong.nn.adapters import check_matches, matches
+from lifelong.errors import CheckpointError, ConfigError, PolicyError
+from lifelong.nn.adapters import check_matches, initial_pair, matches
 
-_GAP = 7.0  # [nat] below the best logit: e^-7 is less than a thousandth of its weight
-_RIDGE = 1e-4  # regularisation of the least squares
+Pair = Mapping[str, Tensor]  # a (r, inputs), b (out, r)
+Add = Callable[[str, nn.Module, Tensor], Tensor | None]  # name of a layer, layer, its input -> what is added
+Encode = Callable[[nn.Module, Callable[..., Tensor], Any], Tensor]  # policy, its own encode, observation
+
+_MARK = "_has_experts"  # attribute of a policy with experts; copies of it have them too
 
 
-class Router(nn.Module):
-    """Network from a query to the coefficients of the experts in every group of layers.
+class ExpertLibrary:
+    """Low-rank pairs of every task, by layer; each pair is A (r, inputs) and B (out, r), both trainable.
 
-    A hidden layer, a key for each choice and group, and a softmax over the `top_k` best choices. Choice 0 is the
-    base alone; experts are appended with `grow`.
-
-    Args:
-        enter: Weight of the hidden layer (hidden, Q).
-        keys: Keys of the choices (N, G, hidden).
-        bias: Biases of the choices (N, G).
-        top_k: Number of choices that share the weight; 0: all.
+    Attributes:
+        pairs: Task -> name of the layer or weight -> `a` and `b`.
+        form: Form of `state`, see `lifelong.checkpoints.check`.
     """
 
-    def __init__(self, *, enter: Tensor, keys: Tensor, bias: Tensor, top_k: int) -> None:
-        super().__init__()
-        self.enter, self.top_k = nn.Parameter(enter), top_k
-        self.keys, self.bias = nn.Parameter(keys), nn.Parameter(bias)
+    form: ClassVar[Any] = {int: {str: {"a": Tensor, "b": Tensor}}}
 
-    def hidden(self, query: Tensor) -> Tensor:
-        """Map queries (B, Q) to the hidden layer's output (B, hidden), float32."""
-        with torch.autocast(query.device.type, enabled=False):
-            return functional.gelu(query.float() @ self.enter.T)
+    def __init__(self) -> None:
+        self.pairs: dict[int, dict[str, dict[str, nn.Parameter]]] = {}
 
-    def logits(self, query: Tensor) -> Tensor:
-        """Map queries (B, Q) to logits (B, G, N), float32."""
-        with torch.autocast(query.device.type, enabled=False):
-            return torch.einsum("bh,ngh->bgn", self.hidden(query), self.keys) + self.bias.T
+    def __bool__(self) -> bool:
+        return bool(self.pairs)
 
-    def forward(self, query: Tensor) -> Tensor:
-        """Map queries (B, Q) to coefficients (B, G, N), which sum to one over N and are zero beyond the best."""
-        logits = self.logits(query)
-        if 0 < self.top_k < logits.shape[-1]:
-            least = logits.topk(self.top_k, dim=-1).values[..., -1:]
-            logits = logits.masked_fill(logits < least, -math.inf)
-        return logits.softmax(-1)
+    def __contains__(self, task: int) -> bool:
+        return task in self.pairs
 
-    @torch.no_grad()
-    def grow(self, count: int, queries: Tensor, earlier: Tensor) -> None:
-        """Append choices whose keys fit two targets by weighted least squares.
+    def __getitem__(self, task: int) -> dict[str, dict[str, nn.Parameter]]:
+        return self.pairs[task]
 
-        On the new task's queries their logit starts equal to that of the best choice, on earlier queries `_GAP`
-        below it. Keys of zero would disturb earlier tasks, and replay would then suppress the new choices on all
-        queries before the router learned to tell these apart.
+    def add(
+        self,
+        task: int,
+        weights: Mapping[str, Tensor],
+        rank: int,
+        draws: torch.Generator,
+        *,
+        count: int = 1,
+        start: int | None = None,
+    ) -> None:
+        """Add a pair for each weight, whose product is zero at first.
 
         Args:
-            count: Number of choices to append.
-            queries: Queries of the new task (B, Q).
-            earlier: Queries of earlier tasks (M, Q).
+            task: Task that learns them.
+            weights: Name -> weight (out, ...), flattened to a matrix.
+            rank: Largest rank; a weight's smaller side where that is less.
+            draws: CPU generator.
+            count: Number of experts in a pair, one below the other.
+            start: Task whose pairs are copied instead; None, or a task without any: none.
         """
-        both = torch.cat([queries, earlier])
-        target = self.logits(both).amax(-1)  # (B + M, G)
-        target[len(queries) :] -= _GAP
-        hidden = functional.pad(self.hidden(both), (0, 1), value=1.0).double()
-        weight = torch.cat([q.new_full((len(q), 1), 1 / max(1, len(q))) for q in (queries, earlier)]).double()
-        gram = hidden.T @ (weight * hidden) + _RIDGE * torch.eye(hidden.shape[1]).to(hidden)
-        solved = torch.linalg.solve(gram, hidden.T @ (weight * target.double())).to(
-            self.keys
-        )  # (hidden + 1, G)
-        keys, bias = solved[:-1].T.expand(count, -1, -1), solved[-1].expand(count, -1)
-        self.keys = nn.Parameter(torch.cat([self.keys, keys]))
-        self.bias = nn.Parameter(torch.cat([self.bias, bias]))
+        if start in self.pairs:
+            copied = {
+                n: {k: nn.Parameter(p.detach().clone()) for k, p in pair.items()}
+                for n, pair in self.pairs[start].items()
+            }
+            self.pairs[task] = copied
+            return
+        self.pairs[task] = {}
+        for name, weight in weights.items():
+            out, inputs = weight.flatten(1).shape
+            a, b = initial_pair(out, inputs, count * min(rank, out, inputs), draws)
+            self.pairs[task][name] = {k: nn.Parameter(t.to(weight.device)) for k, t in (("a", a), ("b", b))}
+
+    def parameters(self, task: int) -> list[nn.Parameter]:
+        """Return a task's A and B."""
+        return [p for pair in self.pairs[task].values() for p in pair.values()]
+
+    def sizes(self) -> dict[int, int]:
+        """Return the number of parameters of each task's pairs."""
+        return {task: sum(p.numel() for p in self.parameters(task)) for task in self.pairs}
+
+    def state(self) -> dict[int, dict[str, dict[str, Tensor]]]:
+        """Return all pairs as tensors."""
+        return {
+            task: {name: {k: p.detach() for k, p in pair.items()} for name, pair in of_task.items()}
+            for task, of_task in self.pairs.items()
+        }
+
+    def load(self, state: Mapping[int, Mapping[str, Pair]]) -> None:
+        """Restore what `state` returned.
+
+        Raises:
+            CheckpointError: A and B of a pair have no common rank.
+        """
+        for name, pair in ((n, pair) for of_task in state.values() for n, pair in of_task.items()):
+            if not (pair["a"].dim() == pair["b"].dim() == 2 and len(pair["a"]) == pair["b"].shape[1]):
+                raise CheckpointError(f"A and B of the experts of {name} do not go together")
+        self.pairs = {
+            task: {name: {k: nn.Parameter(t) for k, t in pair.items()} for name, pair in of_task.items()}
+            for task, of_task in state.items()
+        }
 
 
-def routed_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:
+class Attachment:
+    """Forward hooks on a policy's layers, and another `encode`, as long as they are attached.
+
+    A copy of the policy made meanwhile has them too: they refer to the policy they are called on.
+    """
+
+    def __init__(self) -> None:
+        self._handles: list[RemovableHandle] = []
+
+    def attach(
+        self, policy: nn.Module, layers: Mapping[str, nn.Module], add: Add, encode: Encode | None = None
+    ) -> None:
+        """Add something to the output of layers; do nothing where that is done already.
+
+        Args:
+            policy: Policy with the layers.
+            layers: Layers by name.
+            add: Function that returns what is added, given name, layer and input; None for nothing.
+            encode: Function called in place of `policy.encode`.
+
+        Raises:
+            ConfigError: The policy has no `encode`.
+        """
+        if is_attached(policy):
+            return
+        if encode is not None:
+            own = getattr(type(policy), "encode", None)
+            if own is None:
+                raise ConfigError(
+                    f"{type(policy).__name__} has no encode(observation), by which experts are chosen; use algo=lora"
+                )
+            policy.__dict__["encode"] = MethodType(
+                lambda self_, seen: encode(self_, MethodType(own, self_), seen), policy
+            )
+        policy.__dict__[_MARK] = True
+        self._handles = [layer.register_forward_hook(_hook(name, add)) for name, layer in layers.items()]
+
+    def detach(self, policy: nn.Module) -> None:
+        """Remove what was attached."""
+        for handle in self._handles:
+            handle.remove()
+        self._handles = []
+        policy.__dict__.pop("encode", None)
+        policy.__dict__.pop(_MARK, None)
+
+    @contextmanager
+    def within(
+        self, policy: nn.Module, layers: Mapping[str, nn.Module], add: Add, encode: Encode | None = None
+    ) -> Iterator[None]:
+        """Attach within the context; what was attached before it stays."""
+        before = is_attached(policy)
+        self.attach(policy, layers, add, encode)
+        try:
+            yield
+        finally:
+            if not before:
+                self.detach(policy)
+
+
+def is_attached(policy: nn.Module) -> bool:
+    """Return whether a policy's layers have experts at present."""
+    return _MARK in policy.__dict__
+
+
+def _hook(name: str, add: Add) -> Callable[[nn.Module, Any, Tensor], Tensor]:
+    def hook(layer: nn.Module, args: Any, output: Tensor) -> Tensor:
+        added = add(name, layer, args[0])
+        return output if added is None else output + added
+
+    return hook
+
+
+def adapted_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:
     """Return the linear layers and convolutions whose weight's name matches one of the patterns, by name.
 
     Raises:
@@ -96,37 +196,88 @@ def routed_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Mo
     return {name: layers[name] for name in found}
 
 
-def expert_shape(layer: nn.Module) -> tuple[int, int]:
-    """Return rows and columns of a layer's weight as a matrix."""
-    out, inputs = layer.weight.flatten(1).shape  # type: ignore[operator, union-attr]
-    return out, inputs
+def adaptable_modules(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:
+    """Return the modules whose name matches one of the patterns: feed-forward networks, and layers outside of them.
+
+    A feed-forward network is a sequence of modules with linear layers and no convolution.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    modules: dict[str, nn.Module] = {}
+    for name, module in policy.named_modules():
+        inside = any(name.startswith(f"{other}.") for other in modules)
+        conv = isinstance(module, nn.Conv2d) and module.groups == 1
+        if not inside and (isinstance(module, nn.Linear) or conv or _is_feed_forward(module)):
+            modules[name] = module
+    found = [name for name in modules if matches(name, patterns)]
+    check_matches(found, patterns, list(modules), "feed-forward network, linear layer or convolution")
+    return {name: modules[name] for name in found}
+
+
+def _is_feed_forward(module: nn.Module) -> bool:
+    kinds = [type(part) for part in module] if isinstance(module, nn.Sequential) else []
+    return nn.Linear in kinds and nn.Conv2d not in kinds
+
+
+def matrix_of(module: nn.Module) -> Tensor:
+    """Return a layer's weight; of a feed-forward network an empty tensor (out, inputs) in its place."""
+    if not isinstance(module, nn.Sequential):
+        return module.weight  # type: ignore[return-value]
+    linear = [part for part in module if isinstance(part, nn.Linear)]
+    weight = linear[0].weight
+    return weight.new_zeros(()).expand(linear[-1].out_features, linear[0].in_features)
+
+
+def weights_of(layers: Mapping[str, nn.Module]) -> dict[str, Tensor]:
+    """Return the weight of each layer."""
+    return {name: layer.weight for name, layer in layers.items()}  # type: ignore[misc]
 
 
 def expert_output(
-    layer: nn.Module, x: Tensor, pairs: Sequence[Mapping[str, Tensor]], weights: Tensor
+    layer: nn.Module, x: Tensor, pairs: Iterable[Pair], weights: Tensor | None = None, *, relu: bool = False
 ) -> Tensor:
-    """Return what the experts add to a layer's output: `sum_i c_i B_i A_i x`, another mixture for each row.
+    """Return what experts add to a layer's output, `sum_i c_i B_i A_i x`, another mixture for each row.
 
     Args:
-        layer: Linear layer or convolution.
+        layer: Linear layer, convolution, or feed-forward network.
         x: Input of the layer; the first axis has B rows, or a multiple with the rows of one sample adjacent.
-        pairs: For the experts of each task, `a` (experts r, inputs) and `b` (out, experts r).
-        weights: Coefficients c, each repeated r times, (B, sum of experts r).
+        pairs: Pairs of experts, of r ranks together.
+        weights: Coefficients c, each repeated by its expert's rank, (B, r); None: all 1.
+        relu: Whether a ReLU lies between A and B.
 
     Raises:
         PolicyError: The first axis is no multiple of B.
     """
-    rows, samples = len(x), len(weights)
-    if rows % samples:
-        raise PolicyError(
-            f"a layer has {rows} rows for {samples} samples: rows cannot be assigned to samples"
-        )
-    a, b = torch.cat([p["a"] for p in pairs]), torch.cat([p["b"] for p in pairs], dim=1)
-    weights = weights.repeat_interleave(rows // samples, dim=0)
+    a, b = (
+        torch.cat(parts, dim=dim)
+        for dim, parts in enumerate(zip(*((p["a"], p["b"]) for p in pairs), strict=True))
+    )
     if isinstance(layer, nn.Conv2d):
         kernel = a.view(len(a), *layer.weight.shape[1:])
         h = functional.conv2d(x, kernel, None, layer.stride, layer.padding, layer.dilation)
-        return functional.conv2d(h * weights[:, :, None, None].to(h.dtype), b[:, :, None, None])
-    h = functional.linear(x, a)
-    shape = (rows, *[1] * (h.dim() - 2), h.shape[-1])
-    return functional.linear(h * weights.view(shape).to(h.dtype), b)
+    else:
+        h = functional.linear(x, a)
+    if relu:
+        h = functional.relu(h)
+    if weights is not None:
+        rows = weights.repeat_interleave(rows_per_sample(x, len(weights)), dim=0)
+        axis = 1 if isinstance(layer, nn.Conv2d) else h.dim() - 1
+        shape = [len(rows) if i == 0 else len(a) if i == axis else 1 for i in range(h.dim())]
+        h = h * rows.view(shape).to(h.dtype)
+    return (
+        functional.conv2d(h, b[:, :, None, None]) if isinstance(layer, nn.Conv2d) else functional.linear(h, b)
+    )
+
+
+def rows_per_sample(x: Tensor, samples: int) -> int:
+    """Return how many rows of a layer's input belong to each of B samples.
+
+    Raises:
+        PolicyError: The first axis is no multiple of B.
+    """
+    if len(x) % samples:
+        raise PolicyError(
+            f"a layer has {len(x)} rows for {samples} samples: rows cannot be assigned to samples"
+        )
+    return len(x) // samples

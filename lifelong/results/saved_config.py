@@ -74,6 +74,7 @@ _POLICIES = {
 }
 _ER, _AGEM = "lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM"
 _EWC, _PACKNET = "lifelong.algorithms.ewc.EWC", "lifelong.algorithms.packnet.PackNet"
+_DMPEL = "lifelong.algorithms.dmpel.DMPEL"
 _REPLAY = {_ER, _AGEM}
 
 
@@ -169,6 +170,8 @@ def upgrade_algorithm(node: Mapping[str, Any]) -> Node:
         node: The `algo` node; nodes of other algorithms and of today come back unchanged.
     """
     target = str(node.get("_target_"))
+    if target == _DMPEL:  # its weights of earlier versions are refused when they are loaded
+        return {key: value for key, value in node.items() if key != "replay"}
     if target not in _REPLAY | {_EWC, _PACKNET} or {"memory", "estimator", "masks_only"} & set(node):
         return dict(node)
     upgraded = dict(node)

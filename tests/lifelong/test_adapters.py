@@ -9,10 +9,12 @@ from torch import nn
 
 from lifelong import checkpoints
 from lifelong.algorithms import DMPEL, LoRA
+from lifelong.algorithms.base import load_algorithm
 from lifelong.algorithms.dmpel import _padded
-from lifelong.data.windows import WindowSubset
-from lifelong.errors import ConfigError, PolicyError
-from lifelong.nn.experts import Router, expert_output
+from lifelong.data.windows import WindowSubset, of_episodes
+from lifelong.errors import CheckpointError, ConfigError, PolicyError
+from lifelong.nn.experts import expert_output
+from lifelong.nn.routing import SigmoidRouter
 from lifelong.seeding import generator, seeded
 from lifelong.sequence.stages import TrainingPhase
 from lifelong.streams import StageWindows
@@ -24,7 +26,10 @@ from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn,
 from tests.harness.fakes import DeepPolicy, Windows
 from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
-ALL = {"lora": lambda: LoRA(rank=2, alpha=4.0), "dmpel": lambda: DMPEL(rank=2, alpha=4.0, pool=2)}
+ALL = {
+    "lora": lambda: LoRA(rank=2, alpha=4.0),
+    "dmpel": lambda: DMPEL(rank=2, alpha=4.0, pool=2, recall_steps=20),
+}
 POLICIES = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}
 SMALL = FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32")
 
@@ -101,6 +106,7 @@ def test_the_weights_kept_are_those_of_the_best_epoch(harness, tmp_path, make, m
     kept = {}
     monkeypatch.setitem(sequences.ALGORITHMS, "this", make)
     p = harness.run_context(tmp_path, "this")
+    p.algorithm.recall_steps = 0  # recall changes the router after the task
     sequence = harness.sequence(p)
     evaluate = sequence._evaluate
 
@@ -208,7 +214,7 @@ def test_lora_gradients_are_those_of_the_factors():
     policy.dropout.p = 0.0
     for task in (0, 1):
         learn(algorithm, policy, task)
-    pair = algorithm._pairs[1]["head.weight"]
+    pair = algorithm._library[1]["head.weight"]
     a, b = (pair[k].detach().clone().requires_grad_() for k in "ab")
     policy.eval()
     hidden = []
@@ -304,36 +310,32 @@ def test_dmpel_changes_each_sample_by_its_own_weights(layer):
         expert_output(layer, x[:5], tasks, c.repeat_interleave(2, dim=1))
 
 
-def test_dmpel_coefficients_are_shares_of_the_best_choices():
-    draws = generator(1)
-    sizes = {"enter": (8, 5), "keys": (6, 2, 8), "bias": (6, 2)}
-    router = Router(**{k: torch.randn(v, generator=draws) for k, v in sizes.items()}, top_k=3)
-    query = torch.randn(10, 5, generator=draws)
-    c = router(query)
-    torch.testing.assert_close(c.sum(-1), torch.ones(10, 2))
-    assert ((c > 0).sum(-1) == 3).all()
-    assert torch.equal(c.argmax(-1), router.logits(query).argmax(-1))
+def small_router(experts: int, top_k: int, seed: int = 1) -> SigmoidRouter:
+    return SigmoidRouter.new(5, 8, 2, experts, top_k, generator(seed))
 
 
-def test_dmpel_new_choices_start_equal_on_new_contexts_and_low_on_earlier_ones():
-    """Contexts of a task differ little, those of two tasks in a few entries."""
-    draws = generator(1)
-    sizes = {"enter": (32, 50), "keys": (3, 2, 32), "bias": (3, 2)}
-    router = Router(**{k: 0.2 * torch.randn(v, generator=draws) for k, v in sizes.items()}, top_k=0)
-    tasks = torch.randn(50, generator=draws) + 0.5 * torch.randn(3, 1, 50, generator=draws)
-    new, *old = tasks + 0.05 * torch.randn(3, 20, 50, generator=draws)
-    earlier = torch.cat(old)
-    before = router(earlier)
-    router.grow(2, new, earlier)
-    assert router.keys.shape[0] == 5
-    gap = router.logits(new)[..., 3:] - router.logits(new)[..., :3].amax(-1, keepdim=True)
-    assert gap.abs().max() < 0.5
-    assert (router(earlier)[..., :3] - before).abs().max() < 0.03
-    torch.testing.assert_close(router.keys[3], router.keys[4])
+def test_dmpel_coefficients_are_those_of_the_best_experts_and_start_at_equal_shares():
+    router, query = small_router(6, 3), torch.randn(10, 5, generator=generator(2))
+    every, c = router.coefficients(query), router(query)
+    assert c.shape == (10, 2, 6) and ((c > 0).sum(-1) == 3).all()
+    assert torch.equal(c[c > 0], every[c > 0]) and (c.amin(-1) == 0).all()
+    assert torch.equal(c.argmax(-1), every.argmax(-1))
+    assert (every - 1 / 3).abs().max() < 0.1
+    assert (small_router(1, 3)(query) - 1).abs().max() < 0.2, "a single expert starts at its whole weight"
+
+
+def test_dmpel_experts_do_not_compete():
+    """The coefficient of an expert does not depend on the logit of another, as it would in a softmax."""
+    router, query = small_router(3, 0), torch.randn(10, 5, generator=generator(2))
+    before = router(query)
+    with torch.no_grad():
+        router.bias[:, 0] += 5
+    assert torch.equal(router(query)[..., 1:], before[..., 1:])
+    assert (router(query)[..., 0] > before[..., 0]).all()
 
 
 def test_dmpel_new_experts_start_at_zero_and_old_ones_never_change():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
     learn_small(algorithm, policy, 0)
     base, kept = copy.deepcopy(policy.state_dict()), {}
     begun = copy.deepcopy(algorithm)
@@ -351,22 +353,50 @@ def test_dmpel_new_experts_start_at_zero_and_old_ones_never_change():
     sequences.assert_same(dict(policy.state_dict()), dict(base))
 
 
-def test_dmpel_replay_keeps_the_coefficients_of_earlier_tasks():
-    drift, settings = {}, dataclasses.replace(SMALL, batch_size=2, epochs=1, steps_per_epoch=40)
-    for replay in (0.0, 10.0):
-        policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, replay=replay)
-        for task in range(3):
-            learn_small(algorithm, policy, task, settings)
+LONG = dataclasses.replace(SMALL, batch_size=4, epochs=2, steps_per_epoch=60, lr=2e-3)
+
+
+def test_dmpel_recall_keeps_the_coefficients_of_earlier_tasks():
+    drift = {}
+    for steps in (0, 1000):
+        policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=steps)
+        for task in range(4):
+            learn_small(algorithm, policy, task, LONG)
         memory = algorithm.state_dict()["memory"]
         now = {t: algorithm._router(m["queries"]) for t, m in memory.items()}
-        gaps = {t: (_padded(memory[t]["coefficients"], now[t]) - now[t]).abs().max().item() for t in now}
-        assert gaps[2] == 0
-        drift[replay] = max(gaps.values())
-    assert drift[10.0] < 0.05 < 0.1 < drift[0.0], drift
+        drift[steps] = max(
+            (_padded(memory[t]["coefficients"], 3) - now[t]).abs().max().item() for t in memory
+        )
+    assert drift[1000] < 0.1 < 0.3 < drift[0], drift
+
+
+def test_dmpel_the_newest_expert_stays_alive():
+    """At the end of the third task with an expert, it still counts, and its B still moves."""
+    policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=20)
+    for task in range(3):
+        learn_small(algorithm, policy, task, LONG)
+    algorithm.begin_task(3, sequences.dataset(3), policy)
+    fit(policy, sequences.dataset(3), algorithm, settings=LONG, seed=(3, 0))
+    assert algorithm._router(algorithm._episodes["queries"])[..., -1].min() > 0.1
+    policy.loss(algorithm.mix(everything(3), generator(0))).backward()
+    assert all(pair["b"].grad.abs().max() > 0 for pair in algorithm._library[3].values())
+
+
+def test_dmpel_of_earlier_versions_is_refused_in_a_line(tmp_path):
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
+    for task in (0, 1):
+        learn_small(algorithm, policy, task)
+    router = {"enter": torch.zeros(8, 24), "keys": torch.zeros(2, 3, 8), "bias": torch.zeros(2, 3)}
+    state = algorithm.state_dict() | {"router": router}
+    with pytest.raises(CheckpointError, match=r"softmax of earlier versions.*resume=false") as error:
+        load_algorithm(
+            DMPEL(rank=2, pool=2, recall_steps=20), state, {}, policy, tmp_path / "task_1.safetensors"
+        )
+    assert "\n" not in str(error.value)
 
 
 def test_dmpel_routes_by_the_first_frame_of_a_demonstration():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
     for task in (0, 1):
         learn_small(algorithm, policy, task)
     algorithm.begin_task(2, sequences.dataset(2), policy)
@@ -382,7 +412,8 @@ def test_dmpel_routes_by_the_first_frame_of_a_demonstration():
 def test_dmpel_finds_demonstrations_in_composed_datasets():
     algorithm, parts = DMPEL(pool=2), [sequences.dataset(t) for t in (0, 1)]
     some = WindowSubset(parts[1], torch.tensor([3, 12, 15]))
-    queries, of_window = algorithm._contexts(StageWindows([parts[0], some], 1))
+    read = lambda batch: algorithm.query(batch.observation)  # noqa: E731
+    queries, of_window = of_episodes(StageWindows([parts[0], some], 1), read)
     expected = [0] * 10 + [1] * 10 + [2, 3, 3]
     assert of_window.tolist() == expected
     starts = [parts[k // 2].batch(torch.tensor([10 * (k % 2)])).observation for k in range(4)]
@@ -390,7 +421,7 @@ def test_dmpel_finds_demonstrations_in_composed_datasets():
 
 
 def test_dmpel_copies_of_a_policy_in_training_mix_experts_of_their_own_weights():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
     for task in (0, 1):
         learn_small(algorithm, policy, task)
     with algorithm.policy_for(1, policy) as acting, torch.no_grad():
@@ -405,7 +436,7 @@ def test_dmpel_copies_of_a_policy_in_training_mix_experts_of_their_own_weights()
 @pytest.mark.parametrize("head", ["gmm", "flow"])
 def test_dmpel_acts_as_it_was_trained(kind, head):
     """The frames of a demonstration one by one give what its first window gives; and rows do not mix."""
-    policy, algorithm = make_policy(kind, head), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(kind, head), DMPEL(rank=2, pool=2, recall_steps=20)
     policy.stochastic = False
     for task in (0, 1, 2):
         learn_small(algorithm, policy, task)
@@ -435,7 +466,7 @@ def frame(observation: Observation, step: int) -> Observation:
 
 
 def test_dmpel_routes_once_in_an_episode():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
     for task in (0, 1):
         learn_small(algorithm, policy, task)
     observation, seen = everything(1).rows(slice(0, 3)).observation, []
@@ -451,7 +482,7 @@ def test_dmpel_routes_once_in_an_episode():
 
 
 def test_dmpel_leaves_the_policy_as_it_was():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
     for task in (0, 1):
         learn_small(algorithm, policy, task)
     plain = make_policy().eval()
@@ -466,7 +497,7 @@ def test_dmpel_leaves_the_policy_as_it_was():
 
 
 def test_dmpel_needs_no_task_number():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2)
+    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
     for task in (0, 1, 2):
         learn_small(algorithm, policy, task)
     predicted = []
@@ -478,9 +509,7 @@ def test_dmpel_needs_no_task_number():
 
 def test_policies_that_dmpel_cannot_route_are_named():
     policy, algorithm = DeepPolicy(), DMPEL()
-    algorithm._router = Router(
-        enter=torch.zeros(1, 1), keys=torch.zeros(1, 1, 1), bias=torch.zeros(1, 1), top_k=0
-    )
+    algorithm._router = small_router(1, 0)
     with pytest.raises(ConfigError, match="DeepPolicy has no encode"), algorithm.policy_for(0, policy):
         pass
 
