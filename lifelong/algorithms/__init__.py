@@ -2,6 +2,7 @@
 
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.algorithms.compressed_er import CompressedER
 from lifelong.algorithms.derpp import DERpp
 from lifelong.algorithms.dmpel import DMPEL
 from lifelong.algorithms.er import ER
@@ -9,6 +10,7 @@ from lifelong.algorithms.ewc import EWC
 from lifelong.algorithms.lora import LoRA
 from lifelong.algorithms.lwf import LwF
 from lifelong.algorithms.mas import MAS
+from lifelong.algorithms.mlr import MLR
 from lifelong.algorithms.multitask import Multitask
 from lifelong.algorithms.packnet import PackNet
 from lifelong.algorithms.sequential import Sequential
@@ -21,8 +23,10 @@ __all__ = [
     "ER",
     "EWC",
     "MAS",
+    "MLR",
     "SI",
     "Algorithm",
+    "CompressedER",
     "DERpp",
     "LoRA",
     "LwF",

@@ -13,6 +13,21 @@ from lifelong.types import Batch, Count
 MEMORY_FORM = {"budget": int, "indices": {str: Tensor}}  # see `lifelong.checkpoints.check`
 
 
+def even_shares(sizes: Mapping[int, int], budget: int) -> dict[int, int]:
+    """Return each task's share of a budget: equal ones, where what small tasks do not need is given to the others.
+
+    Args:
+        sizes: What each task needs at most, by task id.
+        budget: Sum of the shares at most.
+    """
+    shares, left = {}, budget
+    tasks = sorted(sizes, key=lambda task: (sizes[task], task))
+    for position, task in enumerate(tasks):
+        shares[task] = min(sizes[task], left // (len(tasks) - position))
+        left -= shares[task]
+    return shares
+
+
 class ReplayMemory:
     """A uniform sample of the windows of each past task, within one budget.
 
@@ -62,11 +77,8 @@ class ReplayMemory:
 
     def _shrink(self) -> None:
         """Reduce every task to its share; what small tasks do not need is given to the others."""
-        left, tasks = self.budget, sorted(self._indices, key=lambda t: (len(self._indices[t]), t))
-        for position, task in enumerate(tasks):
-            share = min(len(self._indices[task]), left // (len(tasks) - position))
+        for task, share in even_shares(self.shares, self.budget).items():
             self._indices[task] = self._indices[task][:share].clone()
-            left -= share
 
     def sample(self, n: int, generator: torch.Generator) -> Batch:
         """Return windows drawn uniformly over all that are held, those of one task after those of another.

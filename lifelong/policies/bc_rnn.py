@@ -71,7 +71,8 @@ class BCRNN(HistoryPolicy):
             proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
         )
         readings = sum(spec.proprio.values())
-        self.rnn: nn.LSTM = temporal(in_dim=image_embed * len(spec.views) + text_embed + readings)
+        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
+        self.rnn: nn.LSTM = temporal(in_dim=sum(self._sizes.values()))
         self.head = self.build_head(head, in_dim=self.rnn.hidden_size)
         self._state: tuple[Tensor, Tensor] | None = None  # each (layers, B, hidden)
         self._age = 0  # steps that the state has seen
@@ -89,6 +90,11 @@ class BCRNN(HistoryPolicy):
         parts.append(self.language(language)[:, None].expand(b, t, -1))
         parts += self.proprio(observation.proprio).values()
         return torch.cat(parts, dim=-1)
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the parts (B, T, ...) of each camera, the instruction and the readings; see `HistoryPolicy`."""
+        parts = dict(zip(self._sizes, features.split(list(self._sizes.values()), dim=-1), strict=True))
+        return {name: part for name, part in parts.items() if part.shape[-1]}
 
     def over_time(self, features: Tensor) -> Tensor:
         """Map features (B, T, F) to the LSTM's outputs, (B, T, hidden), from an empty state."""

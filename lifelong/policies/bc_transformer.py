@@ -77,6 +77,13 @@ class BCTransformer(HistoryPolicy):
             tokens.append(latent.view(b, t, 1, -1))
         return torch.cat(tokens, dim=2)
 
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the tokens (B, T, M, E) of the instruction, the readings and each camera; see `HistoryPolicy`."""
+        proprio = features[:, :, 1 : 1 + len(self.spec.proprio)]
+        rest = features[:, :, 1 + len(self.spec.proprio) :]
+        views = dict(zip(self.spec.views, rest.split(1, dim=2), strict=True))
+        return {"language": features[:, :, :1]} | ({"proprio": proprio} if self.spec.proprio else {}) | views
+
     def over_time(self, features: Tensor) -> Tensor:
         """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
         return self.transformer(features)[:, :, 0]

@@ -92,6 +92,12 @@ class BCViLT(HistoryPolicy):
             tokens.append(self.proprio(observation.proprio))
         return torch.cat([*tokens, seen.view(b, t, 1, -1)], dim=2)
 
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the tokens (B, T, M, E) of the instruction, the readings and all cameras; see `HistoryPolicy`."""
+        proprio = features[:, :, 1 : 1 + len(self.spec.proprio)]
+        views = {"images": features[:, :, 1 + len(self.spec.proprio) :]}
+        return {"language": features[:, :, :1]} | ({"proprio": proprio} if self.spec.proprio else {}) | views
+
     def over_time(self, features: Tensor) -> Tensor:
         """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
         return self.transformer(features)[:, :, 0]

@@ -47,6 +47,23 @@ class HistoryPolicy(Policy):
     def encode(self, observation: Observation) -> Tensor:
         """Return the features of every frame by itself, (B, T, ...)."""
 
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the parts of `encode`'s features by what they tell of, each (B, T, ...); together they are all.
+
+        They are called `language`, `proprio` (where there is any), and after the views, or `images` where those are
+        mixed; the view that is named first comes first.
+
+        Args:
+            features: Features (B, T, ...).
+
+        Raises:
+            PolicyError: The policy does not implement it.
+        """
+        raise PolicyError(
+            f"{type(self).__name__} has no modalities(features), which algorithms that distil features need: "
+            "implement it, or choose another algorithm"
+        )
+
     @abstractmethod
     def over_time(self, features: Tensor) -> Tensor:
         """Map features (B, T, ...) to latents (B, T, E), each computed from its own frame and earlier ones."""
@@ -115,3 +132,17 @@ class HistoryPolicy(Policy):
             features = torch.cat([self._history, features], dim=1)
         self._history = features[:, -self.memory_steps :]
         return self.over_time(self._history)[:, -1]
+
+
+def with_features(policy: Policy) -> HistoryPolicy:
+    """Return a policy that has features of frames, for an algorithm that needs them.
+
+    Raises:
+        PolicyError: It has none.
+    """
+    if not isinstance(policy, HistoryPolicy):
+        raise PolicyError(
+            f"{type(policy).__name__} has no encode, over_time and head, which this algorithm needs: derive it from "
+            "HistoryPolicy, or choose another algorithm"
+        )
+    return policy

@@ -1,0 +1,64 @@
+"""Experience replay from a memory of compressed frames."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.compressed_memory import COMPRESSED_FORM, CompressedMemory
+from lifelong.data.compressed_windows import Quality
+from lifelong.data.windows import TaskWindows
+from lifelong.policies.base import Policy
+from lifelong.types import Batch, Count, NonNegative
+
+
+class CompressedER(Algorithm):
+    """Replay as `ER` does, from windows whose frames are kept as small pictures, within a number of bytes.
+
+    The loss and the draws are those of experience replay (Chaudhry et al. 2019): `ratio` windows of earlier tasks join
+    each of the batch. What differs is what is kept. `CompressedMemory` has the frames themselves, as WebP of a
+    twentieth of their size, so the state is all that later tasks need: demonstrations of earlier tasks may be gone.
+    """
+
+    state_form = {"memory": COMPRESSED_FORM}
+
+    def __init__(
+        self,
+        *,
+        budget: Count = 9_500_000,
+        quality: Quality = 60,
+        ratio: NonNegative = 1.0,
+        keep_decoded: bool = True,
+    ):
+        """Create the algorithm.
+
+        Args:
+            budget: Largest number of bytes kept over all tasks.
+            quality: Quality of the pictures, that of WebP.
+            ratio: Number of windows replayed for each window of the present task; 1 doubles the batch.
+            keep_decoded: Whether decoded frames stay in the process's memory while a task is learned; see
+                `CompressedMemory`.
+        """
+        self.memory, self.ratio = CompressedMemory(budget, quality, keep_decoded), ratio
+
+    def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Return the batch followed by `ratio` times as many windows of earlier tasks."""
+        if not len(self.memory):
+            return batch
+        replayed = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
+        return batch.join(replayed.to(batch.actions.device))
+
+    def end_task(
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Compress the task's share of windows."""
+        self.memory.add(dataset, generator)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the compressed windows."""
+        return {"memory": self.memory.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned; no dataset is read."""
+        self.memory.load_state_dict(state["memory"])

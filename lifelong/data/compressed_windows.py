@@ -1,0 +1,270 @@
+"""Windows of a task with their frames as small pictures.
+
+Shape legend: F frames, N windows, K instructions, T time, V views, H W C image, D size of a reading, A action, L
+language embedding.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from PIL import Image
+from pydantic import Field
+from torch import Tensor
+
+from lifelong.data.windows import TaskWindows
+from lifelong.errors import DataError
+from lifelong.types import Batch, Observation
+
+Quality = Annotated[int, Field(ge=0, le=100)]  # of WebP
+
+_TENSORS = ("codes", "ends", "actions", "frames", "window_ids", "languages", "language_ids")
+WINDOWS_FORM = {  # see `lifelong.checkpoints.check`
+    **dict.fromkeys(_TENSORS, Tensor),
+    "proprio": {str: Tensor},
+    **dict.fromkeys(("task_id", "total", "views", "height", "width"), int),
+}
+
+_CHUNK = 16  # windows that are read and compressed at a time
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedWindows:
+    """Windows of a task whose frames are compressed.
+
+    A frame is one WebP picture of all views, one above the other. Frames are numbered in the order in which windows
+    use them first, so the first windows need the first frames only.
+
+    Attributes:
+        codes: WebP files of the frames, one after the other, (bytes,) uint8.
+        ends: End of each frame's file in `codes`, (F,) int32.
+        proprio: Name to (F, D) float32.
+        actions: (F, A) float32.
+        frames: Frame at each step of each window, (N, T) int32.
+        window_ids: Index of each window in its task's dataset, (N,) int32.
+        languages: Embeddings of the instructions, (K, L) float32.
+        language_ids: Instruction of each window, (N,) int32.
+        task_id: Position in the task sequence.
+        total: Number of windows of the task, of which these are a part.
+        views: V.
+        height: H, pixels.
+        width: W, pixels.
+    """
+
+    codes: Tensor
+    ends: Tensor
+    proprio: Mapping[str, Tensor]
+    actions: Tensor
+    frames: Tensor
+    window_ids: Tensor
+    languages: Tensor
+    language_ids: Tensor
+    task_id: int
+    total: int
+    views: int
+    height: int
+    width: int
+
+    def __len__(self) -> int:
+        """Return the number of windows, N."""
+        return len(self.frames)
+
+    def nbytes(self) -> int:
+        """Return the number of bytes of all tensors."""
+        return sum(t.nbytes for t in (*(getattr(self, name) for name in _TENSORS), *self.proprio.values()))
+
+    def within(self, budget: int) -> "CompressedWindows":
+        """Return the first windows, as many as have at most `budget` bytes together."""
+        last = self.frames.amax(1).cummax(0).values.long()  # (N,) last frame that the first windows need
+        per_frame = self.ends.itemsize + sum(4 * x.shape[1] for x in (self.actions, *self.proprio.values()))
+        per_window = 4 * (self.frames.shape[1] + 2)
+        sizes = self.ends.long()[last] + (last + 1) * per_frame + torch.arange(1, len(last) + 1) * per_window
+        return self._first(int((sizes + self.languages.nbytes <= budget).sum()), last)
+
+    def _first(self, windows: int, last: Tensor) -> "CompressedWindows":
+        frames = int(last[windows - 1]) + 1 if windows else 0
+        part = {
+            name: getattr(self, name)[:windows].clone() for name in ("frames", "window_ids", "language_ids")
+        }
+        part |= {name: getattr(self, name)[:frames].clone() for name in ("ends", "actions")}
+        part["codes"] = self.codes[: int(self.ends[frames - 1]) if frames else 0].clone()
+        return replace(self, proprio={k: v[:frames].clone() for k, v in self.proprio.items()}, **part)
+
+    def pictures(self, frames: Tensor) -> Tensor:
+        """Decode frames (n,), -> (n, V, H, W, C) uint8.
+
+        Raises:
+            DataError: A file is no WebP picture of the views' size.
+        """
+        out = np.empty((len(frames), self.views * self.height, self.width, 3), np.uint8)
+        codes = self.codes.numpy()
+        for row, frame in enumerate(frames.tolist() if self.views else ()):
+            start = int(self.ends[frame - 1]) if frame else 0
+            out[row] = _decode(codes[start : int(self.ends[frame])].tobytes(), out.shape[1:])
+        return torch.from_numpy(out).view(len(frames), self.views, self.height, self.width, 3)
+
+    def batch(self, indices: Tensor, decoded: Tensor | None = None) -> Batch:
+        """Return the windows of the given indices, (B,) int64 in [0, N), as one batch.
+
+        Args:
+            indices: The windows.
+            decoded: All frames of `pictures`, if they are decoded already.
+        """
+        frames = self.frames[indices].long()
+        if decoded is None:
+            needed, places = frames.unique(return_inverse=True)
+            images = self.pictures(needed)[places]
+        else:
+            images = decoded[frames]
+        observation = Observation(
+            images,
+            {name: readings[frames] for name, readings in self.proprio.items()},
+            self.languages[self.language_ids[indices].long()],
+        )
+        tasks = torch.full((len(indices),), self.task_id, dtype=torch.int64)
+        return Batch(observation, self.actions[frames], tasks, self.window_ids[indices].long())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all attributes, as tensors and numbers."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**values, "proprio": dict(self.proprio)}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "CompressedWindows":
+        """Return the windows that have a state, on the CPU.
+
+        Raises:
+            DataError: Its parts contradict each other.
+        """
+        tensors = {name: state[name].cpu() for name in _TENSORS}
+        proprio = {name: values.cpu() for name, values in state["proprio"].items()}
+        windows = cls(**{**state, **tensors, "proprio": proprio})
+        if not windows._is_whole():
+            raise DataError(f"the compressed windows of task {windows.task_id} contradict each other")
+        return windows
+
+    def _is_whole(self) -> bool:
+        """Return whether kinds and lengths of the tensors fit together, and indices are within what they count."""
+        lengths = self.ends.diff(prepend=self.ends.new_zeros(1))
+        per_frame, per_window = (self.actions, *self.proprio.values()), (self.window_ids, self.language_ids)
+        return (
+            self.codes.dtype == torch.uint8
+            and self.codes.dim() == self.ends.dim() == 1
+            and self.frames.dim() == self.languages.dim() == 2
+            and all(x.dtype == torch.int32 for x in (self.ends, self.frames, *per_window))
+            and all(x.is_floating_point() and x.dim() == 2 and len(x) == len(self.ends) for x in per_frame)
+            and all(x.dim() == 1 and len(x) == len(self) for x in per_window)
+            and min(len(self), self.height, self.width) > 0
+            and min(self.views, int(lengths.min())) >= 0
+            and int(self.ends[-1]) == len(self.codes)
+            and _are_below(self.frames, len(self.ends))
+            and _are_below(self.language_ids, len(self.languages))
+        )
+
+
+class _Packer:
+    """Collects windows, and each of their frames once.
+
+    Frames are told apart by their content, so it does not matter how a dataset's windows overlap.
+    """
+
+    def __init__(self, quality: int):
+        self.quality, self.nbytes = quality, 0
+        self.seen: dict[bytes, int] = {}
+        self.instructions: dict[bytes, int] = {}
+        self.codes: list[bytes] = []
+        self.rows: dict[str, list[Tensor]] = {}
+
+    def add(self, batch: Batch) -> None:
+        """Add windows, on the CPU."""
+        observation = batch.observation
+        for window in range(len(batch)):
+            frames = [self._frame(batch, window, step) for step in range(batch.actions.shape[1])]
+            words = observation.language[window].numpy().tobytes()
+            if words not in self.instructions:
+                self.instructions[words] = len(self.instructions)
+                self._keep("languages", observation.language[window])
+            self._keep("frames", torch.tensor(frames, dtype=torch.int32))
+            self._keep("window_ids", batch.window_ids[window].int())
+            self._keep("language_ids", torch.tensor(self.instructions[words], dtype=torch.int32))
+
+    def _frame(self, batch: Batch, window: int, step: int) -> int:
+        """Return the number of a frame, which is compressed if it is new."""
+        observation = batch.observation
+        image, action = observation.images[window, step].numpy(), batch.actions[window, step]
+        readings = {name: values[window, step] for name, values in observation.proprio.items()}
+        content = b"".join(
+            x.tobytes() for x in (image, action.numpy(), *(r.numpy() for r in readings.values()))
+        )
+        if content not in self.seen:
+            self.seen[content] = len(self.seen)
+            self.codes.append(_encode(image, self.quality))
+            self.nbytes += len(self.codes[-1])
+            self._keep("actions", action)
+            for name, reading in readings.items():
+                self._keep(f"proprio/{name}", reading)
+        return self.seen[content]
+
+    def _keep(self, name: str, row: Tensor) -> None:
+        self.rows.setdefault(name, []).append(row.clone())
+
+    def windows(self, like: Batch, total: int) -> CompressedWindows:
+        """Return what was collected, of `total` windows; the names and sizes are those of a batch."""
+        stacked = {name: torch.stack(rows) for name, rows in self.rows.items()}
+        views, height, width = like.observation.images.shape[2:5]
+        return CompressedWindows(
+            codes=torch.from_numpy(np.frombuffer(b"".join(self.codes), np.uint8).copy()),
+            ends=torch.tensor([len(code) for code in self.codes]).cumsum(0).int(),
+            proprio={name: stacked.pop(f"proprio/{name}") for name in like.observation.proprio},
+            task_id=int(like.task_ids[0]),
+            total=total,
+            views=views,
+            height=height,
+            width=width,
+            **stacked,
+        )
+
+
+def compress(dataset: TaskWindows, order: Tensor, budget: int, quality: Quality) -> CompressedWindows:
+    """Compress a task's windows, as many as have at most `budget` bytes together.
+
+    Args:
+        dataset: Windows of the task.
+        order: Indices of its windows, (n,) int64; the first ones are kept.
+        budget: Largest number of bytes.
+        quality: Quality of WebP.
+    """
+    packer, first = _Packer(quality), dataset.batch(order[:1])
+    for indices in order.split(_CHUNK):
+        packer.add(dataset.batch(indices).to("cpu"))
+        if packer.nbytes > budget:
+            break
+    return packer.windows(first, len(dataset)).within(budget)
+
+
+def _encode(image: np.ndarray, quality: int) -> bytes:
+    """Return a frame's views (V, H, W, C), one above the other, as a WebP file; nothing of no views."""
+    if not len(image):
+        return b""
+    file = io.BytesIO()
+    Image.fromarray(image.reshape(-1, *image.shape[2:])).save(file, "WEBP", quality=quality)
+    return file.getvalue()
+
+
+def _decode(code: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the picture (height, width, 3) in a WebP file; raise DataError if there is none of this shape."""
+    try:
+        with Image.open(io.BytesIO(code), formats=["WEBP"]) as picture:
+            if (picture.height, picture.width, 3) == shape:
+                return np.asarray(picture.convert("RGB"))
+            found = f"{picture.width} x {picture.height} pixels"
+    except (OSError, ValueError) as error:
+        found = f"no picture ({error})"
+    raise DataError(f"a frame in the memory has {found}; expected {shape[1]} x {shape[0]} pixels")
+
+
+def _are_below(indices: Tensor, size: int) -> bool:
+    return int(indices.min()) >= 0 and int(indices.max()) < size
