@@ -1,6 +1,7 @@
 """Lifelong-learning algorithms: what each adds to the one training loop, one class per file."""
 
 from lifelong.algorithms.agem import AGEM
+from lifelong.algorithms.averaging import Averaging
 from lifelong.algorithms.base import Algorithm, Phase
 from lifelong.algorithms.compressed_er import CompressedER
 from lifelong.algorithms.derpp import DERpp
@@ -12,6 +13,7 @@ from lifelong.algorithms.lwf import LwF
 from lifelong.algorithms.mas import MAS
 from lifelong.algorithms.mlr import MLR
 from lifelong.algorithms.multitask import Multitask
+from lifelong.algorithms.omla import OMLA
 from lifelong.algorithms.packnet import PackNet
 from lifelong.algorithms.sequential import Sequential
 from lifelong.algorithms.si import SI
@@ -24,8 +26,10 @@ __all__ = [
     "EWC",
     "MAS",
     "MLR",
+    "OMLA",
     "SI",
     "Algorithm",
+    "Averaging",
     "CompressedER",
     "DERpp",
     "LoRA",

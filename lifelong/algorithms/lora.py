@@ -88,7 +88,7 @@ class LoRA(Algorithm):
         draws = torch.Generator().manual_seed(self._seed)
         adapted = {name: base for name, base in self._base.items() if not matches(name, self.own)}
         self._library.add(task_index, adapted, self.rank, draws)
-        _put(policy, self._base)
+        put_weights(policy, self._base)
         policy.zero_grad()  # the optimiser, which does it at each step, no longer has the matrices
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
@@ -125,7 +125,7 @@ class LoRA(Algorithm):
     def after_step(self, policy: Policy) -> None:
         """Compute the adapted weights again."""
         pairs = self._present()
-        _put(policy, {name: self._sum(name, pair) for name, pair in pairs.items()})
+        put_weights(policy, {name: self._sum(name, pair) for name, pair in pairs.items()})
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
@@ -147,11 +147,11 @@ class LoRA(Algorithm):
         present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self._base}
         stage = min(learned)  # index of the last task of a stage
         sums = {name: self._sum(name, pair) for name, pair in self._library.pairs.get(stage, {}).items()}
-        _put(policy, self._base | sums | self._kept.get(stage, {}))
+        put_weights(policy, self._base | sums | self._kept.get(stage, {}))
         try:
             yield policy
         finally:
-            _put(policy, present)
+            put_weights(policy, present)
 
     def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
         """Return nothing: a task's policy is its weights."""
@@ -175,10 +175,8 @@ class LoRA(Algorithm):
             CheckpointError: An adapter does not fit its weight.
         """
         self._library.load(state["pairs"])
-        for name, pair in ((n, p) for of_task in state["pairs"].values() for n, p in of_task.items()):
-            base, shape = state["base"].get(name), (len(pair["b"]), pair["a"].shape[1])
-            if base is None or base.flatten(1).shape != shape:
-                raise CheckpointError(f"the adapter of {name} does not fit a weight of the base")
+        for of_task in state["pairs"].values():
+            check_pairs(of_task, state["base"])
         self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
         self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])
         self._base, self._kept = dict(state["base"]), dict(state["own"])
@@ -202,8 +200,22 @@ class LoRA(Algorithm):
         return base + (self.scale * (pair["b"] @ pair["a"])).view(base.shape)
 
 
+def check_pairs(pairs: Mapping[str, Mapping[str, Tensor]], base: Mapping[str, Tensor]) -> None:
+    """Check that the A and B of an adapter fit the weights of the base.
+
+    Raises:
+        CheckpointError: One does not; the message names it.
+    """
+    for name, pair in pairs.items():
+        a, b, weight = pair["a"], pair["b"], base.get(name)
+        fits = weight is not None and a.dim() == b.dim() == 2 and len(a) == b.shape[1]
+        if not fits or (len(b), a.shape[1]) != weight.flatten(1).shape:
+            raise CheckpointError(f"the adapter of {name} does not fit a weight of the base")
+
+
 @torch.no_grad()
-def _put(policy: Policy, values: Mapping[str, Tensor]) -> None:
+def put_weights(policy: Policy, values: Mapping[str, Tensor]) -> None:
+    """Set parameters of a policy, by name, in place."""
     for name, p in policy.named_parameters():
         if name in values:
             p.copy_(values[name])

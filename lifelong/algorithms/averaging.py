@@ -1,0 +1,86 @@
+"""Weight averaging between tasks."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lifelong.algorithms.base import Algorithm
+from lifelong.checkpoints import Weights
+from lifelong.data.windows import TaskWindows
+from lifelong.policies.base import Policy
+from lifelong.types import Natural, Share
+
+
+class Averaging(Algorithm):
+    """Fine-tune on each task, then move only part of the way to what was found.
+
+    After task t the weights are `theta_t = (1 - a_t) theta_{t-1} + a_t theta*_t`, where theta*_t is what fine-tuning on
+    the task ends with, from theta_{t-1} on. With `a_t = 1 / t` that is the mean of all solutions: mean-IMM (Lee et al.
+    2017, arXiv:1703.08475) with equal shares of the tasks and weights transferred from one to the next. A constant
+    share is an exponential average, continual model averaging (Marouf et al. 2024, arXiv:2312.08977); with one task
+    after pretraining it is WiSE-FT (Wortsman et al. 2022, arXiv:2109.01903). No data are kept, and nothing is added to
+    a step.
+
+    An average is good for both tasks only where the loss is low along the straight line between the two weights. That
+    is likelier the closer they are: after pretraining, at low rates, with few steps.
+
+    Statistics of batch normalisation are averaged like weights. Izmailov et al. (2018, arXiv:1803.05407) compute them
+    anew with the averaged weights instead, for which the data of all tasks would be needed.
+
+    The learning curve, and with it forward transfer and the choice of the best epoch, is of the fine-tuned weights;
+    the success matrix, its diagonal too, is of the averaged ones.
+    """
+
+    state_form = {"tasks": int, "before": (None, Weights(complete=True))}
+
+    def __init__(self, *, share: Share | None = None, base_tasks: Natural = 1):
+        """Create the algorithm.
+
+        Args:
+            share: Share of the new task's solution after each task, in [0, 1]. None: that which gives the mean over
+                the solutions so far.
+            base_tasks: Number of tasks (stages, where tasks are learned together) whose solution is taken whole; what
+                the last of them ends with counts as the first solution. 0 for a pretrained policy, which counts as
+                one.
+        """
+        self.share, self.base_tasks, self.tasks = share, base_tasks, 0
+        self._before: dict[str, Tensor] | None = None  # weights and buffers when the present task began
+
+    def share_of(self, number: int) -> float:
+        """Return the share that the solution of a task is given.
+
+        Args:
+            number: Number of the task, from 1.
+        """
+        later = number - self.base_tasks
+        if later <= 0:
+            return 1.0
+        return 1 / (later + 1) if self.share is None else self.share
+
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
+        """Store the weights that the task begins with, if they are needed at its end."""
+        if self.share_of(self.tasks + 1) < 1:
+            self._before = {name: value.detach().clone() for name, value in policy.state_dict().items()}
+
+    @torch.no_grad()
+    def end_task(
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Average the task's weights with those before it; numbers that are no weights stay as they are."""
+        self.tasks += 1
+        if self._before is None:
+            return
+        for name, value in policy.state_dict().items():  # shares memory with the policy
+            if value.is_floating_point():
+                value.copy_(torch.lerp(self._before[name], value, self.share_of(self.tasks)))
+        self._before = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the number of tasks learned and, while one is, the weights before it."""
+        return {"tasks": self.tasks, "before": self._before}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned."""
+        self.tasks, self._before = int(state["tasks"]), state["before"]

@@ -1,0 +1,137 @@
+"""What weight averaging between tasks promises, as properties."""
+
+import copy
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from lifelong import checkpoints
+from lifelong.algorithms import Averaging, Sequential
+from lifelong.checkpoints import check
+from lifelong.errors import ConfigError
+from lifelong.settings import Configuration
+from tests.harness import sequences
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn
+from tests.harness.configs import composed
+from tests.harness.fakes import DeepPolicy, Windows
+
+pytestmark = pytest.mark.unit
+
+
+def policy() -> DeepPolicy:
+    torch.manual_seed(0)
+    return DeepPolicy()
+
+
+def weights(found: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """Return copies of weights and statistics, without counts of batches."""
+    return {name: v.clone() for name, v in found.state_dict().items() if v.is_floating_point()}
+
+
+def solutions_and_ends(algorithm: Averaging, tasks: int) -> tuple[list[dict], list[dict]]:
+    """Return the weights before and after each task's end, with fine-tuning between them."""
+    acting, solutions, ends = policy(), [], []
+    plain = algorithm.end_task
+
+    def end_task(task, dataset, found, generator) -> None:
+        solutions.append(weights(found))
+        plain(task, dataset, found, generator)
+        ends.append(weights(found))
+
+    algorithm.end_task = end_task  # type: ignore[method-assign]
+    for task in range(tasks):
+        learn(algorithm, acting, task)
+    return solutions, ends
+
+
+def test_after_every_task_the_weights_are_the_mean_of_the_solutions() -> None:
+    solutions, ends = solutions_and_ends(Averaging(), 4)
+    for count, end in enumerate(ends, start=1):
+        for name, value in end.items():
+            mean = torch.stack([solution[name] for solution in solutions[:count]]).mean(0)
+            torch.testing.assert_close(value, mean, rtol=1e-5, atol=1e-6)
+    assert any(not torch.equal(ends[3][name], value) for name, value in solutions[3].items())
+
+
+def test_a_constant_share_is_an_exponential_average() -> None:
+    solutions, ends = solutions_and_ends(Averaging(share=0.25), 3)
+    for name, value in ends[2].items():
+        expected = 0.75 * (0.75 * solutions[0][name] + 0.25 * solutions[1][name]) + 0.25 * solutions[2][name]
+        torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_with_a_share_of_one_it_is_fine_tuning_to_the_bit_and_with_zero_nothing_moves() -> None:
+    plain, averaged, frozen = policy(), policy(), policy()
+    learners = Sequential(), Averaging(share=1.0), Averaging(share=0.0)
+    for task in range(3):
+        for learner, found in zip(learners, (plain, averaged, frozen), strict=True):
+            learn(learner, found, task)
+        if task == 0:
+            first = weights(frozen)
+    sequences.assert_same(dict(averaged.state_dict()), dict(plain.state_dict()))
+    sequences.assert_same(weights(frozen), first)
+
+
+@pytest.mark.parametrize(
+    ("share", "base", "expected"),
+    [
+        (None, 1, (1, 1 / 2, 1 / 3, 1 / 4)),
+        (None, 0, (1 / 2, 1 / 3, 1 / 4, 1 / 5)),  # the pretrained policy counts as one
+        (None, 2, (1, 1, 1 / 2, 1 / 3)),
+        (0.3, 1, (1, 0.3, 0.3, 0.3)),
+        (0.3, 0, (0.3, 0.3, 0.3, 0.3)),
+    ],
+)
+def test_shares_of_the_tasks(share, base, expected) -> None:
+    learner = Averaging(share=share, base_tasks=base)
+    assert tuple(learner.share_of(k) for k in range(1, 5)) == expected
+
+
+def test_statistics_of_batch_normalisation_are_averaged_and_counts_are_not() -> None:
+    found = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))
+    learner, draws = Averaging(share=0.5, base_tasks=0), torch.Generator()
+    learner.begin_task(0, Windows(0), found)
+    found[1].running_mean.fill_(4.0)
+    found[1].num_batches_tracked.fill_(7)
+    learner.end_task(0, Windows(0), found, draws)
+    assert found[1].running_mean.tolist() == [2.0, 2.0]
+    assert found[1].num_batches_tracked == 7
+
+
+def test_nothing_is_kept_from_task_to_task_but_a_number() -> None:
+    learner, acting = Averaging(), policy()
+    for task in range(2):
+        learn(learner, acting, task)
+    assert learner.state_dict() == {"tasks": 2, "before": None}
+    learner.begin_task(2, Windows(2), acting)
+    check(learner.state_dict(), Averaging.state_form, "state", acting)
+
+
+def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sequences, "ALGORITHMS", {"averaging": Averaging})
+    assert_resumed_equals_uninterrupted(tmp_path, "averaging", monkeypatch)
+
+
+def test_a_state_restored_within_a_task_changes_nothing(tmp_path) -> None:
+    whole, acting = Averaging(), policy()
+    for task in (0, 1):
+        learn(whole, acting, task)
+    whole.begin_task(2, Windows(2), acting)
+    checkpoints.save(tmp_path / "s", {"algorithm": whole.state_dict()})
+    other = Averaging()
+    other.load_state_dict(checkpoints.load(tmp_path / "s")["algorithm"], {})
+    copied = copy.deepcopy(acting)
+    for learner, found in ((whole, acting), (other, copied)):
+        with torch.no_grad():
+            for parameter in found.parameters():
+                parameter.add_(1)
+        learner.end_task(2, Windows(2), found, torch.Generator())
+    sequences.assert_same(dict(copied.state_dict()), dict(acting.state_dict()))
+
+
+def test_a_share_above_one_is_refused_in_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"algo\.share.* 2"):
+        Configuration(OmegaConf.to_container(composed("algo=averaging", "algo.share=2.0"))).check_some(
+            ["algo"]
+        )
