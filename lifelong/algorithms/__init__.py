@@ -3,11 +3,13 @@
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.averaging import Averaging
 from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.algorithms.clare import CLARE
 from lifelong.algorithms.compressed_er import CompressedER
 from lifelong.algorithms.derpp import DERpp
 from lifelong.algorithms.dmpel import DMPEL
 from lifelong.algorithms.er import ER
 from lifelong.algorithms.ewc import EWC
+from lifelong.algorithms.iscil import IsCiL
 from lifelong.algorithms.lora import LoRA
 from lifelong.algorithms.lwf import LwF
 from lifelong.algorithms.mas import MAS
@@ -21,6 +23,7 @@ from lifelong.algorithms.single_task import SingleTask
 
 __all__ = [
     "AGEM",
+    "CLARE",
     "DMPEL",
     "ER",
     "EWC",
@@ -32,6 +35,7 @@ __all__ = [
     "Averaging",
     "CompressedER",
     "DERpp",
+    "IsCiL",
     "LoRA",
     "LwF",
     "Multitask",

@@ -26,7 +26,17 @@ pytestmark = pytest.mark.unit
 
 BEGINS = "a run begins"
 CHOICES = [
-    *("algo=er", "algo=agem", "algo=ewc", "algo=packnet", "algo=lora", "algo=dmpel", "algo=derpp", "algo=si"),
+    *(
+        "algo=er",
+        "algo=agem",
+        "algo=ewc",
+        "algo=packnet",
+        "algo=lora",
+        "algo=dmpel",
+        "algo=iscil",
+        "algo=clare",
+    ),
+    *("algo=derpp", "algo=si"),
     *("policy=bc_rnn_small", "policy=bc_vilt_small", "policy=bc_transformer", "policy/head=flow_small"),
     *(
         "compat=libero",

@@ -61,9 +61,10 @@ def request(obs, row: int = 0, **more) -> dict:
     return {f"observation/{name}": value[row] for name, value in obs.items()} | more
 
 
-@pytest.mark.parametrize("algo", ["er", "packnet", "dmpel", "lora", "single_task"])
+@pytest.mark.parametrize("algo", ["er", "packnet", "dmpel", "iscil", "clare", "lora", "single_task"])
 def test_served_actions_are_those_in_process(folder, algo):
-    served = run_of(folder, f"algo={algo}", *SAMPLING)
+    quick = {"clare": ["algo.discriminator_steps=2"], "dmpel": ["algo.recall_steps=2"]}.get(algo, [])
+    served = run_of(folder, f"algo={algo}", *quick, *SAMPLING)
     seen = frames(served.run.policy.spec, rows=3)
     with policy_servers.served(served) as address:
         for task in (*served.run.tasks, get_task("libero_goal/1")):

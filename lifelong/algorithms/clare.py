@@ -1,0 +1,265 @@
+"""Adapters that are added and chosen layer by layer, by how well autoencoders know a layer's inputs."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import TaskWindows
+from lifelong.errors import CheckpointError
+from lifelong.nn.adapters import freeze_statistics
+from lifelong.nn.experts import (
+    Attachment,
+    ExpertLibrary,
+    adaptable_modules,
+    expert_output,
+    matrix_of,
+)
+from lifelong.nn.routing import Discriminator, groups_of_rows
+from lifelong.policies.base import Policy
+from lifelong.types import Count, Natural, NonNegative, Positive, Width
+
+BASE = -1  # in place of a task whose adapter is used: none
+_CHUNK = 32  # windows per forward pass
+_ROWS = 512  # samples of a layer's inputs that an autoencoder learns from
+
+Samples = dict[str, Tensor]  # layer -> its inputs (n, tokens, D)
+
+
+class CLARE(Algorithm):
+    """Add adapters where a task's features are new, and let autoencoders choose among them.
+
+    Römer, Zhang and Schoellig 2026, "CLARE: continual learning for vision-language-action models via autonomous
+    adapter routing and expansion", arXiv:2601.09512. A layer computes `FFN(x) + B relu(A x)` with the base frozen.
+    Every layer has an autoencoder for each task, trained on its inputs after the task, which belongs to an adapter.
+    The adapter of the autoencoder with the smallest reconstruction error acts, in each layer and for each sample by
+    itself; no task number is needed.
+
+    Before a new task, its samples pass through the policy as it is. A layer gets a new adapter if the mean z-score of
+    the errors, |e - mean| / std, exceeds `threshold` for all of its autoencoders; otherwise the task uses the adapter
+    of the one with the smallest mean error. If no layer is new, the first one gets an adapter. Only new adapters learn,
+    and only while their task is learned: the base and earlier adapters never change.
+
+    Departures:
+
+    * The paper adapts feed-forward networks of a pretrained transformer. Here `adapted` says which, and may name
+      other linear layers and convolutions; of a convolution's input, a sample is the mean over the image.
+    * Inputs of the base's own task have autoencoders as well, which choose the base without an adapter. A pretrained
+      base (`base_tasks=0`) has none, as in the paper.
+    * Mean and standard deviation of the errors are those of the samples after training, not running averages.
+    * The autoencoders learn from up to 512 samples of a layer, collected from `windows` windows.
+    """
+
+    state_form = {
+        **dict.fromkeys(("task_index", "base_left", "seed"), int),
+        "library": ExpertLibrary.form,
+        "discriminators": {int: {str: Discriminator.form}},
+        "chosen": {int: {str: int}},
+    }
+
+    def __init__(
+        self,
+        *,
+        rank: Width = 16,
+        alpha: NonNegative = 16.0,
+        adapted: Sequence[str] = ("*",),
+        threshold: NonNegative = 2.5,
+        hidden: Width = 16,
+        discriminator_steps: Natural = 200,
+        discriminator_lr: Positive = 5e-3,
+        windows: Count = 500,
+        base_tasks: Natural = 1,
+    ):
+        """Create the algorithm.
+
+        Args:
+            rank: Rank of an adapter.
+            alpha: Numerator of the adapters' scale alpha / rank.
+            adapted: Patterns of names of feed-forward networks, and of linear layers and convolutions outside of them,
+                e.g. `transformer.layers.*.mlp`, `head.*`.
+            threshold: Mean z-score from which a layer's inputs count as new.
+            hidden: Number of hidden units of an autoencoder.
+            discriminator_steps: Number of steps that autoencoders are trained for, after the task.
+            discriminator_lr: Learning rate of the autoencoders.
+            windows: Number of a task's windows that are looked at before and after it is learned.
+            base_tasks: Number of tasks (stages, where tasks are learned together) that train the whole policy, which
+                is frozen afterwards; 0 for a pretrained policy.
+        """
+        self.rank, self.scale, self.adapted = rank, alpha / rank, tuple(adapted)
+        self.threshold, self.hidden, self.windows = threshold, hidden, windows
+        self.discriminator_steps, self.discriminator_lr = discriminator_steps, discriminator_lr
+        self.task_index, self._base_left, self._seed = -1, base_tasks, 0
+        self._library, self._attachment = ExpertLibrary(), Attachment()
+        self._discriminators: dict[int, dict[str, Discriminator]] = {}  # task -> layer -> autoencoder
+        self._chosen: dict[int, dict[str, int]] = {}  # task -> layer -> task whose adapter it uses, or BASE
+        self._learning: int | None = (
+            None  # task whose adapters all samples use; None: each has its own chosen
+        )
+
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
+        """Decide which layers get adapters; none while the base is learned."""
+        self.task_index, modules = task_index, adaptable_modules(policy, self.adapted)
+        if self._base_left:
+            self._base_left -= 1
+            self._chosen[task_index] = dict.fromkeys(modules, BASE)
+            return
+        policy.zero_grad()
+        draws = torch.Generator().manual_seed(self._seed)
+        uses = dict.fromkeys(modules, task_index)
+        if self._discriminators:
+            compared = self._compare(self._collect(dataset, policy, draws))
+            uses = {name: compared[name] for name in modules}
+        if task_index not in uses.values():
+            uses[next(iter(uses))] = task_index
+        self._chosen[task_index] = uses
+        new = {name: matrix_of(modules[name]) for name, used in uses.items() if used == task_index}
+        self._library.add(task_index, new, self.rank, draws)
+
+    def trained(self, policy: Policy) -> list[nn.Parameter]:
+        """Return the parameters of the new adapters; everything while the base is learned."""
+        if self.task_index not in self._library:
+            return super().trained(policy)
+        policy.requires_grad_(False)
+        self._learning = self.task_index
+        self._attachment.attach(policy, *self._hooks(policy))
+        return self._library.parameters(self.task_index)
+
+    def mode_train(self, policy: Policy) -> None:
+        """Set training mode, with running statistics frozen with the base."""
+        policy.train()
+        if self._library:
+            freeze_statistics(policy)
+
+    def end_phase(self, phase: Any, policy: Policy) -> None:
+        """Remove the adapters from the policy's layers."""
+        self._attachment.detach(policy)
+        self._learning = None
+
+    def end_task(
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Train the task's autoencoders on the inputs that the layers have with its adapters."""
+        samples = self._collect(dataset, policy, generator, task_index)
+        settings = self.hidden, self.discriminator_steps, self.discriminator_lr
+        self._discriminators[task_index] = {
+            name: Discriminator.fit(x, *settings, generator) for name, x in samples.items()
+        }
+        self._seed = int(torch.randint(2**62, (), generator=generator))
+
+    @contextmanager
+    def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
+        """Yield the policy that chooses adapters, the same for every task.
+
+        While a task is learned, it has no autoencoders yet: its own adapters act then.
+        """
+        if not self._library:
+            yield policy
+            return
+        unfinished = self.task_index in self._library and self.task_index not in self._discriminators
+        now = self.task_index if unfinished else None
+        learning, self._learning = self._learning, now
+        try:
+            with self._attachment.within(policy, *self._hooks(policy)):
+                yield policy
+        finally:
+            self._learning = learning
+
+    def route(self, name: str, samples: Tensor) -> Tensor:
+        """Return the task whose adapter acts on each sample (n, tokens, D) of a layer's input, (n,) int64."""
+        known = [(t, of[name]) for t, of in self._discriminators.items()]
+        uses = torch.tensor([self._chosen[t][name] for t, _ in known], device=samples.device)
+        return uses[torch.stack([d.errors(samples) for _, d in known]).argmin(0)]
+
+    def _compare(self, samples: Samples) -> dict[str, int]:
+        """Return for each layer the task whose adapter the present task uses: its own where the samples are new."""
+        uses = {}
+        for name, x in samples.items():
+            known = {t: of[name] for t, of in self._discriminators.items()}
+            new = all(d.z_scores(x).mean() > self.threshold for d in known.values())
+            nearest = min(known, key=lambda t: float(known[t].errors(x).mean()))
+            uses[name] = self.task_index if new else self._chosen[nearest][name]
+        return uses
+
+    def _hooks(self, policy: Policy) -> tuple[Mapping[str, nn.Module], Callable[..., Tensor | None]]:
+        """Return the layers with adapters, and what is added to their outputs."""
+        return adaptable_modules(policy, self.adapted), self._added
+
+    def _added(self, name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
+        """Return the adapters' outputs, each on its rows; None where all rows use the base alone."""
+        if self._learning is not None:
+            groups: list[tuple[int, Tensor | None]] = [(self._chosen[self._learning][name], None)]
+        else:
+            groups = groups_of_rows(self.route(name, _samples(layer, x)))
+        total: Tensor | None = None
+        for task, rows in groups:
+            if task == BASE:
+                continue
+            pairs = [self._library[task][name]]
+            part = self.scale * expert_output(layer, x if rows is None else x[rows], pairs, relu=True)
+            if rows is None:
+                return part
+            if total is None:
+                total = part.new_zeros(len(x), *part.shape[1:])
+            total[rows] = part
+        return total
+
+    @torch.no_grad()
+    def _collect(
+        self, dataset: TaskWindows, policy: Policy, draws: torch.Generator, task: int | None = None
+    ) -> Samples:
+        """Return inputs of the layers on some of a task's windows, with its adapters or, without it, chosen ones."""
+        found: dict[str, list[Tensor]] = {}
+        device, was_training = next(policy.parameters()).device, policy.training
+        chosen = torch.randperm(len(dataset), generator=draws)[: self.windows]
+        learning, self._learning = self._learning, task
+
+        def added(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
+            found.setdefault(name, []).append(_samples(layer, x)[: max(1, _ROWS * _CHUNK // len(chosen))])
+            return self._added(name, layer, x)
+
+        policy.eval()
+        try:
+            with self._attachment.within(policy, adaptable_modules(policy, self.adapted), added):
+                for part in chosen.split(_CHUNK):
+                    policy.predict(dataset.batch(part).to(device))
+        finally:
+            self._learning = learning
+            policy.train(was_training)
+        return {name: torch.cat(parts) for name, parts in found.items()}
+
+    def sizes(self) -> dict[int, int]:
+        """Return the number of parameters of each task's new adapters."""
+        return self._library.sizes()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all adapters and autoencoders, and which belong together."""
+        place = {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
+        known = {task: {n: d.weights for n, d in of.items()} for task, of in self._discriminators.items()}
+        chosen = {task: dict(of) for task, of in self._chosen.items()}
+        return {**place, "library": self._library.state(), "discriminators": known, "chosen": chosen}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            CheckpointError: Adapters, autoencoders and what connects them do not go together.
+        """
+        library, chosen, known = state["library"], state["chosen"], state["discriminators"]
+        used = [(task, name) for of in chosen.values() for name, task in of.items() if task != BASE]
+        fits = all(name in library.get(task, {}) for task, name in used)
+        if not fits or any(of.keys() != chosen.get(task, {}).keys() for task, of in known.items()):
+            raise CheckpointError("the adapters and their autoencoders do not go together")
+        self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
+        self._seed, self._chosen = int(state["seed"]), {task: dict(of) for task, of in chosen.items()}
+        self._discriminators = {t: {n: Discriminator(w) for n, w in of.items()} for t, of in known.items()}
+        self._library.load(library)
+
+
+def _samples(layer: nn.Module, x: Tensor) -> Tensor:
+    """Return a layer's input as samples of tokens, (n, tokens, D): of an image the mean, of a vector one token."""
+    if isinstance(layer, nn.Conv2d):
+        return x.detach().mean((2, 3))[:, None]
+    return x.detach().reshape(len(x), -1, x.shape[-1])
