@@ -11,6 +11,7 @@
     mix(batch, generator) -> batch                    each step, before the loss
     penalty(policy) -> scalar or None                 each step, after the loss
     after_backward(policy)                            each step, before gradients are clipped
+    after_clipping(policy)                            each step, before the optimiser moves the weights
     after_step(policy)                                each step, after the optimiser moved the weights
     end_phase(phase, policy)                          after each phase, with the weights that are kept
     end_task(task_index, dataset, policy, generator)  after the last phase
@@ -155,6 +156,9 @@ class Algorithm:
 
     def after_backward(self, policy: Policy) -> None:
         """Change the gradients before they are clipped; in the precision of the loss."""
+
+    def after_clipping(self, policy: Policy) -> None:
+        """Change the gradients after they are clipped; what is removed here counts in their norm."""
 
     def after_step(self, policy: Policy) -> None:
         """Change the weights after the optimiser moved them."""

@@ -94,8 +94,12 @@ class ReplayMemory:
         if not size:
             raise DataError("nothing to sample: the memory is empty. Add a task first")
         rounds = [torch.randperm(size, generator=generator) for _ in range(-(-n // size))]
+        return self._windows(torch.cat(rounds)[:n])
+
+    def _windows(self, chosen: Tensor) -> Batch:
+        """Return windows by their positions (B,) in the memory."""
         kept = [WindowSubset(self._datasets[task], indices) for task, indices in self._indices.items()]
-        return JoinedWindows(kept).batch(torch.cat(rounds)[:n])
+        return JoinedWindows(kept).batch(chosen)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and the indices by task id; frames are read again from the demonstrations."""
@@ -133,15 +137,38 @@ class ReplayMemory:
 class FirstWindows(ReplayMemory):
     """The first windows of each past task, in the order of its file: the memory of LIBERO's code.
 
-    A thousand of them are the first eight or so demonstrations, not a sample of the task.
+    A thousand of them are the first eight or so demonstrations, not a sample of the task. With `batch_size` they come
+    as from its loader: in passes in which no window repeats, whose last batch is short. A pass ends with the epoch
+    here, so that an epoch can be repeated; there it goes on.
 
     Args:
         budget: Number of windows kept of each task.
+        batch_size: Number of windows of a batch, however many are asked for; None: as many as are asked for, drawn
+            anew for each batch.
     """
 
-    def __init__(self, budget: Count) -> None:
+    def __init__(self, budget: Count, batch_size: Count | None = None) -> None:
         super().__init__(budget)
-        self.per_task = budget
+        self.per_task, self.batch_size = budget, batch_size
+        self._pass: tuple[torch.Generator | None, Tensor] = (None, torch.empty(0, dtype=torch.int64))
+
+    def sample(self, n: int, generator: torch.Generator) -> Batch:
+        """Return the next windows of the pass, or a sample as `ReplayMemory.sample`.
+
+        Args:
+            n: Number of windows, where there is no `batch_size`.
+            generator: Draws the order of each pass; another one than before starts a new pass.
+
+        Raises:
+            DataError: The memory is empty.
+        """
+        if self.batch_size is None or not len(self):
+            return super().sample(n, generator)
+        drawn_by, left = self._pass
+        if drawn_by is not generator or not len(left):
+            left = torch.randperm(len(self), generator=generator)
+        self._pass = (generator, left[self.batch_size :])
+        return self._windows(left[: self.batch_size])
 
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""

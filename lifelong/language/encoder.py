@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources, util
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
@@ -47,11 +48,15 @@ class LanguageEncoder:
     model: PathText = "minilm"
     cache_dir: PathText | Path | None = None
     dim: Width | None = None
+    numbered: bool = False
+    pad_to: Annotated[int, Field(ge=0, le=512)] = 0
 
     def embed(self, texts: Sequence[str]) -> Tensor:
         """Return the embeddings of N texts, (N, L) float32."""
         folder = self.cache_dir or paths.cache_dir() / "language"
-        return embed(texts, self.model, cache_dir=folder, dim=self.dim)
+        return embed(
+            texts, self.model, cache_dir=folder, dim=self.dim, numbered=self.numbered, pad_to=self.pad_to
+        )
 
 
 def embed(
@@ -60,6 +65,8 @@ def embed(
     *,
     cache_dir: str | Path | None = None,
     dim: int | None = None,
+    numbered: bool = False,
+    pad_to: int = 0,
 ) -> Tensor:
     """Return the embeddings of instructions.
 
@@ -68,6 +75,10 @@ def embed(
         model: One of `MODELS`, or a folder with a model saved by transformers (bert, roberta, gpt2, clip).
         cache_dir: Folder that caches computed embeddings by model and text; None caches none.
         dim: Length L for `onehot`, where text i becomes row i of the identity; None is N.
+        numbered: Whether `Task 1`, `Task 2` and so on are encoded in place of the texts: the task identity of LIBERO's
+            code.
+        pad_to: Number of tokens to which texts are padded for transformers, as LIBERO's code does (25); 0: not padded.
+            It changes the last digits, and with gpt2 all, because there the state of the last padding is taken.
 
     Returns:
         Embeddings, (N, L) float32; L is 384 for minilm, 512 for clip, 768 for the others.
@@ -78,6 +89,8 @@ def embed(
     """
     if isinstance(texts, str):
         raise LanguageError("embed takes a list of texts, not one text; write [text]")
+    if numbered:
+        texts = [f"Task {number}" for number in range(1, len(texts) + 1)]
     if model == "onehot":
         return _one_hot(len(texts), dim)
     if model == "minilm":
@@ -87,7 +100,7 @@ def embed(
             f"unknown language model {model!r}. Valid: {', '.join(MODELS)}, or a model's folder"
         )
     name = _HUB_NAMES.get(model, model)
-    return _cached(texts, name, cache_dir, lambda missing: _run_transformer(missing, name))
+    return _cached(texts, name, cache_dir, lambda missing: _run_transformer(missing, name, pad_to), pad_to)
 
 
 @cache
@@ -149,14 +162,18 @@ def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
 
 
 def _cached(
-    texts: Sequence[str], name: str, cache_dir: str | Path | None, encode: Callable[[list[str]], Tensor]
+    texts: Sequence[str],
+    name: str,
+    cache_dir: str | Path | None,
+    encode: Callable[[list[str]], Tensor],
+    pad_to: int = 0,
 ) -> Tensor:
     """Read embeddings from the cache; encode the missing ones together and write them to the cache."""
     if not len(texts):
         raise LanguageError("no texts to embed; give at least one")
     if cache_dir is None:
         return encode(list(texts))
-    folder, mark = Path(cache_dir), _fingerprint(name)
+    folder, mark = Path(cache_dir), _fingerprint(name) + (f"\0padded to {pad_to}" if pad_to else "")
     digest = lambda text: hashlib.sha256(f"{mark}\0{text}".encode()).hexdigest()[:32]  # noqa: E731
     paths = {text: folder / f"{digest(text)}.npz" for text in texts}
     found = {text: vector for text, path in paths.items() if (vector := _stored(path)) is not None}
@@ -196,14 +213,14 @@ def _fingerprint(name: str) -> str:
     return json.dumps([str(folder.resolve()), files])
 
 
-def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
+def _run_transformer(texts: Sequence[str], name: str, pad_to: int = 0) -> Tensor:
     """Return sentence embeddings (N, L), chosen for each family of models as in LIBERO.
 
     BERT and RoBERTa: the pooler's output; CLIP: the projected text features; GPT-2: the last state of the last token
-    of the text (the original uses that of the padding).
+    of the text, or of the padding.
     """
     rows = []
-    for output in _outputs(texts, name):
+    for output in _outputs(texts, name, pad_to):
         if getattr(output, "text_embeds", None) is not None:
             rows.append(output.text_embeds)
         elif getattr(output, "pooler_output", None) is not None:
@@ -213,14 +230,19 @@ def _run_transformer(texts: Sequence[str], name: str) -> Tensor:
     return torch.cat(rows)
 
 
-def _outputs(texts: Sequence[str], name: str) -> Iterator[Any]:
+def _outputs(texts: Sequence[str], name: str, pad_to: int = 0) -> Iterator[Any]:
     """Yield the model's output for each text.
 
     Texts are encoded one by one: padding would change the last digits, depending on the other texts of the batch.
     """
     tokenizer, model = _load(name)
+    if tokenizer.pad_token is None:
+        tokenizer.pad_token = tokenizer.eos_token
+    how = (
+        {"padding": "max_length", "max_length": pad_to} if pad_to else {"truncation": True, "max_length": 77}
+    )
     for text in texts:
-        tokens = tokenizer([text], truncation=True, max_length=77, return_tensors="pt")
+        tokens = tokenizer([text], return_tensors="pt", **how)
         with torch.no_grad():
             yield model(**tokens)
 

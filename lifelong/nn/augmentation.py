@@ -65,7 +65,7 @@ class RandomShift(Augmentation):
         """Return changed images; see `Augmentation`."""
         b, _, v, h, w, _ = images.shape
         shifts = torch.randint(0, 2 * self.pixels + 1, (b, v, 2), generator=generator).tolist()
-        padded = _repeat_border(images, self.pixels)
+        padded = repeat_border(images, self.pixels)
         moved = torch.empty_like(images)
         for row, per_view in enumerate(shifts):
             for view, (y, x) in enumerate(per_view):
@@ -73,7 +73,7 @@ class RandomShift(Augmentation):
         return moved
 
 
-def _repeat_border(images: Tensor, pixels: int) -> Tensor:
+def repeat_border(images: Tensor, pixels: int) -> Tensor:
     """Pad images (..., H, W, C) to (..., H + 2 pixels, W + 2 pixels, C)."""
     if not pixels:
         return images

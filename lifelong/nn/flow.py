@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
-from lifelong.nn.heads import ActionHead
+from lifelong.nn.heads import ActionHead, full_precision
 from lifelong.types import Depth, Width
 
 _EVAL_SEED = 0
@@ -181,10 +181,11 @@ class VelocityField(nn.Module):
             Velocities (..., H, A) float32, zero where no action exists.
         """
         flat = (x * slots[..., None]).flatten(-2)
-        h = self.enter(torch.cat([latent.float(), flat, slots, _time_code(time)], dim=-1))
-        for block in self.blocks:
-            h = h + block(h)
-        return self.leave(h).float().view(x.shape) * slots[..., None]
+        with full_precision(x):
+            h = self.enter(torch.cat([latent.float(), flat, slots, _time_code(time)], dim=-1))
+            for block in self.blocks:
+                h = h + block(h)
+            return self.leave(h).view(x.shape) * slots[..., None]
 
 
 def _time_code(time: Tensor) -> Tensor:

@@ -17,7 +17,9 @@ from lifelong.types import Depth, NonNegative, Width
 class ActionHead(nn.Module, ABC):
     """Distribution of actions in [-1, 1]^A, given latents (..., E).
 
-    `forward` returns the parameters of the distribution, the other methods read them.
+    `forward` returns the parameters of the distribution, the other methods read them. Heads compute in float32 under
+    autocast too: bfloat16 rounds an action by up to 0.004, and by 0.0018 RMS where a mixture's smallest deviation is
+    1e-4.
 
     Attributes:
         chunk: Number of actions that a latent predicts: that of its own step and of the following ones.
@@ -63,6 +65,11 @@ class ActionHead(nn.Module, ABC):
         ]
         device = next(iter(params.values())).device
         return torch.stack(draws).to(device)
+
+
+def full_precision(x: Tensor) -> torch.autocast:
+    """Return a context in which nothing on the device of `x` is cast to a lower precision."""
+    return torch.autocast(x.device.type, enabled=False)
 
 
 def _trunk(in_dim: int, hidden: int, layers: int, norm: bool) -> nn.Sequential:
@@ -118,18 +125,18 @@ class GMMHead(ActionHead):
 
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
         """Return `means` (..., K, A) in (-1, 1), `stds` (..., K, A) and `logits` (..., K), float32."""
-        h = self.trunk(latent)
         shape = (*latent.shape[:-1], self.modes, self.action_dim)
-        raw_stds = self.stds(h).float().view(shape)
-        return {
-            "means": self.means(h).float().view(shape).tanh(),
-            "stds": functional.softplus(raw_stds) + self.min_std,
-            "logits": self.logits(h).float(),
-        }
+        with full_precision(latent):
+            h = self.trunk(latent.float())
+            return {
+                "means": self.means(h).view(shape).tanh(),
+                "stds": functional.softplus(self.stds(h).view(shape)) + self.min_std,
+                "logits": self.logits(h),
+            }
 
     def log_prob(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
         """Return log sum_k w_k prod_a N(action_a; mean_ka, std_ka) of actions, (..., A) -> (...)."""
-        with torch.autocast(actions.device.type, enabled=False):
+        with full_precision(actions):
             z = (actions.float().unsqueeze(-2) - params["means"]) / params["stds"]
             per_mode = (-0.5 * z.square() - params["stds"].log()).sum(-1)  # (..., K)
             per_mode = per_mode - 0.5 * self.action_dim * math.log(2.0 * math.pi)
@@ -189,7 +196,8 @@ class DeterministicHead(ActionHead):
 
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
         """Return `means` (..., A), float32."""
-        return {"means": self.means(self.trunk(latent)).float().tanh()}
+        with full_precision(latent):
+            return {"means": self.means(self.trunk(latent.float())).tanh()}
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
         """Return the absolute error, mean over the action's dimensions, (..., A) -> (...)."""

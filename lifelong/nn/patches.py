@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import TransformerLayer
-from lifelong.nn.vision import Norm, Side, make_norm
+from lifelong.nn.vision import Norm, Pixels, Side, make_norm, to_network
 from lifelong.types import Depth, Share, Width
 
 
@@ -24,6 +24,8 @@ class PatchEncoder(nn.Module):
         stem_stride: Stride of the convolution.
         patch: Side of a patch, in cells of the convolution's output.
         norm: Normalisation, see `make_norm`.
+        pixels: Form in which images enter: `centred` or `libero`, see `to_network`.
+        rectify: Whether a ReLU follows the last normalisation; the original has none there.
 
     Raises:
         PolicyError: An unknown norm, or an image that patches do not tile.
@@ -39,8 +41,11 @@ class PatchEncoder(nn.Module):
         stem_stride: Side = 2,
         patch: Side = 8,
         norm: Norm = "group",
+        pixels: Pixels = "centred",
+        rectify: bool = True,
     ) -> None:
         super().__init__()
+        self.pixels, self.rectify = pixels, rectify
         padding = stem_kernel // 2
         cells = [(n + 2 * padding - stem_kernel) // stem_stride + 1 for n in image_size]
         if any(n < patch or n % patch for n in cells):
@@ -60,8 +65,9 @@ class PatchEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Encode images (N, H, W, 3) uint8 to tokens (N, P, E), row by row."""
-        h = images.movedim(-1, 1).to(torch.float32).mul_(2.0 / 255.0).sub_(1.0)
-        h = functional.relu(self.norm(self.project(self.stem(h))), inplace=True)
+        h = self.norm(self.project(self.stem(to_network(images, self.pixels))))
+        if self.rectify:
+            h = functional.relu(h, inplace=True)
         return h.flatten(2).transpose(1, 2)
 
 
@@ -80,7 +86,9 @@ class SpatialTransformer(nn.Module):
         heads: Number of attention heads.
         head_dim: Size of a head.
         mlp_dim: Width of the feed-forward networks.
-        dropout: Dropout after attention and in the feed-forward networks.
+        dropout: Dropout of attention weights, after attention and in the feed-forward networks.
+        attention_dropout: Dropout of attention weights alone, see `TransformerLayer`.
+        drop_path: Chance that a frame skips a feed-forward network, see `TransformerLayer`.
     """
 
     def __init__(
@@ -95,13 +103,23 @@ class SpatialTransformer(nn.Module):
         head_dim: Width = 120,
         mlp_dim: Width = 256,
         dropout: Share = 0.1,
+        attention_dropout: Share | None = None,
+        drop_path: Share = 0.0,
     ) -> None:
         super().__init__()
         self.positions = nn.Parameter(torch.randn(views, patches, dim))
         self.modalities = nn.Parameter(torch.randn(views + 1, dim))  # each view, then language
         self.read = nn.Parameter(torch.randn(dim))
         self.layers = nn.ModuleList(
-            TransformerLayer(dim=dim, heads=heads, head_dim=head_dim, mlp_dim=mlp_dim, dropout=dropout)
+            TransformerLayer(
+                dim=dim,
+                heads=heads,
+                head_dim=head_dim,
+                mlp_dim=mlp_dim,
+                dropout=dropout,
+                attention_dropout=attention_dropout,
+                drop_path=drop_path,
+            )
             for _ in range(layers)
         )
         self.project = nn.Linear(dim, out_dim)

@@ -49,6 +49,14 @@ def attend(qkv: Tensor, heads: int, mask: Tensor | None = None, dropout: float =
     return mixed.transpose(1, 2).reshape(b, s, -1)
 
 
+def drop_samples(x: Tensor, chance: float, training: bool) -> Tensor:
+    """Return x (B, ...) with whole samples zeroed by chance and the others scaled up; in training only."""
+    if not training or chance == 0.0:
+        return x
+    kept = x.new_empty(len(x), *(1,) * (x.dim() - 1)).bernoulli_(1.0 - chance)
+    return x * kept.div_(max(1.0 - chance, torch.finfo(x.dtype).tiny))
+
+
 class TransformerLayer(nn.Module):
     """Pre-norm self-attention and feed-forward network; unlike torch's layer it leaves the head size free.
 
@@ -58,11 +66,25 @@ class TransformerLayer(nn.Module):
         head_dim: Size of a head.
         mlp_dim: Width of the feed-forward network.
         dropout: Dropout of attention weights, after attention and in the feed-forward network.
+        attention_dropout: Dropout of attention weights alone; None: `dropout`. The original has none there.
+        drop_path: Chance in training that a whole sample skips the feed-forward network, the others being scaled up
+            (Huang et al., stochastic depth, ECCV 2016). The original has 0.1 there, and none around attention.
     """
 
-    def __init__(self, *, dim: int, heads: int, head_dim: int, mlp_dim: int, dropout: float) -> None:
+    def __init__(
+        self,
+        *,
+        dim: int,
+        heads: int,
+        head_dim: int,
+        mlp_dim: int,
+        dropout: float,
+        attention_dropout: float | None = None,
+        drop_path: float = 0.0,
+    ) -> None:
         super().__init__()
-        self.heads, self.head_dim, self.dropout = heads, head_dim, dropout
+        self.heads, self.head_dim, self.drop_path = heads, head_dim, drop_path
+        self.dropout = dropout if attention_dropout is None else attention_dropout
         self.attention_norm, self.mlp_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.qkv = nn.Linear(dim, 3 * heads * head_dim, bias=False)
         self.out = nn.Linear(heads * head_dim, dim)
@@ -80,7 +102,7 @@ class TransformerLayer(nn.Module):
         dropout = self.dropout if self.training else 0.0
         mixed = attend(self.qkv(self.attention_norm(x)), self.heads, mask, dropout)
         x = x + self.drop(self.out(mixed))
-        return x + self.mlp(self.mlp_norm(x))
+        return x + drop_samples(self.mlp(self.mlp_norm(x)), self.drop_path, self.training)
 
 
 class TemporalTransformer(nn.Module):
@@ -95,6 +117,8 @@ class TemporalTransformer(nn.Module):
         head_dim: Size of a head.
         mlp_dim: Width of the feed-forward networks.
         dropout: Dropout of attention weights, after attention and in the feed-forward networks.
+        attention_dropout: Dropout of attention weights alone, see `TransformerLayer`.
+        drop_path: Chance that a window skips a feed-forward network, see `TransformerLayer`.
         max_length: Longest window, T.
     """
 
@@ -107,11 +131,21 @@ class TemporalTransformer(nn.Module):
         head_dim: Width = 64,
         mlp_dim: Width = 256,
         dropout: Share = 0.1,
+        attention_dropout: Share | None = None,
+        drop_path: Share = 0.0,
         max_length: int = 10,
     ) -> None:
         super().__init__()
         self.layers = nn.ModuleList(
-            TransformerLayer(dim=dim, heads=heads, head_dim=head_dim, mlp_dim=mlp_dim, dropout=dropout)
+            TransformerLayer(
+                dim=dim,
+                heads=heads,
+                head_dim=head_dim,
+                mlp_dim=mlp_dim,
+                dropout=dropout,
+                attention_dropout=attention_dropout,
+                drop_path=drop_path,
+            )
             for _ in range(layers)
         )
         self.register_buffer("positions", sinusoidal_positions(max_length, dim), persistent=False)

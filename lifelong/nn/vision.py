@@ -4,6 +4,7 @@ Shape legend: N images, C channels, H W image, K keypoints, L language embedding
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Literal
 
 import torch
@@ -16,6 +17,29 @@ from lifelong.types import Positive, Width
 
 Norm = Literal["group", "batch", "none"]  # see `make_norm`
 Side = Annotated[int, Field(ge=1, le=1000)]  # [pixels or cells] of a kernel, a stride or a patch
+Pixels = Literal["centred", "libero"]  # see `to_network`
+Init = Literal["identity", "libero"]  # see `ResNetFiLMEncoder`
+
+
+def to_network(images: Tensor, pixels: str) -> Tensor:
+    """Return images as the first convolution takes them.
+
+    Args:
+        images: Images (N, H, W, 3) uint8, upright.
+        pixels: `centred`: upright and in [-1, 1]; `libero`: bottom row first and in [0, 1], as the original's
+            networks see what its simulator renders.
+
+    Returns:
+        Images (N, 3, H, W) float32, with channels last in memory.
+
+    Raises:
+        PolicyError: Another form of pixels.
+    """
+    if pixels == "centred":
+        return images.movedim(-1, 1).to(torch.float32).mul_(2.0 / 255.0).sub_(1.0)
+    if pixels == "libero":
+        return images.flip(1).movedim(-1, 1).to(torch.float32).div_(255.0)
+    raise PolicyError(f"unknown form of pixels {pixels!r}. Valid: centred, libero")
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:
@@ -46,15 +70,21 @@ def make_norm(kind: str, channels: int) -> nn.Module:
 class FiLM(nn.Module):
     """Feature-wise linear modulation: h <- (1 + gamma(language)) h + beta(language).
 
-    Perez et al., FiLM (AAAI 2018), eq. 1-2. Starts as the identity, so an untrained instruction changes
-    nothing.
+    Perez et al., FiLM (AAAI 2018), eq. 1-2.
+
+    Args:
+        language_dim: L.
+        channels: C.
+        identity: Whether it starts as the identity, so that an untrained instruction changes nothing; otherwise it
+            starts as any linear layer, as in the original.
     """
 
-    def __init__(self, *, language_dim: int, channels: int) -> None:
+    def __init__(self, *, language_dim: int, channels: int, identity: bool = True) -> None:
         super().__init__()
         self.project = nn.Linear(language_dim, 2 * channels)
-        nn.init.zeros_(self.project.weight)
-        nn.init.zeros_(self.project.bias)
+        if identity:
+            nn.init.zeros_(self.project.weight)
+            nn.init.zeros_(self.project.bias)
 
     def forward(self, h: Tensor, language: Tensor) -> Tensor:
         """Modulate `h` (N, C, H, W) by `language` (M, L); N is a multiple of M, frames of a window adjacent."""
@@ -188,6 +218,10 @@ class ResNetFiLMEncoder(nn.Module):
         norm: Normalisation after convolutions: `group`, `batch` or `none`, see `make_norm`.
         stem_film: Whether the instruction modulates the stem's features too, as it does those of every block. Without
             blocks it is the only place where it can.
+        pixels: Form in which images enter: `centred` or `libero`, see `to_network`.
+        init: Initial weights. `identity`: FiLM starts as the identity, convolutions as PyTorch's do. `libero`: FiLM
+            starts as any linear layer, convolutions of stem and blocks by He et al. (ICCV 2015, fan out), as
+            torchvision's ResNet.
 
     Raises:
         PolicyError: An unknown readout, or an image too small for the number of stages.
@@ -209,23 +243,29 @@ class ResNetFiLMEncoder(nn.Module):
         readout: Literal["keypoints", "flat"] = "keypoints",
         norm: Norm = "group",
         stem_film: bool = False,
+        pixels: Pixels = "centred",
+        init: Init = "identity",
     ) -> None:
         super().__init__()
+        self.pixels = pixels
         stem = [
             nn.Conv2d(3, width, stem_kernel, stem_stride, padding=stem_kernel // 2, bias=norm == "none"),
             make_norm(norm, width),
             nn.ReLU(inplace=True),
         ]
         self.stem = nn.Sequential(*stem, *([nn.MaxPool2d(3, 2, padding=1)] if stem_pool else []))
-        self.stem_film = FiLM(language_dim=language_dim, channels=width) if stem_film else None
+        film = partial(FiLM, language_dim=language_dim, identity=init == "identity")
+        self.stem_film = film(channels=width) if stem_film else None
         self.blocks, self.films = nn.ModuleList(), nn.ModuleList()
         channels = width
         for stage, count in enumerate(stage_blocks):
             for index in range(count):
                 out, stride = width * 2**stage, 2 if stage > 0 and index == 0 else 1
                 self.blocks.append(BasicBlock(in_channels=channels, channels=out, stride=stride, norm=norm))
-                self.films.append(FiLM(language_dim=language_dim, channels=out))
+                self.films.append(film(channels=out))
                 channels = out
+        if init == "libero":
+            _init_as_torchvision(self)  # stem and blocks only: the rest is not built yet
         size = self._map_size(image_size)
         keypoints = keypoints or max(1, latent_dim // 2)
         self.readout = make_readout(readout, channels, size, keypoints, temperature)
@@ -259,10 +299,16 @@ class ResNetFiLMEncoder(nn.Module):
         Returns:
             Latents (N, E).
         """
-        h = images.movedim(-1, 1)  # a view; already channels-last in memory
-        h = self.stem(h.to(torch.float32).mul_(2.0 / 255.0).sub_(1.0))
+        h = self.stem(to_network(images, self.pixels))
         if self.stem_film is not None:
             h = self.stem_film(h, language)
         for block, film in zip(self.blocks, self.films, strict=True):
             h = film(block(h), language)
         return self.project(self.readout(h))
+
+
+def _init_as_torchvision(module: nn.Module) -> None:
+    """Draw the weights of all convolutions as torchvision's ResNet does (He et al., ICCV 2015, fan out)."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")

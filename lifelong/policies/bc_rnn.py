@@ -33,9 +33,9 @@ class BCRNN(HistoryPolicy):
         temporal: Network over time, see `TemporalLSTM`; completed with `in_dim`.
         head: Action head: `GMMHead`, `DeterministicHead` or `FlowHead`; completed with `in_dim` and `action_dim`.
         memory: What the LSTM remembers when acting. Windows in training start with an empty state, so it must not
-            grow older than they are. `reset`: the state is carried on and emptied every `seq_len` steps, as in the
-            original; the steps after that hardly know the past. `window`: the LSTM reads the last `seq_len` frames
-            again at every step.
+            grow older than they are. `reset`: the state is carried on and emptied every `seq_len` steps; the steps
+            after that hardly know the past. `window`: the LSTM reads the last `seq_len` frames again at every step.
+            `none`: the state is empty at every step, as where the original acts; each action follows from one frame.
         stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
@@ -54,15 +54,15 @@ class BCRNN(HistoryPolicy):
         encoder: ImageEncoder = ResNetFiLMEncoder,
         temporal: Annotated[Component, CompletedWith(("in_dim",))] = TemporalLSTM,
         head: Head = GMMHead,
-        memory: Literal["reset", "window"] = "reset",
+        memory: Literal["reset", "window", "none"] = "reset",
         stochastic: bool = False,
         normalise_proprio: bool = True,
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic)
-        if memory not in ("reset", "window"):
-            raise PolicyError(f"unknown memory {memory!r}. Valid: reset, window")
+        if memory not in ("reset", "window", "none"):
+            raise PolicyError(f"unknown memory {memory!r}. Valid: none, reset, window")
         self.memory, self.standardise_language = memory, standardise_language
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
@@ -108,6 +108,8 @@ class BCRNN(HistoryPolicy):
     def _latest_latent(self, features: Tensor) -> Tensor:
         if self.memory == "window":
             return super()._latest_latent(features)
+        if self.memory == "none":
+            return self.over_time(features)[:, -1]
         if self._age == self.memory_steps:
             self._state, self._age = None, 0
         latent, self._state = self.rnn(features, self._state)

@@ -72,6 +72,17 @@ _POLICIES = {
         "temporal": ("TemporalTransformer", _TRANSFORMER),
     },
 }
+# Keys that classes had not always, with the values by which they do as before; by the end of the class's name.
+_DROPOUT = {"attention_dropout": None, "drop_path": 0.0}
+_ADDED: Mapping[str, Mapping[str, Any]] = {
+    "ResNetFiLMEncoder": {"stem_film": False, "pixels": "centred", "init": "identity"},
+    "PatchEncoder": {"pixels": "centred", "rectify": True},
+    "TemporalTransformer": _DROPOUT,
+    "SpatialTransformer": _DROPOUT,
+    "FitSettings": {"lr_every": "step", "last_batch": "filled", "statistics_first": False},
+    "LanguageEncoder": {"numbered": False, "pad_to": 0},
+    "FirstWindows": {"batch_size": None},
+}
 _ER, _AGEM = "lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM"
 _EWC, _PACKNET = "lifelong.algorithms.ewc.EWC", "lifelong.algorithms.packnet.PackNet"
 _DMPEL = "lifelong.algorithms.dmpel.DMPEL"
@@ -112,10 +123,19 @@ def upgrade_config(config: Mapping[str, Any]) -> Node:
         "stream": upgrade_stream,
     }
     return {
-        key: upgrades[key](node) if key in upgrades and isinstance(node, Mapping) else node
+        key: _with_added(upgrades[key](node) if key in upgrades and isinstance(node, Mapping) else node)
         for key, node in config.items()
         if key != "compat"
     }
+
+
+def _with_added(node: Any) -> Any:
+    """Return a node with the keys that its classes have got since it was saved."""
+    if not isinstance(node, Mapping):
+        return [_with_added(part) for part in node] if isinstance(node, list) else node
+    target = str(node.get("_target_", ""))
+    added = _ADDED.get(target.rpartition(".")[2], {}) if target.startswith("lifelong.") else {}
+    return {**added, **{key: _with_added(value) for key, value in node.items()}}
 
 
 def upgrade_data(node: Mapping[str, Any]) -> Node:

@@ -208,7 +208,12 @@ class TaskSequence:
             context.policy,
             dataset,
             context.algorithm,
-            settings=replace(context.fit, epochs=phase.epochs, steps_per_epoch=phase.steps_per_epoch),
+            settings=replace(
+                context.fit,
+                epochs=phase.epochs,
+                steps_per_epoch=phase.steps_per_epoch,
+                statistics_first=context.fit.statistics_first and not phase.number,
+            ),
             seed=(context.seed, FIT, phase.task, phase.number),
             device=context.device,
             augment=context.augment,

@@ -131,7 +131,7 @@ def stored_bytes(algorithm: Algorithm) -> int:
         if isinstance(memory, ReplayMemory) and len(memory):
             window = memory.sample(1, generator(0))
             frames = (window.observation.images, *window.observation.proprio.values(), window.actions)
-            total += len(memory) * _count_bytes(list(frames))
+            total += len(memory) * _count_bytes(list(frames)) // len(window)
     return total
 
 

@@ -111,25 +111,29 @@ def fit(
     step, load = step or default_step, load or partial(map, dataset.batch)
     steps = settings.steps_per_epoch or math.ceil(len(dataset) / size)
     total = settings.epochs * steps
+    count = len(dataset) if settings.last_batch == "short" and not settings.steps_per_epoch else steps * size
     first, loss, penalty = 0, math.nan, 0.0
     if resume is not None:
         load_weights(policy, resume["policy"], "the training state")
         _load_optimizer(optimizer, resume["optimizer"])
         first, loss, penalty = resume["epoch"], resume["loss"], resume["penalty"]
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
+    if settings.statistics_first and resume is None:
+        with seeded(*seed, 0, 2, device=device):
+            _adapt_statistics(policy, dataset, algorithm, size, device, augment, generator(*seed, 0, 3))
     on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer))
     with tqdm(
         total=total, initial=first * steps, desc=label, disable=not progress, unit="step", leave=False
     ) as bar:
         for epoch in range(first, settings.epochs):
             began, draws = time.perf_counter(), generator(*seed, epoch, 0)
-            order = _shuffled_indices(len(dataset), steps * size, draws)
+            order = _shuffled_indices(len(dataset), count, draws)
             losses = []  # of each step: the policy's loss, the penalty
             default_step.synchronise()
             algorithm.mode_train(policy)
             with seeded(*seed, epoch, 1, *own_draws, device=device):
                 for k, batch in enumerate(load(order.split(size))):
-                    lr = learning_rate(epoch * steps + k, total, settings)
+                    lr = learning_rate(epoch * steps + k, total, settings, epoch * steps)
                     losses.append(torch.stack(step(batch, draws, lr)))
                     bar.update()
             loss, penalty = ranks.sum(torch.stack(losses).mean(0)).tolist()
@@ -141,18 +145,40 @@ def fit(
             on_epoch(EpochEnd(epoch + 1, loss, penalty, time.perf_counter() - began, policy, optimizer))
 
 
-def learning_rate(step: int, total: int, settings: FitSettings) -> float:
+def learning_rate(step: int, total: int, settings: FitSettings, epoch_start: int = 0) -> float:
     """Return the learning rate of a step: linear warm-up, then half a cosine from `lr` to `lr_min`.
 
     Args:
         step: Number of the step within the task, from 0.
         total: Number of steps of the task.
         settings: Learning rates and warm-up.
+        epoch_start: First step of the epoch, whose place on the cosine counts with `lr_every` of `epoch`.
     """
     if step < settings.warmup_steps:
         return settings.lr * (step + 1) / settings.warmup_steps
+    if settings.lr_every == "epoch":
+        step = max(epoch_start, settings.warmup_steps)
     share = (step - settings.warmup_steps) / max(1, total - settings.warmup_steps)
     return settings.lr_min + (settings.lr - settings.lr_min) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+@torch.no_grad()
+def _adapt_statistics(
+    policy: Policy,
+    dataset: WindowDataset,
+    algorithm: Algorithm,
+    size: int,
+    device: torch.device,
+    augment: BatchAugmentation | None,
+    draws: torch.Generator,
+) -> None:
+    """Pass all windows through the policy in training mode, which moves BatchNorm's running statistics only."""
+    algorithm.mode_train(policy)
+    if not any(isinstance(m, nn.modules.batchnorm._BatchNorm) and m.training for m in policy.modules()):
+        return
+    for indices in torch.randperm(len(dataset), generator=draws).split(size):
+        batch = dataset.batch(indices)
+        policy.loss((batch if augment is None else augment(batch, draws)).to(device))
 
 
 def _shuffled_indices(windows: int, count: int, draws: torch.Generator) -> Tensor:

@@ -33,6 +33,13 @@ class FitSettings:
         betas: AdamW's decay rates.
         weight_decay: AdamW's decoupled weight decay.
         grad_clip: Largest norm of the gradient; 0 disables clipping.
+        lr_every: When the cosine's learning rate is set anew: at every `step`, or once for each `epoch`, as in the
+            original, whose last epoch then ends above `lr_min`.
+        last_batch: What an epoch that passes every window once does with a last batch of too few windows: `filled` up
+            from another permutation, or `short`, as in the original.
+        statistics_first: Whether BatchNorm's running statistics adapt to a task before its first step: all windows
+            pass the network once in training mode, as where the original measures the loss at epoch 0. Without
+            effect on policies without such layers.
         precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor supports it.
         accumulate: Number of micro-batches that a batch is divided into, one after the other in memory. The
             gradient is that of the whole batch, up to rounding and to what the policy draws itself (dropout).
@@ -49,6 +56,9 @@ class FitSettings:
     betas: Annotated[Sequence[Rate], Field(min_length=2, max_length=2)] = (0.9, 0.999)
     weight_decay: NonNegative = 1e-4
     grad_clip: NonNegative = 100.0
+    lr_every: Literal["step", "epoch"] = "step"
+    last_batch: Literal["filled", "short"] = "filled"
+    statistics_first: bool = False
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     accumulate: Count = 1
     compile: Annotated[Literal["off", "default", "reduce-overhead"], BeforeValidator(_read_off)] = "off"

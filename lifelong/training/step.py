@@ -88,6 +88,7 @@ class Step:
             self.algorithm.after_backward(self.policy)
         if self.settings.grad_clip:
             nn.utils.clip_grad_norm_(self._optimized, self.settings.grad_clip)
+        self.algorithm.after_clipping(self.policy)
         for group in self.optimizer.param_groups if lr is not None else ():
             group["lr"] = lr
         self.optimizer.step()

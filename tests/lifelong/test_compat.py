@@ -14,6 +14,7 @@ from lifelong.seeding import generator
 from lifelong.settings import build
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
+from lifelong.training.step import Step
 from tests.harness import sequences
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted, by_hand, learn, outputs
 from tests.harness.configs import CONFIGS, FILES, composed
@@ -49,11 +50,11 @@ def test_memory_is_the_first_windows_of_each_task_in_file_order(name):
 
 
 def test_memory_may_be_longer_than_a_task_and_is_restored():
-    algorithm = made("er", "libero", "algo.memory.budget=30")
+    algorithm = made("er", "libero", "algo.memory.budget=30", "algo.memory.batch_size=8")
     algorithm.end_task(0, Windows(0, size=20), LinearPolicy(), generator(0))
     algorithm.end_task(1, Windows(1, size=40), LinearPolicy(), generator(0))
     assert algorithm.memory.shares == {0: 20, 1: 30}
-    other = made("er", "libero", "algo.memory.budget=30")
+    other = made("er", "libero", "algo.memory.budget=30", "algo.memory.batch_size=8")
     other.load_state_dict(algorithm.state_dict(), {0: Windows(0, size=20), 1: Windows(1, size=40)})
     batch = Windows(2).batch(torch.arange(8))
     mixed = [a.mix(batch, generator(5)) for a in (algorithm, other)]
@@ -64,13 +65,32 @@ def test_memory_may_be_longer_than_a_task_and_is_restored():
 
 @pytest.mark.parametrize("compat", ["none", "libero"])
 def test_agem_augments_its_reference_as_the_original_only(compat):
-    algorithm = made("agem", compat, "algo.memory.budget=20")
+    sizes = () if compat == "none" else ("algo.memory.batch_size=20",)
+    algorithm = made("agem", compat, "algo.memory.budget=20", *sizes)
     algorithm.set_augmentation(mirrored)
     algorithm.end_task(0, Windows(0), LinearPolicy(), generator(0))
     algorithm.mix(Windows(1).batch(torch.arange(20)), generator(0))
     reference, stored = algorithm._reference, Windows(0)
     sign = -1 if compat == "libero" else 1
     assert torch.equal(reference.actions[:, 0], sign * stored.targets[reference.window_ids])
+
+
+def test_windows_of_the_memory_come_in_passes_without_repetition_as_from_a_loader():
+    algorithm = made("er", "libero", "algo.memory.budget=10", "algo.memory.batch_size=8")
+    for task in range(2):
+        algorithm.end_task(task, Windows(task), LinearPolicy(), generator(0))
+    batch, draws = Windows(2).batch(torch.arange(3)), generator(1)
+    drawn = [algorithm.mix(batch, draws) for _ in range(6)]
+    assert [len(mixed) - 3 for mixed in drawn] == [8, 8, 4, 8, 8, 4]  # whatever the batch's size is
+    replayed = [
+        [(int(t), int(w)) for t, w in zip(m.task_ids[3:], m.window_ids[3:], strict=True)] for m in drawn
+    ]
+    everything = sorted((task, window) for task in range(2) for window in range(10))
+    assert sorted(sum(replayed[:3], [])) == everything and sorted(sum(replayed[3:], [])) == everything
+    assert replayed[:3] != replayed[3:]
+    again = generator(1)  # an epoch that is repeated draws the same, wherever the last pass ended
+    algorithm.mix(batch, generator(7))
+    assert torch.equal(algorithm.mix(batch, again).window_ids, drawn[0].window_ids)
 
 
 # --- EWC
@@ -152,6 +172,24 @@ def test_packnet_never_trains_biases_and_layer_norms_but_all_else_with_every_tas
 
 
 @pytest.mark.parametrize("compat", ["none", "libero"])
+def test_packnet_zeroes_frozen_gradients_after_they_are_clipped_as_the_original_only(compat):
+    """What is frozen counts in the norm that is clipped, so less is left for the weights that move."""
+    policy, algorithm, _ = learned(compat, 0.0, tasks=1)
+    algorithm.begin_task(1, Windows(1), policy)
+    algorithm.begin_phase(algorithm.phases()[0], policy)
+    optimizer = torch.optim.SGD(algorithm.trained(policy), lr=0.0)
+    settings = FitSettings(grad_clip=1e-3, precision="fp32")
+    algorithm.mode_train(policy)
+    Step(policy, algorithm, optimizer, settings, torch.device("cpu"))(
+        Windows(1).batch(torch.arange(8)), generator(0)
+    )
+    left = torch.stack([p.grad.norm() for p in policy.parameters() if p.grad is not None]).norm().item()
+    assert left == pytest.approx(1e-3, rel=1e-3) if compat == "none" else 0 < left < 0.99e-3
+    owned = algorithm.state_dict()["owner"]["head.weight"] == 1
+    assert owned.any() and not policy.head.weight.grad[owned].any()
+
+
+@pytest.mark.parametrize("compat", ["none", "libero"])
 def test_packnet_forgets_as_the_original_only(compat):
     policy, algorithm, states = learned(compat, 0.1)
     then, before = states[1]
@@ -210,6 +248,56 @@ def test_compat_libero_sets_every_choice(name, preset):
     assert config.eval.selection == "reporting" and config.eval.select == "best" and config.policy.stochastic
     assert (config.algo != composed(f"algo={name}", f"preset={preset}").algo) == (name in WITH_COMPAT)
     build(config.algo)
+
+
+PAPER = {  # what `preset=paper compat=libero` sets beside algorithms
+    "language": {"model": "bert", "pad_to": 25, "numbered": False},
+    "data": {"pairing": "stored"},
+    "train": {
+        "lr_every": "epoch",
+        "last_batch": "short",
+        "statistics_first": True,
+        "precision": "fp32",
+    },
+    "eval": {"precision": "fp32", "selection": "reporting", "select": "best"},
+    "policy": {"stochastic": True, "normalise_proprio": False, "standardise_language": False},
+}
+ENCODERS = {
+    "bc_transformer": {"norm": "batch", "pixels": "libero", "init": "libero"},
+    "bc_rnn": {"norm": "batch", "pixels": "libero", "init": "libero"},
+    "bc_vilt": {"norm": "batch", "pixels": "libero", "rectify": False},
+}
+
+
+@pytest.mark.parametrize("policy", ENCODERS)
+def test_the_paper_preset_with_compat_libero_is_the_original(policy):
+    config = composed("preset=paper", "compat=libero", f"policy={policy}")
+    ours = composed("preset=paper", f"policy={policy}")
+    for group, values in PAPER.items():
+        assert {key: config[group][key] for key in values} == values
+    assert {key: config.policy.encoder[key] for key in ENCODERS[policy]} == ENCODERS[policy]
+    assert not set(ENCODERS[policy].items()) & set(ours.policy.encoder.items())
+    for part in {"temporal", "spatial"} & set(config.policy) if policy != "bc_rnn" else ():
+        assert (config.policy[part].attention_dropout, config.policy[part].drop_path) == (0.0, 0.1)
+    assert config.policy.get("memory", "none") == "none"
+    assert [a["_target_"].rpartition(".")[2] for a in config.augmentation.augmentations] == [
+        "SharedJitter",
+        "SharedShift",
+    ]
+    assert config.augmentation != ours.augmentation and ours.language.model == "minilm"
+
+
+def test_presets_for_small_machines_keep_their_inputs_and_their_training():
+    for preset in ("laptop", "smoke"):
+        theirs, ours = composed(f"preset={preset}", "compat=libero"), composed(f"preset={preset}")
+        for group in ("language", "data", "augmentation", "train"):
+            assert theirs[group] == ours[group], (preset, group)
+        assert theirs.policy.encoder == ours.policy.encoder
+
+
+def test_choices_on_the_command_line_win_over_those_of_compat():
+    config = composed("preset=paper", "compat=libero", "language=minilm", "augmentation=none")
+    assert config.language.model == "minilm" and not config.augmentation.augmentations
 
 
 def test_compat_none_sets_none_of_them():

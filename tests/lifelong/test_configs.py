@@ -65,7 +65,8 @@ def unread(target: type) -> set[str]:
 def choice(file: Path) -> list[str]:
     """The overrides that compose a file."""
     if str(file.parent) == "compat/libero":  # chosen by two groups
-        return [f"algo={file.stem}", "compat=libero"]
+        groups = [g for g in ("algo", "policy", "language") if (CONFIGS / g / file.name).is_file()]
+        return ["compat=libero", *(f"{group}={file.stem}" for group in groups)]
     option = f"{file.parent}={file.stem}"
     return ["algo=ewc", option] if str(file.parent) == "algo/estimator" else [option]
 
@@ -121,6 +122,9 @@ def test_the_paper_preset_is_the_published_protocol():
         "betas": [0.9, 0.999],
         "weight_decay": 1e-4,
         "grad_clip": 100.0,
+        "lr_every": "step",
+        "last_batch": "filled",
+        "statistics_first": False,
         "precision": "auto",
         "accumulate": 1,
         "compile": "off",

@@ -10,6 +10,8 @@ import torch
 from lifelong.errors import LanguageError
 from lifelong.language import encoder as language
 from lifelong.language.encoder import LanguageEncoder, embed, normal_form, shipped
+from lifelong.settings import build
+from tests.harness.configs import composed
 
 pytestmark = pytest.mark.unit
 TEXTS = ["turn on the stove", "close the microwave"]
@@ -118,6 +120,61 @@ def test_transformers_encode_each_text_by_itself(models: dict[str, Path], name: 
     assert not torch.allclose(together[0], together[1])
     for text, row in zip(texts, together, strict=True):  # to the bit, so that it may be kept
         assert torch.equal(embed([text], str(models[name]))[0], row)
+
+
+def test_padding_is_not_attended_to_and_gpt2_takes_its_state(models: dict[str, Path]) -> None:
+    """The original pads to 25 tokens."""
+    for name in ("bert", "clip", "roberta"):
+        folder = str(models[name])
+        torch.testing.assert_close(
+            embed(TEXTS, folder, pad_to=25), embed(TEXTS, folder), atol=1e-5, rtol=1e-4
+        )
+    folder = str(models["gpt2"])
+    tokenizer, model = language._load(folder)
+    tokens = tokenizer(TEXTS, padding="max_length", max_length=25, return_tensors="pt")
+    with torch.no_grad():
+        states = model(**tokens).last_hidden_state
+    torch.testing.assert_close(embed(TEXTS, folder, pad_to=25), states[:, -1], atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(embed(TEXTS, folder, pad_to=25), embed(TEXTS, folder), atol=1e-3)
+
+
+def test_a_tasks_number_may_be_encoded_in_place_of_its_text(models: dict[str, Path], tmp_path: Path) -> None:
+    folder = str(models["bert"])
+    assert torch.equal(embed(TEXTS, folder, numbered=True), embed(["Task 1", "Task 2"], folder))
+    encoder = LanguageEncoder(folder, cache_dir=tmp_path, numbered=True, pad_to=25)
+    assert torch.equal(encoder.embed(TEXTS), encoder.embed(["any", "other"]))
+
+
+def test_padded_embeddings_are_cached_apart(models: dict[str, Path], tmp_path: Path) -> None:
+    folder = str(models["gpt2"])
+    plain, padded = (embed(TEXTS, folder, cache_dir=tmp_path, pad_to=length) for length in (0, 25))
+    assert len(list(tmp_path.glob("*.npz"))) == 4
+    assert torch.equal(embed(TEXTS, folder, cache_dir=tmp_path, pad_to=25), padded)
+    assert not torch.equal(plain, padded)
+
+
+@pytest.mark.parametrize("chosen", ["bert", "onehot"])
+def test_compat_libero_embeds_with_bert_as_the_original(
+    chosen: str, models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["preset=paper", "compat=libero", *([f"language={chosen}"] if chosen != "bert" else [])]
+    config = composed(*words, f"language.cache_dir={tmp_path}").language
+    monkeypatch.setitem(language._HUB_NAMES, "bert", str(models["bert"]))
+    texts = TEXTS if chosen == "bert" else ["Task 1", "Task 2"]
+    assert torch.equal(build(config).embed(TEXTS), embed(texts, str(models["bert"]), pad_to=25))
+
+
+def test_compat_libero_without_berts_weights_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("transformers")
+    monkeypatch.setitem(language._HUB_NAMES, "bert", str(tmp_path))  # a folder without a model
+    config = composed("preset=paper", "compat=libero", f"language.cache_dir={tmp_path}").language
+    with pytest.raises(
+        LanguageError, match=r"weights of .* are not available.*hf download.*language=minilm"
+    ) as error:
+        build(config).embed(TEXTS)
+    assert "\n" not in str(error.value)
 
 
 def test_embeddings_are_cached_by_model_and_text(

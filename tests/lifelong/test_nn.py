@@ -18,6 +18,7 @@ from lifelong.nn import (
     Compose,
     DeterministicHead,
     FiLM,
+    FlowHead,
     GMMHead,
     ProprioTokens,
     RandomShift,
@@ -26,8 +27,8 @@ from lifelong.nn import (
     TemporalTransformer,
 )
 from lifelong.nn.tokens import standardise
-from lifelong.nn.transformer import block_causal_mask
-from lifelong.nn.vision import FlatReadout
+from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask
+from lifelong.nn.vision import FlatReadout, to_network
 from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import PolicySpec
 
@@ -153,6 +154,62 @@ def test_gmm_loss_is_float32_under_autocast() -> None:
         losses = head.losses(params, randn(5, 3))
     assert losses.dtype == torch.float32
     assert all(v.dtype == torch.float32 for v in params.values())
+
+
+@pytest.mark.parametrize("head", [GMMHead, DeterministicHead, FlowHead])
+def test_heads_compute_in_float32_under_autocast(head) -> None:
+    """Means in bfloat16 are 0.0014 RMS from those in float32, where a mixture's smallest deviation is 1e-4."""
+    torch.manual_seed(0)
+    head, latent = head(in_dim=16, action_dim=7, hidden=64).eval(), randn(32, 4, 16)
+    actions, exact = randn(32, 4, 7).tanh(), head(latent)
+    with torch.autocast("cpu", torch.bfloat16, enabled=True):
+        low = head(latent)
+        found = head.losses(low, actions), head.mean(low)
+    assert all(torch.equal(low[name], value) for name, value in exact.items())
+    assert torch.equal(found[0], head.losses(exact, actions)) and torch.equal(found[1], head.mean(exact))
+
+
+def test_pixels_of_the_original_are_its_range_and_its_first_row() -> None:
+    images = torch.randint(0, 256, (2, 4, 5, 3), dtype=torch.uint8, generator=generator())
+    kept = images.clone()
+    ours, theirs = to_network(images, "centred"), to_network(images, "libero")
+    assert torch.equal(images, kept)
+    assert ours.shape == theirs.shape == (2, 3, 4, 5)
+    torch.testing.assert_close(ours[0, 1], images[0, :, :, 1] / 127.5 - 1)
+    torch.testing.assert_close(theirs[0, 1], images[0, :, :, 1].flipud() / 255)
+    with pytest.raises(PolicyError, match="Valid: centred, libero"):
+        to_network(images, "raw")
+
+
+def test_initial_weights_of_the_original_are_those_of_torchvisions_resnet() -> None:
+    """A normal distribution of variance 2 / (9 channels out); FiLM is not the identity."""
+    torch.manual_seed(0)
+    ours, theirs = small_encoder(width=64), small_encoder(width=64, init="libero", norm="batch")
+    weight = theirs.blocks[0].conv1.weight
+    assert weight.std().item() == pytest.approx((2 / (9 * 64)) ** 0.5, rel=0.02)
+    assert weight.abs().max() > 3.5 * weight.std() > 2 * ours.blocks[0].conv1.weight.abs().max()
+    assert theirs.films[0].project.weight.any() and not ours.films[0].project.weight.any()
+
+
+def test_drop_path_skips_whole_feed_forward_networks_and_nothing_in_evaluation() -> None:
+    layer = TransformerLayer(
+        dim=8, heads=2, head_dim=4, mlp_dim=16, dropout=0.0, attention_dropout=0.0, drop_path=0.3
+    )
+    x = randn(2000, 3, 8)
+    plain = layer.eval()(x)
+    mixed = x + layer.out(attend(layer.qkv(layer.attention_norm(x)), 2))
+    torch.manual_seed(0)
+    dropped = layer.train()(x)
+    skipped = (dropped - mixed).abs().amax((1, 2)) < 1e-6
+    assert skipped.float().mean().item() == pytest.approx(0.3, abs=0.03)
+    torch.testing.assert_close((dropped - mixed)[~skipped] * 0.7, (plain - mixed)[~skipped])
+
+
+def test_attention_weights_have_a_dropout_of_their_own() -> None:
+    sizes = {"dim": 8, "heads": 2, "head_dim": 4, "mlp_dim": 16}
+    assert TransformerLayer(**sizes, dropout=0.5).dropout == 0.5
+    layer = TransformerLayer(**sizes, dropout=0.5, attention_dropout=0.0)
+    assert (layer.dropout, layer.drop.p) == (0.0, 0.5)
 
 
 def test_gmm_mode_is_the_heaviest_mean_and_samples_follow_the_mixture() -> None:

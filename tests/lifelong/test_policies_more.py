@@ -60,6 +60,7 @@ CHOICES = [
     for group in ("policy", "policy/head")
     for file in sorted((CONFIGS / group).glob("*.yaml"))
 ]
+WITHOUT_MEMORY = (BCRNN, {**SMALL["rnn-window"][1], "memory": "none"})
 every_policy = pytest.mark.parametrize("kind", SMALL)
 every_head = pytest.mark.parametrize("head", ["gmm", "deterministic", "flow"])
 
@@ -77,7 +78,7 @@ def make_policy(
     **head_sizes,
 ) -> Policy:
     """A small policy; `dropout` is that of all its networks that have one."""
-    target, components = SMALL[kind]
+    target, components = WITHOUT_MEMORY if kind == "rnn-none" else SMALL[kind]
     parts = dict(components)
     for name in {"spatial", "temporal"} & set(parts) if dropout is not None else ():
         parts[name] = partial(parts[name], dropout=dropout)
@@ -164,6 +165,17 @@ def test_a_carried_state_is_emptied_every_seq_len_steps() -> None:
     changed[:, 4] = 255 - changed[:, 4]  # the first frame of the second half is felt until its end
     other = act_through(policy, Observation(changed, long.observation.proprio, long.observation.language))
     assert not torch.allclose(actions[:, 7], other[:, 7], atol=1e-6)
+
+
+def test_without_a_memory_each_action_follows_from_its_frame_alone() -> None:
+    policy, long = (
+        make_policy("rnn-none", head="gmm").eval(),
+        fake_batch(SPEC, 2, generator(), steps=8),
+    )
+    actions = act_through(policy, long.observation)
+    for step in (0, 3, 7):
+        alone = act_through(policy, steps(long.observation, slice(step, step + 1)))
+        torch.testing.assert_close(actions[:, step : step + 1], alone)
 
 
 @every_policy
@@ -369,7 +381,7 @@ class TestFlow:
 
 def test_wrong_use_is_refused() -> None:
     batch = fake_batch(SPEC, 2, generator())
-    with pytest.raises(PolicyError, match="Valid: reset, window"):
+    with pytest.raises(PolicyError, match="Valid: none, reset, window"):
         BCRNN(spec=SPEC, memory="carry")
     with pytest.raises(PolicyError, match="do not tile"):
         BCViLT(spec=SPEC, encoder=partial(PATCHES, patch=3))

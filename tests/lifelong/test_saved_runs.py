@@ -63,7 +63,7 @@ RESNET_T = (
 )
 # The commands of today that configure the saved runs.
 COMMANDS = {
-    "er": ("algo=er", "compat=libero", "algo.memory.budget=50", *RESNET_T),
+    "er": ("algo=er", "compat=libero", "algo.memory.budget=50", "algo.memory.batch_size=null", *RESNET_T),
     "ewc": ("algo=ewc", "algo.estimator.windows=16", *RESNET_T),
     "packnet": (
         *("algo=packnet", "policy=bc_rnn_small", "policy/head=gmm_small"),

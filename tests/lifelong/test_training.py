@@ -31,6 +31,67 @@ def trained(policy, **kwargs):
     return policy.state_dict()
 
 
+def test_the_learning_rate_of_an_epoch_is_that_of_torchs_cosine():
+    settings = FitSettings(epochs=5, lr=1e-2, lr_min=1e-3, lr_every="epoch")
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=settings.lr)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=5, eta_min=settings.lr_min)
+    rates = []
+
+    def step(batch, draws, lr):
+        rates.append(lr)
+        return torch.zeros(()), torch.zeros(())
+
+    fit(LinearPolicy(), Windows(), Sequential(), settings=settings, seed=(0,), step=step)
+    assert len(rates) == 5  # one batch an epoch
+    settings = FitSettings(epochs=5, batch_size=8, lr=1e-2, lr_min=1e-3, lr_every="epoch")
+    rates.clear()
+    fit(LinearPolicy(), Windows(), Sequential(), settings=settings, seed=(0,), step=step)
+    for epoch in range(5):
+        expected = optimizer.param_groups[0]["lr"]
+        assert rates[3 * epoch : 3 * epoch + 3] == pytest.approx([expected] * 3, rel=1e-12)
+        optimizer.step()
+        schedule.step()
+    warm = FitSettings(epochs=5, warmup_steps=4, lr=1e-2, lr_every="epoch")
+    assert learning_rate(1, 50, warm, 0) == 5e-3 and learning_rate(6, 50, warm, 0) == 1e-2
+
+
+@pytest.mark.parametrize(("last", "sizes"), [("short", [8, 8, 4]), ("filled", [8, 8, 8])])
+def test_the_last_batch_of_an_epoch_is_filled_or_short(last, sizes):
+    seen = []
+
+    def step(batch, draws, lr):
+        seen.append(batch.window_ids)
+        return torch.zeros(()), torch.zeros(())
+
+    settings = FitSettings(epochs=1, batch_size=8, last_batch=last)
+    fit(LinearPolicy(), Windows(), Sequential(), settings=settings, seed=(0,), step=step)
+    assert [len(ids) for ids in seen] == sizes
+    assert sorted(torch.cat(seen)[:20].tolist()) == list(range(20))
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_statistics_adapt_to_a_task_before_its_first_step_and_nothing_else_does(on):
+    """In training mode, once over all windows, with the augmentation; a resumed run does not do it again."""
+    torch.manual_seed(0)
+    policy, at_start = DeepPolicy(), []
+    before = copy.deepcopy(policy.state_dict())
+    settings = FitSettings(epochs=1, batch_size=8, statistics_first=on, precision="fp32")
+
+    def keep(end):
+        at_start.append(copy.deepcopy(end.state()))
+
+    fit(policy, Windows(), Sequential(), settings=settings, seed=(0,), on_epoch=keep)
+    first = at_start[0]["policy"]
+    changed = {name for name, value in before.items() if not torch.equal(value, first[name])}
+    statistics = {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
+    assert changed == (statistics if on else set())
+    assert first["norm.num_batches_tracked"] == (3 if on else 0)
+    again = DeepPolicy()
+    fit(again, Windows(), Sequential(), settings=settings, seed=(0,), resume=copy.deepcopy(at_start[0]))
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name
+
+
 @pytest.mark.parametrize("stop", [0, 1, 4, 5])
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, stop):
     torch.manual_seed(0)

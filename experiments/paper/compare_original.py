@@ -1,0 +1,72 @@
+"""Compares `preset=paper compat=libero` with LIBERO's code: the same weights, the same batches, side by side.
+
+    export LIBERO_ORIGINAL_SOURCE=~/LIBERO LIBERO_ORIGINAL_PYTHON=~/original-training/bin/python
+    PYTHONPATH=. python experiments/paper/compare_original.py [--quick] [--record tests/lifelong/data/original.npz]
+
+Prints a table of relative differences. `--quick` takes pictures of 64 and windows of 4 frames; `--record` keeps
+LIBERO's numbers of these, with which tests compare where its code is not at hand.
+"""
+
+import argparse
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from tests.harness import original, original_results
+from tests.harness.original_results import relative, worst
+
+PARTS = {  # by policy: functions of original_results and the batches they take
+    "bc_transformer": {
+        "learn": ("first", "episode"),
+        "with_dropout": ("first",),
+        "ewc": ("first", "second"),
+        "packnet": ("first", "second"),
+    },
+    "bc_rnn": {"learn": ("first", "episode")},
+    "bc_vilt": {"learn": ("first", "episode")},
+}
+
+
+def compared(name: str, part: str, spec: original.PolicySpec, kept: dict) -> Iterator[tuple[str, float, str]]:
+    """Yield what is compared, the largest relative difference, and where it is."""
+    given = {label: original.smooth_batch(spec, k) for k, label in enumerate(("first", "second"))}
+    given["episode"] = original.smooth_batch(spec, 2, steps=spec.seq_len + 2)
+    policy = original.our_policy(name, spec, dropout=part == "with_dropout")
+    theirs = original.run_original(policy, name, part, given)
+    ours = getattr(original_results, part)(policy, *(given[label] for label in PARTS[name][part]))
+    for key, value in ours.items():
+        if isinstance(value, dict):
+            yield key, *worst(value, original.in_our_names(policy, name, theirs, key))
+        else:
+            yield key, relative(value, torch.from_numpy(np.asarray(theirs[key]))), ""
+    if part == "learn":
+        gradient = original.in_our_names(policy, name, theirs, "gradient")
+        kept[f"{name}/names"] = np.array(sorted(gradient))
+        kept[f"{name}/gradient_norms"] = np.array(
+            [gradient[n].norm() for n in sorted(gradient)], dtype=np.float32
+        )
+        kept |= {f"{name}/{key}": theirs[key] for key, value in ours.items() if not isinstance(value, dict)}
+
+
+def main() -> None:
+    """Print the table, a row as soon as it is known."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--record")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    spec, kept = original.QUICK if args.quick or args.record else original.SPEC, {}
+    print("| policy | part | what | largest relative difference | where |\n|---|---|---|---:|---|")
+    for name, parts in PARTS.items():
+        for part in parts:
+            for what, difference, where in compared(name, part, spec, kept):
+                print(f"| {name} | {part} | {what} | {difference:.1e} | {where} |", flush=True)
+    if args.record:
+        np.savez_compressed(args.record, **kept)
+
+
+if __name__ == "__main__":
+    main()

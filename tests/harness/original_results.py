@@ -1,0 +1,185 @@
+"""What ours finds for the weights and batches that LIBERO's code gets too, in the shapes of `original_learning.py`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.windows import JoinedWindows
+from lifelong.nn.transformer import TemporalTransformer
+from lifelong.policies.base import Policy
+from lifelong.seeding import generator
+from lifelong.settings import build
+from lifelong.training.fit import learning_rate
+from lifelong.training.settings import FitSettings
+from lifelong.training.step import Step
+from lifelong.types import Batch
+from tests.harness import original
+from tests.harness.configs import composed
+
+Found = dict[str, Tensor]
+ROUNDING = 1e-5  # of the norm of all gradients; where terms of that size cancel, the rest is rounding
+
+
+def fit_settings() -> FitSettings:
+    """Return the settings of training of `preset=paper compat=libero`."""
+    return build(composed("preset=paper", "compat=libero").train)
+
+
+def one_step(policy: Policy, batch: Batch, algorithm: Algorithm) -> float:
+    """Make one step as training does, at the first learning rate; return the policy's loss."""
+    settings = fit_settings()
+    optimizer = torch.optim.AdamW(
+        algorithm.trained(policy),
+        lr=settings.lr,
+        betas=tuple(settings.betas),
+        weight_decay=settings.weight_decay,
+    )
+    algorithm.mode_train(policy)
+    loss, _ = Step(policy, algorithm, optimizer, settings, torch.device("cpu"))(batch, generator(0))
+    return loss.item()
+
+
+def gradients(policy: Policy) -> Found:
+    """Return copies of all gradients; zero where there is none."""
+    return {
+        n: torch.zeros_like(p) if p.grad is None else p.grad.clone() for n, p in policy.named_parameters()
+    }
+
+
+def weights(policy: Policy) -> Found:
+    """Return copies of weights and running statistics."""
+    return {n: t.clone() for n, t in policy.state_dict().items()}
+
+
+def learn(policy: Policy, first: Batch, episode: Batch) -> dict:
+    """Return losses, gradients, the weights after a step, and the distributions of actions over an episode."""
+    fresh, found = weights(policy), {}
+    with torch.no_grad():
+        found["eval_loss"] = policy.eval().loss(first)
+    found |= acts(policy, episode)
+    policy.train().loss(first).backward()
+    found["gradient"] = gradients(policy)
+    policy.load_state_dict(fresh)
+    found["loss"] = torch.tensor(one_step(policy, first, original.our_algorithm("sequential")))
+    found["clipped"], found["stepped"] = gradients(policy), weights(policy)
+    settings, steps = fit_settings(), 7
+    rates = [learning_rate(e * steps + 3, 50 * steps, settings, e * steps) for e in range(50)]
+    found["rates"] = torch.tensor([*rates, settings.lr_min], dtype=torch.float64)
+    policy.load_state_dict(fresh)
+    return found
+
+
+@torch.no_grad()
+def acts(policy: Policy, episode: Batch) -> Found:
+    """Return the distribution of the action at each frame, as the policy acts."""
+    policy.eval().reset(len(episode))
+    steps = episode.actions.shape[1]
+    params = [policy._step(original.episode_frame(episode, step)) for step in range(steps)]
+    joined = {name: torch.stack([p[name] for p in params], 1) for name in params[0]}
+    return {
+        "act_means": joined["means"].flatten(0, 1).view(len(episode), -1, *joined["means"].shape[-2:]),
+        "act_stds": joined["stds"],
+        "act_logits": joined["logits"].log_softmax(-1),
+    }
+
+
+@contextmanager
+def shared_draws(seed: int) -> Iterator[None]:
+    """Let dropout draw from the generator that `original_learning.py` has."""
+    draws = np.random.RandomState(seed)
+    dropout, bernoulli = torch.nn.functional.dropout, Tensor.bernoulli_
+
+    def drop(x: Tensor, p: float = 0.5, training: bool = True, inplace: bool = False) -> Tensor:
+        if not training or not p:
+            return x
+        return x * torch.from_numpy(draws.random_sample(tuple(x.shape)) >= p) / (1 - p)
+
+    def draw(self: Tensor, p: float) -> Tensor:
+        return self.copy_(torch.from_numpy(draws.random_sample(tuple(self.shape)) < p))
+
+    torch.nn.functional.dropout, Tensor.bernoulli_ = drop, draw
+    try:
+        yield
+    finally:
+        torch.nn.functional.dropout, Tensor.bernoulli_ = dropout, bernoulli
+
+
+def with_dropout(policy: Policy, first: Batch) -> dict:
+    """Return loss and gradients in training mode, with the dropout of `shared_draws`."""
+    assert any(isinstance(m, TemporalTransformer) for m in policy.modules())
+    with shared_draws(7):
+        loss = policy.train().loss(first)
+    loss.backward()
+    return {"dropout_loss": loss.detach(), "dropout_gradient": gradients(policy)}
+
+
+class _Rows:
+    """The windows of a batch as a dataset."""
+
+    def __init__(self, batch: Batch, task: int = 0):
+        self.rows, self.task_id = batch, task
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def batch(self, indices: Tensor) -> Batch:
+        return self.rows.rows(indices)
+
+
+def ewc(policy: Policy, first: Batch, second: Batch) -> dict:
+    """Return EWC's Fisher information after a task of two batches, and a step of the next one."""
+    config = composed("preset=paper", "compat=libero", "algo=ewc", "algo.estimator.batch_size=1").algo
+    algorithm = build(config)
+    windows = JoinedWindows([_Rows(first), _Rows(second)])
+    algorithm.end_task(0, windows, policy, generator(0))
+    found = {"fisher": dict(algorithm.anchor.importance)}
+    with torch.no_grad():
+        for p in policy.parameters():
+            p.mul_(1.01)
+    penalty = algorithm.penalty(policy)
+    loss = one_step(policy, first, algorithm)
+    return found | {
+        "penalty": penalty.detach(),
+        "ewc_loss": torch.tensor(loss),
+        "ewc_clipped": gradients(policy),
+    }
+
+
+def packnet(policy: Policy, first: Batch, second: Batch) -> dict:
+    """Return PackNet's weights after a step of each of two tasks and the pruning between them, and the owners."""
+    algorithm = original.our_algorithm("packnet")
+    train, retrain = algorithm.phases()
+    algorithm.begin_task(0, _Rows(first), policy)
+    algorithm.begin_phase(train, policy)
+    one_step(policy, first, algorithm)
+    found = {"packnet_first": weights(policy)}
+    algorithm.end_phase(train, policy)
+    found |= {"owner": dict(algorithm.state_dict()["owner"]), "packnet_pruned": weights(policy)}
+    algorithm.end_phase(retrain, policy)
+    algorithm.begin_task(1, _Rows(second, 1), policy)
+    algorithm.begin_phase(train, policy)
+    one_step(policy, second, algorithm)
+    return found | {"packnet_second": weights(policy)}
+
+
+# --- comparison
+
+
+def relative(ours: Tensor, theirs: Tensor, scale: float = 0.0) -> float:
+    """Return |ours - theirs| / |theirs|, in norms; a norm below `scale` counts as that."""
+    difference = (ours.double() - theirs.double()).norm()
+    return (difference / max(theirs.double().norm().item(), scale, 1e-30)).item()
+
+
+def worst(ours: Found, theirs: Found) -> tuple[float, str]:
+    """Return the largest relative difference of tensors of theirs, and which it is.
+
+    What a tensor differs by counts relative to its norm, or to `ROUNDING` of all tensors' norm if that is more: a
+    gradient that is zero but for rounding has no relative difference.
+    """
+    scale = ROUNDING * torch.stack([t.double().norm() for t in theirs.values()]).norm().item()
+    return max((relative(ours[name], value, scale), name) for name, value in theirs.items())
