@@ -217,13 +217,16 @@ def fill(policy: Policy) -> None:
 def smooth_batch(spec: PolicySpec, number: int, windows: int = 2, steps: int | None = None) -> Batch:
     """Return a batch of smooth pictures, readings and actions, the same everywhere.
 
+    The first seeds were chosen for gradients that float32 determines: computed with other kernels they are the same to
+    1e-4. Where a unit is at the kink of a ReLU, rounding decides about its share of the gradient.
+
     Args:
         spec: Sizes of all of them.
         number: Seed.
         windows: Number of windows.
         steps: Number of frames; None for the spec's `seq_len`.
     """
-    draws, steps = np.random.RandomState(100 + number), steps or spec.seq_len
+    draws, steps = np.random.RandomState(106 + number), steps or spec.seq_len
     coarse = torch.from_numpy(draws.random_sample((windows * 2, 3 * steps, 8, 8)))
     smooth = torch.nn.functional.interpolate(coarse, size=spec.image_size, mode="bilinear")
     smooth = smooth.view(windows, 2, steps, 3, *spec.image_size).permute(0, 2, 1, 4, 5, 3)
