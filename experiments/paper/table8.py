@@ -79,14 +79,20 @@ def row(args: argparse.Namespace, algo: str) -> str:
 
 def main() -> None:
     """Run what is not finished, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--benchmark", choices=PUBLISHED, default="libero_object")
     parser.add_argument("--algo", nargs="+", choices=PUBLISHED["libero_object"], default=["sequential", "er"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[100])
-    parser.add_argument("--demos", help="folder of the human demonstrations; without it they are recorded here")
+    parser.add_argument(
+        "--demos", help="folder of the human demonstrations; without it they are recorded here"
+    )
     parser.add_argument("--runs", default="runs/table8")
     parser.add_argument("--only-read", action="store_true")
-    parser.add_argument("overrides", nargs="*", help="further settings of train.py, such as data.memory=device")
+    parser.add_argument(
+        "overrides", nargs="*", help="further settings of train.py, such as data.memory=device"
+    )
     args = parser.parse_args()
     for algo in args.algo:
         for seed in args.seeds:

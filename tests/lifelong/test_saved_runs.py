@@ -131,7 +131,11 @@ def test_a_configuration_of_today_is_not_changed(name):
             {"_target_": "lifelong.algorithms.agem.AGEM", "budget": 7, "per_task": 5, "compat": "libero"},
             {
                 "_target_": "lifelong.algorithms.agem.AGEM",
-                "memory": {"_target_": "lifelong.data.memory.FirstWindows", "budget": 5},
+                "memory": {
+                    "_target_": "lifelong.data.memory.FirstWindows",
+                    "budget": 5,
+                    "batch_size": None,
+                },
                 "augment_reference": True,
             },
         ),
