@@ -13,9 +13,10 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.cli import ending
@@ -67,6 +68,52 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _report(error)
         except Exception as error:  # noqa: BLE001 - told by kind
             return _report(error)
+
+
+def compose_run(words: Sequence[str], config_dir: Path | None = None) -> tuple[DictConfig, dict[str, str]]:
+    """Compose the configuration of a run, without running it.
+
+    Args:
+        words: Overrides, as of `libero train`.
+        config_dir: Folder of the user's configuration files beside the package's.
+
+    Returns:
+        The configuration, and the name of the file chosen in each group.
+
+    Raises:
+        LiberoError: An override names something that does not exist, or cannot be applied.
+    """
+    folder, own = config_folder(), [] if config_dir is None else [config_dir.resolve()]
+    check_choices(words, (folder, *own))
+    overrides = [*words, *(f"hydra.searchpath=[file://{path}]" for path in own)]
+    try:
+        with initialize_config_dir(str(folder), version_base="1.3"):
+            config = compose("config", overrides, return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise _with_suggestion(error, words) or ConfigError(
+            f"the configuration cannot be composed: {' '.join(str(error).split())}"
+        ) from error
+    choices = dict(config.hydra.runtime.choices)
+    with open_dict(config):
+        del config["hydra"]
+    return config, choices
+
+
+def swept(words: Sequence[str]) -> dict[str, list[str]]:
+    """Return the overrides that list several values, as key -> values, such as algo.strength=0.1,1.
+
+    Raises:
+        ConfigError: A word is no override.
+    """
+    try:
+        overrides = OverridesParser.create().parse_overrides(list(words))
+    except HydraException as error:
+        raise ConfigError(f"{' '.join(str(error).split())}") from error
+    return {
+        override.get_key_element(): list(override.sweep_string_iterator())
+        for override in overrides
+        if override.is_sweep_override()
+    }
 
 
 def config_folder() -> Path:

@@ -20,10 +20,18 @@ class AGEM(Algorithm):
     `g . g_ref < 0`, `g <- g - (g . g_ref / g_ref . g_ref) g_ref` (Chaudhry et al. 2019, "Efficient lifelong
     learning with A-GEM", eq. 11). The memory is ER's; its windows are used without augmentation.
 
+    In behaviour cloning it forgets nearly as fine-tuning does. One instruction-conditioned network learns similar
+    tasks, so g and g_ref mostly agree (a mean cosine of +0.27 in a measurement on LIBERO-Object) and the constraint
+    acts in about one step of eight; where it acts, one batch's loss is kept from rising to first order, at a rate at
+    which second order matters. Nothing lowers a loss that has risen, as replay does. Projecting AdamW's update, which
+    the step really follows, instead of the gradient does not help.
+
     LIBERO's code has `FirstWindows` as memory and augments its windows. No results of that are published.
     """
 
     state_form = {"memory": MEMORY_FORM}
+    tuned = {"ratio": (0.5, 1.0, 2.0)}
+    plain_start = True
 
     def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0, augment_reference: bool = False):
         """Create the algorithm.

@@ -94,10 +94,16 @@ class Algorithm:
             augmentation.
         state_form: Form of what the class's own `state_dict` returns, see `lifelong.checkpoints.check`. A state from a
             file is checked by it before `load_state_dict` gets it; without one it is not checked.
+        tuned: Settings that decide what is kept and what is learned, with the values that `libero tune` tries; the
+            first is the one it varies unasked. They do not act before the `end_task` of the first task.
+        plain_start: Whether the first task is learned as by fine-tuning, with no state before its `end_task`;
+            `libero tune` then learns it once for all such algorithms.
     """
 
     augment: Augmentation | None = None
     state_form: ClassVar[Any] = {}
+    tuned: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    plain_start: ClassVar[bool] = False
 
     def set_augmentation(self, augment: Augmentation | None) -> None:
         """Receive the augmentation of training batches, before any other hook and also when a run is resumed."""

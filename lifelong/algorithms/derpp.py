@@ -18,18 +18,22 @@ _CHUNK = 32  # windows per forward pass at the end of a task
 class DERpp(Algorithm):
     """Replay earlier windows with their demonstrated actions, and with the policy's outputs of that time.
 
-    The loss is `L(present) + alpha E_M |z - h(x)|^2 + beta E_M L(x, y)` with independent draws from the
+    The loss is `L(present) + alpha E_M D(z, h(x)) + beta E_M L(x, y)` with independent draws from the
     memory M for the two expectations (Buzzega et al. 2020, "Dark experience for general continual learning",
     eq. 6). Here
 
-    * h is the policy's deterministic action at every step of a window and z what it was at the end of the
+    * h is the policy's distribution of actions at every step of a window and z what it was at the end of the
       window's task (there are no logits; the ends of tasks are known, so no reservoir is needed);
     * beta is `ratio`: replayed windows join the batch, as in ER, and all weigh the same in its mean;
-    * |.|^2 is summed over an action's dimensions and averaged over steps and windows. Inputs are not
-      augmented there: z was not.
+    * D is the head's divergence, in place of the paper's |z - h(x)|^2 of logits: the squared distance of deterministic
+      actions, a bound of the Kullback-Leibler divergence of mixtures. It is averaged over steps and windows. Inputs
+      are not augmented there: z was not.
     """
 
-    state_form = {"memory": MEMORY_FORM, "outputs": {int: Tensor}}
+    # a tensor is a mean action, which earlier versions kept
+    state_form = {"memory": MEMORY_FORM, "outputs": {int: (Tensor, {str: Tensor})}}
+    tuned = {"alpha": (0.03, 0.1, 0.3, 1.0, 3.0), "ratio": (0.5, 1.0, 2.0)}
+    plain_start = True
 
     def __init__(self, *, budget: Count = 10_000, ratio: NonNegative = 1.0, alpha: NonNegative = 0.3):
         """Create the algorithm.
@@ -39,13 +43,13 @@ class DERpp(Algorithm):
             ratio: Number of windows replayed for each window of the present task, and the same number for outputs.
             alpha: Weight of the outputs. 3 would weigh errors of 0.05 as the absolute error of a deterministic
                 head does (3 * 7 * 0.05^2 = 0.05), but larger ones, of new tasks, far more: 0.3 learned
-                better and forgot less (experiments/algorithms). For the likelihoods of a mixture the same
-                calculation gives about 50 (1 / (2 * 0.1^2)), a tenth of it 5; neither was tried.
+                better and forgot less (experiments/algorithms). The divergence of mixtures has the unit of their
+                loss.
         """
         self.ratio, self.alpha = ratio, alpha
         self.memory = ReplayMemory(budget)
         self._kept: dict[int, Tensor] = {}  # task -> (n,) windows in the memory
-        self._outputs: dict[int, Tensor] = {}  # task -> (n, T, A), z of each of them
+        self._outputs: dict[int, dict[str, Tensor]] = {}  # task -> z of each of them, each (n, T, ...)
         self._replayed: Batch | None = None  # drawn by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
@@ -57,21 +61,22 @@ class DERpp(Algorithm):
         return batch.join(self.memory.sample(count, generator))
 
     def penalty(self, policy: Policy) -> Tensor | None:
-        """Return `alpha |z - h(x)|^2` on the drawn windows, a scalar; None during the first task."""
+        """Return `alpha D(z, h(x))` on the drawn windows, a scalar; None during the first task."""
         if self._replayed is None:
             return None
         batch, self._replayed = self._replayed.to(_device(policy)), None
-        distance = policy.predict(batch) - self.stored_outputs(batch)
-        return self.alpha * distance.square().sum(-1).mean()
+        return self.alpha * policy.divergence(batch, self.stored_outputs(batch)).mean()
 
-    def stored_outputs(self, batch: Batch) -> Tensor:
-        """Return the policy's outputs on windows of the memory at the end of their tasks, (B, T, A)."""
-        parts = batch.actions.new_empty(batch.actions.shape)
+    def stored_outputs(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the policy's answers on windows of the memory at the end of their tasks, each (B, T, ...)."""
+        found: dict[str, Tensor] = {}
         for task, kept in self._kept.items():
             mine = batch.task_ids == task
             rows = (batch.window_ids[mine, None].to(kept.device) == kept).int().argmax(1)
-            parts[mine] = self._outputs[task][rows].to(parts)
-        return parts
+            for name, values in self._outputs[task].items():
+                part = found.setdefault(name, batch.actions.new_empty(len(batch), *values.shape[1:]))
+                part[mine] = values[rows].to(part)
+        return found
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
@@ -79,33 +84,45 @@ class DERpp(Algorithm):
         """Add the task's windows to the memory, with the policy's outputs on them."""
         self.memory.add(dataset, generator)
         before, self._kept = set(self._kept), self._held()
+        only_means = any(
+            "mean" in answers for answers in self._outputs.values()
+        )  # as an earlier version kept
         for task, kept in self._kept.items():
             if task in before:  # a smaller share is a prefix of the larger one
-                self._outputs[task] = self._outputs[task][: len(kept)].clone()
+                self._outputs[task] = {n: z[: len(kept)].clone() for n, z in self._outputs[task].items()}
             else:
-                self._outputs[task] = _outputs(policy, dataset, kept)
+                self._outputs[task] = _outputs(policy, dataset, kept, only_means)
 
     def state_dict(self) -> dict[str, Any]:
         """Return which windows are kept, and their outputs, which cannot be computed again later."""
-        return {"memory": self.memory.state_dict(), "outputs": dict(self._outputs)}
+        outputs = {task: dict(answers) for task, answers in self._outputs.items()}
+        return {"memory": self.memory.state_dict(), "outputs": outputs}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; the frames come from the datasets."""
         self.memory.load_state_dict(state["memory"], datasets)
-        self._kept, self._outputs = self._held(), dict(state["outputs"])
+        self._kept = self._held()
+        self._outputs = {
+            task: {"mean": kept} if isinstance(kept, Tensor) else dict(kept)
+            for task, kept in state["outputs"].items()
+        }
 
     def _held(self) -> dict[int, Tensor]:
         return {int(task): kept for task, kept in self.memory.state_dict()["indices"].items()}
 
 
 @torch.no_grad()
-def _outputs(policy: Policy, dataset: TaskWindows, windows: Tensor) -> Tensor:
-    """Return the policy's actions on windows, in evaluation mode, (n, T, A)."""
+def _outputs(policy: Policy, dataset: TaskWindows, windows: Tensor, only_means: bool) -> dict[str, Tensor]:
+    """Return the policy's answers on windows, in evaluation mode, each (n, T, ...)."""
+
+    def answers(batch: Batch) -> dict[str, Tensor]:
+        return {"mean": policy.predict(batch)} if only_means else policy.answers(batch)
+
     was_training, device = policy.training, _device(policy)
     policy.eval()
-    parts = [policy.predict(dataset.batch(i).to(device)).float() for i in windows.split(_CHUNK)]
+    parts = [answers(dataset.batch(i).to(device)) for i in windows.split(_CHUNK)]
     policy.train(was_training)
-    return torch.cat(parts)
+    return {name: torch.cat([part[name].float() for part in parts]) for name in parts[0]}
 
 
 def _device(policy: Policy) -> torch.device:

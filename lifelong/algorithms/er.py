@@ -22,6 +22,8 @@ class ER(Algorithm):
     """
 
     state_form = {"memory": MEMORY_FORM}
+    tuned = {"ratio": (0.25, 0.5, 1.0, 2.0)}
+    plain_start = True
 
     def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0):
         """Create the algorithm.

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -138,21 +139,47 @@ class BatchFisher(ImportanceEstimator):
 
 
 class ActionSensitivity(ImportanceEstimator):
-    """Mean absolute gradient of the squared actions of single windows, in evaluation mode.
+    """Mean absolute gradient of the actions of single windows, in evaluation mode. No labels are needed.
 
-    Aljundi et al. 2018, section 4.1: `|d |h(x)|^2 / d theta|`, h being the policy's deterministic actions, their
-    square summed over dimensions and averaged over the window's steps. No labels are needed.
+    `squared` is Aljundi et al. 2018, section 4.1: `|d |h(x)|^2 / d theta|`, h being the policy's deterministic actions,
+    their square summed over dimensions and averaged over the window's steps. That is `2 |h . dh/dtheta|`: a weight on
+    which actions near zero depend, the precise ones before a grasp, counts for nothing.
+
+    `projected` takes the gradient of `r . h(x)` with r normal and independent, of variance 1, for every window, step
+    and dimension, instead. Its mean absolute value is `sqrt(2 / pi) |dh/dtheta|` whatever the actions are: each output
+    counts alike. (That a random projection's gradient has the whole Jacobian's column norms in expectation is
+    Hutchinson's estimator, as in curvature from sampled outputs: Martens 2020, arXiv:1412.1193, section 9.)
 
     Args:
         windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
+        of: What the gradient is taken of, `projected` or `squared` actions.
     """
 
-    def __init__(self, *, windows: Natural = 512):
+    def __init__(self, *, windows: Natural = 512, of: Literal["projected", "squared"] = "projected"):
         super().__init__(windows=windows)
+        self.of = of
+        self._draws: torch.Generator | None = None
+
+    def estimate(
+        self,
+        dataset: WindowDataset,
+        policy: Policy,
+        generator: torch.Generator,
+        augment: Callable[[Batch, torch.Generator], Batch] | None = None,
+    ) -> dict[str, Tensor]:
+        """Estimate the importance; the generator also draws the projections. See `ImportanceEstimator`."""
+        self._draws = generator
+        return super().estimate(dataset, policy, generator, augment)
 
     def objective(self, policy: Policy, batch: Batch) -> Tensor:
-        """Return the squared length of the actions, mean over steps."""
-        return policy.predict(batch).square().sum(-1).mean()
+        """Return a random projection of the actions, or their squared length, mean over steps."""
+        actions = policy.predict(batch)
+        if self.of == "squared":
+            return actions.square().sum(-1).mean()
+        directions = torch.randn(actions.shape, generator=self._draws).to(actions)
+        return (directions * actions).sum() / actions.shape[
+            :-1
+        ].numel() ** 0.5  # (B, T, A), of variance |h|^2
 
     def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
         """Add the gradient's absolute value."""

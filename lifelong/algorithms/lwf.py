@@ -18,24 +18,27 @@ from lifelong.types import Batch, NonNegative
 class LwF(Algorithm):
     """On the new task's windows, respond to old instructions as the policy before the task did.
 
-    The loss gains `strength * |h_old(x, l) - h(x, l)|^2`, with x the new task's observations, l the
-    instruction of an earlier task drawn for each window, h the policy's deterministic actions and h_old those
-    of the frozen weights at the end of the last task. Li and Hoiem 2016, "Learning without forgetting"
-    (section 3), distil the old tasks' output layers on the new task's images; a policy with an instruction has
-    one output layer, and the instruction takes the place of the choice among them. No data are kept. Observations
+    The loss gains `strength * D(h_old(x, l), h(x, l))`, with x the new task's observations, l the
+    instruction of an earlier task drawn for each window, h the policy's distribution of actions, h_old that
+    of the frozen weights at the end of the last task and D the head's divergence: the squared distance of
+    deterministic actions, a bound of the Kullback-Leibler divergence of mixtures. Li and Hoiem 2016, "Learning without
+    forgetting" (section 3), distil the old tasks' output layers on the new task's images; a policy with an instruction
+    has one output layer, and the instruction takes the place of the choice among them. No data are kept. Observations
     are not augmented in this term.
     """
 
     state_form = {"weights": Weights(), "languages": {int: Tensor}}
+    tuned = {"strength": (0.03, 0.1, 0.3, 1.0, 3.0)}
+    plain_start = True
 
     def __init__(self, *, strength: NonNegative = 3.0):
         """Create the algorithm.
 
         Args:
-            strength: Weight of the distillation; the square is summed over an action's dimensions and
-                averaged over steps and windows. 3 weighs errors of 0.05 as the absolute error of a
-                deterministic head does (3 * 7 * 0.05^2 = 0.05); for the likelihoods of a mixture about 50, as
-                1 / (2 * 0.1^2) makes the term the divergence of two Gaussians of deviation 0.1.
+            strength: Weight of the divergence, which is averaged over steps and windows. At 3 the squared distance,
+                summed over an action's dimensions, weighs errors of 0.05 as the absolute error of a deterministic
+                head does (3 * 7 * 0.05^2 = 0.05). The divergence of mixtures has the unit of their loss: 1 weighs
+                both alike.
         """
         self.strength = strength
         self._weights: dict[str, Tensor] = {}  # of the teacher
@@ -53,13 +56,13 @@ class LwF(Algorithm):
         return batch
 
     def penalty(self, policy: Policy) -> Tensor | None:
-        """Return `strength * |h_old - h|^2`, a scalar; None during the first task."""
+        """Return `strength * D(h_old, h)`, a scalar; None during the first task."""
         if self._distilled is None:
             return None
         batch, self._distilled = self._distilled.to(next(policy.parameters()).device), None
         with torch.no_grad():
-            targets = self._build_teacher(policy).predict(batch)
-        return self.strength * (policy.predict(batch) - targets).square().sum(-1).mean()
+            teacher = self._build_teacher(policy).answers(batch)
+        return self.strength * policy.divergence(batch, teacher).mean()
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator

@@ -1,7 +1,7 @@
 """Memory aware synapses."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,20 +18,30 @@ class MAS(Algorithm):
     """Pull each weight towards its last anchor, the harder the more the policy's actions depend on it.
 
     Aljundi et al. 2018, "Memory aware synapses: learning what (not) to forget". After a task
-    `Omega_i += mean over windows of |d |h(x)|^2 / d theta_i|` (section 4.1), see `ActionSensitivity`; the loss of
-    later tasks gains `strength * sum_i Omega_i (theta_i - anchor_i)^2`.
+    `Omega_i += mean over windows of |d f(x) / d theta_i|` (section 4.1); the loss of later tasks gains
+    `strength * sum_i Omega_i (theta_i - anchor_i)^2`. The paper's f is the squared length of the output, by which
+    actions near zero count for nothing; here it is a random projection of it, see `ActionSensitivity`.
     """
 
     state_form = {"anchor": ANCHOR_FORM}
+    tuned = {"strength": (0.1, 1.0, 10.0, 30.0, 100.0, 1000.0)}
+    plain_start = True
 
-    def __init__(self, *, strength: NonNegative = 1.0, windows: Natural = 512):
+    def __init__(
+        self,
+        *,
+        strength: NonNegative = 1.0,
+        windows: Natural = 512,
+        of: Literal["projected", "squared"] = "projected",
+    ):
         """Create the algorithm.
 
         Args:
-            strength: Weight of the penalty (lambda); 1 as in the paper, not tuned for behaviour cloning.
+            strength: Weight of the penalty (lambda); 1 as in the paper.
             windows: Number of windows, drawn without replacement, that the estimate uses, one by one; 0: all.
+            of: What a weight matters for: a random projection of the actions, or their squared length as in the paper.
         """
-        self.strength, self.estimator = strength, ActionSensitivity(windows=windows)
+        self.strength, self.estimator = strength, ActionSensitivity(windows=windows, of=of)
         self.anchor = Anchor()
 
     def penalty(self, policy: Policy) -> Tensor | None:

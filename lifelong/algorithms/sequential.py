@@ -5,3 +5,5 @@ from lifelong.algorithms.base import Algorithm
 
 class Sequential(Algorithm):
     """Train on each task in turn, starting from the weights the last one left (LIBERO, section 4: SeqL)."""
+
+    plain_start = True

@@ -29,6 +29,7 @@ class SI(Algorithm):
     """
 
     state_form = {"anchor": ANCHOR_FORM, "omega": Weights(), "way": Weights()}
+    tuned = {"strength": (0.01, 0.1, 1.0, 10.0, 100.0)}
 
     def __init__(self, *, strength: NonNegative = 0.1, damping: Positive = 1e-3):
         """Create the algorithm.

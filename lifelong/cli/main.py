@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 from libero_env.cli import arguments, assets, demos, ending, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
-from lifelong.cli import check, compare, evaluate, protocols, saliency, serve
+from lifelong.cli import check, compare, evaluate, protocols, saliency, serve, tune
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -165,6 +165,7 @@ def run_report(args: argparse.Namespace) -> None:
 
 COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     register_train,
+    tune.register,
     register_doctor,
     tasks.register,
     demos.register,

@@ -5,7 +5,7 @@ Shape legend: B batch, T time, E latent, K modes, A action.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -46,6 +46,24 @@ class ActionHead(nn.Module, ABC):
     @abstractmethod
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
         """Draw an action, (..., A)."""
+
+    def answers(self, params: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return what a student of this distribution needs of it, each (..., *); by default the mean."""
+        return {"mean": self.mean(params)}
+
+    def divergence(self, teacher: Mapping[str, Tensor], params: dict[str, Tensor]) -> Tensor:
+        """Return how far a distribution is from a teacher's: zero, and least, where they are the same.
+
+        By default the squared distance of the means.
+
+        Args:
+            teacher: From the teacher's `answers`, each (..., *).
+            params: Parameters of the distribution that learns from it.
+
+        Returns:
+            The divergence of each action, (...), with gradients to `params`.
+        """
+        return (self.mean(params) - teacher["mean"]).square().sum(-1)
 
     def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
         """Return the actions to execute before the next latent is needed.
@@ -153,6 +171,28 @@ class GMMHead(ActionHead):
     def mean(self, params: dict[str, Tensor]) -> Tensor:
         """Return sum_k w_k mean_k, (..., A); unlike the heaviest component's mean it is smooth in the parameters."""
         return (params["logits"].softmax(-1).unsqueeze(-1) * params["means"]).sum(-2)
+
+    def answers(self, params: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return all parameters of the mixture."""
+        return dict(params)
+
+    def divergence(self, teacher: Mapping[str, Tensor], params: dict[str, Tensor]) -> Tensor:
+        """Return an upper bound of the Kullback-Leibler divergence of a teacher's mixture from this one, (...).
+
+        With weights w and components N_k it is `KL(w' | w) + sum_k w'_k KL(N'_k | N_k)`, the primed ones the teacher's:
+        by the chain rule the divergence of component and action together, of which that of the action alone is a part
+        (Do 2003, "Fast approximation of Kullback-Leibler distance for dependence trees and hidden Markov models"). It
+        is closed, in nats like the loss, and zero only where weights and all components that have weight are equal.
+        Components are compared by their numbers, which fits a student that began as the teacher.
+        """
+        if "mean" in teacher:  # all that earlier versions kept
+            return super().divergence(teacher, params)
+        with torch.autocast(params["means"].device.type, enabled=False):
+            ratio = (teacher["stds"] / params["stds"]).square()
+            distance = ((teacher["means"] - params["means"]) / params["stds"]).square()
+            per_mode = 0.5 * (ratio - 1 - ratio.log() + distance).sum(-1)  # (..., K)
+            before, now = teacher["logits"].log_softmax(-1), params["logits"].log_softmax(-1)
+            return (before.exp() * (before - now + per_mode)).sum(-1)
 
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
         """Draw an action from the mixture, (..., A)."""

@@ -4,7 +4,7 @@ Shape legend: B batch, T time, V views, H W C image, A action, L language embedd
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -73,6 +73,21 @@ class Policy(nn.Module, ABC):
             f"{type(self).__name__} has no predict(batch), which algorithms that distil need: "
             "implement it, or choose another algorithm"
         )
+
+    def answers(self, batch: Batch) -> dict[str, Tensor]:
+        """Return what a student learns from at every step of each window, each (B, T, ...); by default `predict`."""
+        return {"mean": self.predict(batch)}
+
+    def divergence(self, batch: Batch, teacher: Mapping[str, Tensor]) -> Tensor:
+        """Return how far the policy is from a teacher at every step, (B, T): zero, and least, where they agree.
+
+        By default the squared distance of the mean actions, summed over their dimensions.
+
+        Args:
+            batch: Windows.
+            teacher: The teacher's `answers` on them.
+        """
+        return (self.predict(batch) - teacher["mean"]).square().sum(-1)
 
     @abstractmethod
     def reset(self, num_envs: int) -> None:

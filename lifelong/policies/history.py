@@ -4,7 +4,7 @@ Shape legend: B batch, T time, E latent, A action.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -100,6 +100,14 @@ class HistoryPolicy(Policy):
     def predict(self, batch: Batch) -> Tensor:
         """Return the mean action at every step; see `Policy`."""
         return self.head.mean(self.distribution(batch.observation))
+
+    def answers(self, batch: Batch) -> dict[str, Tensor]:
+        """Return what the head's students learn from; see `Policy`."""
+        return self.head.answers(self.distribution(batch.observation))
+
+    def divergence(self, batch: Batch, teacher: Mapping[str, Tensor]) -> Tensor:
+        """Return the head's divergence from a teacher; see `Policy`."""
+        return self.head.divergence(teacher, self.distribution(batch.observation))
 
     def reset(self, num_envs: int) -> None:
         """Forget the history and the planned actions; see `Policy`."""

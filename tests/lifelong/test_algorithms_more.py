@@ -10,6 +10,7 @@ from lifelong.algorithms import AGEM, MAS, SI, Algorithm, DERpp, LwF, Multitask,
 from lifelong.algorithms.agem import project
 from lifelong.data.memory import ReplayMemory
 from lifelong.data.windows import JoinedWindows
+from lifelong.policies.base import Policy
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator
@@ -31,7 +32,13 @@ ALL = {
 }
 
 
-class Linear(LinearPolicy):
+class Distilled:
+    """What a policy's base class derives from `predict` for algorithms that distil."""
+
+    answers, divergence = Policy.answers, Policy.divergence
+
+
+class Linear(Distilled, LinearPolicy):
     """A linear policy that also says what it would do; it listens to the instruction."""
 
     def __init__(self):
@@ -42,7 +49,7 @@ class Linear(LinearPolicy):
         return self.linear(batch.observation.proprio["x"]) + batch.observation.language[:, None]
 
 
-class Deep(DeepPolicy):
+class Deep(Distilled, DeepPolicy):
     def predict(self, batch):
         return self.forward(batch.observation.proprio["x"])
 
@@ -252,8 +259,8 @@ def test_derpp_stores_the_outputs_at_the_end_of_each_task():
         then = torch.stack(
             [answers[t][w] for t, w in zip(batch.task_ids.tolist(), batch.window_ids, strict=True)]
         )
-        torch.testing.assert_close(algorithm.stored_outputs(batch), then)
-    assert sum(len(z) for z in algorithm.state_dict()["outputs"].values()) == len(algorithm.memory)
+        torch.testing.assert_close(algorithm.stored_outputs(batch), {"mean": then})
+    assert sum(len(z["mean"]) for z in algorithm.state_dict()["outputs"].values()) == len(algorithm.memory)
 
 
 def test_derpp_has_no_penalty_while_the_outputs_are_the_same():
@@ -269,6 +276,23 @@ def test_derpp_has_no_penalty_while_the_outputs_are_the_same():
     algorithm.mix(batch, draws)
     assert algorithm.penalty(policy).item() == pytest.approx(2.0 * 0.25)
     assert algorithm.penalty(policy) is None  # the draw of one step is not used in another
+
+
+def test_derpp_goes_on_from_the_mean_actions_that_an_earlier_version_kept():
+    torch.manual_seed(0)
+    policy, algorithm = Deep(), DERpp(budget=25)
+    for task in (0, 1):
+        learn(algorithm, policy, task)
+    state = algorithm.state_dict()
+    earlier = {**state, "outputs": {task: answers["mean"] for task, answers in state["outputs"].items()}}
+    checkpoints.check(earlier, DERpp.state_form, "a run")
+    other = DERpp(budget=25)
+    other.load_state_dict(earlier, {0: Windows(0), 1: Windows(1)})
+    sequences.assert_same(other.state_dict(), state)
+    learn(other, policy, 2)
+    batch = other.memory.sample(25, generator(0))
+    assert other.stored_outputs(batch).keys() == {"mean"}
+    assert policy.divergence(batch, other.stored_outputs(batch)).isfinite().all()
 
 
 # --- LwF
@@ -353,16 +377,32 @@ def test_si_omega_excludes_the_gradient_of_the_penalty():
 # --- MAS
 
 
-def test_mas_importance_is_the_mean_size_of_single_windows_gradients():
+def test_mas_squared_importance_is_the_mean_size_of_single_windows_gradients():
     policy, data = Linear(), Windows(size=7)
     policy.train()
-    importance = MAS(windows=0).estimator.estimate(data, policy, generator(0))
+    importance = MAS(windows=0, of="squared").estimator.estimate(data, policy, generator(0))
     out = data.features @ policy.linear.weight.T + policy.linear.bias  # (N, A); |out|^2 by W: 2 out x^T
     by_hand = 2 * (out[:, :, None] * data.features[:, None, :]).abs().mean(0)
     torch.testing.assert_close(importance["linear.weight"], by_hand)
     torch.testing.assert_close(importance["linear.bias"], 2 * out.abs().mean(0))
     assert not importance["unused"].any()
     assert policy.training and all(p.grad is None for p in policy.parameters())
+
+
+@pytest.mark.parametrize(("of", "counted"), [("squared", 0.0), ("projected", (2 / torch.pi) ** 0.5)])
+def test_mas_counts_weights_of_actions_near_zero_by_their_effect(of, counted):
+    """An output that is always zero depends on its weights as any other: E|r . dh/dtheta| is sqrt(2/pi) |dh/dtheta|."""
+    policy, data = Linear(), Windows(size=500)
+    with torch.no_grad():
+        policy.linear.weight[0].zero_()
+        policy.linear.bias[0].zero_()
+    importance = MAS(windows=0, of=of).estimator.estimate(data, policy, generator(0))
+    effect = data.features.abs().mean(0)  # |d h_0 / d W_0|
+    torch.testing.assert_close(importance["linear.weight"][0], counted * effect, rtol=0.15, atol=1e-6)
+    assert importance["linear.bias"][0].item() == pytest.approx(counted, rel=0.15)
+    assert importance["linear.weight"][1].min() > 0
+    again = MAS(windows=0, of=of).estimator.estimate(data, policy, generator(0))
+    assert torch.equal(again["linear.weight"], importance["linear.weight"]), "the generator alone draws"
 
 
 @pytest.mark.parametrize("make", [SI, MAS])

@@ -235,6 +235,81 @@ def test_deterministic_head_loss_is_absolute_error() -> None:
     assert torch.equal(head.mode(params), head.sample(params, None))
 
 
+def mixture(seed: int, modes: int = 3, rows: int = 5) -> dict[str, torch.Tensor]:
+    draws = generator(seed)
+    return {
+        "means": torch.randn(rows, modes, 2, generator=draws).tanh(),
+        "stds": 0.1 + torch.rand(rows, modes, 2, generator=draws),
+        "logits": torch.randn(rows, modes, generator=draws),
+    }
+
+
+def gmm(modes: int = 3) -> GMMHead:
+    return GMMHead(in_dim=4, action_dim=2, modes=modes, hidden=8)
+
+
+def test_mixture_divergence_is_zero_and_least_exactly_where_the_student_is_the_teacher() -> None:
+    head, teacher = gmm(), mixture(0)
+    student = {name: value.clone().requires_grad_() for name, value in teacher.items()}
+    divergence = head.divergence(head.answers(teacher), student)
+    assert divergence.shape == (5,) and not divergence.any()
+    for grad in torch.autograd.grad(divergence.sum(), list(student.values())):
+        assert grad.abs().max() < 1e-6
+    for name in teacher:  # every parameter counts
+        change = torch.linspace(0.1, 0.5, teacher[name].numel()).view_as(teacher[name])
+        moved = {**teacher, name: teacher[name] + change}
+        assert (head.divergence(teacher, moved) > 1e-5).all(), name
+    shifted = {**teacher, "logits": teacher["logits"] + 3}  # the same weights
+    assert head.divergence(teacher, shifted).abs().max() < 1e-6
+
+
+def test_mixture_divergence_bounds_that_of_the_actions_and_is_exact_for_one_gaussian() -> None:
+    for modes in (1, 3):
+        head, teacher, student = gmm(modes), mixture(1, modes, rows=1), mixture(2, modes, rows=1)
+        many = {name: value.expand(40_000, *value.shape[1:]) for name, value in teacher.items()}
+        actions = head.sample(many, generator())
+        other = {name: value.expand(40_000, *value.shape[1:]) for name, value in student.items()}
+        gaps = head.log_prob(many, actions) - head.log_prob(other, actions)
+        estimate, error = gaps.mean().item(), gaps.std().item() / 200
+        bound = head.divergence(teacher, student).item()
+        assert bound > estimate - 4 * error
+        if modes == 1:
+            assert bound == pytest.approx(estimate, abs=4 * error)
+
+
+def test_a_student_of_a_mixture_becomes_it_where_the_mean_alone_would_not_tell_them_apart() -> None:
+    """Two modes at -0.5 and 0.5 have the mean of one broad mode at 0."""
+    head = gmm(modes=2)
+    teacher = {
+        "means": torch.tensor([[[-0.5, 0.0], [0.5, 0.0]]]),
+        "stds": torch.full((1, 2, 2), 0.1),
+        "logits": torch.zeros(1, 2),
+    }
+    student = {
+        "means": torch.zeros(1, 2, 2, requires_grad=True),
+        "stds": torch.full((1, 2, 2), 0.5, requires_grad=True),
+        "logits": torch.zeros(1, 2, requires_grad=True),
+    }
+    assert torch.equal(head.mean(teacher), head.mean(student))
+    assert head.divergence(teacher, student) > 1
+    optimizer = torch.optim.Adam(student.values(), lr=0.02)
+    for _ in range(300):
+        optimizer.zero_grad()
+        head.divergence(teacher, student).sum().backward()
+        optimizer.step()
+    for name, value in teacher.items():
+        torch.testing.assert_close(student[name].detach(), value, rtol=0, atol=0.02)
+
+
+def test_deterministic_divergence_is_the_squared_distance_of_the_actions() -> None:
+    head = DeterministicHead(in_dim=4, action_dim=3, hidden=8)
+    teacher, student = head(randn(2, 5, 4)), head(randn(2, 5, 4) + 1)
+    expected = (student["means"] - teacher["means"]).square().sum(-1)
+    assert torch.equal(head.divergence(head.answers(teacher), student), expected)
+    only_mean = {"mean": torch.zeros(5, 2)}  # of a mixture, from a memory that an earlier version kept
+    assert torch.equal(gmm().divergence(only_mean, mixture(0)), gmm().mean(mixture(0)).square().sum(-1))
+
+
 def test_proprio_is_of_order_one_and_dropout_takes_whole_windows() -> None:
     tokens = ProprioTokens(proprio={"gripper_states": 2}, dim=2, dropout=0.5)
     nn.init.eye_(tokens.linears["gripper_states"].weight)

@@ -1,0 +1,245 @@
+"""Short streams of tasks, learned as a run learns them and measured on held-out demonstrations instead of rollouts."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from libero_env.storage import read_record, write_record
+from libero_env.tasks import Task
+from lifelong import checkpoints
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.demonstrations import DemoDatasets, find_demos
+from lifelong.data.settings import DataSettings
+from lifelong.data.windows import TaskWindows
+from lifelong.errors import ConfigError
+from lifelong.policies.base import Policy
+from lifelong.seeding import generator, seeded
+from lifelong.settings import Configuration
+from lifelong.training.fit import fit
+from lifelong.training.precision import autocast
+from lifelong.training.settings import FitSettings
+from lifelong.types import Batch, PolicySpec
+
+FORMAT = 1  # of a trial's record; another one is measured again
+MEASURED = 512  # largest number of held-out windows of a task
+INIT, FIT, END_TASK = 0, 1, 2  # first words of the seeds, as in a run
+_CHUNK = 128  # windows of a forward pass
+_GROUPS = ("algo", "policy", "data", "augmentation", "train", "language")  # that a trial depends on
+# Tasks of libero_90, in scenes that no other suite has: packages into a tray, packages into a basket
+STREAMS = (
+    (
+        "LIVING_ROOM_SCENE4_pick_up_the_chocolate_pudding_and_put_it_in_the_tray",
+        "LIVING_ROOM_SCENE4_pick_up_the_salad_dressing_and_put_it_in_the_tray",
+    ),
+    (
+        "LIVING_ROOM_SCENE2_pick_up_the_milk_and_put_it_in_the_basket",
+        "LIVING_ROOM_SCENE2_pick_up_the_butter_and_put_it_in_the_basket",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ProxySettings:
+    """Settings of the measurement.
+
+    Attributes:
+        streams: Tasks of each stream, in learning order.
+        seeds: Seeds with which each stream is learned.
+        steps: Number of optimiser steps on a task.
+        held_out: Share of each task's demonstrations that is not learned from but measured on.
+    """
+
+    streams: tuple[tuple[Task, ...], ...]
+    seeds: tuple[int, ...] = (1,)
+    steps: int = 160
+    held_out: float = 0.25
+
+
+@dataclass(frozen=True)
+class StreamData:
+    """Demonstrations of a stream's tasks.
+
+    Attributes:
+        spec: What the policy observes and does.
+        training: Windows to learn from, of each task.
+        held_out: Windows to measure on, of each task.
+    """
+
+    spec: PolicySpec
+    training: tuple[TaskWindows, ...]
+    held_out: tuple[Batch, ...]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One configuration that learns one stream.
+
+    Attributes:
+        config: Configuration of a run, as plain data.
+        stream: Tasks in learning order.
+        seed: Seed of all random draws.
+        steps: Number of optimiser steps on a task.
+        held_out: Share of the demonstrations that is measured on.
+    """
+
+    config: Mapping[str, Any]
+    stream: tuple[Task, ...]
+    seed: int
+    steps: int
+    held_out: float
+
+    def key(self) -> str:
+        """Return a digest of all that the trial depends on."""
+        return self._digest(self.config["algo"], self.stream)
+
+    def start_key(self, algorithm: Algorithm) -> str:
+        """Return a digest of all that the first task's learning depends on."""
+        own = {name: value for name, value in self.config["algo"].items() if name not in algorithm.tuned}
+        return self._digest({} if algorithm.plain_start else own, self.stream[:1])
+
+    def _digest(self, algo: Mapping[str, Any], tasks: Sequence[Task]) -> str:
+        groups = {group: self.config[group] for group in _GROUPS} | {"algo": algo}
+        rest = [FORMAT, [task.id for task in tasks], self.seed, self.steps, self.held_out]
+        return hashlib.sha256(json.dumps([groups, rest], sort_keys=True).encode()).hexdigest()[:16]
+
+
+def open_stream(
+    config: Mapping[str, Any], tasks: Sequence[Task], held_out: float, progress: bool | None = None
+) -> StreamData:
+    """Read the demonstrations of a stream; missing ones are recorded.
+
+    Args:
+        config: Configuration of a run, as plain data.
+        tasks: Tasks in learning order.
+        held_out: Share of each task's demonstrations, the last ones, that is measured on.
+        progress: Whether to show a progress bar of recordings.
+
+    Raises:
+        ConfigError: Too few demonstrations to learn from some and measure on others.
+    """
+    checked = Configuration(config)
+    data: DataSettings = checked.build("data")
+    learned = data.demos - round(held_out * data.demos)
+    if not 0 < learned < data.demos:
+        raise ConfigError(
+            f"{learned} of {data.demos} demonstrations would be learned from; valid: at least one, and at least one "
+            "held out (data.demos, --held-out)"
+        )
+    languages = checked.build("language").embed([task.language for task in tasks])
+    spec = data.spec(languages.shape[1])
+    paths = find_demos(tasks, [data.demos] * len(tasks), data, progress)
+    device = torch.device("cpu")
+    training, everything = (
+        DemoDatasets(paths, [count] * len(tasks), spec, languages, data, device)
+        for count in (learned, data.demos)
+    )
+    windows = tuple(training[k] for k in range(len(tasks)))
+    measured = tuple(_sample(everything[k], len(windows[k])) for k in range(len(tasks)))
+    return StreamData(spec, windows, measured)
+
+
+def _sample(dataset: TaskWindows, first: int) -> Batch:
+    """Return windows from `first` on at equal distances, `MEASURED` at most."""
+    left = len(dataset) - first
+    return dataset.batch(first + torch.linspace(0, left - 1, min(left, MEASURED)).round().long())
+
+
+def measure(trial: Trial, data: Callable[[], StreamData], folder: Path) -> list[list[float]]:
+    """Learn a trial's stream and return its errors; what was measured before is read back.
+
+    Args:
+        trial: What to learn.
+        data: Function that returns the demonstrations of its stream, called where they are needed.
+        folder: Folder of the records and of the weights after first tasks.
+
+    Returns:
+        For each stage, the mean absolute error of the actions on held-out windows of each task so far.
+    """
+    path = folder / "trials" / f"{trial.key()}.json"
+    if (record := read_record(path)) is not None:
+        return record["errors"]
+    began = time.perf_counter()
+    errors = _learn(trial, data(), folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_record(path, {"errors": errors, "seconds": round(time.perf_counter() - began, 1)})
+    return errors
+
+
+def _learn(trial: Trial, data: StreamData, folder: Path) -> list[list[float]]:
+    config, seed = Configuration(trial.config), trial.seed
+    algorithm: Algorithm = config.build("algo")
+    if algorithm.stages(len(data.training)) != tuple((task,) for task in range(len(data.training))):
+        raise ConfigError(
+            f"{type(algorithm).__name__} learns several tasks together; nothing is forgotten and nothing tuned"
+        )
+    with seeded(seed, INIT):
+        policy: Policy = config.build("policy", spec=data.spec)
+    settings = scaled(config.build("train"), trial.steps)
+    algorithm.set_augmentation(config.build("augmentation"))
+    first = folder / "first" / f"{trial.start_key(algorithm)}.safetensors"
+    errors: list[list[float]] = []
+    for task, windows in enumerate(data.training):
+        if task == 0 and first.exists():
+            state = checkpoints.load(first)
+            checkpoints.load_weights(policy, state["policy"], first)
+            if not algorithm.plain_start:
+                algorithm.load_state_dict(state["algorithm"], {})
+        else:
+            _train(algorithm, policy, task, windows, settings, seed)
+            if task == 0:
+                own = {} if algorithm.plain_start else algorithm.state_dict()
+                state = {"policy": policy.state_dict(), "algorithm": own}
+                checkpoints.save(first, state)
+        with seeded(seed, END_TASK, task, 1):
+            algorithm.end_task(task, windows, policy, generator(seed, END_TASK, task))
+        errors.append([_error(algorithm, policy, k, data.held_out[k], settings) for k in range(task + 1)])
+    return errors
+
+
+def _train(
+    algorithm: Algorithm, policy: Policy, task: int, windows: TaskWindows, settings: FitSettings, seed: int
+) -> None:
+    """Train on a task through all phases of the algorithm."""
+    algorithm.begin_task(task, windows, policy)
+    for number, phase in enumerate(algorithm.phases()):
+        algorithm.begin_phase(phase, policy)
+        epochs = max(1, round(settings.epochs * phase.share))
+        fit(
+            policy,
+            windows,
+            algorithm,
+            settings=replace(settings, epochs=epochs),
+            seed=(seed, FIT, task, number),
+            augment=algorithm.augment,
+        )
+        algorithm.end_phase(phase, policy)
+
+
+def scaled(settings: FitSettings, steps: int) -> FitSettings:
+    """Return settings with about this number of steps a task, and a warm-up of the same share of them.
+
+    Args:
+        settings: Settings of a run.
+        steps: Number of steps; what is over after all epochs have the same number is left out.
+    """
+    per_epoch = max(1, steps // settings.epochs)
+    epochs = min(settings.epochs, steps)
+    whole = settings.epochs * (settings.steps_per_epoch or per_epoch)
+    warmup = round(settings.warmup_steps * epochs * per_epoch / whole)
+    return replace(settings, epochs=epochs, steps_per_epoch=per_epoch, warmup_steps=warmup)
+
+
+@torch.no_grad()
+def _error(algorithm: Algorithm, policy: Policy, task: int, batch: Batch, settings: FitSettings) -> float:
+    """Return the mean absolute error of the policy's actions on windows of a task."""
+    with algorithm.policy_for(task, policy) as acting, autocast(torch.device("cpu"), settings.precision):
+        acting.eval()
+        parts = [batch.rows(rows) for rows in torch.arange(len(batch)).split(_CHUNK)]
+        errors = [(acting.predict(part).float() - part.actions).abs().flatten(1).mean(1) for part in parts]
+    return float(torch.cat(errors).mean())

@@ -1,0 +1,232 @@
+"""Tuning chooses by what is kept and learned, goes on where it was stopped, and writes what a run then reads."""
+
+import json
+
+import pytest
+import torch
+import yaml
+
+from lifelong import algorithms
+from lifelong.cli.main import main
+from lifelong.errors import LiberoError
+from lifelong.launch import compose_run, swept
+from lifelong.settings import Configuration, plain_data
+from lifelong.training.settings import FitSettings
+from lifelong.tuning import proxy, sweep
+from lifelong.tuning.frontier import Frontier, Outcome, render
+from lifelong.tuning.proxy import StreamData, scaled
+from tests.harness.configs import CONFIGS, composed
+from tests.harness.runs import TINY, make_windows
+
+TUNED = {
+    name: kind
+    for name, kind in vars(algorithms).items()
+    if isinstance(kind, type) and getattr(kind, "tuned", None)
+}
+FAST = ("--steps", "2", "--stream", "61,62", "--beside")
+WORDS = [*TINY, "algo=ewc", "algo.estimator.windows=2", "train.batch_size=4"]
+
+
+def outcome(label: str, *finals: tuple[float, float]) -> Outcome:
+    """One value's errors (kept, learned) in several trials of two tasks; fine-tuning leaves 0.1 on each."""
+    trials = tuple([[0.1], [kept, learned]] for kept, learned in finals)
+    return Outcome(label, {"algo.strength": float(label)}, trials, tuple([[0.1], [0.3, 0.1]] for _ in finals))
+
+
+# --- the choice
+
+
+def test_the_choice_has_the_least_error_on_all_tasks_by_the_geometric_mean() -> None:
+    loose, right, stiff = outcome("1", (0.3, 0.1)), outcome("2", (0.15, 0.11)), outcome("3", (0.14, 0.2))
+    frontier = Frontier((loose, right, stiff))
+    assert frontier.chosen is right and not frontier.at_edge()
+    assert right.kept.value == pytest.approx(1.5) and right.learned.value == pytest.approx(1.1)
+    assert right.score.value == pytest.approx((1.5 * 1.1) ** 0.5)
+    assert Frontier((right, stiff)).at_edge() and not Frontier((right,)).at_edge()
+
+
+def test_spread_is_over_trials_and_each_has_its_own_unit() -> None:
+    hard = Outcome(
+        "1", {}, ([[0.2], [0.4, 0.2]], [[0.1], [0.1, 0.1]]), ([[0.2], [0.9, 0.2]], [[0.1], [0.5, 0.1]])
+    )
+    assert (hard.kept.low, hard.kept.high) == pytest.approx((1.0, 2.0))
+    assert hard.kept.value == pytest.approx(2**0.5) and str(hard.learned) == "1.00"
+    assert hard.errors == pytest.approx((0.25, 0.15))
+
+
+def test_the_frontier_is_what_nothing_else_is_better_than_in_both() -> None:
+    one, two, worse = outcome("1", (0.3, 0.1)), outcome("2", (0.2, 0.12)), outcome("3", (0.25, 0.13))
+    frontier = Frontier((one, two, worse), (outcome("9", (0.1, 0.1)),))
+    assert [frontier.is_efficient(o) for o in frontier.outcomes] == [True, True, False]
+    table = render(frontier, "3").splitlines()
+    assert "default" in table[4] and "frontier" not in table[4] and "**chosen**" in table[3]
+    assert len(table) == 6 and len({len(line) for line in table}) == 1
+
+
+# --- the measurement
+
+
+def test_steps_are_scaled_with_their_warm_up() -> None:
+    short = scaled(FitSettings(epochs=8, steps_per_epoch=100, warmup_steps=50), 160)
+    assert (short.epochs, short.steps_per_epoch, short.warmup_steps) == (8, 20, 10)
+    assert (scaled(FitSettings(epochs=50), 5).epochs, scaled(FitSettings(epochs=50), 5).steps_per_epoch) == (
+        5,
+        1,
+    )
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_settings_that_are_tuned_exist_and_do_not_act_before_the_end_of_the_first_task(name: str) -> None:
+    kind = TUNED[name]
+    plain = plain_data(composed(f"algo={name.lower()}"))
+    for key, values in kind.tuned.items():
+        states = []
+        for value in values:
+            config = {**plain, "algo": {**plain["algo"], key: value}}
+            algorithm, policy = Configuration(config).build("algo"), torch.nn.Linear(1, 1)
+            assert getattr(algorithm, key) == value
+            states.append((algorithm, policy))
+        assert sorted(values) == list(values)
+    if kind.plain_start:
+        untouched = Configuration(plain).build("algo").state_dict()
+        assert not any(isinstance(v, torch.Tensor) for v in _leaves(untouched)), (
+            "a state before the first end"
+        )
+
+
+def _leaves(tree):
+    return [leaf for v in tree.values() for leaf in _leaves(v)] if isinstance(tree, dict) else [tree]
+
+
+@pytest.fixture
+def fake_streams(monkeypatch):
+    """Streams of random frames instead of demonstrations; return the list of those that were opened."""
+    opened = []
+
+    def open_stream(config, tasks, held_out):
+        checked = Configuration(config)
+        spec = checked.build("data").spec(384)
+        windows = [make_windows(task, spec) for task in range(len(tasks))]
+        opened.append(len(tasks))
+        return StreamData(spec, tuple(windows), tuple(w.batch(torch.arange(8)) for w in windows))
+
+    sweep._open.cache_clear()
+    monkeypatch.setattr(sweep, "open_stream", open_stream)
+    yield opened
+    sweep._open.cache_clear()
+
+
+def tune(*words: str) -> int:
+    return main(["tune", *words])
+
+
+def test_a_sweep_is_measured_once_and_its_choice_is_what_a_run_reads(tmp_path, fake_streams, capsys) -> None:
+    out, own = tmp_path / "out", tmp_path / "own"
+    words = [*WORDS, "algo.strength=10,1e3", *FAST, "--out", str(out), "--write", str(own)]
+    assert tune(*words) == 0
+    said = capsys.readouterr().out
+    assert "| 1000 " in said and "| sequential " in said and "**chosen**" in said
+    record = json.loads((out / "ewc-deterministic_small-strength.json").read_text())
+    assert [row["label"] for row in record["values"]] == ["10", "1000"]
+    assert (out / "ewc-deterministic_small-strength.png").stat().st_size > 1000
+    tuned = own / "tuned" / "deterministic_small" / "ewc.yaml"
+    assert yaml.safe_load(tuned.read_text()) == {"strength": record["chosen"]["algo.strength"]}
+    (own / "tuned" / "mine.yaml").write_text(tuned.read_text())
+    config, _ = compose_run(["algo=ewc", "tuned@algo=mine"], own)
+    assert config.algo.strength == record["chosen"]["algo.strength"]
+
+    assert fake_streams == [2]
+    assert tune(*words) == 0, "everything is read back"
+    assert fake_streams == [2]
+    assert json.loads((out / "ewc-deterministic_small-strength.json").read_text()) == record
+
+
+def test_a_sweep_that_is_stopped_goes_on_to_the_same_result(tmp_path, fake_streams, monkeypatch) -> None:
+    words = [*WORDS, "algo.strength=10,1e3", *FAST, "--out"]
+    assert tune(*words, str(tmp_path / "whole")) == 0
+    trained, train = [], proxy._train
+
+    def stopped(algorithm, policy, task, windows, settings, seed):
+        if len(trained) == 3:  # in the second task of the first value
+            raise KeyboardInterrupt
+        trained.append(task)
+        train(algorithm, policy, task, windows, settings, seed)
+
+    monkeypatch.setattr(proxy, "_train", stopped)
+    while tune(*words, str(tmp_path / "parts")):
+        assert len(trained) <= 3
+        trained.pop()
+    name = "ewc-deterministic_small-strength.json"
+    assert (tmp_path / "parts" / name).read_text() == (tmp_path / "whole" / name).read_text()
+
+
+def test_the_first_task_is_learned_once_for_all_values_to_the_same_bits(
+    tmp_path, fake_streams, monkeypatch
+) -> None:
+    words = [*WORDS, "algo=si", "~algo.estimator", "algo.strength=0.1,1", *FAST, "--out"]
+    words = [word for word in words if "estimator" not in word and word != "algo=ewc"]
+    trained, train = [], proxy._train
+    monkeypatch.setattr(
+        proxy, "_train", lambda a, p, task, *rest: (trained.append(task), train(a, p, task, *rest))
+    )
+    assert tune(*words, str(tmp_path / "shared")) == 0
+    assert trained == [0, 1, 0, 1, 1], (
+        "fine-tuning; SI, which collects its path on the first task; again from there"
+    )
+    digests = iter(range(100))
+    monkeypatch.setattr(proxy.Trial, "start_key", lambda trial, algorithm: str(next(digests)))
+    assert tune(*words, str(tmp_path / "apart")) == 0
+    assert trained[5:] == [0, 1] * 3
+    name = "si-deterministic_small-strength.json"
+    assert (tmp_path / "shared" / name).read_text() == (tmp_path / "apart" / name).read_text()
+
+
+# --- what is typed wrongly
+
+
+def test_lists_of_values_are_found_and_others_are_left() -> None:
+    assert swept(["algo=ewc", "algo.strength=1,1e3", "data.proprio=[a,b]"]) == {
+        "algo.strength": ["1", "1000.0"]
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["algo=dmpel"], "suggests no values"),
+        (["algo=ewc", "algo.strenght=1,2"], "Did you mean algo.strength"),
+        (["algo=ewcc"], "Did you mean 'ewc'"),
+        (["algo=ewc", "algo.strength=-1,2"], "algo.strength"),
+        (["algo=ewc", "--stream", "61"], "one task"),
+        (["algo=ewc", "--stream", "61,990"], "unknown task"),
+        (["algo=multitask", "train.lr=1e-3,2e-3"], "several tasks together"),
+        (["algo=ewc", "algo.strength=[1"], "["),
+    ],
+)
+def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> None:
+    assert tune(*TINY, *words, "--steps", "1", "--beside", "--out", str(tmp_path)) != 0
+    error = capsys.readouterr().err
+    assert told in error and len(error.strip().splitlines()) == 1
+
+
+def test_a_key_outside_of_the_algorithm_is_measured_but_not_written(tmp_path) -> None:
+    one = Outcome("0.1", {"train.lr": 0.1}, (), ())
+    with pytest.raises(LiberoError, match=r"train.lr is no setting of the algorithm"):
+        sweep.write_tuned(one, tmp_path / "x.yaml", "")
+
+
+# --- what is shipped
+
+SHIPPED = sorted((CONFIGS / "tuned").glob("*/*.yaml"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_chosen_values_are_used_with_their_head_and_not_with_the_original(path) -> None:
+    head, algo = path.parent.name, path.stem
+    values = yaml.safe_load(path.read_text())
+    used = plain_data(compose_run([f"algo={algo}", f"policy/head={head}"])[0])["algo"]
+    assert {key: used[key] for key in values} == values
+    paper = plain_data(compose_run(["preset=paper", "compat=libero", f"algo={algo}"])[0])["algo"]
+    plain = yaml.safe_load((CONFIGS / "algo" / f"{algo}.yaml").read_text())
+    assert {key: paper[key] for key in values} == {key: plain[key] for key in values}
+    assert "libero tune" in path.read_text()
