@@ -1,25 +1,23 @@
 """ResNet-MLP: ResNet with FiLM per camera, an action head on the features of one frame.
 
-Shape legend: B batch, T time, F features of a frame, L language embedding.
+Shape legend: B batch, T time, F features of a frame.
 """
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lifelong.nn.heads import DeterministicHead
-from lifelong.nn.tokens import LanguageToken, ProprioScaling, standardise
 from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder
-from lifelong.types import Observation, PolicySpec, Share, Width
+from lifelong.policies.history import Head, ImageEncoder
+from lifelong.policies.joined import JoinedFeaturesPolicy
+from lifelong.types import PolicySpec, Share, Width
 
 
-class BCMLP(HistoryPolicy):
+class BCMLP(JoinedFeaturesPolicy):
     """Behaviour cloning from one frame: an action head on all of its features, side by side.
 
     The cameras' latents, the instruction's latent and the proprioceptive readings are joined to one vector, which the
-    head reads. It has no memory: the frames of a window are learned one by one. A short training learns to look: with
-    a transformer over the same features the arm's pose gives the action away first, and the hand goes where the object
-    is on average (experiments/laptop).
+    head reads. It has no memory: the frames of a window are learned one by one. In a short training it learns to find
+    the object where a transformer over the same features does not (experiments/laptop).
 
     Args:
         spec: What the policy observes and does.
@@ -50,36 +48,17 @@ class BCMLP(HistoryPolicy):
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(spec, stochastic=stochastic)
-        self.standardise_language = standardise_language
-        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
-        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
-        self.proprio = ProprioScaling(
-            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
+        super().__init__(
+            spec=spec,
+            image_embed=image_embed,
+            text_embed=text_embed,
+            encoder=encoder,
+            stochastic=stochastic,
+            normalise_proprio=normalise_proprio,
+            proprio_dropout=proprio_dropout,
+            standardise_language=standardise_language,
         )
-        readings = sum(spec.proprio.values())
-        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
-        self.head = self.build_head(head, in_dim=sum(self._sizes.values()))
-
-    def encode(self, observation: Observation) -> Tensor:
-        """Return one vector per frame, (B, T, F)."""
-        images, language = observation.images, observation.language
-        b, t = images.shape[:2]
-        if self.standardise_language:
-            language = standardise(language)
-        parts = [
-            encoder(images[:, :, view].flatten(0, 1), language).view(b, t, -1)
-            for view, encoder in enumerate(self.encoders.values())
-        ]
-        parts.append(self.language(language)[:, None].expand(b, t, -1))
-        parts += self.proprio(observation.proprio).values()
-        return torch.cat(parts, dim=-1)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the parts (B, T, ...) of each camera, the instruction and the readings; see `HistoryPolicy`."""
-        parts = dict(zip(self._sizes, features.split(list(self._sizes.values()), dim=-1), strict=True))
-        return {name: part for name, part in parts.items() if part.shape[-1]}
+        self.head = self.build_head(head, in_dim=self.features)
 
     def over_time(self, features: Tensor) -> Tensor:
         """Return the features (B, T, F) as they are: each frame is by itself."""

@@ -5,19 +5,18 @@ Shape legend: B batch, T time, F features of a frame, A action, L language embed
 
 from typing import Annotated, Literal
 
-import torch
 from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import GMMHead
 from lifelong.nn.recurrent import TemporalLSTM
-from lifelong.nn.tokens import LanguageToken, ProprioScaling, standardise
 from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Component, Head, HistoryPolicy, ImageEncoder
-from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
+from lifelong.policies.history import Component, Head, ImageEncoder
+from lifelong.policies.joined import JoinedFeaturesPolicy
+from lifelong.types import CompletedWith, PolicySpec, Share, Width
 
 
-class BCRNN(HistoryPolicy):
+class BCRNN(JoinedFeaturesPolicy):
     """Behaviour cloning with LIBERO's ResNet-RNN (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     The cameras' latents, the instruction's latent and the proprioceptive readings are joined to one vector per frame
@@ -60,41 +59,23 @@ class BCRNN(HistoryPolicy):
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(spec, stochastic=stochastic)
+        super().__init__(
+            spec=spec,
+            image_embed=image_embed,
+            text_embed=text_embed,
+            encoder=encoder,
+            stochastic=stochastic,
+            normalise_proprio=normalise_proprio,
+            proprio_dropout=proprio_dropout,
+            standardise_language=standardise_language,
+        )
         if memory not in ("reset", "window", "none"):
             raise PolicyError(f"unknown memory {memory!r}. Valid: none, reset, window")
-        self.memory, self.standardise_language = memory, standardise_language
-        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
-        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
-        self.proprio = ProprioScaling(
-            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
-        )
-        readings = sum(spec.proprio.values())
-        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
-        self.rnn: nn.LSTM = temporal(in_dim=sum(self._sizes.values()))
+        self.memory = memory
+        self.rnn: nn.LSTM = temporal(in_dim=self.features)
         self.head = self.build_head(head, in_dim=self.rnn.hidden_size)
         self._state: tuple[Tensor, Tensor] | None = None  # each (layers, B, hidden)
         self._age = 0  # steps that the state has seen
-
-    def encode(self, observation: Observation) -> Tensor:
-        """Return one vector per frame, (B, T, F)."""
-        images, language = observation.images, observation.language
-        b, t = images.shape[:2]
-        if self.standardise_language:
-            language = standardise(language)
-        parts = [
-            encoder(images[:, :, view].flatten(0, 1), language).view(b, t, -1)
-            for view, encoder in enumerate(self.encoders.values())
-        ]
-        parts.append(self.language(language)[:, None].expand(b, t, -1))
-        parts += self.proprio(observation.proprio).values()
-        return torch.cat(parts, dim=-1)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the parts (B, T, ...) of each camera, the instruction and the readings; see `HistoryPolicy`."""
-        parts = dict(zip(self._sizes, features.split(list(self._sizes.values()), dim=-1), strict=True))
-        return {name: part for name, part in parts.items() if part.shape[-1]}
 
     def over_time(self, features: Tensor) -> Tensor:
         """Map features (B, T, F) to the LSTM's outputs, (B, T, hidden), from an empty state."""

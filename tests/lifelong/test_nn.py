@@ -105,6 +105,19 @@ def test_encoder_frames_of_a_window_share_its_language(norm: str) -> None:
     assert not torch.allclose(encoder(images, language.flip(0)), together)
 
 
+@pytest.mark.parametrize("stem_film", [False, True])
+def test_the_instruction_modulates_a_stem_without_blocks_where_it_is_asked_to(stem_film: bool) -> None:
+    encoder = ResNetFiLMEncoder(
+        image_size=(16, 16), language_dim=6, stage_blocks=(0,), width=8, stem_pool=False, stem_film=stem_film
+    )
+    for name, weight in encoder.named_parameters():
+        if "film" in name:
+            nn.init.normal_(weight)
+    images = torch.randint(0, 256, (2, 16, 16, 3), dtype=torch.uint8)
+    one, other = encoder(images, torch.randn(2, 6)), encoder(images, torch.randn(2, 6))
+    assert torch.equal(one, other) == (not stem_film)
+
+
 def test_encoder_refuses_invalid_sizes_and_norms() -> None:
     with pytest.raises(PolicyError, match="too small to localise"):
         small_encoder(stage_blocks=(1, 1, 1, 1), stem_pool=True)
