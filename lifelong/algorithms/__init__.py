@@ -12,6 +12,7 @@ from lifelong.algorithms.ewc import EWC
 from lifelong.algorithms.iscil import IsCiL
 from lifelong.algorithms.lora import LoRA
 from lifelong.algorithms.lwf import LwF
+from lifelong.algorithms.m2distill import M2Distill
 from lifelong.algorithms.mas import MAS
 from lifelong.algorithms.mlr import MLR
 from lifelong.algorithms.multitask import Multitask
@@ -38,6 +39,7 @@ __all__ = [
     "IsCiL",
     "LoRA",
     "LwF",
+    "M2Distill",
     "Multitask",
     "PackNet",
     "Phase",

@@ -1,0 +1,203 @@
+"""What distillation of features and of the action distribution promises."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lifelong import checkpoints
+from lifelong.algorithms import ER, M2Distill
+from lifelong.algorithms.base import load_algorithm
+from lifelong.algorithms.m2distill import distances
+from lifelong.data.memory import ReplayMemory
+from lifelong.errors import PolicyError
+from lifelong.nn.augmentation import RandomShift
+from lifelong.policies.history import HistoryPolicy
+from lifelong.seeding import generator, seeded
+from lifelong.training.costs import stored_bytes
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
+from tests.harness import sequences
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted
+from tests.harness.fakes import LinearPolicy, Windows
+from tests.harness.policies import small_rnn, small_transformer, small_vilt
+
+SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
+POLICIES = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}
+KINDS = {"image", "language", "proprio", "policy"}
+
+
+def make_policy(kind: str = "bc_transformer", head: str = "gmm") -> HistoryPolicy:
+    with seeded(3):
+        return POLICIES[kind](sequences.SPEC, head)
+
+
+def learn(algorithm, policy, task: int) -> None:
+    dataset = sequences.dataset(task)
+    algorithm.begin_task(task, dataset, policy)
+    fit(policy, dataset, algorithm, settings=SMALL, seed=(task,), augment=algorithm.augment)
+    algorithm.end_task(task, dataset, policy, generator(task))
+
+
+def pair(kind: str = "bc_transformer", head: str = "gmm"):
+    """Return a teacher, a student that is equal to it, both without dropout, and an observation."""
+    policy = make_policy(kind, head).eval()
+    return policy, copy.deepcopy(policy), sequences.dataset(0).batch(torch.arange(6)).observation
+
+
+@pytest.mark.parametrize("head", ["gmm", "deterministic", "flow"])
+@pytest.mark.parametrize("kind", POLICIES)
+def test_all_distances_and_their_gradients_are_zero_at_the_old_weights(kind, head):
+    teacher, student, observation = pair(kind, head)
+    found = distances(student, teacher, observation)
+    assert found.keys() == KINDS
+    assert all(distance.item() == pytest.approx(0, abs=1e-6) for distance in found.values())
+    torch.stack(list(found.values())).sum().backward()
+    assert all(p.grad is None or p.grad.abs().max() < 1e-5 for p in student.parameters())
+
+
+def moved(student: HistoryPolicy, pattern: str) -> None:
+    with torch.no_grad():
+        for name, p in student.named_parameters():
+            if pattern in name:
+                p.add_(0.1 * torch.randn(p.shape, generator=generator(1)))
+
+
+@pytest.mark.parametrize(
+    ("part", "kinds"),
+    [
+        ("language.linear", {"language", "policy"}),
+        ("proprio.linears", {"proprio", "policy"}),
+        ("encoders.", {"image", "policy"}),
+        ("transformer.", {"policy"}),
+        ("head.", {"policy"}),
+    ],
+)
+def test_each_distance_tells_of_its_own_modality(part, kinds):
+    teacher, student, observation = pair()
+    moved(student, part)
+    found = distances(student, teacher, observation)
+    assert {name for name, distance in found.items() if distance.item() > 1e-6} == kinds
+    assert all(distance.item() >= 0 for distance in found.values())
+
+
+@pytest.mark.parametrize("kind", ["language", "image", "proprio"])
+def test_a_step_against_a_distance_brings_that_modality_back(kind):
+    teacher, student, observation = pair()
+    moved(student, "")
+    before = distances(student, teacher, observation)[kind]
+    before.backward()
+    with torch.no_grad():
+        for p in student.parameters():
+            if p.grad is not None:
+                p -= 1e-3 * p.grad
+    assert distances(student, teacher, observation)[kind].item() < before.item()
+
+
+def test_the_image_distance_is_the_sum_over_the_cameras_of_squared_norms():
+    teacher, student, observation = pair()
+    moved(student, "encoders.")
+    with torch.no_grad():
+        old, new = (p.modalities(p.encode(observation))["agentview_rgb"] for p in (teacher, student))
+    expected = (old - new).square().sum(-1).mean()
+    assert distances(student, teacher, observation)["image"].item() == pytest.approx(
+        expected.item(), rel=1e-5
+    )
+
+
+def test_the_penalty_is_the_weighted_sum_on_earlier_windows():
+    algorithm = M2Distill(image=2.0, language=3.0, proprio=5.0, policy=7.0, ratio=0.5)
+    policy = make_policy()
+    batch = sequences.dataset(1).batch(torch.arange(8))
+    assert algorithm.mix(batch, generator(0)) is batch and algorithm.penalty(policy) is None
+    algorithm.end_task(0, sequences.dataset(0), policy, generator(0))
+    teacher = copy.deepcopy(policy).eval()
+    moved(policy.eval(), "")
+    mixed = algorithm.mix(batch, generator(0))
+    assert mixed.task_ids.tolist() == [1] * 8 + [0] * 4
+    drawn = algorithm._distilled
+    assert drawn.task_ids.tolist() == [0] * 4
+    found = distances(policy, teacher, drawn.observation)
+    expected = 2 * found["image"] + 3 * found["language"] + 5 * found["proprio"] + 7 * found["policy"]
+    assert algorithm.penalty(policy).item() == pytest.approx(expected.item(), rel=1e-4)
+    assert algorithm.penalty(policy) is None  # each draw counts once
+
+
+def test_what_is_distilled_on_is_augmented_as_batches_are():
+    algorithm = M2Distill(ratio=1.0)
+    algorithm.set_augmentation(RandomShift(3))
+    algorithm.end_task(0, sequences.dataset(0), make_policy(), generator(0))
+    algorithm.mix(sequences.dataset(1).batch(torch.arange(8)), generator(0))
+    drawn = algorithm._distilled
+    kept = sequences.dataset(0).batch(drawn.window_ids)
+    assert torch.equal(drawn.actions, kept.actions)
+    assert not torch.equal(drawn.observation.images, kept.observation.images)
+
+
+def test_without_weights_it_is_replay_with_other_draws_and_no_gradient():
+    policy, algorithm = make_policy(), M2Distill(image=0, language=0, proprio=0, policy=0)
+    algorithm.end_task(0, sequences.dataset(0), policy, generator(0))
+    moved(policy, "")
+    algorithm.mix(sequences.dataset(1).batch(torch.arange(8)), generator(0))
+    penalty = algorithm.penalty(policy)
+    penalty.backward()
+    assert penalty.item() == 0 and not any(p.grad.any() for p in policy.parameters() if p.grad is not None)
+
+
+def test_distillation_keeps_features_and_actions_nearer_than_replay_alone():
+    found = []
+    for algorithm in (
+        ER(memory=ReplayMemory(20)),
+        M2Distill(budget=20),
+    ):
+        policy = make_policy()
+        learn(algorithm, policy, 0)
+        teacher = copy.deepcopy(policy).eval()
+        fit(policy, sequences.dataset(1), algorithm, settings=replace(SMALL, epochs=6, lr=3e-3), seed=(1,))
+        with torch.no_grad():
+            seen = sequences.dataset(0).batch(torch.arange(20)).observation
+            found.append(distances(policy.eval(), teacher, seen))
+    replay, distilled = found
+    assert all(distilled[kind] < replay[kind] for kind in KINDS)
+
+
+def test_the_first_task_is_learned_as_by_fine_tuning():
+    plain, policy = make_policy(), make_policy()
+    fit(plain, sequences.dataset(0), sequences.Sequential(), settings=SMALL, seed=(0,))
+    learn(M2Distill(), policy, 0)
+    sequences.assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
+
+
+def test_a_state_restored_between_tasks_changes_nothing(tmp_path):
+    policy, algorithm = make_policy(), M2Distill(budget=25)
+    for task in (0, 1):
+        learn(algorithm, policy, task)
+    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
+    learn(algorithm, policy, 2)
+    state = checkpoints.load(tmp_path / "s")
+    other_policy, other = make_policy(), M2Distill()
+    other_policy.load_state_dict(state["policy"])
+    known = {task: sequences.dataset(task) for task in (0, 1)}
+    load_algorithm(other, state["algorithm"], known, other_policy, tmp_path / "s")
+    learn(other, other_policy, 2)
+    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
+    sequences.assert_same(other.state_dict(), algorithm.state_dict())
+
+
+def test_it_stores_the_windows_and_one_copy_of_the_weights():
+    policy, algorithm, replay = make_policy(), M2Distill(budget=25), ER(memory=ReplayMemory(25))
+    for stored in (algorithm, replay):
+        stored.end_task(0, sequences.dataset(0), policy, generator(0))
+    weights = sum(t.nbytes for t in policy.state_dict().values())
+    assert stored_bytes(algorithm) == stored_bytes(replay) + weights
+
+
+def test_a_policy_without_features_is_refused_in_a_line():
+    with pytest.raises(PolicyError, match="LinearPolicy has no encode, over_time and head"):
+        M2Distill().end_task(0, Windows(0), LinearPolicy(), generator(0))
+
+
+def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
+    monkeypatch.setitem(sequences.ALGORITHMS, "m2distill", lambda: M2Distill(budget=12))
+    assert_resumed_equals_uninterrupted(tmp_path, "m2distill", monkeypatch)
