@@ -77,7 +77,7 @@ def floats(batch: Batch) -> torch.Tensor:
 def measure_here(path: Path, repeats: int) -> list[Row]:
     """This package: gathering from memory and from disk, then what is done with a batch."""
     rows, source = [], DemoSource(path, SPEC)
-    for memory, where in (("host", "frames in memory"), ("mmap", "frames mapped from disk, read before")):
+    for memory, where in (("host", "frames in memory"), ("disk", "frames on disk, read before")):
         dataset = open_windows(source, language=torch.zeros(SPEC.language_dim), memory=memory)
         order = shuffled(len(dataset))
         rows.append(measured(f"here, {where}", lambda d=dataset, o=order: d.batch(next(o)), repeats))

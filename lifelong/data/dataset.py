@@ -1,4 +1,4 @@
-"""Windows over the demonstrations of one task, held in memory.
+"""Windows over the demonstrations of one task, with the frames in memory or on disk.
 
 Shape legend: F frames of all demonstrations, W = F windows, B batch, T time, V views, H W C image, D size of a reading,
 A action, L language embedding.
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from libero_env.demos.read import Demo
+from lifelong.data.frame_file import FrameFile
 from lifelong.data.source import (
     DemoSource,
     check_fits,
@@ -36,7 +37,7 @@ class SequenceVLDataset:
     Build one with `from_file`, `from_source` or `from_demos`.
 
     Attributes:
-        images: (F, V, H, W, C) uint8, upright.
+        images: (F, V, H, W, C) uint8, upright; in memory, or a file of them.
         proprio: Name to (F, D) float32.
         actions: (F, A) float32.
         last: Index of the last frame of each frame's demonstration, (F,) int64.
@@ -48,7 +49,7 @@ class SequenceVLDataset:
             asynchronously.
     """
 
-    images: Tensor
+    images: Tensor | FrameFile
     proprio: Mapping[str, Tensor]
     actions: Tensor
     last: Tensor
@@ -179,11 +180,21 @@ class SequenceVLDataset:
         batch = Batch(observation, gather(self.actions), torch.full_like(indices, self.task_id), indices)
         return batch if self.batch_device is None else batch.to(self.batch_device)
 
-    def _gather(self, array: Tensor, frames: Tensor) -> Tensor:
+    def _gather(self, array: Tensor | FrameFile, frames: Tensor) -> Tensor:
         """Return the rows (B, T, ...) of an array (F, ...) at frames (B, T)."""
         shape = (frames.numel(), *array.shape[1:])
-        out = torch.empty(shape, dtype=array.dtype, pin_memory=True) if self.pin_memory else None
-        return torch.index_select(array, 0, frames.flatten(), out=out).view(*frames.shape, *array.shape[1:])
+        dtype = torch.uint8 if isinstance(array, FrameFile) else array.dtype
+        out = torch.empty(shape, dtype=dtype, pin_memory=True) if self.pin_memory else None
+        if isinstance(array, FrameFile):
+            rows = array.rows(frames.flatten(), out)
+        else:
+            rows = torch.index_select(array, 0, frames.flatten(), out=out)
+        return rows.view(*frames.shape, *array.shape[1:])
+
+    def expect(self, indices: Tensor) -> None:
+        """Read the windows of the given indices, (B,) int64, ahead where frames are on disk."""
+        if isinstance(self.images, FrameFile):
+            self.images.expect(self.frames(torch.as_tensor(indices, device="cpu")).flatten())
 
     def to(self, device: torch.device | str) -> "SequenceVLDataset":
         """Return the same windows, held on another device."""

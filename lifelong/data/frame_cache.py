@@ -1,8 +1,8 @@
-"""Frames on disk, mapped into memory, for datasets that are larger than memory.
+"""Frames on disk, read when a batch needs them, for datasets that are larger than memory.
 
 There is a folder for each demonstration file and each choice of what is read of it:
 
-    images.u8     (F, V, H, W, C) uint8 without a header; the system reads a page when a batch needs it
+    images.u8     (F, V, H, W, C) uint8 without a header, see `lifelong.data.frame_file`
     arrays.npz    proprioception, actions, last frames of the demonstrations
     index.json    shape and digest of the images, and what the folder was made from
 
@@ -20,14 +20,12 @@ import logging
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
@@ -45,6 +43,7 @@ from libero_env.storage import (
     write_record,
 )
 from lifelong.data.dataset import SequenceVLDataset
+from lifelong.data.frame_file import FrameFile
 from lifelong.data.source import DemoSource, check_language, demo_tensors, last_frames
 from lifelong.errors import DataError
 
@@ -58,8 +57,8 @@ _PATIENCE, _LONGEST_BUILD = (
 _log = logging.getLogger(__name__)
 
 
-def open_mapped(source: DemoSource, *, language: Tensor, task_id: int = 0) -> SequenceVLDataset:
-    """Return the windows of a file, with the images mapped from disk. The folder is built if it does not exist.
+def open_on_disk(source: DemoSource, *, language: Tensor, task_id: int = 0) -> SequenceVLDataset:
+    """Return the windows of a file, with the images on disk. The folder is built if it does not exist.
 
     Args:
         source: What is read.
@@ -74,17 +73,14 @@ def open_mapped(source: DemoSource, *, language: Tensor, task_id: int = 0) -> Se
     folder, shape = _ensure_folder(source)
     arrays = {name: torch.from_numpy(array) for name, array in read_npz(folder / "arrays.npz").items()}
     proprio = {name: arrays[f"proprio/{name}"] for name in source.spec.proprio}
-    images = np.memmap(folder / "images.u8", dtype=np.uint8, mode="r", shape=shape)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the map is not writable, and nothing writes to it
-        frames = torch.from_numpy(images)
+    frames = FrameFile(folder / "images.u8", shape)
     return SequenceVLDataset(
         frames, proprio, arrays["actions"], arrays["last"], language, task_id, source.spec.seq_len
     )
 
 
 def cache_root() -> Path:
-    """Return the folder of all mapped frames, `frames` in the cache folder."""
+    """Return the folder of all frames on disk, `frames` in the cache folder."""
     return cache_dir() / "frames"
 
 

@@ -3,8 +3,9 @@
     device   all frames in GPU memory; nothing is copied while training
     pinned   in host memory; batches are gathered in page-locked memory and copied while the GPU computes
     host     in host memory; batches are copied when they are requested
-    mmap     on disk, see `lifelong.data.frame_cache`; batches are gathered and copied as for `pinned`
-    auto     `device` if the frames fit into GPU memory, else `pinned`; without a GPU `host`; `mmap` if they do not
+    disk     on disk, see `lifelong.data.frame_cache`; a batch is read when it is requested, or ahead, and copied as
+             for `pinned`. `mmap` is an earlier name of it
+    auto     `device` if the frames fit into GPU memory, else `pinned`; without a GPU `host`; `disk` if they do not
              fit into host memory
 
 The batches are bitwise the same. `auto` decides for each task when its windows are read, so tasks that are held for
@@ -22,7 +23,7 @@ from lifelong.data.robomimic_backend import RobomimicWindows
 from lifelong.data.source import DemoSource
 from lifelong.errors import DataError
 
-MEMORY = ("auto", "host", "pinned", "device", "mmap")
+MEMORY = ("auto", "host", "pinned", "device", "disk", "mmap")
 BACKENDS = ("native", "robomimic")
 
 _GPU_RESERVE = 0.4  # [share of GPU memory] kept free for training
@@ -60,19 +61,20 @@ def open_windows(
             raise DataError(f"data.{key} is {value!r}; valid: {', '.join(valid)}")
     if backend == "robomimic":
         return RobomimicWindows(source, language=language, task_id=task_id, device=device)
+    memory = "disk" if memory == "mmap" else memory
     if memory == "auto":
         memory = choose_memory(source.nbytes(), device)
-    elif memory != "mmap":
+    elif memory != "disk":
         _check_fits(source, memory, device)
     if memory == "pinned" and device.type != "cuda":
-        raise DataError(f"data.memory=pinned needs a GPU, and device={device}; valid: auto, host, mmap")
-    if memory == "mmap":
-        dataset = frame_cache.open_mapped(source, language=language, task_id=task_id)
+        raise DataError(f"data.memory=pinned needs a GPU, and device={device}; valid: auto, host, disk")
+    if memory == "disk":
+        dataset = frame_cache.open_on_disk(source, language=language, task_id=task_id)
     else:
         dataset = SequenceVLDataset.from_source(source, language=language, task_id=task_id)
     if memory == "device":
         return dataset.to(device)
-    pin = device.type == "cuda" and memory in ("pinned", "mmap")
+    pin = device.type == "cuda" and memory in ("pinned", "disk")
     return dataset.with_batches_on(device, pin_memory=pin) if device.type != "cpu" else dataset
 
 
@@ -86,7 +88,7 @@ def _check_fits(source: DemoSource, memory: str, device: torch.device) -> None:
         if needed > free:
             raise DataError(
                 f"{source.path} needs {show_bytes(needed)} of {place} and {show_bytes(free)} are free; set "
-                "data.memory=mmap, a smaller data.image_size or fewer data.demos"
+                "data.memory=disk, a smaller data.image_size or fewer data.demos"
             )
 
 
@@ -98,5 +100,5 @@ def choose_memory(nbytes: int, device: torch.device) -> str:
             return "device"
     free, total = host_memory()
     if nbytes > free - max(_HOST_RESERVE * total, _HOST_RESERVE_BYTES):
-        return "mmap"
+        return "disk"
     return "pinned" if device.type == "cuda" else "host"

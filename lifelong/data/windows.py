@@ -1,8 +1,9 @@
 """Datasets of windows, whatever reads and holds them: what they have in common, parts and joins of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import zip_longest
 from typing import Protocol
 
 import torch
@@ -32,6 +33,25 @@ class TaskWindows(WindowDataset, Protocol):
         ...
 
 
+def batches_in_order(dataset: WindowDataset, chunks: Sequence[Tensor]) -> Iterator[Batch]:
+    """Yield the windows of each list of indices; those of the next one are read ahead, if the dataset can do that.
+
+    Args:
+        dataset: The windows.
+        chunks: Indices of the windows of each batch, (B,) int64.
+    """
+    for indices, following in zip_longest(chunks, chunks[1:]):
+        batch = dataset.batch(indices)
+        if following is not None:
+            _expect(dataset, following)
+        yield batch
+
+
+def _expect(dataset: WindowDataset, indices: Tensor) -> None:
+    if expect := getattr(dataset, "expect", None):
+        expect(indices)
+
+
 class JoinedWindows:
     """The windows of several datasets as one dataset; indices are counted through the datasets in order."""
 
@@ -43,14 +63,22 @@ class JoinedWindows:
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64), those of one dataset after those of another."""
-        parts, start = [], 0
+        return reduce(Batch.join, [dataset.batch(chosen) for dataset, chosen in self._divided(indices)])
+
+    def expect(self, indices: Tensor) -> None:
+        """Read the windows of the given indices, (B,) int64, ahead where datasets can."""
+        for dataset, chosen in self._divided(indices):
+            _expect(dataset, chosen)
+
+    def _divided(self, indices: Tensor) -> Iterator[tuple[WindowDataset, Tensor]]:
+        """Yield each dataset of which there are windows, with their indices in it."""
+        start = 0
         for dataset in self.datasets:
             end = start + len(dataset)
             chosen = indices[(indices >= start) & (indices < end)] - start
             start = end
             if len(chosen):
-                parts.append(dataset.batch(chosen))
-        return reduce(Batch.join, parts)
+                yield dataset, chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +99,10 @@ class WindowSubset:
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64 in [0, n)) as one batch."""
         return self.dataset.batch(self.chosen[indices])
+
+    def expect(self, indices: Tensor) -> None:
+        """Read the windows of the given indices, (B,) int64 in [0, n), ahead where the dataset can."""
+        _expect(self.dataset, self.chosen[indices])
 
 
 @torch.no_grad()

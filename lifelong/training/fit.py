@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import check, load_weights
-from lifelong.data.windows import WindowDataset
+from lifelong.data.windows import WindowDataset, batches_in_order
 from lifelong.errors import CheckpointError, TrainingError
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator, seeded
@@ -97,7 +97,7 @@ def fit(
         step: Function that moves the weights once, given a batch, the epoch's generator and the learning rate, and
             returns the loss and the penalty. Default: `Step` with AdamW.
         load: Function that returns the batches of an epoch, given the indices of each; it may read ahead. Default:
-            `dataset.batch`.
+            those of `dataset.batch`, with the next one read ahead where frames are on disk.
 
     Raises:
         TrainingError: The dataset is empty, or the loss is not finite.
@@ -108,7 +108,7 @@ def fit(
     device, size = torch.device(device), settings.batch_size
     optimizer = _make_optimizer(algorithm.trained(policy), settings)
     default_step = Step(policy, algorithm, optimizer, settings, device, augment, ranks)
-    step, load = step or default_step, load or partial(map, dataset.batch)
+    step, load = step or default_step, load or partial(batches_in_order, dataset)
     steps = settings.steps_per_epoch or math.ceil(len(dataset) / size)
     total = settings.epochs * steps
     count = len(dataset) if settings.last_batch == "short" and not settings.steps_per_epoch else steps * size

@@ -47,7 +47,7 @@ def test_streams_from_the_command_line(tmp_path):
         "stream.demos_later=1",
         "stream.blur=0.2",
     )
-    status, output = train(tmp_path, *stream, "data.memory=mmap")
+    status, output = train(tmp_path, *stream, "data.memory=disk")
     assert status == 0, output
     assert "1 tasks of libero_object" in output and "Tasks 1-2/2: together" in output
     assert "2 tasks learned" in output

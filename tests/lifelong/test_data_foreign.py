@@ -66,7 +66,7 @@ def test_windows_do_not_depend_on_how_they_are_read_and_held(
     shifted = pairing == "aligned" and stated in (None, "libero", b"libero")
     frames = sum(n - shifted for n in lengths[:limit])
     source = DemoSource(path, SPEC, limit, pairing)
-    ways = [{"memory": memory} for memory in ("host", "mmap", "device", "auto")] + [{"backend": "robomimic"}]
+    ways = [{"memory": memory} for memory in ("host", "disk", "device", "auto")] + [{"backend": "robomimic"}]
     if not frames:
         for how in ways:
             with pytest.raises(DataError, match="demonstration"):
@@ -85,7 +85,7 @@ def test_windows_do_not_depend_on_how_they_are_read_and_held(
 
 
 @pytest.mark.parametrize("stated", ["bogus", b"bogus", 1])
-@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "mmap"}, {"backend": "robomimic"}])
+@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "disk"}, {"backend": "robomimic"}])
 def test_an_unknown_pairing_gives_no_windows(tmp_path, stated, how):
     path = write_file(tmp_path / "x_demo.hdf5", pairing=stated)
     with pytest.raises(DemoError, match=r"x_demo\.hdf5.*pairing"):
@@ -93,7 +93,7 @@ def test_an_unknown_pairing_gives_no_windows(tmp_path, stated, how):
 
 
 @pytest.mark.parametrize("key", ["actions", "obs/ee_pos"])
-@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "mmap"}, {"backend": "robomimic"}])
+@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "disk"}, {"backend": "robomimic"}])
 def test_values_that_are_not_finite_name_the_file_instead_of_the_learning_rate(tmp_path, key, how):
     path = write_file(tmp_path / "x_demo.hdf5")
     with h5py.File(path, "a") as file:
@@ -115,7 +115,7 @@ def test_frames_that_do_not_fit_into_memory_are_refused_before_they_are_read(tmp
     monkeypatch.setattr(loading, "host_memory", lambda: (100, 1000))
     monkeypatch.setattr(dataset.torch, "empty", None)
     with pytest.raises(
-        DataError, match=r"needs 360 B of host memory and 100 B are free; set data\.memory=mmap"
+        DataError, match=r"needs 360 B of host memory and 100 B are free; set data\.memory=disk"
     ):
         open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="host")
 

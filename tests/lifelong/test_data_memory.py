@@ -15,8 +15,11 @@ from libero_env.demos.read import Demo, demo_lengths, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import DemoSource, ReplayMemory, SequenceVLDataset, frame_cache, loading, open_windows
 from lifelong.data.frame_cache import cache_root
+from lifelong.data.frame_file import FrameFile
 from lifelong.data.loading import choose_memory
+from lifelong.data.windows import JoinedWindows, WindowSubset, batches_in_order
 from lifelong.errors import DataError
+from lifelong.streams import StageWindows
 from lifelong.types import Batch, PolicySpec
 
 pytestmark = pytest.mark.unit
@@ -79,7 +82,7 @@ def everything(dataset) -> Batch:
 
 
 @pytest.mark.parametrize("pairing", ["aligned", "stored"])
-@pytest.mark.parametrize("memory", ["auto", "host", "device", "mmap"])
+@pytest.mark.parametrize("memory", ["auto", "host", "device", "disk", "mmap"])
 def test_batches_are_the_same_in_all_memories(path: Path, memory: str, pairing: str) -> None:
     source = DemoSource(path, SPEC, limit=3, pairing=pairing)
     plain = SequenceVLDataset.from_file(
@@ -92,7 +95,7 @@ def test_batches_are_the_same_in_all_memories(path: Path, memory: str, pairing: 
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("memory", ["auto", "host", "pinned", "device", "mmap"])
+@pytest.mark.parametrize("memory", ["auto", "host", "pinned", "device", "disk"])
 def test_batches_are_the_same_on_a_gpu(path: Path, memory: str) -> None:
     if not torch.cuda.is_available():
         pytest.skip("no GPU")
@@ -114,14 +117,14 @@ def test_batches_are_on_the_requested_device(path: Path) -> None:
 
 def test_frames_are_written_once_and_found_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = DemoSource(path, SPEC)
-    first = open_windows(source, language=LANGUAGE, memory="mmap")
+    first = open_windows(source, language=LANGUAGE, memory="disk")
     monkeypatch.setattr(frame_cache, "_write_arrays", lambda *_: pytest.fail("written again"))
     again = open_windows(
         DemoSource(path, PolicySpec(image_size=(6, 8), language_dim=4, seq_len=2)),
         language=LANGUAGE,
-        memory="mmap",
+        memory="disk",
     )
-    assert torch.equal(again.images, first.images)
+    assert torch.equal(again.images.to(CPU), first.images.to(CPU))
     assert again.batch(torch.arange(3)).actions.shape == (3, 2, 7)
     assert not list(cache_root().glob("*.part")) and not list(cache_root().glob(".*.part"))
 
@@ -132,21 +135,21 @@ def test_other_settings_have_other_frames(path: Path) -> None:
     for kind in kinds:
         source = DemoSource(expert, SPEC, **kind)
         plain = open_windows(source, language=LANGUAGE, memory="host")
-        assert_same(everything(open_windows(source, language=LANGUAGE, memory="mmap")), everything(plain))
+        assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), everything(plain))
     assert len(list(cache_root().glob("other_demo-*"))) == len(kinds)
 
 
 def test_a_file_that_was_recorded_again_is_read_again(path: Path) -> None:
     source = DemoSource(path, SPEC)
-    before = open_windows(source, language=LANGUAGE, memory="mmap")
-    kept, stat = before.images.clone(), path.stat()
+    before = open_windows(source, language=LANGUAGE, memory="disk")
+    kept, stat = before.images.to(CPU), path.stat()
     write_file(path, seed=1)
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # not even its time tells
     assert path.stat().st_size == stat.st_size
-    after = open_windows(source, language=LANGUAGE, memory="mmap")
+    after = open_windows(source, language=LANGUAGE, memory="disk")
     assert_same(everything(after), everything(open_windows(source, language=LANGUAGE, memory="host")))
-    assert not torch.equal(after.images, kept)
-    assert torch.equal(before.images, kept)  # whoever has the old frames open keeps them
+    assert not torch.equal(after.images.to(CPU), kept)
+    assert torch.equal(before.images.to(CPU), kept)  # whoever has the old frames open keeps them
     assert len(list(cache_root().glob("task_demo-*"))) == 1
 
 
@@ -163,9 +166,9 @@ def test_files_of_a_killed_process_are_not_taken_as_complete(
         patch.setattr(frame_cache, "_write_arrays", killed)
         patch.setattr(frame_cache.shutil, "rmtree", lambda *_, **__: None)  # a dead process cleans nothing up
         with pytest.raises(KeyboardInterrupt):
-            open_windows(source, language=LANGUAGE, memory="mmap")
+            open_windows(source, language=LANGUAGE, memory="disk")
     (left,) = cache_root().glob(".*.part")
-    held = open_windows(source, language=LANGUAGE, memory="mmap")
+    held = open_windows(source, language=LANGUAGE, memory="disk")
     assert_same(everything(held), everything(open_windows(source, language=LANGUAGE, memory="host")))
     assert not left.exists()
 
@@ -177,7 +180,7 @@ def test_files_of_a_killed_process_are_not_taken_as_complete(
 )
 def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str, how: str) -> None:
     source = DemoSource(path, SPEC)
-    expected = everything(open_windows(source, language=LANGUAGE, memory="mmap"))
+    expected = everything(open_windows(source, language=LANGUAGE, memory="disk"))
     (file,) = cache_root().glob(f"task_demo-*/{name}")
     content = file.read_bytes()
     half = len(content) // 2
@@ -189,10 +192,73 @@ def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str,
     elif how == "of an earlier version":
         index = json.loads(content)
         file.write_text(json.dumps({key: index[key] for key in ("source", "file", "shape")}))
-    assert_same(everything(open_windows(source, language=LANGUAGE, memory="mmap")), expected)
+    assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), expected)
     (line,) = [m for m in caplog.messages if "written again" in m]
     assert line.startswith(str(file.parent)) and line.endswith("written again")
     assert file.exists()
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> tuple[FrameFile, np.ndarray]:
+    values = np.random.default_rng(0).integers(0, 256, (30, 2, 3), dtype=np.uint8)
+    values.tofile(tmp_path / "frames")
+    return FrameFile(tmp_path / "frames", values.shape), values
+
+
+@pytest.mark.parametrize(
+    "indices", [[], [0], [3, 4, 5, 5, 5], [29, 0, 1, 7, 6], list(range(30)), [4, 5, 4, 5, 6]]
+)
+def test_any_frames_are_read_from_a_file(frames, indices: list[int]) -> None:
+    file, values = frames
+    file.expect(torch.tensor(indices, dtype=torch.int64))  # changes nothing
+    found = file.rows(torch.tensor(indices, dtype=torch.int64))
+    assert found.dtype == torch.uint8 and np.array_equal(found.numpy(), values[indices])
+
+
+def test_a_file_of_frames_that_is_cut_off_while_it_is_open_is_named(frames, tmp_path: Path) -> None:
+    file, values = frames
+    os.truncate(tmp_path / "frames", 6 * 20 + 3)
+    assert np.array_equal(file.rows(torch.arange(20)).numpy(), values[:20])
+    with pytest.raises(DataError, match=r"frames ends before frame 20 of 30.*same command again"):
+        file.rows(torch.tensor([5, 20]))
+
+
+def test_frames_on_disk_do_not_count_as_memory(tmp_path: Path) -> None:
+    shape = (4000, 2, 64, 64, 3)
+    (tmp_path / "frames").touch()
+    os.truncate(tmp_path / "frames", int(np.prod(shape)))  # 98 MB of zeros, which take no space
+    file, out = FrameFile(tmp_path / "frames", shape), torch.empty(40, *shape[1:], dtype=torch.uint8)
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    before = resident()
+    for indices in torch.randperm(4000, generator=torch.Generator().manual_seed(0)).split(40):
+        assert not file.rows(indices, out).any()
+    assert resident() - before < 20e6
+
+
+def test_the_next_batch_is_read_ahead_in_every_kind_of_dataset(path: Path, monkeypatch) -> None:
+    held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
+    plain = open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="host")
+    expected: list[list[int]] = []
+    monkeypatch.setattr(FrameFile, "expect", lambda self, found: expected.append(found.tolist()))
+
+    def joined(one):
+        return JoinedWindows([one, WindowSubset(one, torch.tensor([4, 2]))])
+
+    for wrap in (lambda one: one, joined, lambda one: StageWindows([one, one], 1)):
+        expected.clear()
+        size = len(wrap(plain))
+        chunks = torch.randperm(size, generator=torch.Generator().manual_seed(1))[:6].split(2)
+        both = [list(batches_in_order(wrap(dataset), chunks)) for dataset in (held, plain)]
+        for one, other in zip(*both, strict=True):
+            assert_same(one, other)
+        assert len(both[0]) == 3 and len(expected) >= 2
+    first, second = torch.arange(2), torch.arange(2, 4)
+    expected.clear()
+    list(batches_in_order(held, [first, second]))
+    assert expected == [held.frames(second).flatten().tolist()]
 
 
 def test_large_files_of_frames_are_compared_in_parts(tmp_path: Path) -> None:
@@ -211,7 +277,7 @@ def test_large_files_of_frames_are_compared_in_parts(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_one_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LIBERO_CACHE", str(path))  # a file
     with pytest.raises(DataError, match=r"cannot be written .* set data\.memory=host") as caught:
-        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="mmap")
+        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
     assert "\n" not in str(caught.value)
 
 
@@ -229,7 +295,7 @@ def test_a_process_that_writes_for_too_long_is_named(path: Path, monkeypatch, ca
 
 
 def build(path: Path, counter: Path) -> None:
-    """Map the frames, in another process, and report if they had to be written."""
+    """Open the frames, in another process, and report if they had to be written."""
     write = frame_cache._write_arrays
 
     def counted(source: DemoSource, folder: Path) -> tuple[int, ...]:
@@ -238,7 +304,7 @@ def build(path: Path, counter: Path) -> None:
         return write(source, folder)
 
     frame_cache._write_arrays = counted
-    held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="mmap")
+    held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
     assert_same(everything(held), everything(open_windows(DemoSource(path, SPEC), language=LANGUAGE)))
 
 
@@ -258,14 +324,14 @@ def test_a_full_disk_is_reported_and_leaves_nothing(path: Path, monkeypatch: pyt
     usage = type("Usage", (), {"free": 10})
     monkeypatch.setattr(frame_cache.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(DataError, match=r"cannot be written.*LIBERO_CACHE.*data\.memory=host"):
-        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="mmap")
+        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
     assert [p.suffix for p in cache_root().iterdir()] == [".lock"]
 
 
 def test_broken_files_are_refused_in_all_memories(path: Path) -> None:
     with h5py.File(path, "a") as file:
         del file["data/demo_1/obs/gripper_states"]
-    for memory in ("host", "mmap"):
+    for memory in ("host", "disk"):
         with pytest.raises(DemoError, match=r"task_demo\.hdf5.*demo_1.*gripper_states"):
             open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory)
 
@@ -275,9 +341,9 @@ def test_broken_files_are_refused_in_all_memories(path: Path) -> None:
     [
         ((90, 100), (90, 100), "device"),
         ((60, 100), (90, 100), "pinned"),  # 40 % of the GPU is left to training
-        ((60, 100), (44, 100), "mmap"),
+        ((60, 100), (44, 100), "disk"),
         (None, (90, 100), "host"),
-        (None, (44, 100), "mmap"),
+        (None, (44, 100), "disk"),
     ],
 )
 def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
@@ -294,11 +360,11 @@ def test_the_memory_of_this_machine_is_measured() -> None:
 
 def test_unknown_memories_and_backends_name_the_valid_ones(path: Path) -> None:
     source = DemoSource(path, SPEC)
-    with pytest.raises(DataError, match="valid: auto, host, pinned, device, mmap"):
-        open_windows(source, language=LANGUAGE, memory="disk")
+    with pytest.raises(DataError, match="valid: auto, host, pinned, device, disk, mmap"):
+        open_windows(source, language=LANGUAGE, memory="tape")
     with pytest.raises(DataError, match="valid: native, robomimic"):
         open_windows(source, language=LANGUAGE, backend="lerobot")
-    with pytest.raises(DataError, match="valid: auto, host, mmap"):
+    with pytest.raises(DataError, match="valid: auto, host, disk"):
         open_windows(source, language=LANGUAGE, memory="pinned")
 
 
@@ -308,7 +374,7 @@ def test_replay_memory_accepts_windows_held_on_disk(path: Path) -> None:
         replay.add(open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory), draws)
         return replay.sample(6, draws)
 
-    assert_same(drawn("mmap"), drawn("host"))
+    assert_same(drawn("disk"), drawn("host"))
 
 
 def test_lengths_are_those_of_the_demonstrations(path: Path) -> None:
@@ -360,7 +426,7 @@ def test_without_robomimic_the_remedy_is_named(path: Path, monkeypatch: pytest.M
 
 
 def test_the_index_states_what_frames_were_made_from(path: Path) -> None:
-    open_windows(DemoSource(path, SPEC, limit=2), language=LANGUAGE, memory="mmap")
+    open_windows(DemoSource(path, SPEC, limit=2), language=LANGUAGE, memory="disk")
     (index,) = cache_root().glob("*/index.json")
     found = json.loads(index.read_text())
     assert found["source"] == str(path.resolve()) and found["read"]["limit"] == 2

@@ -284,7 +284,7 @@ def test_memory_that_there_is_not_is_refused_with_the_estimate():
 
 
 def test_the_estimate_counts_demonstrations_only_where_they_are_in_memory():
-    for memory, count in (("auto", 2), ("mmap", 2), ("host", 3)):
+    for memory, count in (("auto", 2), ("disk", 2), ("host", 3)):
         data = DataSettings(50, 128, 10, ["agentview_rgb"], [], memory=memory)
         assert len(training_needs(data, FitSettings(), None, demos=50, episodes=20, replayed=0.0)) == count
     assert experiment.EXAMPLE_DIM == 384
