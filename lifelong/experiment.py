@@ -25,7 +25,7 @@ from lifelong.errors import ConfigError
 from lifelong.evaluation.environment_record import renderer_name_or_none
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.pretraining import load_initial_weights, pretraining_context, pretraining_directory
+from lifelong.pretraining import INIT, load_initial_weights, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
 from lifelong.results.conditions import changed_conditions, present_conditions, recorded_threads
 from lifelong.results.log import ResultLog
@@ -44,7 +44,6 @@ from lifelong.types import PolicySpec
 
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
 EXAMPLE_DIM = 384  # of instructions' embeddings, by which a policy is measured before they are computed
-INIT = 0  # first word of the seed of the policy's initial weights, see lifelong.sequence
 
 
 def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) -> Path:  # noqa: B008 - frozen

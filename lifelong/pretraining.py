@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +15,17 @@ from lifelong import checkpoints
 from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
 from lifelong.errors import CheckpointError, ConfigError
+from lifelong.evaluation.restore import read_config, restore
+from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import RunDirectory, result_relevant
 from lifelong.results.saved_config import read_saved_config, upgrade_config
+from lifelong.seeding import seeded
 from lifelong.settings import PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
+
+INIT = 0  # first word of the seed of the policy's initial weights, see `lifelong.sequence`
 
 
 def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
@@ -43,6 +48,32 @@ def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
             f"{file} holds no policy's weights; name a run's directory or a task_<k>.safetensors"
         )
     return state["policy"], file
+
+
+def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[str] = ()) -> Policy:
+    """Return a policy with the weights that a run began with, on the CPU.
+
+    Args:
+        run: Directory of the run.
+        weights: A finished run or a checkpoint with these weights. None: those of its seed, or its `init_from`.
+        allow: Packages whose classes the configuration may name, too.
+
+    Raises:
+        ConfigError: The run was pretrained, and no weights are given.
+        CheckpointError: There are no such weights, or they are those of another policy.
+    """
+    loaded, config = restore(run, device="cpu", allow=allow), read_config(run / "config.yaml", allow)
+    with seeded(loaded.seed, INIT):
+        policy: Policy = config.build("policy", spec=loaded.policy.spec)
+    before = weights or config.values.get("init_from")
+    if before is None and config.build("pretrain").sequence():
+        raise ConfigError(
+            f"{run} began with pretrained weights; name them with --initial, such as a folder in runs/pretrain"
+        )
+    if before is not None:
+        found, file = load_initial_weights(Path(before).expanduser())
+        checkpoints.load_weights(policy, found, file)
+    return policy
 
 
 def _last_checkpoint(run: Path) -> Path:

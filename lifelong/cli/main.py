@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 from libero_env.cli import arguments, assets, demos, ending, objects, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
-from lifelong.cli import check, compare, evaluate, protocols, saliency, serve, tune
+from lifelong.cli import check, compare, evaluate, protocols, relearn, saliency, serve, tune
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -174,6 +174,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     teleop.register,
     evaluate.register,
     saliency.register,
+    relearn.register,
     protocols.register,
     serve.register,
     compare.register,

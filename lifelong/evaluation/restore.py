@@ -19,7 +19,7 @@ from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.saved_config import read_saved_config, upgrade_config
 from lifelong.settings import BenchmarkSettings, Configuration
-from lifelong.streams import StreamSettings, learning_stages
+from lifelong.streams import Stages, StreamSettings, learning_stages
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import Need, check_memory, policy_bytes
 
@@ -79,13 +79,17 @@ class LoadedRun:
             )
         return found
 
+    @property
+    def stages(self) -> Stages:
+        """Positions of the tasks that were learned together, stage after stage."""
+        return learning_stages(self.algorithm, self.group_sizes or (1,) * len(self.tasks))
+
     @contextmanager
     def acting(self, task: Task) -> Iterator[Policy]:
         """Yield the policy that acts on a task; for a task that is not the run's, that of the last task learned."""
         names = [t.name for t in self.tasks]
         position = names.index(task.name) if task.name in names else self.learned
-        stages = learning_stages(self.algorithm, self.group_sizes or (1,) * len(self.tasks))
-        stage = next(stage for stage in stages if position in stage)
+        stage = next(stage for stage in self.stages if position in stage)
         with self.algorithm.policy_for(stage[-1], self.policy) as policy:
             yield policy
 
@@ -108,7 +112,7 @@ def restore(
         LifelongError: There is no such run or checkpoint, or it does not match its configuration.
     """
     path, checkpoint, after = _find(source, after)
-    config = _read_config(path / "config.yaml", allow)
+    config = read_config(path / "config.yaml", allow)
     where = Ranks().device(device)
     benchmark: BenchmarkSettings = config.build("benchmark")
     tasks = benchmark.sequence()
@@ -163,8 +167,17 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
     return source, folder.task_path(chosen), chosen
 
 
-def _read_config(file: Path, allow: Sequence[str]) -> Configuration:
-    """Return the parts of a run's configuration that acting needs, checked."""
+def read_config(file: Path, allow: Sequence[str]) -> Configuration:
+    """Return the configuration of a saved run; the parts of it that acting needs are checked.
+
+    Args:
+        file: File config.yaml of the run.
+        allow: Packages whose classes the configuration may name, too.
+
+    Raises:
+        LifelongError: The file is missing.
+        ConfigError: A part is not valid, or names a class of another package.
+    """
     if not file.is_file():
         raise LifelongError(f"{file} is missing: a checkpoint needs the configuration of its run")
     values = upgrade_config(read_saved_config(file))

@@ -26,6 +26,7 @@ from lifelong.report.tables import atom_rows, cost_table, duration, episodes_tex
 from lifelong.report.templates import page_template
 from lifelong.results.metrics import METRIC_NAMES, Metrics, average_success
 from lifelong.results.records import RunRecord
+from lifelong.results.relearning import read_relearning, savings, savings_rows
 from lifelong.results.results import after_base_stage
 
 METRIC_TEXTS = {
@@ -109,6 +110,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
         "total_time": duration(sum(times.values())),
         "episodes": episodes_text(*run.results.episodes()),
+        "relearning": savings_rows(savings(read_relearning(run.path))),
         "subgoals": run.results.subgoals().predicates,
         "atoms": atom_rows(run.results.subgoals(), labels),
         "most_forgotten": most_forgotten(run.results.subgoals().atoms),

@@ -188,6 +188,45 @@ class TaskEndRecord:
 
 
 @dataclass(frozen=True)
+class RelearnRecord:
+    """Fine-tuning on a task of a finished run, from one start, in a file of its own beside the run's records.
+
+    Attributes:
+        task: Position of the task.
+        start: Weights that it began with: `final`, those that acted on the task at the end of the run, or `initial`,
+            those that the run began with.
+        learned_error: Error on held-out demonstrations when the run had just learned the task.
+        tolerance: Share by which the error may be larger than that for the task to count as back.
+        held_out: Number of held-out demonstrations.
+        rate: Learning rate.
+        steps: Numbers of optimiser steps after which the error was measured, ascending from 0; the last one is where
+            the task was back, or where it was given up.
+        errors: Errors after these steps.
+    """
+
+    kind: Literal["relearn"] = field(default="relearn", init=False)
+    task: Count
+    start: Literal["final", "initial"]
+    learned_error: Number
+    tolerance: Number
+    held_out: Count
+    rate: Number
+    steps: tuple[Count, ...]
+    errors: tuple[Number, ...]
+    seconds: Number
+
+    def __post_init__(self) -> None:
+        if not len(self.steps) == len(self.errors) > 0:
+            raise ValueError(f"{len(self.steps)} steps have {len(self.errors)} errors")
+
+    @property
+    def needed(self) -> int | None:
+        """Number of steps until the task was back; None if it was given up before."""
+        limit = (1 + self.tolerance) * self.learned_error
+        return self.steps[-1] if self.errors[-1] <= limit else None
+
+
+@dataclass(frozen=True)
 class RunEndRecord:
     """The end of the run: the whole sequence is learned."""
 
@@ -196,7 +235,16 @@ class RunEndRecord:
     finished: str
 
 
-Record = RunRecord | LossRecord | EvalRecord | PhaseRecord | CostRecord | TaskEndRecord | RunEndRecord
+Record = (
+    RunRecord
+    | LossRecord
+    | EvalRecord
+    | PhaseRecord
+    | CostRecord
+    | TaskEndRecord
+    | RelearnRecord
+    | RunEndRecord
+)
 RECORD_TYPES: Mapping[str, type[Record]] = {
     "run": RunRecord,
     "loss": LossRecord,
@@ -204,6 +252,7 @@ RECORD_TYPES: Mapping[str, type[Record]] = {
     "phase": PhaseRecord,
     "cost": CostRecord,
     "task_end": TaskEndRecord,
+    "relearn": RelearnRecord,
     "run_end": RunEndRecord,
 }
 

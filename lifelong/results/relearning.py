@@ -1,0 +1,99 @@
+"""What relearning came to: steps until a forgotten task is back, beside learning it for the first time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lifelong.results.log import ResultLog
+from lifelong.results.records import RelearnRecord
+
+FILE_NAME = "relearning.jsonl"  # in the run's directory
+
+
+@dataclass(frozen=True)
+class Savings:
+    """One task, relearned and learned for the first time under the same conditions.
+
+    Attributes:
+        task: Position of the task.
+        learned_error: Error on held-out demonstrations when the run had just learned it.
+        final_error: Error at the end of the run.
+        again: Number of steps from the end of the run until the error was back; None if it was given up.
+        first: Number of steps from the run's initial weights; None if it was given up, or not measured.
+        tried: Number of steps after which the longer of the two was given up.
+    """
+
+    task: int
+    learned_error: float
+    final_error: float
+    again: int | None
+    first: int | None
+    tried: int
+
+    @property
+    def share(self) -> float | None:
+        """Savings (Ebbinghaus 1885): the share of the first steps that relearning does without, 1 if none is needed.
+
+        Below 0, relearning takes longer. None unless both ended.
+        """
+        if self.again is None or not self.first:
+            return None
+        return 1 - self.again / self.first
+
+
+def read_relearning(run: Path) -> list[RelearnRecord]:
+    """Return what `libero relearn` has measured in a run's directory; nothing without its file.
+
+    Raises:
+        ResultsError: The file cannot be read.
+    """
+    file = run / FILE_NAME
+    return ResultLog(file).read().of(RelearnRecord) if file.is_file() else []
+
+
+def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
+    """Pair the starts of each task, the latest of each under the same conditions.
+
+    Args:
+        records: From `read_relearning`, in the order they were written.
+    """
+    found = []
+    for task in sorted({r.task for r in records}):
+        last = next((r for r in reversed(records) if (r.task, r.start) == (task, "final")), None)
+        if last is None:
+            continue
+        rivals = [r for r in records if (r.task, r.start) == (task, "initial") and _like(r, last)]
+        first = rivals[-1] if rivals else None
+        tried = max(last.steps[-1], first.steps[-1] if first else 0)
+        needed = first.needed if first else None
+        found.append(Savings(task, last.learned_error, last.errors[0], last.needed, needed, tried))
+    return found
+
+
+def _like(a: RelearnRecord, b: RelearnRecord) -> bool:
+    names = ("learned_error", "tolerance", "held_out", "rate")
+    return all(getattr(a, name) == getattr(b, name) for name in names)
+
+
+def savings_rows(found: Sequence[Savings]) -> list[tuple[str, ...]]:
+    """Return the savings as text: task from 1, error just learned and at the end, steps again and at first, savings."""
+    rows = []
+    for row in found:
+        first, again = _steps(row.first, row.tried), _steps(row.again, row.tried)
+        share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
+        rows.append(
+            (str(row.task + 1), f"{row.learned_error:.3f}", f"{row.final_error:.3f}", again, first, share)
+        )
+    return rows
+
+
+def savings_table(records: Sequence[RelearnRecord]) -> str:
+    """Return what was measured as a table in plain text."""
+    head = ("task", "error just learned", "error at the end", "steps again", "steps at first", "savings")
+    rows = [head, *savings_rows(savings(records))]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+
+
+def _steps(needed: int | None, tried: int) -> str:
+    return f"> {tried}" if needed is None else str(needed)
