@@ -18,10 +18,12 @@ class CompressedER(Algorithm):
 
     The loss and the draws are those of experience replay (Chaudhry et al. 2019): `ratio` windows of earlier tasks join
     each of the batch. What differs is what is kept. `CompressedMemory` has the frames themselves, as WebP of a
-    twentieth of their size, so the state is all that later tasks need: demonstrations of earlier tasks may be gone.
+    twenty-fifth of their size, so the state is all that later tasks need: demonstrations of earlier tasks may be gone.
     """
 
     state_form = {"memory": COMPRESSED_FORM}
+    tuned = {"ratio": (0.25, 0.5, 1.0, 2.0)}
+    plain_start = True
 
     def __init__(
         self,

@@ -38,6 +38,8 @@ class M2Distill(Algorithm):
     """
 
     state_form = {"memory": MEMORY_FORM, "weights": Weights()}
+    tuned = {"policy": (0.1, 0.3, 1.0, 3.0), "image": (0.003, 0.01, 0.03, 0.1)}
+    plain_start = True
 
     def __init__(
         self,

@@ -55,6 +55,8 @@ class MLR(Algorithm):
         "near": Tensor,
     }
 
+    tuned = {"adjustment": (0.0, 0.03, 0.1, 0.3), "margin": (0.4, 0.72, 1.0)}
+
     def __init__(
         self,
         *,

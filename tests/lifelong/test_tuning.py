@@ -78,7 +78,7 @@ def test_steps_are_scaled_with_their_warm_up() -> None:
 @pytest.mark.parametrize("name", TUNED)
 def test_settings_that_are_tuned_exist_and_do_not_act_before_the_end_of_the_first_task(name: str) -> None:
     kind = TUNED[name]
-    plain = plain_data(composed(f"algo={name.lower()}"))
+    plain = plain_data(composed(f"algo={kind.__module__.rpartition('.')[2]}"))
     for key, values in kind.tuned.items():
         states = []
         for value in values:
