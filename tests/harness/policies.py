@@ -13,7 +13,7 @@ from lifelong.nn import (
     TemporalLSTM,
     TemporalTransformer,
 )
-from lifelong.policies import BCRNN, BCTransformer, BCViLT
+from lifelong.policies import BCMLP, BCRNN, BCTransformer, BCViLT
 from lifelong.types import PolicySpec
 
 small_resnet = partial(ResNetFiLMEncoder, width=8, stage_blocks=[1], stem_pool=False)
@@ -47,6 +47,13 @@ def small_rnn(spec: PolicySpec, head: str | partial = "gmm", **changes: Any) -> 
     head = small_head(head) if isinstance(head, str) else head
     components = {"encoder": small_resnet, "temporal": temporal, "head": head}
     return BCRNN(spec=spec, **({"image_embed": 8, "text_embed": 4} | components | changes))
+
+
+def small_mlp(spec: PolicySpec, head: str | partial = "gmm", **changes: Any) -> BCMLP:
+    """Return a ResNet-MLP with a latent of eight numbers for each camera."""
+    head = small_head(head) if isinstance(head, str) else head
+    components = {"encoder": small_resnet, "head": head, "image_embed": 8, "text_embed": 4}
+    return BCMLP(spec=spec, **(components | changes))
 
 
 def small_vilt(spec: PolicySpec, head: str | partial = "gmm", dropout: float = 0.1, **changes: Any) -> BCViLT:

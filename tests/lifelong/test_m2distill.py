@@ -21,10 +21,15 @@ from lifelong.training.settings import FitSettings
 from tests.harness import sequences
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.fakes import LinearPolicy, Windows
-from tests.harness.policies import small_rnn, small_transformer, small_vilt
+from tests.harness.policies import small_mlp, small_rnn, small_transformer, small_vilt
 
 SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
-POLICIES = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}
+POLICIES = {
+    "bc_transformer": small_transformer,
+    "bc_rnn": small_rnn,
+    "bc_vilt": small_vilt,
+    "bc_mlp": small_mlp,
+}
 KINDS = {"image", "language", "proprio", "policy"}
 
 

@@ -21,10 +21,11 @@ from lifelong.training.settings import FitSettings
 from tests.harness import sequences
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.fakes import LinearPolicy, Windows
-from tests.harness.policies import small_rnn, small_transformer, small_vilt
+from tests.harness.policies import small_mlp, small_rnn, small_transformer, small_vilt
 
 SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
-POLICIES = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}
+MIXING = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}  # over time
+POLICIES = MIXING | {"bc_mlp": small_mlp}
 TWO_VIEWS = replace(sequences.SPEC, views=("a", "b"), proprio={"x": 2, "y": 3})
 
 
@@ -224,7 +225,7 @@ def test_features_at_their_instruction_are_not_adjusted_and_those_at_another_one
     assert towards < 0
 
 
-@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("kind", MIXING)
 def test_the_adjustment_acts_on_the_trained_part_of_any_policy(kind):
     policy, algorithm = learned(1, kind, adjustment=5.0)
     dataset = sequences.dataset(1)
