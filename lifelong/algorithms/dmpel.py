@@ -143,12 +143,8 @@ class DMPEL(Algorithm):
         """Return the batch with the query of its episode in each window."""
         if self._router is None:
             return batch
-        known, device = batch.task_ids == self.task_index, batch.actions.device
-        queries = batch.actions.new_empty(len(batch), self._router.enter.shape[1])
-        of_window, contexts = self._episodes["of_window"], self._episodes["queries"].to(device)
-        queries[known] = contexts[of_window.to(device)[batch.window_ids[known]]]
-        if not known.all():
-            queries[~known] = self.query(batch.observation)[~known]
+        queries, of_window = (self._episodes[k].to(batch.actions.device) for k in ("queries", "of_window"))
+        queries = queries[of_window[batch.window_ids]]
         proprio = {**batch.observation.proprio, _QUERY: queries[:, None]}
         return replace(batch, observation=replace(batch.observation, proprio=proprio))
 

@@ -208,8 +208,8 @@ def check_pairs(pairs: Mapping[str, Mapping[str, Tensor]], base: Mapping[str, Te
     """
     for name, pair in pairs.items():
         a, b, weight = pair["a"], pair["b"], base.get(name)
-        fits = weight is not None and a.dim() == b.dim() == 2 and len(a) == b.shape[1]
-        if not fits or (len(b), a.shape[1]) != weight.flatten(1).shape:
+        fits = a.dim() == b.dim() == 2 and len(a) == b.shape[1]
+        if weight is None or not fits or (len(b), a.shape[1]) != weight.flatten(1).shape:
             raise CheckpointError(f"the adapter of {name} does not fit a weight of the base")
 
 

@@ -110,17 +110,22 @@ def test_the_weights_kept_are_those_of_the_best_epoch(harness, tmp_path, make, m
     p = harness.run_context(tmp_path, "this")
     p.algorithm.recall_steps = 0  # recall changes the router after the task
     sequence = harness.sequence(p)
-    evaluate = sequence._evaluate
+    evaluate = sequence.evaluator.evaluate
+
+    def present() -> torch.Tensor:
+        if isinstance(p.algorithm, CLARE):  # which chooses differently once the task has autoencoders
+            return torch.cat([weight.detach().flatten() for weight in p.algorithm._library.parameters(1)])
+        return answers(p.algorithm, p.policy, 1)
 
     def staged(phase, learned, task, epoch):
         if phase == "curve" and learned == 1 and epoch == 1:
-            kept["then"] = answers(p.algorithm, p.policy, 1)
+            kept["then"] = present()
         record = evaluate(phase, learned, task, epoch)
         if phase == "matrix" and learned == 1 and task == 1:
-            kept["end"] = answers(p.algorithm, p.policy, 1)
+            kept["end"] = present()
         return record
 
-    monkeypatch.setattr(sequence, "_evaluate", staged)
+    monkeypatch.setattr(sequence.evaluator, "evaluate", staged)
     monkeypatch.setattr(TrainingPhase, "best_epoch", lambda self, results, until: min(until, 1))
     sequence.run()
     assert torch.equal(kept["then"], kept["end"])
@@ -402,12 +407,10 @@ def test_dmpel_routes_by_the_first_frame_of_a_demonstration():
     for task in (0, 1):
         learn_small(algorithm, policy, task)
     algorithm.begin_task(2, sequences.dataset(2), policy)
-    later = sequences.dataset(3).batch(torch.tensor([4]))  # of a task whose demonstrations are not known
-    mixed = algorithm.mix(everything(2).join(later), generator(0))
+    mixed = algorithm.mix(everything(2), generator(0))
     queries = mixed.observation.proprio["routing_query"][:, 0]
     first = algorithm.query(everything(2).observation)
     assert torch.equal(queries[:10], first[[0] * 10]) and torch.equal(queries[10:20], first[[10] * 10])
-    assert torch.equal(queries[20:], algorithm.query(later.observation))
     assert not torch.equal(first[0], first[10])
 
 
