@@ -40,6 +40,10 @@ class FrameFile:
     def __len__(self) -> int:
         return self.shape[0]
 
+    def __getitem__(self, frames: Tensor) -> Tensor:
+        """Return frames by index, as a tensor does; see `rows`."""
+        return self.rows(frames)
+
     @property
     def nbytes(self) -> int:
         """Number of bytes of the frames, on the disk."""
@@ -81,7 +85,7 @@ class FrameFile:
 
     def _read(self, rows: np.ndarray, first: int) -> None:
         """Fill rows (n, bytes) with the frames from `first` on."""
-        left, offset = memoryview(rows.reshape(-1)), first * self._size
+        left, offset = rows.reshape(-1).data, first * self._size
         while left:
             try:
                 count = os.preadv(self._file, [left], offset)

@@ -213,6 +213,7 @@ def test_any_frames_are_read_from_a_file(frames, indices: list[int]) -> None:
     file.expect(torch.tensor(indices, dtype=torch.int64))  # changes nothing
     found = file.rows(torch.tensor(indices, dtype=torch.int64))
     assert found.dtype == torch.uint8 and np.array_equal(found.numpy(), values[indices])
+    assert torch.equal(file[torch.tensor(indices, dtype=torch.int64)], found)
 
 
 def test_a_file_of_frames_that_is_cut_off_while_it_is_open_is_named(frames, tmp_path: Path) -> None:
