@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from tests.harness import original, original_results
-from tests.harness.original_results import relative, worst
+from tests.harness.original_results import relative, update_difference, where_owners_agree, worst
 
 PARTS = {  # by policy: functions of original_results and the batches they take
     "bc_transformer": {
@@ -34,14 +34,26 @@ def compared(name: str, part: str, spec: original.PolicySpec, kept: dict) -> Ite
     given["episode"] = original.smooth_batch(spec, 2, steps=spec.seq_len + 2)
     policy = original.our_policy(name, spec, dropout=part == "with_dropout")
     theirs = original.run_original(policy, name, part, given)
+    before = original_results.weights(policy)
     ours = getattr(original_results, part)(policy, *(given[label] for label in PARTS[name][part]))
+    found = {
+        k: original.in_our_names(policy, name, theirs, k) for k, v in ours.items() if isinstance(v, dict)
+    }
     for key, value in ours.items():
-        if isinstance(value, dict):
-            yield key, *worst(value, original.in_our_names(policy, name, theirs, key))
+        if key == "stepped":
+            yield "update", update_difference(before, value, found[key], ours["clipped"]), ""
+        elif key == "owner":
+            apart, where = max(((value[n] != found[key][n]).float().mean().item(), n) for n in value)
+            yield "share of weights with another owner", apart, where
+        elif key.startswith("packnet"):
+            kept = [where_owners_agree(side, ours["owner"], found["owner"]) for side in (value, found[key])]
+            yield f"{key}, owners alike", *worst(*kept)
+        elif key in found:
+            yield key, *worst(value, found[key])
         else:
             yield key, relative(value, torch.from_numpy(np.asarray(theirs[key]))), ""
     if part == "learn":
-        gradient = original.in_our_names(policy, name, theirs, "gradient")
+        gradient = found["gradient"]
         kept[f"{name}/names"] = np.array(sorted(gradient))
         kept[f"{name}/gradient_norms"] = np.array(
             [gradient[n].norm() for n in sorted(gradient)], dtype=np.float32

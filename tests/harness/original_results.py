@@ -21,7 +21,7 @@ from tests.harness import original
 from tests.harness.configs import composed
 
 Found = dict[str, Tensor]
-ROUNDING = 1e-5  # of the norm of all gradients; where terms of that size cancel, the rest is rounding
+ROUNDING = 1e-7  # of all tensors' norm: below it a gradient is zero but for rounding
 
 
 def fit_settings() -> FitSettings:
@@ -55,20 +55,27 @@ def weights(policy: Policy) -> Found:
     return {n: t.clone() for n, t in policy.state_dict().items()}
 
 
-def learn(policy: Policy, first: Batch, episode: Batch) -> dict:
-    """Return losses, gradients, the weights after a step, and the distributions of actions over an episode."""
+def measure(policy: Policy, first: Batch, episode: Batch) -> dict:
+    """Return losses, gradients, the distributions of actions over an episode, and the learning rates of 50 epochs."""
     fresh, found = weights(policy), {}
     with torch.no_grad():
         found["eval_loss"] = policy.eval().loss(first)
     found |= acts(policy, episode)
-    policy.train().loss(first).backward()
-    found["gradient"] = gradients(policy)
-    policy.load_state_dict(fresh)
-    found["loss"] = torch.tensor(one_step(policy, first, original.our_algorithm("sequential")))
-    found["clipped"], found["stepped"] = gradients(policy), weights(policy)
+    loss = policy.train().loss(first)
+    loss.backward()
+    found["loss"], found["gradient"] = loss.detach(), gradients(policy)
     settings, steps = fit_settings(), 7
     rates = [learning_rate(e * steps + 3, 50 * steps, settings, e * steps) for e in range(50)]
     found["rates"] = torch.tensor([*rates, settings.lr_min], dtype=torch.float64)
+    policy.load_state_dict(fresh)
+    return found
+
+
+def learn(policy: Policy, first: Batch, episode: Batch) -> dict:
+    """Return what `measure` does, and gradients and weights after a step of training."""
+    fresh, found = weights(policy), measure(policy, first, episode)
+    found["loss"] = torch.tensor(one_step(policy, first, original.our_algorithm("sequential")))
+    found["clipped"], found["stepped"] = gradients(policy), weights(policy)
     policy.load_state_dict(fresh)
     return found
 
@@ -169,17 +176,50 @@ def packnet(policy: Policy, first: Batch, second: Batch) -> dict:
 # --- comparison
 
 
-def relative(ours: Tensor, theirs: Tensor, scale: float = 0.0) -> float:
-    """Return |ours - theirs| / |theirs|, in norms; a norm below `scale` counts as that."""
+def relative(ours: Tensor, theirs: Tensor) -> float:
+    """Return |ours - theirs| / |theirs|, in norms."""
     difference = (ours.double() - theirs.double()).norm()
-    return (difference / max(theirs.double().norm().item(), scale, 1e-30)).item()
+    return (difference / max(theirs.double().norm().item(), 1e-30)).item()
 
 
 def worst(ours: Found, theirs: Found) -> tuple[float, str]:
     """Return the largest relative difference of tensors of theirs, and which it is.
 
-    What a tensor differs by counts relative to its norm, or to `ROUNDING` of all tensors' norm if that is more: a
-    gradient that is zero but for rounding has no relative difference.
+    Tensors that are zero but for rounding on both sides are left out: the gradients of biases that a norm or a softmax
+    right after them takes out again.
     """
-    scale = ROUNDING * torch.stack([t.double().norm() for t in theirs.values()]).norm().item()
-    return max((relative(ours[name], value, scale), name) for name, value in theirs.items())
+    zero = rounding(theirs)
+    used = [n for n, t in theirs.items() if max(t.norm(), ours[n].norm()) > zero]
+    return max((relative(ours[name], theirs[name]), name) for name in used)
+
+
+def rounding(tensors: Found) -> float:
+    """Return the norm below which one of the tensors is zero but for rounding."""
+    return ROUNDING * torch.stack([t.double().norm() for t in tensors.values()]).norm().item()
+
+
+def update_difference(before: Found, ours: Found, theirs: Found, gradient: Found) -> float:
+    """Return how far two updates of all weights are apart, relative to their norm.
+
+    Entries whose gradient is below a thousandth of its tensor's RMS are left out: Adam's first step moves every weight
+    by the learning rate, and where the gradient is rounding alone, rounding decides which way.
+    """
+    apart, length, zero = 0.0, 0.0, rounding(gradient)
+    for name, g in gradient.items():
+        if g.norm() <= zero:
+            continue
+        used = g.abs() > 1e-3 * g.square().mean().sqrt()
+        there, here = (theirs[name] - before[name])[used], (ours[name] - before[name])[used]
+        apart, length = apart + (here - there).square().sum().item(), length + there.square().sum().item()
+    return (apart / length) ** 0.5
+
+
+def where_owners_agree(weights: Found, ours: Found, theirs: Found) -> Found:
+    """Return weights without those that one side owns and the other does not.
+
+    A weight at the threshold of pruning may be on either side of it, by rounding.
+    """
+    return {
+        name: value * (ours[name] == theirs[name]) if name in theirs else value
+        for name, value in weights.items()
+    }
