@@ -154,7 +154,7 @@ def test_distillation_keeps_features_and_actions_nearer_than_replay_alone():
     found = []
     for algorithm in (
         ER(memory=ReplayMemory(20)),
-        M2Distill(budget=20),
+        M2Distill(budget=20, image=0.1, language=0.1, proprio=0.1, policy=1.0),
     ):
         policy = make_policy()
         learn(algorithm, policy, 0)
