@@ -226,7 +226,9 @@ def test_chosen_values_are_used_with_their_head_and_not_with_the_original(path) 
     values = yaml.safe_load(path.read_text())
     used = plain_data(compose_run([f"algo={algo}", f"policy/head={head}"])[0])["algo"]
     assert {key: used[key] for key in values} == values
-    paper = plain_data(compose_run(["preset=paper", "compat=libero", f"algo={algo}"])[0])["algo"]
-    plain = yaml.safe_load((CONFIGS / "algo" / f"{algo}.yaml").read_text())
-    assert {key: paper[key] for key in values} == {key: plain[key] for key in values}
-    assert "libero tune" in path.read_text()
+    source = path.read_text()
+    assert "libero tune" in source or "Derived, not measured" in source
+    if algo in ("ewc", "er", "agem", "packnet"):  # whose published choices compat=libero composes
+        original = plain_data(compose_run(["compat=libero", f"algo={algo}", f"policy/head={head}"])[0])["algo"]
+        plain = plain_data(compose_run(["compat=libero", "preset=paper", f"algo={algo}"])[0])["algo"]
+        assert {key: original[key] for key in values} == {key: plain[key] for key in values}
