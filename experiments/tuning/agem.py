@@ -33,7 +33,8 @@ class Watched(AGEM):
         loss = policy.loss(self._reference)
         grads = torch.autograd.grad(loss, params, allow_unused=True)
         pairs = [(p, r) for p, r in zip(params, grads, strict=True) if r is not None and p.grad is not None]
-        mine, theirs = (torch.cat([t.flatten() for t in side]) for side in zip(*[(p.grad, r) for p, r in pairs]))  # noqa: B905
+        mine = torch.cat([p.grad.flatten() for p, _ in pairs])
+        theirs = torch.cat([r.flatten() for _, r in pairs])
         COSINES.append(torch.cosine_similarity(mine, theirs, 0).item())
         if self.projected == "gradient":
             super().after_backward(policy)

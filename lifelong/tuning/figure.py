@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, save
 from lifelong.tuning.frontier import Frontier, Outcome
 
-_TICKS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)  # of factors
+_TICKS = (1.0, 1.05, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 8.0, 9.0)  # of factors
 
 
 def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:

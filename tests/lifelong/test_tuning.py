@@ -229,6 +229,8 @@ def test_chosen_values_are_used_with_their_head_and_not_with_the_original(path) 
     source = path.read_text()
     assert "libero tune" in source or "Derived, not measured" in source
     if algo in ("ewc", "er", "agem", "packnet"):  # whose published choices compat=libero composes
-        original = plain_data(compose_run(["compat=libero", f"algo={algo}", f"policy/head={head}"])[0])["algo"]
+        original = plain_data(compose_run(["compat=libero", f"algo={algo}", f"policy/head={head}"])[0])[
+            "algo"
+        ]
         plain = plain_data(compose_run(["compat=libero", "preset=paper", f"algo={algo}"])[0])["algo"]
         assert {key: original[key] for key in values} == {key: plain[key] for key in values}
