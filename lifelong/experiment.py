@@ -254,6 +254,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             conditions=present_conditions(
                 context.device, processes=context.ranks.size, renderer=renderer_name_or_none()
             ),
+            transfer=context.eval.transfer_estimate,
         )
     )
     starts = context.directory.log.read().of(RunRecord)

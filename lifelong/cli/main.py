@@ -157,10 +157,13 @@ def register_report(subparsers: Subparsers) -> None:
 
 
 def run_report(args: argparse.Namespace) -> None:
-    """Write the page and print its path."""
-    from lifelong.report.page import write_report
+    """Write the page; print its path and, of several runs, what can be told apart."""
+    from lifelong.report.page import comparison_text, write_report
 
-    print(write_report(args.run_dirs, args.out))
+    page = write_report(args.run_dirs, args.out)
+    print(page)
+    if len(args.run_dirs) > 1:
+        print(*comparison_text(page), sep="\n")
 
 
 COMMANDS: tuple[Callable[[Subparsers], None], ...] = (

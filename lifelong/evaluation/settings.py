@@ -8,6 +8,7 @@ from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
 from lifelong.results.coverage import MatrixCells, measured_tasks
+from lifelong.results.curves import Transfer
 from lifelong.types import Count, Natural
 
 
@@ -32,6 +33,9 @@ class EvalSettings:
             does.
         select: Weights that are kept of a task: those of the `best` epoch, the earliest of equally good ones, or of
             the `last`.
+        transfer: Estimate of forward transfer. `unbiased`: where the best epoch is kept, it is chosen without the start
+            that measures it, and where the last one is, none is held. `published`: eq. 3 as written, which holds the
+            largest of the measured points.
         precision: Precision of the policy, see `FitSettings`.
         record_every: Number of control steps between two frames of the recorded rollouts; 0 records none.
         open_environments: Number of environments kept open, of different tasks.
@@ -48,6 +52,7 @@ class EvalSettings:
     settle_steps: Natural = 5
     selection: Literal["apart", "reporting"] = "apart"
     select: Literal["best", "last"] = "best"
+    transfer: Literal["unbiased", "published"] = "unbiased"
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     record_every: Natural = 4
     open_environments: Count = 4
@@ -66,6 +71,13 @@ class EvalSettings:
             raise ConfigError(
                 "eval.select=best needs a learning curve, and eval.curve=none has none: set eval.select=last"
             )
+
+    @property
+    def transfer_estimate(self) -> Transfer:
+        """Estimate of forward transfer by its name in `lifelong.results.curves`."""
+        if self.transfer == "published":
+            return "published"
+        return "plain" if self.select == "last" else "cross_fitted"
 
     def init_states(self, phase: Literal["curve", "matrix"]) -> range:
         """Return the indices of the initial states of a learning curve, or of the success matrix."""

@@ -1,11 +1,10 @@
 """Comparison of groups of runs: means over seeds, intervals, differences, forgetting by task, costs.
 
-The number after ± is the standard error over seeds; the intervals are those of `lifelong.results.bootstrap`.
+The number after ± is the standard error over seeds; intervals and tests are those of `lifelong.report.statistics`.
 """
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,10 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.report.runs import Group, Run
-from lifelong.results.bootstrap import DRAWS, Member, Resamples, resample
-from lifelong.results.metrics import METRIC_NAMES, Estimate, mean_and_standard_error
+from lifelong.report.statistics import statistics
+from lifelong.results.metrics import METRIC_NAMES, mean_and_standard_error
+from lifelong.results.samples import Member, metric_values
 from lifelong.results.summary import json_safe
-
-CONFIDENCE = 0.95
-SEED = 2023  # of the bootstrap
 
 
 def compare(groups: Sequence[Group]) -> dict[str, Any]:
@@ -28,33 +25,25 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
         groups: Groups of runs that differ in seed and order only. Runs without a learned task are ignored.
 
     Returns:
-        `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high and the value of
-        each run), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`; `differences`: of each pair, the
-        first minus the second; `bootstrap`: the parameters of the intervals.
+        `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high, the value of
+        each seed or order, standard deviations between these and of the starts), `published` (FWT and AUC of eq. 3 as
+        written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`. `differences`: of each pair, the
+        first minus the second, with its interval, its p-value, that adjusted for all pairs (`told_apart` if below
+        0.05), the number of `seeds` that would tell and the difference that is `shown` by the present ones.
+        `statistics`: how they were computed.
     """
     measured = {g.label: [r for r in g.runs if r.metrics is not None] for g in groups}
-    drawn = {
-        label: resample([Member(r.results.scores(), r.record.tasks) for r in runs], seed=(SEED, number))
-        for number, (label, runs) in enumerate(measured.items())
-        if runs
-    }
+    found = statistics({label: members_of(runs) for label, runs in measured.items() if runs})
     return {
-        "groups": {g.label: _group(g, measured[g.label], drawn.get(g.label)) for g in groups},
-        "differences": [
-            {
-                "of": a,
-                "less": b,
-                "metrics": {n: _interval(drawn[a].difference(drawn[b], n)) for n in METRIC_NAMES},
-            }
-            for a, b in combinations(drawn, 2)
-        ],
-        "bootstrap": {
-            "draws": DRAWS,
-            "seed": SEED,
-            "confidence": CONFIDENCE,
-            "levels": ["order", "run", "episode"],
-        },
+        "groups": {g.label: _group(g, measured[g.label], found["metrics"].get(g.label)) for g in groups},
+        "differences": found["differences"],
+        "statistics": found["statistics"],
     }
+
+
+def members_of(runs: Sequence[Run]) -> list[Member]:
+    """Return runs as what the statistics take."""
+    return [Member(r.results.scores(), r.record.seed, r.record.tasks) for r in runs]
 
 
 def write_comparison(found: Mapping[str, Any], path: Path) -> None:
@@ -64,34 +53,30 @@ def write_comparison(found: Mapping[str, Any], path: Path) -> None:
     )
 
 
-def _group(group: Group, runs: Sequence[Run], drawn: Resamples | None) -> dict[str, Any]:
+def _group(group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None) -> dict[str, Any]:
     return {
         "runs": [str(r.path) for r in group.runs],
         "seeds": [r.record.seed for r in group.runs],
         "orders": len({r.record.tasks for r in group.runs}),
         "measured": len(runs),
-        "metrics": {n: _metric(n, runs, drawn) for n in METRIC_NAMES},
+        "metrics": metrics or {name: dict(_UNKNOWN) for name in METRIC_NAMES},
+        "published": _published(runs),
         "forgetting_by_task": _forgetting(runs),
         "subgoals": _subgoals(runs),
         "costs": costs_of(runs),
     }
 
 
-def _metric(name: str, runs: Sequence[Run], drawn: Resamples | None) -> dict[str, Any]:
-    values = [getattr(r.metrics, name).value for r in runs]
-    mean, error = mean_and_standard_error(values)
-    interval = drawn.interval(name, CONFIDENCE) if drawn else Estimate(np.nan, np.nan, np.nan)
-    return {
-        "mean": mean,
-        "standard_error": error,
-        "low": interval.low,
-        "high": interval.high,
-        "values": values,
-    }
+_UNKNOWN = {
+    **dict.fromkeys(("mean", "standard_error", "low", "high", "sd_of_runs", "sd_of_starts"), float("nan")),
+    "values": [],
+}
 
 
-def _interval(estimate: Estimate) -> dict[str, float]:
-    return {"value": estimate.value, "low": estimate.low, "high": estimate.high}
+def _published(runs: Sequence[Run]) -> dict[str, float]:
+    """Return the means of FWT and AUC as eq. 3 is written, for comparison with published numbers."""
+    values = [metric_values(r.results.scores("curve", "published")) for r in runs]
+    return {name: float(np.mean([v[name] for v in values])) if values else np.nan for name in ("fwt", "auc")}
 
 
 def _forgetting(runs: Sequence[Run]) -> dict[str, dict[str, float]]:

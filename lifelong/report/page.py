@@ -1,6 +1,7 @@
 """A self-contained report page about one run, or a comparison of several."""
 
 import base64
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,12 +23,15 @@ from lifelong.report.figures import (
 )
 from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
+from lifelong.report.statistics import findings
 from lifelong.report.tables import atom_rows, cost_table, duration, episodes_text, most_forgotten, task_costs
 from lifelong.report.templates import page_template
+from lifelong.results.episode_table import write_episodes
 from lifelong.results.metrics import METRIC_NAMES, Metrics, average_success
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import read_relearning, savings, savings_rows
 from lifelong.results.results import after_base_stage
+from lifelong.results.samples import metric_values
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -35,6 +39,11 @@ METRIC_TEXTS = {
     "auc": ("AUC", "success on a task averaged over learning it and all later tasks", "up"),
     "final_success": ("Final", "success over all tasks at the end of the sequence", "up"),
     "just_learned": ("Just learned", "success on each task right after learning it", "up"),
+}
+TRANSFER_TEXTS: dict[str, str] = {
+    "plain": "FWT is the mean of the learning curve, as the last epoch's weights are kept.",
+    "cross_fitted": "FWT holds the best epoch, chosen without the start that measures it.",
+    "published": "FWT holds the best epoch as measured.",
 }
 MEDIA_TYPES = {
     ".gif": "image/gif",
@@ -47,7 +56,7 @@ MEDIA_LIMIT = 48 * 2**20  # [bytes] of rollout recordings in one page
 
 
 def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
-    """Write report.html, heatmap.png and heatmap.pdf; for several runs also forgetting.png, .pdf, comparison.json.
+    """Write report.html and heatmap.png, .pdf; of several runs also forgetting.png, comparison.json, episodes.csv.gz.
 
     Args:
         run_dirs: Directory of one run to describe, or of several to compare. Runs need not be finished.
@@ -76,6 +85,12 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
     return out
 
 
+def comparison_text(page: Path) -> list[str]:
+    """Return what a comparison shows, in sentences, from the numbers beside its page."""
+    found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
+    return findings(found, {name: text[0] for name, text in METRIC_TEXTS.items()})
+
+
 def _default_folder(paths: Sequence[Path]) -> Path:
     """Return where a page is written: in the only run, or in a folder of its own, which git ignores, for several."""
     if len(paths) == 1:
@@ -102,6 +117,8 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "metrics": _metric_rows(run.metrics),
         "later_metrics": _metric_rows(after_base_stage(run.results)),
         "base_tasks": len(record.groups[0]) if record.has_base_stage else 0,
+        "transfer": TRANSFER_TEXTS[run.results.transfer],
+        "published": _published(run),
         "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run.metrics))]),
         "heatmaps": [run_heatmap(run.results, labels)],
         "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
@@ -128,6 +145,7 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
     groups = group_runs(runs)
     found = compare(groups)
     write_comparison(found, folder / "comparison.json")
+    write_episodes(folder / "episodes.csv.gz", [(g.label, run.results) for g in groups for run in g.runs])
     panels, heatmaps, lines = [], [], []
     for group in groups:
         labels = group.labels
@@ -163,6 +181,9 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         ],
         "groups": _group_rows(groups, found),
         "differences": found["differences"],
+        "findings": findings(found, {name: text[0] for name, text in METRIC_TEXTS.items()}),
+        "published": _published_of(found),
+        "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in runs)),
         "forgotten_tasks": _forgotten_tasks(groups, found),
         "forgotten_subgoals": _forgotten_subgoals(found),
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
@@ -183,6 +204,20 @@ def _facts(record: RunRecord) -> list[tuple[str, Any]]:
 
 def _metric_rows(metrics: Metrics | None) -> list[dict[str, Any]]:
     return [] if metrics is None else [{"name": n, "estimate": getattr(metrics, n)} for n in METRIC_NAMES]
+
+
+def _published(run: Run) -> dict[str, float] | None:
+    """Return FWT and AUC as eq. 3 is written; None if these are the run's own, or unknown."""
+    if run.metrics is None or run.results.transfer == "published":
+        return None
+    values = metric_values(run.results.scores("curve", "published"))
+    return values if np.isfinite(values["fwt"]) else None
+
+
+def _published_of(found: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
+    """Return FWT and AUC of each group as eq. 3 is written, where they are known."""
+    rows = [(label, group["published"]) for label, group in found["groups"].items()]
+    return [(label, values) for label, values in rows if np.isfinite(values["fwt"])]
 
 
 def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:

@@ -20,7 +20,10 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.results.saved_config import read_saved_config, upgrade_config
 from lifelong.results.summary import json_safe, summarize
 
-_COMPARED = ("finished", "tasks_learned", "success_matrix", "curves", "losses", "best_epochs", "metrics")
+_COMPARED = (
+    *("finished", "tasks_learned", "success_matrix", "curves", "losses", "best_epochs"),
+    "metrics",
+)
 
 
 @dataclass(frozen=True)
@@ -134,13 +137,15 @@ class _Examiner:
         if not isinstance(written, dict):
             return self._fault(f"{file} is broken: expected an object; the run's command writes it again")
         now = json.loads(json.dumps(json_safe(summarize(results))))
+        earlier = written.get("statistics") != now["statistics"]  # other intervals from the same records
         for summary in (written, now):
             if now["tasks_learned"] <= len(results.run.groups[0]) and isinstance(
                 summary.get("metrics"), dict
             ):
                 summary["metrics"].pop("nbt", None)  # of one task; earlier versions wrote 0
                 summary["metrics"].pop("by_task", None)
-        differing = [key for key in _COMPARED if not _alike(written.get(key), now[key])]
+        compared = [key for key in _COMPARED if not (earlier and key == "metrics")]
+        differing = [key for key in compared if not _alike(written.get(key), now[key])]
         if differing:
             self._fault(
                 f"{file} is not what results.jsonl gives ({', '.join(differing)}); the run's command writes it again"

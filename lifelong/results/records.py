@@ -20,6 +20,7 @@ from pydantic import Field, WrapValidator
 from libero_env.errors import InvalidInputError
 from libero_env.validation import validate
 from lifelong.results.coverage import MatrixCells
+from lifelong.results.curves import Transfer
 
 VERSIONED_PACKAGES = (
     "libero-lifelong",
@@ -60,6 +61,7 @@ class RunRecord:
     group_sizes: tuple[
         Annotated[int, Field(ge=1)], ...
     ] = ()  # of each group, where they are not all of group_size
+    transfer: Transfer | Literal[""] = ""  # estimate of forward transfer; older records do not say
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:
@@ -270,6 +272,7 @@ def start_record(
     group_sizes: Sequence[int] = (),
     conditions: Mapping[str, str] | None = None,
     cells: MatrixCells = "all",
+    transfer: Transfer | Literal[""] = "",
 ) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
@@ -285,6 +288,7 @@ def start_record(
         group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
         conditions: What decides the bits of its results, see `lifelong.results.conditions`.
         cells: Cells of the success matrix that are measured.
+        transfer: Estimate of forward transfer, see `lifelong.results.curves`.
     """
     equal = len(set(group_sizes)) < 2  # written as earlier versions did
     return RunRecord(
@@ -304,6 +308,7 @@ def start_record(
         conditions=conditions or {},
         cells=cells,
         group_sizes=() if equal else tuple(group_sizes),
+        transfer=transfer,
     )
 
 

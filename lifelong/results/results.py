@@ -3,7 +3,6 @@
 `lifelong.results.log.ResultLog` reads and appends the records. Tasks are positions in the sequence.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -13,7 +12,8 @@ from numpy.typing import NDArray
 
 from lifelong.errors import ResultsError
 from lifelong.results.coverage import measured_tasks
-from lifelong.results.metrics import Curve, Metrics, Scores, lifelong_metrics
+from lifelong.results.curves import Curve, Transfer, mean_curve
+from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import (
     CostRecord,
     EvalRecord,
@@ -24,6 +24,8 @@ from lifelong.results.records import (
     RunRecord,
     TaskEndRecord,
 )
+from lifelong.results.repeats import repeated_rows
+from lifelong.results.scores import Cell, Scores
 from lifelong.results.subgoals import Subgoals, subgoals
 
 
@@ -83,6 +85,11 @@ class Results:
         }
         return count[False], count[True]
 
+    def evaluations(self) -> list[EvalRecord]:
+        """Return every evaluation once, in the order of the run: the episodes behind all that is reported."""
+        found = {(r.learned, r.phase, r.epoch, r.task): r for r in self.of(EvalRecord)}
+        return [found[key] for key in sorted(found, key=lambda k: (k[0], k[1], k[2], k[3]))]
+
     def has_loss(self, task: int, epoch: int) -> bool:
         """Return whether the loss of this epoch is recorded."""
         return any((r.task, r.epoch) == (task, epoch) for r in self.of(LossRecord))
@@ -109,11 +116,19 @@ class Results:
 
     def curves(self) -> dict[int, Curve]:
         """Return the learning curve of each task that has one."""
+        names = self.run.tasks
+        return {
+            task: _curve([by_epoch[e] for e in sorted(by_epoch)], names[task])
+            for task, by_epoch in self._curve_points().items()
+        }
+
+    def _curve_points(self) -> dict[int, dict[int, EvalRecord]]:
+        """Return the evaluations of each learning curve by task and epoch."""
         points: dict[int, dict[int, EvalRecord]] = {}
         for r in self.of(EvalRecord):
             if r.phase == "curve" and r.learned == self.last_of_group(r.task):
                 points.setdefault(r.task, {})[r.epoch] = r
-        return {task: _curve([by_epoch[e] for e in sorted(by_epoch)]) for task, by_epoch in points.items()}
+        return points
 
     def losses(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the epochs and mean training losses of each task."""
@@ -131,46 +146,98 @@ class Results:
         """Return success rates c[i,j] (K, K), NaN where not evaluated, and their numbers of episodes (K, K).
 
         Args:
+            diagonal: Source of c[i,i], see `matrix_evaluations`.
+        """
+        size = len(self.run.tasks)
+        rates, episodes = np.full((size, size), np.nan), np.zeros((size, size), dtype=np.int64)
+        for cell, record in self.matrix_evaluations(diagonal).items():
+            rates[cell], episodes[cell] = record.rate, len(record.successes)
+        return rates, episodes
+
+    def matrix_evaluations(
+        self, diagonal: Literal["matrix", "curve"] = "matrix"
+    ) -> dict[tuple[int, int], EvalRecord]:
+        """Return the evaluation behind every c[i,j], by (i, j).
+
+        Args:
             diagonal: Source of c[i,i]. "matrix": the evaluation after learning task i, like the rest of its
                 column, so that the choice of the best epoch does not bias the reported number; the best of
                 the learning curve where there is none, in a run that measures all cells. "curve": always the latter,
                 c[i,i] = max over e of c[i,i,e], as eq. 3 is written.
         """
         size = len(self.run.tasks)
-        rates, episodes = np.full((size, size), np.nan), np.zeros((size, size), dtype=np.int64)
-        for r in self.of(EvalRecord):
-            if r.phase == "matrix" and r.task <= r.learned < size:
-                rates[r.learned, r.task], episodes[r.learned, r.task] = r.rate, len(r.successes)
-        curves = self.curves()
-        best = {last: curve.epochs[curve.best] for last, curve in self._group_curves(curves).items()}
-        for task, curve in curves.items():
+        found = {
+            (r.learned, r.task): r
+            for r in self.of(EvalRecord)
+            if r.phase == "matrix" and r.task <= r.learned < size
+        }
+        points = self._curve_points()
+        curves = self._group_curves(self.curves())
+        best = {last: int(curve.epochs[curve.best]) for last, curve in curves.items()}
+        for task, by_epoch in points.items():
             row = self.last_of_group(task)
-            measured = not math.isnan(rates[row, task])
+            measured = (row, task) in found
             ended = self.task_end(row) is not None and self.run.cells == "all"
             if row in best and ((diagonal == "curve" and measured) or (not measured and ended)):
-                point = curve.epochs.tolist().index(best[row])
-                rates[row, task], episodes[row, task] = curve.rates[point], curve.episodes[point]
-        return rates, episodes
+                found[row, task] = by_epoch[best[row]]
+        return found
 
-    def scores(self, diagonal: Literal["matrix", "curve"] = "matrix") -> Scores:
+    @property
+    def transfer(self) -> Transfer:
+        """Estimate of forward transfer: the run's own; for runs that do not say, by which weights they kept."""
+        if self.run.transfer:
+            return self.run.transfer
+        kept = {r.task: r.best_epoch for r in self.of(TaskEndRecord)}
+        curves = {last: c for last, c in self._group_curves(self.curves()).items() if last in kept}
+        last = all(kept[task] == curve.epochs[-1] for task, curve in curves.items())
+        chosen = all(kept[task] == curve.epochs[curve.best] for task, curve in curves.items())
+        return "plain" if last and not chosen else "cross_fitted"
+
+    def scores(
+        self, diagonal: Literal["matrix", "curve"] = "matrix", transfer: Transfer | None = None
+    ) -> Scores:
         """Return the input of the metrics, with the tasks learned so far as the whole sequence.
 
         A group of tasks that were learned together counts as one task; its success is the mean over its tasks.
 
         Args:
-            diagonal: Source of c[i,i], see `success_matrix`.
+            diagonal: Source of c[i,i], see `matrix_evaluations`.
+            transfer: Estimate of forward transfer; None for the run's own.
         """
         size = self.learned_tasks()
         groups = [g for g in self.run.groups if g.stop <= size]
         rates, episodes = self.success_matrix(diagonal)
-        curves, empty = self._group_curves(self.curves()), _curve([])
-        used = tuple(curves.get(g[-1], empty) for g in groups)
+        curves, empty = self._group_curves(self.curves()), _curve([], "")
         rows = [g[-1] for g in groups]
         return Scores(
-            used,
+            tuple(curves.get(row, empty) for row in rows),
             np.stack([rates[rows, g.start : g.stop].mean(1) for g in groups], axis=1),
             np.stack([episodes[rows, g.start : g.stop].sum(1) for g in groups], axis=1),
             tuple(map(len, groups)),
+            self._cells(diagonal, groups),
+            transfer or self.transfer,
+        )
+
+    def _cells(self, diagonal: Literal["matrix", "curve"], groups: Sequence[range]) -> tuple[Cell, ...]:
+        """Return the episodes of the matrix; rollouts are repeated where outcomes and lengths are."""
+        names, row_of = self.run.tasks, {g[-1]: number for number, g in enumerate(groups)}
+        column_of = {task: number for number, g in enumerate(groups) for task in g}
+        used = {
+            (row, task): record
+            for (row, task), record in sorted(self.matrix_evaluations(diagonal).items())
+            if row in row_of and task in column_of
+        }
+        same = repeated_rows(used)
+        return tuple(
+            Cell(
+                row=row_of[row],
+                column=column_of[task],
+                task=names[task],
+                starts=np.array(record.init_states, dtype=np.int64),
+                successes=np.array(record.successes, dtype=bool),
+                same_as=row_of[same[row, task]],
+            )
+            for (row, task), record in used.items()
         )
 
     def _group_curves(self, curves: Mapping[int, Curve]) -> dict[int, Curve]:
@@ -179,7 +246,7 @@ class Results:
         for task, curve in sorted(curves.items()):
             groups.setdefault(self.last_of_group(task), []).append(curve)
         sizes = {group[-1]: len(group) for group in self.run.groups}
-        return {last: _mean_curve(found) for last, found in groups.items() if len(found) == sizes[last]}
+        return {last: mean_curve(found) for last, found in groups.items() if len(found) == sizes[last]}
 
     def costs(self, task: int) -> dict[str, float]:
         """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""
@@ -224,22 +291,14 @@ def after_base_stage(results: Results) -> Metrics | None:
     return lifelong_metrics(results.scores().without_first())
 
 
-def _curve(records: list[EvalRecord]) -> Curve:
+def _curve(records: list[EvalRecord], task: str) -> Curve:
+    """Return a learning curve; if points have other starts than the first, episodes correspond by their number."""
+    count = min((len(r.successes) for r in records), default=0)
     return Curve(
         np.array([r.epoch for r in records], dtype=np.int64),
         np.array([r.rate for r in records], dtype=float),
         np.array([len(r.successes) for r in records], dtype=np.int64),
-    )
-
-
-def _mean_curve(curves: Sequence[Curve]) -> Curve:
-    """Return the mean of several tasks' curves, with the episodes of all."""
-    if len(curves) == 1:
-        return curves[0]
-    epochs = sorted(set.intersection(*(set(c.epochs.tolist()) for c in curves)))
-    chosen = [np.isin(c.epochs, epochs) for c in curves]
-    return Curve(
-        np.array(epochs, dtype=np.int64),
-        np.mean([c.rates[points] for c, points in zip(curves, chosen, strict=True)], axis=0),
-        np.sum([c.episodes[points] for c, points in zip(curves, chosen, strict=True)], axis=0),
+        np.array([r.successes[:count] for r in records], dtype=float)[..., None] if records else None,
+        np.array(records[0].init_states[:count], dtype=np.int64) if records else None,
+        (task,) if records else (),
     )

@@ -1,0 +1,73 @@
+"""Values with their confidence intervals: of success rates, and of weighted sums of independent ones."""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lifelong.results.curves import Floats
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+UNKNOWN = Estimate(float("nan"), float("nan"), float("nan"))
+
+
+def wilson_interval(
+    successes: ArrayLike, episodes: ArrayLike, confidence: float = 0.95
+) -> tuple[Floats, Floats]:
+    """Return Wilson's score interval of a success rate; its width is above 0 also at 0 % and 100 %.
+
+    With p = s/n and z the normal quantile:
+    (p + z²/2n ± z·sqrt(p(1-p)/n + z²/4n²)) / (1 + z²/n)   (Wilson 1927).
+
+    Args:
+        successes: Number of successes s, any shape.
+        episodes: Number of episodes n, same shape; where it is 0 the interval is [0, 1].
+        confidence: Two-sided confidence level.
+
+    Returns:
+        Lower and upper ends in [0, 1], of the broadcast shape.
+    """
+    s, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(episodes, dtype=float))
+    return score_interval(s, n, NormalDist().inv_cdf(0.5 + confidence / 2))
+
+
+def score_interval(successes: Floats, episodes: Floats, z: float) -> tuple[Floats, Floats]:
+    """Return Wilson's interval for a quantile z; numbers of episodes may be effective ones, and no integers."""
+    safe = np.where(episodes > 0, episodes, 1.0)
+    p = np.where(episodes > 0, successes, 0.0) / safe
+    centre = (p + z**2 / (2 * safe)) / (1 + z**2 / safe)
+    half = z * np.sqrt(np.maximum(p * (1 - p), 0) / safe + z**2 / (4 * safe**2)) / (1 + z**2 / safe)
+    # At the ends the bound is exactly 0 or 1; rounding must not put it on the wrong side of p.
+    low, high = np.clip(centre - half, 0, p), np.clip(centre + half, p, 1)
+    return np.where(episodes > 0, low, 0.0), np.where(episodes > 0, high, 1.0)
+
+
+def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high: ArrayLike) -> Estimate:
+    """Return a weighted sum of independent rates, with the interval implied by theirs.
+
+    MOVER (Zou & Donner, Statistics in Medicine 2008): for θ = Σ w·p,
+    θ_low = θ - sqrt(Σ (w·(p - end))²) with the cell's end that lowers w·p, and likewise θ_high.
+
+    Args:
+        weights: (C,) weights w.
+        rates: (C,) rates p.
+        low: (C,) lower ends of their intervals.
+        high: (C,) upper ends of their intervals.
+    """
+    w, p, lo, hi = (np.asarray(x, dtype=float) for x in (weights, rates, low, high))
+    used = w != 0
+    w, p, lo, hi = w[used], p[used], lo[used], hi[used]
+    value = float(np.sum(w * p))
+    down = np.where(w > 0, w * (p - lo), w * (p - hi))
+    up = np.where(w > 0, w * (hi - p), w * (lo - p))
+    return Estimate(value, value - float(np.hypot.reduce(down)), value + float(np.hypot.reduce(up)))
