@@ -5,9 +5,9 @@ python experiments/algorithms/table.py          # reads comparison.json, which `
 
 import json
 from collections.abc import Iterator
-from itertools import combinations
 from pathlib import Path
 
+from lifelong.report.statistics import findings
 from lifelong.report.tables import duration, quantity
 
 HERE = Path(__file__).parent
@@ -21,7 +21,7 @@ def table(heads: list[str], rows: list[list[str]]) -> list[str]:
 
 
 def metric(cell: dict) -> str:
-    """Mean over seeds, and the interval of the hierarchical bootstrap; a dash where nothing is defined."""
+    """Mean over seeds, and its interval over seeds and starts; a dash where nothing is defined."""
     if cell["mean"] is None:
         return "–"
     return f"{cell['mean']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
@@ -35,13 +35,7 @@ def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
     rows = [[label, *costs(group["costs"])] for label, group in groups]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
-    apart = {frozenset((d["of"], d["less"])): d["metrics"]["auc"] for d in found["differences"]}
-    apart = {pair: gap for pair, gap in apart.items() if gap["low"] is not None}
-    unclear = [pair for pair, gap in apart.items() if gap["low"] <= 0 <= gap["high"]]
-    order = [label for label, _ in groups]
-    pairs = [pair for pair in combinations(order, 2) if frozenset(pair) in unclear]
-    text = f"{len(apart) - len(unclear)} of {len(apart)} pairs differ in AUC with 95 % confidence."
-    yield "pairs", [f"{text} Not told apart: {', '.join(f'{a} and {b}' for a, b in pairs)}."]
+    yield "pairs", findings(found, {"auc": "AUC"}, most=len(found["differences"]))
 
 
 def costs(values: dict) -> list[str]:
