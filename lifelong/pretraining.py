@@ -66,7 +66,7 @@ def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[st
     with seeded(loaded.seed, INIT):
         policy: Policy = config.build("policy", spec=loaded.policy.spec)
     before = weights or config.values.get("init_from")
-    if before is None and config.build("pretrain").sequence():
+    if before is None and "pretrain" in config.values and config.build("pretrain").sequence():
         raise ConfigError(
             f"{run} began with pretrained weights; name them with --initial, such as a folder in runs/pretrain"
         )

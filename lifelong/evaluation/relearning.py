@@ -116,7 +116,7 @@ def relearn(
         )
     config = read_config(run.path / "config.yaml", allow)
     fit_settings: FitSettings = config.build("train")
-    augment = config.build("augmentation")
+    augment = config.build("augmentation") if "augmentation" in config.values else None
     log = ResultLog(run.path / FILE_NAME)
     for task in _chosen(run, tasks):
         starts = [s for s in STARTS if not _recorded(log, task, s, settings, fit_settings.lr)]
@@ -257,7 +257,7 @@ def _lesson(
 ) -> Lesson:
     """Read the demonstrations of a task, and measure the error of the policy that had just learned it."""
     data: DataSettings = config.build("data")
-    stream: StreamSettings = config.build("stream")
+    stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
     learned_from = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])[task]
     (path,) = find_demos([run.tasks[task]], [learned_from + settings.held_out], data, None)
     languages, read = run.embed(run.tasks[task])[None], replace(data, memory="host", backend="native")

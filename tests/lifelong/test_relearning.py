@@ -182,7 +182,7 @@ def finished(tmp_path, monkeypatch):
         )
 
     def read_config(*_):
-        return SimpleNamespace(build={"train": FIT, "augmentation": None}.get)
+        return SimpleNamespace(build={"train": FIT}.get, values={"train": {}})
 
     def measured(run, then, task, *_):
         return lesson(error_on(then, lesson(0, task).held_out), task)
