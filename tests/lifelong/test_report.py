@@ -17,6 +17,8 @@ from lifelong.errors import LifelongError
 from lifelong.report.figures import Line, forgetting_figure
 from lifelong.report.page import write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
+from lifelong.report.statistics import statistics
+from lifelong.results.episode_table import read_episodes
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import METRIC_NAMES, METRIC_RANGES
 from lifelong.results.records import (
@@ -28,6 +30,7 @@ from lifelong.results.records import (
     TaskEndRecord,
     start_record,
 )
+from lifelong.results.samples import Member
 from lifelong.results.summary import json_safe, summarize
 
 GROCERIES = [
@@ -261,6 +264,7 @@ def test_several_runs_side_by_side(tmp_path: Path):
     assert {p.name for p in out.parent.iterdir()} == {
         "report.html",
         "comparison.json",
+        "episodes.csv.gz",
         *(f"{stem}.{kind}" for stem in ("heatmap", "forgetting") for kind in ("png", "pdf")),
     }
 
@@ -342,6 +346,17 @@ def test_means_and_intervals_of_the_comparison(compared: tuple[Path, dict]):
     means = [found["groups"][n]["metrics"]["final_success"]["mean"] for n in ("ewc", "er")]
     assert final["value"] == pytest.approx(means[0] - means[1])
     assert final["low"] < final["value"] < final["high"] < 0  # made so: er keeps more
+
+
+def test_the_table_of_episodes_gives_the_same_numbers(compared: tuple[Path, dict]):
+    page, found = compared
+    methods: dict[str, list[Member]] = {}
+    for label, results in read_episodes(page.parent / "episodes.csv.gz"):
+        member = Member(results.scores(), results.run.seed, results.run.tasks)
+        methods.setdefault(label, []).append(member)
+    again = json.loads(json.dumps(json_safe(statistics(methods))))
+    assert again["differences"] == found["differences"]
+    assert again["metrics"] == {label: g["metrics"] for label, g in found["groups"].items()}
 
 
 def test_forgetting_by_task_and_by_subgoal(compared: tuple[Path, dict]):
