@@ -54,8 +54,10 @@ def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
 
 def _point(axes: Axes, outcome: Outcome, marker: str, colour: str, *, filled: bool, large: bool) -> None:
     x, y = outcome.learned, outcome.kept
-    bars = {"xerr": [[x.value - x.low], [x.high - x.value]], "yerr": [[y.value - y.low], [y.high - y.value]]}
-    axes.errorbar(x.value, y.value, **bars, fmt="none", ecolor=colour, elinewidth=0.6, alpha=0.5)
+    xerr, yerr = ([[r.value - r.low], [r.high - r.value]] for r in (x, y))
+    axes.errorbar(
+        x.value, y.value, xerr=xerr, yerr=yerr, fmt="none", ecolor=colour, elinewidth=0.6, alpha=0.5
+    )
     face = colour if filled else "white"
     axes.plot(x.value, y.value, marker, ms=8 if large else 5, mec=colour, mfc=face, mew=1.2)
     weight = "bold" if large else "normal"
