@@ -43,8 +43,8 @@ RECORDS = HERE / "records"
 SETTINGS = ("eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
 
 # suite -> algorithms, in the order in which they are run, and number of seeds
-OBJECT = ("sequential", "er", "packnet", "ewc", "single_task", "multitask", "agem", "derpp", "lwf", "mas", "si")
-OBJECT += ("lora", "dmpel")
+OBJECT = ("sequential", "er", "packnet", "ewc", "multitask", "single_task", "lora", "dmpel", "iscil", "clare", "omla")
+OBJECT += ("compressed_er", "mlr", "derpp", "agem", "lwf", "mas", "si", "averaging")
 STUDIES = {"libero_object": (OBJECT, 5), "libero_goal": (("sequential", "er", "ewc", "packnet"), 3)}
 
 
