@@ -43,7 +43,19 @@ RECORDS = HERE / "records"
 SETTINGS = ("eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
 
 # suite -> algorithms, in the order in which they are run, and number of seeds
-OBJECT = ("sequential", "er", "packnet", "ewc", "multitask", "single_task", "lora", "dmpel", "iscil", "clare", "omla")
+OBJECT = (
+    "sequential",
+    "er",
+    "packnet",
+    "ewc",
+    "multitask",
+    "single_task",
+    "lora",
+    "dmpel",
+    "iscil",
+    "clare",
+    "omla",
+)
 OBJECT += ("compressed_er", "mlr", "derpp", "agem", "lwf", "mas", "si", "averaging")
 STUDIES = {"libero_object": (OBJECT, 5), "libero_goal": (("sequential", "er", "ewc", "packnet"), 3)}
 
@@ -139,7 +151,9 @@ def show(runs: Sequence[Planned]) -> None:
     if missing and known:
         mean = sum(known) / len(known)
         left = sum(_mean(hours.get((run.benchmark, run.algo))) or mean for run in missing)
-        print(f"{len(runs) - len(missing)} of {len(runs)} runs are done; the others take about {left:.0f} core hours")
+        print(
+            f"{len(runs) - len(missing)} of {len(runs)} runs are done; the others take about {left:.0f} core hours"
+        )
 
 
 def _hours(run: Planned) -> float:
@@ -218,17 +232,25 @@ def report(runs: Sequence[Planned]) -> None:
         if not found:
             continue
         with tempfile.TemporaryDirectory() as scratch:
-            page = write_report([run.unpack(Path(scratch)) for run in found], HERE / benchmark / "report.html")
+            page = write_report(
+                [run.unpack(Path(scratch)) for run in found], HERE / benchmark / "report.html"
+            )
         print(f"{len(found)} runs: {page}")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("list", "run", "report"))
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then what runs is stopped")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time")
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "study", help="folder of unfinished runs")
-    parser.add_argument("--only", nargs="+", default=[], help="words that a run's name contains, such as /er/ or seed1")
+    parser.add_argument(
+        "--runs", type=Path, default=ROOT / "runs" / "study", help="folder of unfinished runs"
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[], help="words that a run's name contains, such as /er/ or seed1"
+    )
     args = parser.parse_args()
     runs = [run for run in planned() if all(word in f"{run.name}/" for word in args.only)]
     if args.what == "run":

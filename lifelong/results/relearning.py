@@ -77,7 +77,7 @@ def _like(a: RelearnRecord, b: RelearnRecord) -> bool:
 
 def savings_rows(found: Sequence[Savings]) -> list[tuple[str, ...]]:
     """Return the savings as text: task from 1, error just learned and at the end, steps again and at first, savings."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for row in found:
         first, again = _steps(row.first, row.tried), _steps(row.again, row.tried)
         share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
