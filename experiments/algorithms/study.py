@@ -1,11 +1,11 @@
-"""The study of all algorithms, in pieces: run what is missing, keep every episode's outcome, write tables and pictures.
+"""The study of all algorithms, in pieces: run what is missing, keep all outcomes, write tables and pictures.
 
     python experiments/algorithms/study.py list                # each run: done or missing, its cost, its command
-    python experiments/algorithms/study.py run --minutes 120   # go on with what is missing; it may be stopped at any time
+    python experiments/algorithms/study.py run --minutes 120   # go on with what is missing, until it is stopped
     python experiments/algorithms/study.py report              # tables and pictures of what is finished
 
-A run is a process of its own on one thread. One that was stopped goes on where it was; of a finished one the records are
-kept in records/, compressed. All algorithms are run with one seed before the next, so that what is finished can be
+A run is a process of its own on one thread. One that was stopped goes on where it was; of a finished one the records
+are kept in records/, compressed. All algorithms are run with one seed before the next, so that what is finished can be
 compared at any time. Records of another configuration than today's count as missing.
 """
 
@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
