@@ -73,9 +73,11 @@ def _argument(action: argparse.Action) -> str:
 def groups() -> dict[str, list[Path]]:
     """Return the files of each configuration group, in the order of configs/config.yaml; subgroups after theirs."""
     defaults = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))["defaults"]
-    names = [next(iter(d)) for d in defaults if isinstance(d, dict)]
+    keys = [next(iter(d)) for d in defaults if isinstance(d, dict)]
+    names = dict.fromkeys(key.removeprefix("optional ").partition("@")[0] for key in keys)
     folders = [f for name in names for f in (CONFIGS / name, *sorted((CONFIGS / name).glob("*/")))]
-    return {f.relative_to(CONFIGS).as_posix(): sorted(f.glob("*.yaml")) for f in folders if f.is_dir()}
+    found = {f.relative_to(CONFIGS).as_posix(): sorted(f.glob("*.yaml")) for f in folders}
+    return {name: files for name, files in found.items() if files}
 
 
 def configuration_reference() -> str:

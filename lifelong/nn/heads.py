@@ -145,7 +145,7 @@ class GMMHead(ActionHead):
         """Return `means` (..., K, A) in (-1, 1), `stds` (..., K, A) and `logits` (..., K), float32."""
         shape = (*latent.shape[:-1], self.modes, self.action_dim)
         with full_precision(latent):
-            h = self.trunk(latent.float())
+            h = self.trunk(latent.to(self.means.weight.dtype))
             return {
                 "means": self.means(h).view(shape).tanh(),
                 "stds": functional.softplus(self.stds(h).view(shape)) + self.min_std,
@@ -237,7 +237,7 @@ class DeterministicHead(ActionHead):
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
         """Return `means` (..., A), float32."""
         with full_precision(latent):
-            return {"means": self.means(self.trunk(latent.float())).tanh()}
+            return {"means": self.means(self.trunk(latent.to(self.means.weight.dtype))).tanh()}
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
         """Return the absolute error, mean over the action's dimensions, (..., A) -> (...)."""

@@ -15,6 +15,7 @@ from lifelong.results.records import (
     EvalRecord,
     LossRecord,
     PhaseRecord,
+    RelearnRecord,
     RunEndRecord,
     TaskEndRecord,
     from_line,
@@ -77,8 +78,20 @@ def log(tmp_path: Path) -> ResultLog:
 
 
 def test_every_kind_of_record_survives_the_round_trip():
-    assert {r.kind for r in RUN} == set(RECORD_TYPES)
-    for record in RUN:
+    relearned = RelearnRecord(
+        task=1,
+        start="final",
+        learned_error=0.1,
+        tolerance=0.05,
+        held_out=10,
+        rate=1e-3,
+        steps=(0, 10),
+        errors=(0.4, 0.1),
+        seconds=2.0,
+    )
+    records = [*RUN, relearned]
+    assert {r.kind for r in records} == set(RECORD_TYPES)
+    for record in records:
         line = to_line(record)
         assert line.count(b"\n") == 1 and from_line(line) == record
 
