@@ -97,9 +97,10 @@ def test_windows_of_the_memory_come_in_passes_without_repetition_as_from_a_loade
 
 
 def test_ewc_strength_goes_with_the_estimate():
-    assert (
-        made("ewc", "none").strength == 1500 and made("ewc", "none", "algo/estimator=batch").strength == 5e4
-    )
+    plain = ("algo.strength=null",)  # without what was chosen for the policy's head
+    assert made("ewc", "none", *plain).strength == 1500
+    assert made("ewc", "none", *plain, "algo/estimator=batch").strength == 5e4
+    assert made("ewc", "none").strength == 15000
     theirs = made("ewc", "libero")
     assert (theirs.strength, theirs.gamma) == (5e4, 0.9)
     assert (type(theirs.estimator), theirs.estimator.windows) == (BatchFisher, 0)
