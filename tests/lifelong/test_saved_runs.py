@@ -209,7 +209,9 @@ def test_seeds_of_earlier_versions_are_grouped_with_those_of_today(tmp_path):
     runs = [RUNS / "er"]
     for name, overrides in {"same": (), "other": ("compat=none",)}.items():
         shutil.copytree(RUNS / "er", tmp_path / name)
-        words = [w for w in COMMANDS["er"] if not overrides or "batch_size" not in w]  # a key of compat=libero
+        words = [
+            w for w in COMMANDS["er"] if not overrides or "batch_size" not in w
+        ]  # a key of compat=libero
         config = composed(*SHORT, *words, "policy.stochastic=true", "eval.selection=reporting", *overrides)
         plain = OmegaConf.to_container(config, resolve=True) | {"seed": 2}
         (tmp_path / name / "config.yaml").write_text(yaml.safe_dump(plain))
