@@ -254,6 +254,7 @@ def main() -> int:
     args = parser.parse_args()
     runs = [run for run in planned() if all(word in f"{run.name}/" for word in args.only)]
     if args.what == "run":
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # and end what runs
         args.runs.mkdir(parents=True, exist_ok=True)
         return int(make(runs, args.runs.resolve(), args.minutes, args.jobs) > 0)
     show(runs) if args.what == "list" else report(runs)
