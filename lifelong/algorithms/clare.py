@@ -1,21 +1,18 @@
 """Adapters that are added and chosen layer by layer, by how well autoencoders know a layer's inputs."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
-from lifelong.nn.adapters import freeze_statistics
 from lifelong.nn.experts import (
-    Attachment,
+    Add,
     ExpertLibrary,
     adaptable_modules,
-    expert_output,
     matrix_of,
 )
 from lifelong.nn.routing import Discriminator, groups_of_rows
@@ -29,7 +26,7 @@ _ROWS = 512  # samples of a layer's inputs that an autoencoder learns from
 Samples = dict[str, Tensor]  # layer -> its inputs (n, tokens, D)
 
 
-class CLARE(Algorithm):
+class CLARE(RoutedExperts):
     """Add adapters where a task's features are new, and let autoencoders choose among them.
 
     Römer, Zhang and Schoellig 2026, "CLARE: continual learning for vision-language-action models via autonomous
@@ -53,8 +50,9 @@ class CLARE(Algorithm):
     * The autoencoders learn from up to 512 samples of a layer, collected from `windows` windows.
     """
 
+    relu = True
     state_form = {
-        **dict.fromkeys(("task_index", "base_left", "seed"), int),
+        **RoutedExperts.place_form,
         "library": ExpertLibrary.form,
         "discriminators": {int: {str: Discriminator.form}},
         "chosen": {int: {str: int}},
@@ -88,26 +86,19 @@ class CLARE(Algorithm):
             base_tasks: Number of tasks (stages, where tasks are learned together) that train the whole policy, which
                 is frozen afterwards; 0 for a pretrained policy.
         """
-        self.rank, self.scale, self.adapted = rank, alpha / rank, tuple(adapted)
+        super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
         self.threshold, self.hidden, self.windows = threshold, hidden, windows
         self.discriminator_steps, self.discriminator_lr = discriminator_steps, discriminator_lr
-        self.task_index, self._base_left, self._seed = -1, base_tasks, 0
-        self._library, self._attachment = ExpertLibrary(), Attachment()
         self._discriminators: dict[int, dict[str, Discriminator]] = {}  # task -> layer -> autoencoder
         self._chosen: dict[int, dict[str, int]] = {}  # task -> layer -> task whose adapter it uses, or BASE
-        self._learning: int | None = (
-            None  # task whose adapters all samples use; None: each has its own chosen
-        )
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Decide which layers get adapters; none while the base is learned."""
-        self.task_index, modules = task_index, adaptable_modules(policy, self.adapted)
-        if self._base_left:
-            self._base_left -= 1
+        modules = adaptable_modules(policy, self.adapted)
+        draws = self._begin(task_index, policy)
+        if draws is None:
             self._chosen[task_index] = dict.fromkeys(modules, BASE)
             return
-        policy.zero_grad()
-        draws = torch.Generator().manual_seed(self._seed)
         uses = dict.fromkeys(modules, task_index)
         if self._discriminators:
             compared = self._compare(self._collect(dataset, policy, draws))
@@ -118,26 +109,6 @@ class CLARE(Algorithm):
         new = {name: matrix_of(modules[name]) for name, used in uses.items() if used == task_index}
         self._library.add(task_index, new, self.rank, draws)
 
-    def trained(self, policy: Policy) -> list[nn.Parameter]:
-        """Return the parameters of the new adapters; everything while the base is learned."""
-        if self.task_index not in self._library:
-            return super().trained(policy)
-        policy.requires_grad_(False)
-        self._learning = self.task_index
-        self._attachment.attach(policy, *self._hooks(policy))
-        return self._library.parameters(self.task_index)
-
-    def mode_train(self, policy: Policy) -> None:
-        """Set training mode, with running statistics frozen with the base."""
-        policy.train()
-        if self._library:
-            freeze_statistics(policy)
-
-    def end_phase(self, phase: Any, policy: Policy) -> None:
-        """Remove the adapters from the policy's layers."""
-        self._attachment.detach(policy)
-        self._learning = None
-
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
@@ -147,25 +118,12 @@ class CLARE(Algorithm):
         self._discriminators[task_index] = {
             name: Discriminator.fit(x, *settings, generator) for name, x in samples.items()
         }
-        self._seed = int(torch.randint(2**62, (), generator=generator))
+        self._draw_seed(generator)
 
-    @contextmanager
-    def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """Yield the policy that chooses adapters, the same for every task.
-
-        While a task is learned, it has no autoencoders yet: its own adapters act then.
-        """
-        if not self._library:
-            yield policy
-            return
+    def _acting(self) -> int | None:
+        """Return the present task while it is learned, as it has no autoencoders yet; then each sample chooses."""
         unfinished = self.task_index in self._library and self.task_index not in self._discriminators
-        now = self.task_index if unfinished else None
-        learning, self._learning = self._learning, now
-        try:
-            with self._attachment.within(policy, *self._hooks(policy)):
-                yield policy
-        finally:
-            self._learning = learning
+        return self.task_index if unfinished else None
 
     def route(self, name: str, samples: Tensor) -> Tensor:
         """Return the task whose adapter acts on each sample (n, tokens, D) of a layer's input, (n,) int64."""
@@ -183,7 +141,7 @@ class CLARE(Algorithm):
             uses[name] = self.task_index if new else self._chosen[nearest][name]
         return uses
 
-    def _hooks(self, policy: Policy) -> tuple[Mapping[str, nn.Module], Callable[..., Tensor | None]]:
+    def _hooks(self, policy: Policy) -> tuple[Mapping[str, nn.Module], Add]:
         """Return the layers with adapters, and what is added to their outputs."""
         return adaptable_modules(policy, self.adapted), self._added
 
@@ -193,18 +151,7 @@ class CLARE(Algorithm):
             groups: list[tuple[int, Tensor | None]] = [(self._chosen[self._learning][name], None)]
         else:
             groups = groups_of_rows(self.route(name, _samples(layer, x)))
-        total: Tensor | None = None
-        for task, rows in groups:
-            if task == BASE:
-                continue
-            pairs = [self._library[task][name]]
-            part = self.scale * expert_output(layer, x if rows is None else x[rows], pairs, relu=True)
-            if rows is None:
-                return part
-            if total is None:
-                total = part.new_zeros(len(x), *part.shape[1:])
-            total[rows] = part
-        return total
+        return self._grouped_output(name, layer, x, groups)
 
     @torch.no_grad()
     def _collect(
@@ -214,7 +161,6 @@ class CLARE(Algorithm):
         found: dict[str, list[Tensor]] = {}
         device, was_training = next(policy.parameters()).device, policy.training
         chosen = torch.randperm(len(dataset), generator=draws)[: self.windows]
-        learning, self._learning = self._learning, task
 
         def added(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
             found.setdefault(name, []).append(_samples(layer, x)[: max(1, _ROWS * _CHUNK // len(chosen))])
@@ -222,24 +168,18 @@ class CLARE(Algorithm):
 
         policy.eval()
         try:
-            with self._attachment.within(policy, adaptable_modules(policy, self.adapted), added):
+            with self._using(task, policy, adaptable_modules(policy, self.adapted), added):
                 for part in chosen.split(_CHUNK):
                     policy.predict(dataset.batch(part).to(device))
         finally:
-            self._learning = learning
             policy.train(was_training)
         return {name: torch.cat(parts) for name, parts in found.items()}
 
-    def sizes(self) -> dict[int, int]:
-        """Return the number of parameters of each task's new adapters."""
-        return self._library.sizes()
-
     def state_dict(self) -> dict[str, Any]:
         """Return all adapters and autoencoders, and which belong together."""
-        place = {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
         known = {task: {n: d.weights for n, d in of.items()} for task, of in self._discriminators.items()}
         chosen = {task: dict(of) for task, of in self._chosen.items()}
-        return {**place, "library": self._library.state(), "discriminators": known, "chosen": chosen}
+        return {**self._place(), "library": self._library.state(), "discriminators": known, "chosen": chosen}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -252,8 +192,8 @@ class CLARE(Algorithm):
         fits = all(name in library.get(task, {}) for task, name in used)
         if not fits or any(of.keys() != chosen.get(task, {}).keys() for task, of in known.items()):
             raise CheckpointError("the adapters and their autoencoders do not go together")
-        self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
-        self._seed, self._chosen = int(state["seed"]), {task: dict(of) for task, of in chosen.items()}
+        self._load_place(state)
+        self._chosen = {task: dict(of) for task, of in chosen.items()}
         self._discriminators = {t: {n: Discriminator(w) for n, w in of.items()} for t, of in known.items()}
         self._library.load(library)
 

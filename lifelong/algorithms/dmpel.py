@@ -9,11 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows, of_episodes
 from lifelong.errors import CheckpointError, ConfigError
-from lifelong.nn.adapters import freeze_statistics
-from lifelong.nn.experts import Attachment, ExpertLibrary, adapted_layers, expert_output, weights_of
+from lifelong.nn.experts import ExpertLibrary, adapted_layers, expert_output, weights_of
 from lifelong.nn.routing import SigmoidRouter
 from lifelong.nn.tokens import standardise
 from lifelong.policies.base import Policy
@@ -24,7 +23,7 @@ _ROUTER = {"enter": Tensor, "middle": Tensor, "leave": Tensor, "bias": Tensor}
 _FIRST_ROUTER = {"enter": Tensor, "keys": Tensor, "bias": Tensor}  # a softmax, in earlier versions
 
 
-class DMPEL(Algorithm):
+class DMPEL(RoutedExperts):
     """Add a few low-rank experts with each task, and let a router mix all experts (Lei et al. 2025).
 
     "Dynamic mixture of progressive parameter-efficient expert library for lifelong robot learning",
@@ -51,7 +50,7 @@ class DMPEL(Algorithm):
     """
 
     state_form = {
-        **dict.fromkeys(("task_index", "base_left", "seed"), int),
+        **RoutedExperts.place_form,
         "library": ExpertLibrary.form,
         "router": ({}, _FIRST_ROUTER, _ROUTER),
         "memory": {int: {"queries": Tensor, "coefficients": Tensor}},
@@ -92,34 +91,27 @@ class DMPEL(Algorithm):
         Raises:
             ConfigError: A number below its smallest valid value.
         """
-        positive = {"rank": rank, "experts": experts, "pool": pool, "replay_size": replay_size}
+        super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
+        positive = {"experts": experts, "pool": pool, "replay_size": replay_size}
         for name, value in positive.items():
             if value < 1:
                 raise ConfigError(f"algo.{name} is {value}; it must be at least 1")
-        self.rank, self.scale, self.experts, self.top_k = rank, alpha / rank, experts, top_k
-        self.adapted, self.hidden, self.pool = tuple(adapted), hidden, pool
+        self.experts, self.top_k, self.hidden, self.pool = experts, top_k, hidden, pool
         self.recall_steps, self.recall_lr, self.replay_size = recall_steps, recall_lr, replay_size
-        self.task_index, self._base_left, self._seed = -1, base_tasks, 0
-        self._library, self._attachment = ExpertLibrary(), Attachment()
         self._router: SigmoidRouter | None = None
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self._episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
-        self._now: Tensor | None = None  # (B, G, N), coefficients of the present forward pass
         self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
-
-    # --- hooks
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Store the episodes' contexts; after the base, add experts and build a new router."""
-        self.task_index, layers = task_index, adapted_layers(policy, self.adapted)
+        layers = adapted_layers(policy, self.adapted)
         queries, of_window = of_episodes(dataset, lambda batch: self.query(batch.observation))
         queries = queries.to(next(policy.parameters()).device)
         self._episodes = {"queries": queries, "of_window": of_window}
-        if self._base_left:
-            self._base_left -= 1
+        draws = self._begin(task_index, policy)
+        if draws is None:
             return
-        policy.zero_grad()
-        draws = torch.Generator().manual_seed(self._seed)
         self._library.add(task_index, weights_of(layers), self.rank, draws, count=self.experts)
         count, groups = self.experts * len(self._library.pairs), len(_groups(layers))
         router = SigmoidRouter.new(queries.shape[1], self.hidden, groups, count, self.top_k, draws)
@@ -127,17 +119,8 @@ class DMPEL(Algorithm):
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the router's and the task's experts' parameters; everything while the base is learned."""
-        if self._router is None or self.task_index not in self._library:
-            return super().trained(policy)
-        policy.requires_grad_(False)
-        self._attachment.attach(policy, *self._hooks(policy))
-        return [*self._router.parameters(), *self._library.parameters(self.task_index)]
-
-    def mode_train(self, policy: Policy) -> None:
-        """Set training mode, with running statistics frozen with the base."""
-        policy.train()
-        if self._library:
-            freeze_statistics(policy)
+        learned = super().trained(policy)
+        return learned if self._router is None else [*self._router.parameters(), *learned]
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch with the query of its episode in each window."""
@@ -147,11 +130,6 @@ class DMPEL(Algorithm):
         queries = queries[of_window[batch.window_ids]]
         proprio = {**batch.observation.proprio, _QUERY: queries[:, None]}
         return replace(batch, observation=replace(batch.observation, proprio=proprio))
-
-    def end_phase(self, phase: Any, policy: Policy) -> None:
-        """Remove the experts from the policy's layers."""
-        self._attachment.detach(policy)
-        self._now = None
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
@@ -168,7 +146,7 @@ class DMPEL(Algorithm):
         self._memory[task_index] = {"queries": queries, "coefficients": coefficients}
         self._recall()
         self._episodes = {}
-        self._seed = int(torch.randint(2**62, (), generator=generator))
+        self._draw_seed(generator)
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
@@ -176,13 +154,8 @@ class DMPEL(Algorithm):
         if self._router is None:
             yield policy
             return
-        with self._attachment.within(policy, *self._hooks(policy)):
-            try:
-                yield _Routed(policy, self)
-            finally:
-                self._now = None
-
-    # --- routing
+        with self._using(None, policy, *self._hooks(policy)):
+            yield _Routed(policy, self)
 
     def query(self, observation: Observation) -> Tensor:
         """Return the context in the first frame of windows, (B, Q): instruction, images, proprioception."""
@@ -240,18 +213,11 @@ class DMPEL(Algorithm):
 
         return layers, add, encode
 
-    # --- state
-
-    def sizes(self) -> dict[int, int]:
-        """Return the number of parameters of each task's experts, without the router's."""
-        return self._library.sizes()
-
     def state_dict(self) -> dict[str, Any]:
         """Return experts, router, stored contexts, and those of the present task's windows."""
         router = {} if self._router is None else {n: p.detach() for n, p in self._router.named_parameters()}
-        place = {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
         kept = {"memory": _copied(self._memory), "episodes": dict(self._episodes)}
-        return {**place, "library": self._library.state(), "router": router, **kept}
+        return {**self._place(), "library": self._library.state(), "router": router, **kept}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -267,8 +233,7 @@ class DMPEL(Algorithm):
             )
         self._router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
         _check_shapes(state, self._router)
-        self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
-        self._seed = int(state["seed"])
+        self._load_place(state)
         self._memory, self._episodes = _copied(state["memory"]), dict(state["episodes"])
         self._library.load(state["library"])
 

@@ -7,17 +7,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.frozen_base import FrozenBase
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.errors import CheckpointError, ConfigError
-from lifelong.nn.adapters import check_matches, freeze_statistics, matches
+from lifelong.errors import CheckpointError
+from lifelong.nn.adapters import check_matches, matches
 from lifelong.nn.experts import ExpertLibrary, Pair
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
 
 
-class LoRA(Algorithm):
+class LoRA(FrozenBase):
     """Learn the first task with the whole policy, and every later one with a small adapter on it.
 
     TAIL (Liu et al. 2024, "TAIL: Task-specific adapters for imitation learning with large pretrained models", ICLR)
@@ -35,7 +35,8 @@ class LoRA(Algorithm):
     """
 
     state_form = {
-        **dict.fromkeys(("task_index", "base_left", "base_last", "seed"), int),
+        **FrozenBase.place_form,
+        "base_last": int,
         "base": Weights(),
         "pairs": ExpertLibrary.form,
         "own": {int: Weights()},
@@ -64,32 +65,23 @@ class LoRA(Algorithm):
         Raises:
             ConfigError: A rank below 1 or fewer than 0 tasks.
         """
-        if rank < 1 or base_tasks < 0:
-            raise ConfigError(
-                f"algo.rank={rank}, algo.base_tasks={base_tasks}; valid: at least 1, at least 0"
-            )
-        self.rank, self.scale = rank, alpha / rank
-        self.adapted, self.own = tuple(adapted), tuple(own)
-        self.task_index, self._base_left, self._base_last = -1, base_tasks, -1
-        self._seed = 0  # of the next task's A, drawn when a task ends
+        super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
+        self.own, self._base_last = tuple(own), -1
         self._base: dict[str, Tensor] = {}  # frozen values of all that a task may change
-        self._library = ExpertLibrary()
         self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the base once it is learned, and initialise the task's adapter."""
-        self.task_index = task_index
         names = self._choose(policy) if not self._base else []
-        if self._base_left:
-            self._base_left, self._base_last = self._base_left - 1, task_index
+        draws = self._begin(task_index, policy)
+        if draws is None:
+            self._base_last = task_index
             return
         if not self._base:
             self._base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
-        draws = torch.Generator().manual_seed(self._seed)
         adapted = {name: base for name, base in self._base.items() if not matches(name, self.own)}
         self._library.add(task_index, adapted, self.rank, draws)
         put_weights(policy, self._base)
-        policy.zero_grad()  # the optimiser, which does it at each step, no longer has the matrices
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the task's A and B and its own copies; everything while the base is learned."""
@@ -104,12 +96,6 @@ class LoRA(Algorithm):
             elif name in self._base:
                 chosen.append(p)
         return chosen
-
-    def mode_train(self, policy: Policy) -> None:
-        """Set training mode, with running statistics frozen with the base."""
-        policy.train()
-        if self._base:
-            freeze_statistics(policy)
 
     @torch.no_grad()
     def after_backward(self, policy: Policy) -> None:
@@ -131,7 +117,7 @@ class LoRA(Algorithm):
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Store the task's own copies; its A and B are stored already."""
-        self._seed = int(torch.randint(2**62, (), generator=generator))
+        self._draw_seed(generator)
         if task_index in self._library:
             params = dict(policy.named_parameters())
             names = self._base.keys() - self._library[task_index].keys()
@@ -160,13 +146,12 @@ class LoRA(Algorithm):
     def sizes(self) -> dict[int, int]:
         """Return the number of parameters learned by each task with an adapter, its own copies included."""
         small = sum(p.numel() for n, p in self._base.items() if matches(n, self.own))
-        return {task: small + size for task, size in self._library.sizes().items()}
+        return {task: small + size for task, size in super().sizes().items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the base, and every task's A, B and own copies."""
         state = {"base": dict(self._base), "pairs": self._library.state(), "own": dict(self._kept)}
-        place = {"task_index": self.task_index, "base_left": self._base_left, "base_last": self._base_last}
-        return {**place, "seed": self._seed, **state}
+        return {**self._place(), "base_last": self._base_last, **state}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -177,8 +162,8 @@ class LoRA(Algorithm):
         self._library.load(state["pairs"])
         for of_task in state["pairs"].values():
             check_pairs(of_task, state["base"])
-        self.task_index, self._seed = int(state["task_index"]), int(state["seed"])
-        self._base_left, self._base_last = int(state["base_left"]), int(state["base_last"])
+        self._load_place(state)
+        self._base_last = int(state["base_last"])
         self._base, self._kept = dict(state["base"]), dict(state["own"])
 
     def _present(self) -> Mapping[str, Mapping[str, nn.Parameter]]:

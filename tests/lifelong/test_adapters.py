@@ -94,6 +94,13 @@ def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
     sequences.assert_same(other.state_dict(), algorithm.state_dict())
 
 
+@pytest.mark.parametrize("method", [LoRA, DMPEL, IsCiL, CLARE])
+@pytest.mark.parametrize(("name", "value"), [("rank", 0), ("base_tasks", -1)])
+def test_invalid_settings_are_named(method, name, value):
+    with pytest.raises(ConfigError, match=f"algo.{name} is {value}.*at least 1, at least 0"):
+        method(**{name: value})
+
+
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
 def test_the_base_is_learned_as_by_fine_tuning(make):
     plain, policy, algorithm = make_policy(), make_policy(), make()
@@ -276,12 +283,6 @@ def test_lora_tasks_learned_together_share_an_adapter():
             one = copy.deepcopy(policy.state_dict())
         with algorithm.policy_for(last, policy):
             sequences.assert_same(dict(policy.state_dict()), dict(one))
-
-
-@pytest.mark.parametrize("change", [{"rank": 0}, {"base_tasks": -1}])
-def test_invalid_lora_settings_are_named(change):
-    with pytest.raises(ConfigError, match="at least 1"):
-        LoRA(**change)
 
 
 # --- DMPEL
@@ -519,7 +520,7 @@ def test_policies_that_dmpel_cannot_route_are_named():
         pass
 
 
-@pytest.mark.parametrize("name", ["rank", "experts", "pool", "replay_size"])
+@pytest.mark.parametrize("name", ["experts", "pool", "replay_size"])
 def test_invalid_dmpel_settings_are_named(name):
     with pytest.raises(ConfigError, match=f"algo.{name} is 0"):
         DMPEL(**{name: 0})
