@@ -64,13 +64,15 @@ class RandomShift(Augmentation):
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return changed images; see `Augmentation`."""
         b, _, v, h, w, _ = images.shape
-        shifts = torch.randint(0, 2 * self.pixels + 1, (b, v, 2), generator=generator).tolist()
-        padded = repeat_border(images, self.pixels)
-        moved = torch.empty_like(images)
-        for row, per_view in enumerate(shifts):
+        padded, moved = repeat_border(images, self.pixels), torch.empty_like(images)
+        for row, per_view in enumerate(self._corners(b, v, generator).tolist()):
             for view, (y, x) in enumerate(per_view):
                 moved[row, :, view] = padded[row, :, view, y : y + h, x : x + w]
         return moved
+
+    def _corners(self, windows: int, views: int, generator: torch.Generator | None) -> Tensor:
+        """Draw the first row and column of each window's crop of the padded images, (windows, views, 2) int64."""
+        return torch.randint(0, 2 * self.pixels + 1, (windows, views, 2), generator=generator)
 
 
 def repeat_border(images: Tensor, pixels: int) -> Tensor:

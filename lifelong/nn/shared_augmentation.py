@@ -9,13 +9,13 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lifelong.nn.augmentation import Augmentation, repeat_border
+from lifelong.nn.augmentation import Augmentation, RandomShift
 from lifelong.types import NonNegative, Share
 
 _GRAY = (0.2989, 0.587, 0.114)
 
 
-class SharedShift(Augmentation):
+class SharedShift(RandomShift):
     """Random shift that repeats the border, by -pixels to pixels - 1 in each direction of a bottom-up picture.
 
     The original pads by `pixels` and crops at floor(2 pixels u) with u uniform in [0, 1), which never is 2 pixels; its
@@ -25,18 +25,9 @@ class SharedShift(Augmentation):
         pixels: Largest shift.
     """
 
-    def __init__(self, pixels: Annotated[int, Field(ge=0, le=10_000)] = 4) -> None:
-        self.pixels = pixels
-
-    def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return changed images; see `Augmentation`."""
-        b, _, _, h, w, _ = images.shape
-        starts = torch.randint(0, max(1, 2 * self.pixels), (b, 2), generator=generator).tolist()
-        padded, moved = repeat_border(images, self.pixels), torch.empty_like(images)
-        for row, (up, x) in enumerate(starts):
-            y = 2 * self.pixels - up
-            moved[row] = padded[row, ..., y : y + h, x : x + w, :]
-        return moved
+    def _corners(self, windows: int, views: int, generator: torch.Generator | None) -> Tensor:
+        up, x = torch.randint(0, max(1, 2 * self.pixels), (windows, 2), generator=generator).unbind(1)
+        return torch.stack([2 * self.pixels - up, x], dim=1)[:, None].expand(-1, views, -1)
 
 
 class SharedJitter(Augmentation):
