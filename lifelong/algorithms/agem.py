@@ -1,19 +1,15 @@
 """Averaged gradient episodic memory."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm
-from lifelong.data.memory import MEMORY_FORM, ReplayMemory
-from lifelong.data.windows import TaskWindows
+from lifelong.algorithms.rehearsal import Rehearsal
+from lifelong.data.memory import ReplayMemory
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, NonNegative
 
 
-class AGEM(Algorithm):
+class AGEM(Rehearsal):
     """Remove from each gradient the component that would raise the loss on a sample of earlier tasks.
 
     With g the gradient on the present task and g_ref that on windows drawn from the memory: where
@@ -29,9 +25,7 @@ class AGEM(Algorithm):
     LIBERO's code has `FirstWindows` as memory and augments its windows. No results of that are published.
     """
 
-    state_form = {"memory": MEMORY_FORM}
     tuned = {"ratio": (0.5, 1.0, 2.0)}
-    plain_start = True
 
     def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0, augment_reference: bool = False):
         """Create the algorithm.
@@ -41,13 +35,14 @@ class AGEM(Algorithm):
             ratio: Number of reference windows for each window of the batch; more make g_ref less noisy.
             augment_reference: Whether the reference windows are augmented as in training.
         """
-        self.memory, self.ratio, self.augment_reference = memory, ratio, augment_reference
+        super().__init__(memory, ratio)
+        self.augment_reference = augment_reference
         self._reference: Batch | None = None  # drawn by `mix`, used by `after_backward`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; the reference windows are drawn here."""
         if len(self.memory):
-            self._reference = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
+            self._reference = self._drawn(batch, generator)
             if self.augment_reference and self.augment is not None:
                 self._reference = self.augment(self._reference, generator)
         return batch
@@ -60,20 +55,6 @@ class AGEM(Algorithm):
         loss = policy.loss(self._reference.to(params[0].device))
         self._reference = None
         project(params, torch.autograd.grad(loss, params, allow_unused=True))
-
-    def end_task(
-        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
-    ) -> None:
-        """Add the task's windows to the memory."""
-        self.memory.add(dataset, generator)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return which windows are kept; their frames are read again from the demonstrations."""
-        return {"memory": self.memory.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], datasets)
 
 
 @torch.no_grad()

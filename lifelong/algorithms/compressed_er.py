@@ -1,19 +1,14 @@
 """Experience replay from a memory of compressed frames."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.compressed_memory import COMPRESSED_FORM, CompressedMemory
 from lifelong.data.compressed_windows import Quality
-from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
 from lifelong.types import Batch, Count, NonNegative
 
 
-class CompressedER(Algorithm):
+class CompressedER(Rehearsal):
     """Replay as `ER` does, from windows whose frames are kept as small pictures, within a number of bytes.
 
     The loss and the draws are those of experience replay (Chaudhry et al. 2019): `ratio` windows of earlier tasks join
@@ -23,7 +18,6 @@ class CompressedER(Algorithm):
 
     state_form = {"memory": COMPRESSED_FORM}
     tuned = {"ratio": (0.25, 0.5, 1.0, 2.0)}
-    plain_start = True
 
     def __init__(
         self,
@@ -42,25 +36,10 @@ class CompressedER(Algorithm):
             keep_decoded: Whether decoded frames stay in the process's memory while a task is learned; see
                 `CompressedMemory`.
         """
-        self.memory, self.ratio = CompressedMemory(budget, quality, keep_decoded), ratio
+        super().__init__(CompressedMemory(budget, quality, keep_decoded), ratio)
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch followed by `ratio` times as many windows of earlier tasks."""
         if not len(self.memory):
             return batch
-        replayed = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
-        return batch.join(replayed.to(batch.actions.device))
-
-    def end_task(
-        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
-    ) -> None:
-        """Compress the task's share of windows."""
-        self.memory.add(dataset, generator)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the compressed windows."""
-        return {"memory": self.memory.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned; no dataset is read."""
-        self.memory.load_state_dict(state["memory"])
+        return batch.join(self._drawn(batch, generator).to(batch.actions.device))

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
@@ -15,7 +15,7 @@ from lifelong.types import Batch, Count, NonNegative
 _CHUNK = 32  # windows per forward pass at the end of a task
 
 
-class DERpp(Algorithm):
+class DERpp(Rehearsal):
     """Replay earlier windows with their demonstrated actions, and with the policy's outputs of that time.
 
     The loss is `L(present) + alpha E_M D(z, h(x)) + beta E_M L(x, y)` with independent draws from the
@@ -33,7 +33,6 @@ class DERpp(Algorithm):
     # a tensor is a mean action, which earlier versions kept
     state_form = {"memory": MEMORY_FORM, "outputs": {int: (Tensor, {str: Tensor})}}
     tuned = {"alpha": (0.03, 0.1, 0.3, 1.0, 3.0), "ratio": (0.5, 1.0, 2.0)}
-    plain_start = True
 
     def __init__(self, *, budget: Count = 10_000, ratio: NonNegative = 1.0, alpha: NonNegative = 0.3):
         """Create the algorithm.
@@ -46,8 +45,8 @@ class DERpp(Algorithm):
                 better and forgot less (experiments/algorithms). The divergence of mixtures has the unit of their
                 loss.
         """
-        self.ratio, self.alpha = ratio, alpha
-        self.memory = ReplayMemory(budget)
+        super().__init__(ReplayMemory(budget), ratio)
+        self.alpha = alpha
         self._kept: dict[int, Tensor] = {}  # task -> (n,) windows in the memory
         self._outputs: dict[int, dict[str, Tensor]] = {}  # task -> z of each of them, each (n, T, ...)
         self._replayed: Batch | None = None  # drawn by `mix`, used by `penalty`
@@ -56,9 +55,8 @@ class DERpp(Algorithm):
         """Return the batch followed by `ratio` times as many earlier windows; others are drawn for the outputs."""
         if not len(self.memory):
             return batch
-        count = max(1, round(self.ratio * len(batch)))
-        self._replayed = self.memory.sample(count, generator)
-        return batch.join(self.memory.sample(count, generator))
+        self._replayed = self._drawn(batch, generator)
+        return batch.join(self._drawn(batch, generator))
 
     def penalty(self, policy: Policy) -> Tensor | None:
         """Return `alpha D(z, h(x))` on the drawn windows, a scalar; None during the first task."""
@@ -82,7 +80,7 @@ class DERpp(Algorithm):
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Add the task's windows to the memory, with the policy's outputs on them."""
-        self.memory.add(dataset, generator)
+        super().end_task(task_index, dataset, policy, generator)
         before, self._kept = set(self._kept), self._held()
         only_means = any(
             "mean" in answers for answers in self._outputs.values()
@@ -96,11 +94,11 @@ class DERpp(Algorithm):
     def state_dict(self) -> dict[str, Any]:
         """Return which windows are kept, and their outputs, which cannot be computed again later."""
         outputs = {task: dict(answers) for task, answers in self._outputs.items()}
-        return {"memory": self.memory.state_dict(), "outputs": outputs}
+        return {**super().state_dict(), "outputs": outputs}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], datasets)
+        super().load_state_dict(state, datasets)
         self._kept = self._held()
         self._outputs = {
             task: {"mean": kept} if isinstance(kept, Tensor) else dict(kept)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.checkpoints import Weights
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
@@ -18,7 +18,7 @@ from lifelong.types import Batch, Count, NonNegative, Observation
 _NOT_IMAGES = ("language", "proprio")
 
 
-class M2Distill(Algorithm):
+class M2Distill(Rehearsal):
     """Keep the features of each modality, and the distribution of actions, near those of the policy before the task.
 
     M2Distill (Roy et al. 2024, "M2Distill: Multi-modal distillation for lifelong imitation learning",
@@ -39,7 +39,6 @@ class M2Distill(Algorithm):
 
     state_form = {"memory": MEMORY_FORM, "weights": Weights()}
     tuned = {"policy": (0.03, 0.1, 0.3, 1.0), "image": (0.001, 0.003, 0.01, 0.1)}
-    plain_start = True
 
     def __init__(
         self,
@@ -64,9 +63,8 @@ class M2Distill(Algorithm):
                 teacher's errors. The divergence of mixtures has the unit of their loss, so that 1 weighs both alike;
                 this was not measured.
         """
-        self.ratio, self.policy = ratio, policy
-        self.image, self.language, self.proprio = image, language, proprio
-        self.memory = ReplayMemory(budget)
+        super().__init__(ReplayMemory(budget), ratio)
+        self.image, self.language, self.proprio, self.policy = image, language, proprio, policy
         self._weights: dict[str, Tensor] = {}  # of the teacher
         self._teacher: HistoryPolicy | None = None
         self._distilled: Batch | None = None  # drawn by `mix`, used by `penalty`
@@ -75,10 +73,9 @@ class M2Distill(Algorithm):
         """Return the batch followed by `ratio` times as many earlier windows; others are drawn to distil on."""
         if not len(self.memory):
             return batch
-        count = max(1, round(self.ratio * len(batch)))
-        drawn = self.memory.sample(count, generator)
+        drawn = self._drawn(batch, generator)
         self._distilled = drawn if self.augment is None else self.augment(drawn, generator)
-        return batch.join(self.memory.sample(count, generator))
+        return batch.join(self._drawn(batch, generator))
 
     def penalty(self, policy: Policy) -> Tensor | None:
         """Return the weighted sum of `distances` on the drawn windows, a scalar; None during the first task."""
@@ -95,17 +92,17 @@ class M2Distill(Algorithm):
     ) -> None:
         """Make the present weights the teacher's, and add the task's windows to the memory."""
         with_features(policy)
-        self.memory.add(dataset, generator)
+        super().end_task(task_index, dataset, policy, generator)
         self._weights = {n: t.detach().clone() for n, t in policy.state_dict().items()}
         self._teacher = None
 
     def state_dict(self) -> dict[str, Any]:
         """Return which windows are kept, and the teacher's weights."""
-        return {"memory": self.memory.state_dict(), "weights": dict(self._weights)}
+        return {**super().state_dict(), "weights": dict(self._weights)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; the frames come from the datasets."""
-        self.memory.load_state_dict(state["memory"], datasets)
+        super().load_state_dict(state, datasets)
         self._weights, self._teacher = dict(state["weights"]), None
 
     def _build_teacher(self, policy: HistoryPolicy) -> HistoryPolicy:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lifelong.data.compressed_windows import WINDOWS_FORM, CompressedWindows, Quality, compress
-from lifelong.data.memory import even_shares
+from lifelong.data.memory import TaskMemory, even_shares
 from lifelong.data.windows import JoinedWindows, TaskWindows
 from lifelong.errors import DataError
 from lifelong.types import Batch, Count
@@ -15,7 +15,7 @@ from lifelong.types import Batch, Count
 COMPRESSED_FORM = {"budget": int, "tasks": {int: WINDOWS_FORM}}  # see `lifelong.checkpoints.check`
 
 
-class CompressedMemory:
+class CompressedMemory(TaskMemory[CompressedWindows]):
     """A uniform sample of the windows of each past task, with compressed images, within one budget of bytes.
 
     The bytes are split evenly over the tasks: when a task is added, the shares of the others shrink. A task keeps the
@@ -32,18 +32,9 @@ class CompressedMemory:
     """
 
     def __init__(self, budget: Count, quality: Quality = 60, keep_decoded: bool = True) -> None:
-        self.budget, self.quality, self.keep_decoded = budget, quality, keep_decoded
-        self._tasks: dict[int, CompressedWindows] = {}
+        super().__init__(budget)
+        self.quality, self.keep_decoded = quality, keep_decoded
         self._decoded: dict[int, _Decoded] = {}
-
-    def __len__(self) -> int:
-        """Return the number of windows in the memory."""
-        return sum(map(len, self._tasks.values()))
-
-    @property
-    def shares(self) -> dict[int, int]:
-        """Number of windows of each task, by task id."""
-        return {task: len(windows) for task, windows in self._tasks.items()}
 
     def nbytes(self) -> int:
         """Return the number of bytes that are kept; never more than the budget."""
@@ -60,8 +51,7 @@ class CompressedMemory:
             DataError: The task is in the memory already, or a task's share of the bytes is less than one window.
         """
         task = dataset.task_id
-        if task in self._tasks:
-            raise DataError(f"task {task} is in the memory already; it holds {sorted(self._tasks)}")
+        self._require_new(task)
         steps = dataset.batch(torch.tensor([0])).actions.shape[1]
         runs = list(torch.arange(len(dataset)).split(steps))
         drawn = torch.randperm(len(runs), generator=generator).tolist()
@@ -92,21 +82,24 @@ class CompressedMemory:
         Raises:
             DataError: The memory is empty.
         """
-        size = len(self)
-        if not size:
-            raise DataError("nothing to sample: the memory is empty. Add a task first")
-        rounds = [torch.randperm(size, generator=generator) for _ in range(-(-n // size))]
+        drawn = self._draw(n, generator)
         if self.keep_decoded and not self._decoded:
             self._decoded = {task: _Decoded(windows) for task, windows in self._tasks.items()}
         held = self._decoded if self.keep_decoded else self._tasks
-        return JoinedWindows(list(held.values())).batch(torch.cat(rounds)[:n])
+        return JoinedWindows(list(held.values())).batch(drawn)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and everything that is kept, by task id."""
         return {"budget": self.budget, "tasks": {task: w.state_dict() for task, w in self._tasks.items()}}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(
+        self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows] | None = None
+    ) -> None:
         """Restore what `state_dict` returned.
+
+        Args:
+            state: From `state_dict`.
+            datasets: Windows by task id, as `ReplayMemory` needs them; they are not read.
 
         Raises:
             DataError: The state is not consistent; the memory is unchanged.

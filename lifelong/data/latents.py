@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.data.memory import even_shares
+from lifelong.data.memory import TaskMemory, even_shares
 from lifelong.errors import DataError
-from lifelong.types import Count
 
 _TENSORS = ("codes", "low", "step", "actions")
 LATENTS_FORM = {
@@ -84,25 +83,12 @@ class LatentWindows:
             raise DataError("latents of the memory contradict their ranges or their actions")
 
 
-class LatentMemory:
+class LatentMemory(TaskMemory[LatentWindows]):
     """Latents of windows of each past task, within one budget of windows that is divided evenly.
 
     Args:
         budget: Largest number of windows over all tasks.
     """
-
-    def __init__(self, budget: Count) -> None:
-        self.budget = budget
-        self._tasks: dict[int, LatentWindows] = {}
-
-    def __len__(self) -> int:
-        """Return the number of windows in the memory; never more than the budget."""
-        return sum(map(len, self._tasks.values()))
-
-    @property
-    def shares(self) -> dict[int, int]:
-        """Number of windows of each task, by task id."""
-        return {task: len(windows) for task, windows in self._tasks.items()}
 
     def add(self, task: int, latents: Tensor, actions: Tensor) -> None:
         """Add a task's windows; when another one is added, the first ones stay.
@@ -115,8 +101,7 @@ class LatentMemory:
         Raises:
             DataError: The task is in the memory already.
         """
-        if task in self._tasks:
-            raise DataError(f"task {task} is in the memory already; it holds {sorted(self._tasks)}")
+        self._require_new(task)
         self._tasks[task] = LatentWindows.of(latents.cpu(), actions.cpu())
         for known, share in even_shares(self.shares, self.budget).items():
             if share < len(self._tasks[known]):
@@ -135,11 +120,7 @@ class LatentMemory:
         Raises:
             DataError: The memory is empty.
         """
-        size = len(self)
-        if not size:
-            raise DataError("nothing to sample: the memory is empty. Add a task first")
-        rounds = [torch.randperm(size, generator=generator) for _ in range(-(-n // size))]
-        drawn, start = torch.cat(rounds)[:n], 0
+        drawn, start = self._draw(n, generator), 0
         latents, actions = [], []
         for windows in self._tasks.values():
             rows = drawn[(drawn >= start) & (drawn < start + len(windows))] - start

@@ -1,7 +1,7 @@
 """Memory of past tasks for rehearsal."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sized
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -9,6 +9,8 @@ from torch import Tensor
 from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset
 from lifelong.errors import DataError
 from lifelong.types import Batch, Count
+
+Kept = TypeVar("Kept", bound=Sized)
 
 MEMORY_FORM = {"budget": int, "indices": {str: Tensor}}  # see `lifelong.checkpoints.check`
 
@@ -28,7 +30,45 @@ def even_shares(sizes: Mapping[int, int], budget: int) -> dict[int, int]:
     return shares
 
 
-class ReplayMemory:
+class TaskMemory(Generic[Kept]):
+    """What memories of past tasks share: one budget, windows by task, and draws of as many as a batch needs.
+
+    Args:
+        budget: Largest size over all tasks, in the memory's own unit.
+    """
+
+    def __init__(self, budget: Count) -> None:
+        self.budget = budget
+        self._tasks: dict[int, Kept] = {}  # task id -> its windows
+
+    def __len__(self) -> int:
+        """Return the number of windows in the memory."""
+        return sum(map(len, self._tasks.values()))
+
+    @property
+    def shares(self) -> dict[int, int]:
+        """Number of windows of each task, by task id."""
+        return {task: len(windows) for task, windows in self._tasks.items()}
+
+    def _require_new(self, task: int) -> None:
+        """Raise DataError where the task is in the memory already."""
+        if task in self._tasks:
+            raise DataError(f"task {task} is in the memory already; it holds {sorted(self._tasks)}")
+
+    def _draw(self, n: int, generator: torch.Generator) -> Tensor:
+        """Draw positions of windows, (n,) int64, uniformly over all that are held; beyond their number they repeat.
+
+        Raises:
+            DataError: The memory is empty.
+        """
+        size = len(self)
+        if not size:
+            raise DataError("nothing to sample: the memory is empty. Add a task first")
+        rounds = [torch.randperm(size, generator=generator) for _ in range(-(-n // size))]
+        return torch.cat(rounds)[:n]
+
+
+class ReplayMemory(TaskMemory[Tensor]):
     """A uniform sample of the windows of each past task, within one budget.
 
     The budget is split evenly over the tasks: when a task is added, the shares of the others shrink. A task keeps a
@@ -45,18 +85,8 @@ class ReplayMemory:
     def __init__(self, budget: Count) -> None:
         if budget < 1:
             raise DataError(f"the memory's budget is {budget} windows; it must be at least 1")
-        self.budget = budget
+        super().__init__(budget)  # a task's windows are indices (n,) into its dataset
         self._datasets: dict[int, TaskWindows] = {}
-        self._indices: dict[int, Tensor] = {}  # task id -> (n,) window indices
-
-    def __len__(self) -> int:
-        """Return the number of windows in the memory; never more than the budget."""
-        return sum(len(indices) for indices in self._indices.values())
-
-    @property
-    def shares(self) -> dict[int, int]:
-        """Number of windows of each task, by task id."""
-        return {task: len(indices) for task, indices in self._indices.items()}
 
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task.
@@ -69,16 +99,15 @@ class ReplayMemory:
             DataError: The task is in the memory already.
         """
         task = dataset.task_id
-        if task in self._indices:
-            raise DataError(f"task {task} is in the memory already; it holds {sorted(self._indices)}")
+        self._require_new(task)
         self._datasets[task] = dataset
-        self._indices[task] = torch.randperm(len(dataset), generator=generator)[: self.budget]
+        self._tasks[task] = torch.randperm(len(dataset), generator=generator)[: self.budget]
         self._shrink()
 
     def _shrink(self) -> None:
         """Reduce every task to its share; what small tasks do not need is given to the others."""
         for task, share in even_shares(self.shares, self.budget).items():
-            self._indices[task] = self._indices[task][:share].clone()
+            self._tasks[task] = self._tasks[task][:share].clone()
 
     def sample(self, n: int, generator: torch.Generator) -> Batch:
         """Return windows drawn uniformly over all that are held, those of one task after those of another.
@@ -90,20 +119,16 @@ class ReplayMemory:
         Raises:
             DataError: The memory is empty.
         """
-        size = len(self)
-        if not size:
-            raise DataError("nothing to sample: the memory is empty. Add a task first")
-        rounds = [torch.randperm(size, generator=generator) for _ in range(-(-n // size))]
-        return self._windows(torch.cat(rounds)[:n])
+        return self._windows(self._draw(n, generator))
 
     def _windows(self, chosen: Tensor) -> Batch:
         """Return windows by their positions (B,) in the memory."""
-        kept = [WindowSubset(self._datasets[task], indices) for task, indices in self._indices.items()]
+        kept = [WindowSubset(self._datasets[task], indices) for task, indices in self._tasks.items()]
         return JoinedWindows(kept).batch(chosen)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and the indices by task id; frames are read again from the demonstrations."""
-        return {"budget": self.budget, "indices": {str(task): i.clone() for task, i in self._indices.items()}}
+        return {"budget": self.budget, "indices": {str(task): i.clone() for task, i in self._tasks.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -131,7 +156,7 @@ class ReplayMemory:
                     f"the memory holds window {int(kept.max())} of task {task}, whose dataset has "
                     f"{len(held[task])}: its demonstrations are not those of the interrupted run"
                 )
-        self.budget, self._indices, self._datasets = int(state["budget"]), indices, held
+        self.budget, self._tasks, self._datasets = int(state["budget"]), indices, held
 
 
 class FirstWindows(ReplayMemory):
@@ -173,7 +198,7 @@ class FirstWindows(ReplayMemory):
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""
         super().add(dataset, generator)
-        self._indices[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
+        self._tasks[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
 
     def _shrink(self) -> None:
-        self.budget = self.per_task * len(self._indices)
+        self.budget = self.per_task * len(self._tasks)

@@ -1,0 +1,47 @@
+"""What methods share that keep windows of earlier tasks in a memory."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from lifelong.algorithms.base import Algorithm
+from lifelong.data.compressed_memory import CompressedMemory
+from lifelong.data.memory import MEMORY_FORM, ReplayMemory
+from lifelong.data.windows import TaskWindows
+from lifelong.policies.base import Policy
+from lifelong.types import Batch
+
+
+class Rehearsal(Algorithm):
+    """Every task's windows go into a memory when it ends, and are drawn from it in proportion to later batches."""
+
+    state_form = {"memory": MEMORY_FORM}
+    plain_start = True
+
+    def __init__(self, memory: ReplayMemory | CompressedMemory, ratio: float):
+        """Create the algorithm.
+
+        Args:
+            memory: Memory of earlier tasks' windows.
+            ratio: Number of windows drawn for each window of a batch.
+        """
+        self.memory, self.ratio = memory, ratio
+
+    def _drawn(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Return `ratio` times as many windows of earlier tasks as the batch has, at least one."""
+        return self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
+
+    def end_task(
+        self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
+    ) -> None:
+        """Add the task's windows to the memory."""
+        self.memory.add(dataset, generator)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the memory keeps."""
+        return {"memory": self.memory.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned; frames that the memory does not keep come from the datasets."""
+        self.memory.load_state_dict(state["memory"], datasets)
