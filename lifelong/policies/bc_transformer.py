@@ -7,14 +7,14 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.nn.heads import GMMHead
-from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder, OverTime
+from lifelong.policies.history import Head, ImageEncoder, OverTime
+from lifelong.policies.tokens import TokenPolicy
 from lifelong.types import Observation, PolicySpec, Share, Width
 
 
-class BCTransformer(HistoryPolicy):
+class BCTransformer(TokenPolicy):
     """Behaviour cloning with LIBERO's ResNet-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, one per camera. All tokens of a
@@ -52,38 +52,23 @@ class BCTransformer(HistoryPolicy):
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(spec, stochastic=stochastic)
-        self.standardise_language = standardise_language
+        super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": embed_dim}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
-        self.proprio = ProprioTokens(
-            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
+        self.build_rest(
+            seen=spec.views,
+            embed_dim=embed_dim,
+            temporal=temporal,
+            head=head,
+            normalise_proprio=normalise_proprio,
+            proprio_dropout=proprio_dropout,
         )
-        self.transformer = temporal(dim=embed_dim, max_length=spec.seq_len)
-        self.head = self.build_head(head, in_dim=embed_dim)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
-        images, language = observation.images, observation.language
-        b, t = images.shape[:2]
-        if self.standardise_language:
-            language = standardise(language)
-        tokens = [self.language(language)[:, None, None].expand(b, t, 1, -1)]
-        if self.spec.proprio:
-            tokens.append(self.proprio(observation.proprio))
+        images, language = observation.images, self.instruction(observation)
+        tokens = self.first_tokens(observation, language)
         for view, encoder in enumerate(self.encoders.values()):
             latent = encoder(images[:, :, view].flatten(0, 1), language)
-            tokens.append(latent.view(b, t, 1, -1))
+            tokens.append(latent.view(*images.shape[:2], 1, -1))
         return torch.cat(tokens, dim=2)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the tokens (B, T, M, E) of the instruction, the readings and each camera; see `HistoryPolicy`."""
-        proprio = features[:, :, 1 : 1 + len(self.spec.proprio)]
-        rest = features[:, :, 1 + len(self.spec.proprio) :]
-        views = dict(zip(self.spec.views, rest.split(1, dim=2), strict=True))
-        return {"language": features[:, :, :1]} | ({"proprio": proprio} if self.spec.proprio else {}) | views
-
-    def over_time(self, features: Tensor) -> Tensor:
-        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
-        return self.transformer(features)[:, :, 0]

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import GMMHead
 from lifelong.nn.patches import PatchEncoder, SpatialTransformer
-from lifelong.nn.tokens import LanguageToken, ProprioTokens, standardise
+from lifelong.nn.tokens import LanguageToken
 from lifelong.nn.transformer import TemporalTransformer
-from lifelong.policies.history import Component, Head, HistoryPolicy, OverTime
+from lifelong.policies.history import Component, Head, OverTime
+from lifelong.policies.tokens import TokenPolicy
 from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
 
-class BCViLT(HistoryPolicy):
+class BCViLT(TokenPolicy):
     """Behaviour cloning with LIBERO's ViT-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, and one in which a transformer
@@ -61,8 +62,7 @@ class BCViLT(HistoryPolicy):
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(spec, stochastic=stochastic)
-        self.standardise_language = standardise_language
+        super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
         encoders = {view: encoder(image_size=spec.image_size, dim=patch_embed) for view in spec.views}
         self.encoders = nn.ModuleDict(encoders)
         self.spatial_language = LanguageToken(language_dim=spec.language_dim, dim=patch_embed)
@@ -70,34 +70,21 @@ class BCViLT(HistoryPolicy):
             raise PolicyError("data.views is []; this policy sees nothing without a camera")
         patches = encoders[spec.views[0]].patches
         self.spatial = spatial(views=len(encoders), patches=patches, dim=patch_embed, out_dim=embed_dim)
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
-        self.proprio = ProprioTokens(
-            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
+        self.build_rest(
+            seen=("images",),
+            embed_dim=embed_dim,
+            temporal=temporal,
+            head=head,
+            normalise_proprio=normalise_proprio,
+            proprio_dropout=proprio_dropout,
         )
-        self.transformer = temporal(dim=embed_dim, max_length=spec.seq_len)
-        self.head = self.build_head(head, in_dim=embed_dim)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
-        images, language = observation.images, observation.language
-        b, t = images.shape[:2]
-        if self.standardise_language:
-            language = standardise(language)
+        images, language = observation.images, self.instruction(observation)
         patches = [
             encoder(images[:, :, view].flatten(0, 1)) for view, encoder in enumerate(self.encoders.values())
         ]
         seen = self.spatial(torch.stack(patches, dim=1), self.spatial_language(language))
-        tokens = [self.language(language)[:, None, None].expand(b, t, 1, -1)]
-        if self.spec.proprio:
-            tokens.append(self.proprio(observation.proprio))
-        return torch.cat([*tokens, seen.view(b, t, 1, -1)], dim=2)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the tokens (B, T, M, E) of the instruction, the readings and all cameras; see `HistoryPolicy`."""
-        proprio = features[:, :, 1 : 1 + len(self.spec.proprio)]
-        views = {"images": features[:, :, 1 + len(self.spec.proprio) :]}
-        return {"language": features[:, :, :1]} | ({"proprio": proprio} if self.spec.proprio else {}) | views
-
-    def over_time(self, features: Tensor) -> Tensor:
-        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
-        return self.transformer(features)[:, :, 0]
+        seen = seen.view(*images.shape[:2], 1, -1)
+        return torch.cat([*self.first_tokens(observation, language), seen], dim=2)

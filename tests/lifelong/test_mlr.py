@@ -13,6 +13,7 @@ from lifelong.algorithms.base import load_algorithm
 from lifelong.algorithms.mlr import adjust, describe, encoded, feature_parameters, similar_pairs
 from lifelong.data.latents import LatentMemory, LatentWindows
 from lifelong.errors import CheckpointError, DataError, PolicyError
+from lifelong.policies.history import HistoryPolicy
 from lifelong.seeding import generator, seeded
 from lifelong.streams import StageWindows
 from lifelong.training.costs import step_costs, stored_bytes
@@ -85,12 +86,20 @@ def test_the_modalities_are_all_of_the_features_and_each_tells_of_its_own(kind):
     assert "language" in changed(replace(observation, language=observation.language + torch.arange(4.0)))
 
 
+@pytest.mark.parametrize("kind", ["bc_transformer", "bc_rnn", "bc_mlp"])
+def test_without_a_camera_there_are_the_other_parts(kind):
+    policy = make_policy(kind, replace(sequences.SPEC, views=())).eval()
+    observation = sequences.dataset(0).batch(torch.arange(3)).observation
+    blind = replace(observation, images=observation.images[:, :, :0])
+    assert sorted(policy.modalities(policy.encode(blind))) == ["language", "proprio"]
+
+
 def test_a_policy_that_does_not_name_its_parts_says_so():
     policy = make_policy()
     with pytest.raises(
         PolicyError, match=r"BCTransformer has no modalities\(features\).*choose another algorithm"
     ):
-        super(type(policy), policy).modalities(torch.zeros(1))
+        HistoryPolicy.modalities(policy, torch.zeros(1))
 
 
 # --- what is frozen
