@@ -1,10 +1,9 @@
-"""Worker processes, functions compiled for threads, the progress of long work, and what the machine has for it."""
+"""Worker processes, functions compiled for threads, and the progress of long work."""
 
 import logging
 import multiprocessing
 import os
 import pickle
-import re
 import signal
 import sys
 import threading
@@ -13,7 +12,6 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import suppress
 from functools import lru_cache
 from multiprocessing import connection
-from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -107,55 +105,6 @@ def end_with_parent() -> None:
 def cpu_count() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def available_memory() -> int | None:
-    """Return how much memory a new process could use, [bytes]; None where the system does not say it."""
-    found = []
-    if (meminfo := Path("/proc/meminfo")).is_file():
-        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
-        found.append(1024 * int(lines["MemAvailable"].split()[0]))
-    for folder, limit, used in (
-        ("/sys/fs/cgroup", "memory.max", "memory.current"),
-        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
-    ):
-        texts = [Path(folder, name) for name in (limit, used, "memory.stat")]
-        if all(path.is_file() for path in texts):
-            most, now, parts = (path.read_text().strip() for path in texts)
-            cached = re.search(r"^(?:total_)?inactive_file (\d+)$", parts, re.MULTILINE)
-            spare = (
-                int(cached.group(1)) if cached else 0
-            )  # files that were read, which the system drops first
-            found += [int(most) - int(now) + spare] if most.isdecimal() else []
-    return max(0, min(found)) if found else None
-
-
-def host_memory() -> tuple[int, int]:
-    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    limit = Path("/sys/fs/cgroup/memory.max")
-    if limit.is_file() and (text := limit.read_text().strip()).isdecimal():
-        total = min(total, int(text))
-    free = available_memory()
-    return total // 2 if free is None else min(free, total), total
-
-
-def require_memory(needed: float, what: str, remedy: str) -> None:
-    """Check that memory is available before it is asked for; a process that takes too much is killed.
-
-    Args:
-        needed: Estimate of what is needed, [bytes].
-        what: What it is needed for.
-        remedy: What to change.
-
-    Raises:
-        LiberoError: There is less; the message has both figures.
-    """
-    there = available_memory()
-    if there is not None and needed > there:
-        raise LiberoError(
-            f"{what} needs about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are free: {remedy}"
-        )
 
 
 def progress_bar(*iterable: Any, progress: bool | None = None, **options: Any) -> tqdm:

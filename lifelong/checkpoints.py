@@ -18,6 +18,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from libero_env.memory import physical_memory
 from libero_env.storage import atomic_path, show_bytes
 from lifelong.errors import CheckpointError, DamagedCheckpointError
 
@@ -241,7 +242,7 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
 def _check_size(path: Path) -> None:
     """Raise ValueError where a header or a file is larger than anything that `save` writes here."""
     size = path.stat().st_size
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = physical_memory()
     if size > memory:
         raise ValueError(f"it has {show_bytes(size)}, and this machine a memory of {show_bytes(memory)}")
     with open(path, "rb") as file:

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from libero_env.assets.pack import select_pack
 from libero_env.envs.batch import BatchEnv
+from libero_env.memory import memory_limit
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
@@ -37,7 +38,7 @@ from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, RunSettings, plain_data
 from lifelong.streams import StreamSettings
 from lifelong.training.distributed import Ranks
-from lifelong.training.memory import check_memory, memory_limit, policy_bytes, training_needs
+from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env import mujoco_compat, parallel
+from libero_env import memory, mujoco_compat
 from libero_env.cli import ending
 from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
@@ -369,11 +369,11 @@ def test_the_memory_of_an_evaluation_is_estimated(name, tmp_path):
 
 @pytest.mark.unit
 def test_memory_is_looked_at_before_it_is_asked_for(monkeypatch):
-    assert parallel.available_memory() > 10**6
-    monkeypatch.setattr(parallel, "available_memory", lambda: 10**9)
-    parallel.require_memory(0.9e9, "this", "less of it")
+    assert memory.available_memory() > 10**6
+    monkeypatch.setattr(memory, "available_memory", lambda: 10**9)
+    memory.require_memory(0.9e9, "this", "less of it")
     with pytest.raises(LiberoError, match=r"this needs about 2.0 GB of memory; 1.0 GB are free: less of it"):
-        parallel.require_memory(2e9, "this", "less of it")
+        memory.require_memory(2e9, "this", "less of it")
 
 
 @pytest.fixture

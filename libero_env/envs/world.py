@@ -18,7 +18,7 @@ from libero_env.envs.config import AFTER, EnvConfig, EnvOptions, show_options
 from libero_env.errors import InvalidInputError
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
-from libero_env.parallel import require_memory
+from libero_env.memory import require_memory
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.observations import Observer, is_of_joints

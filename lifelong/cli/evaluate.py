@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from libero_env.cli import arguments, ending
-from libero_env.parallel import cpu_count, require_memory
+from libero_env.memory import require_memory
+from libero_env.parallel import cpu_count
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ rehearsal fill the GPU first, then host memory, then the disk.
 import torch
 from torch import Tensor
 
-from libero_env.parallel import host_memory
+from libero_env.memory import host_memory
 from libero_env.storage import show_bytes
 from lifelong.data import frame_cache
 from lifelong.data.dataset import SequenceVLDataset

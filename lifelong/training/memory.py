@@ -6,14 +6,12 @@ where `data.memory` keeps them in memory (`FRAMES` of each); the images of the e
 Activations, the simulator and copies come on top.
 """
 
-import resource
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
-from lifelong.data.loading import host_memory
+from libero_env.memory import memory_limit
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.settings import Configuration
@@ -21,7 +19,6 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 
 FRAMES = 20  # of a demonstration; fewer than any task takes
-_CGROUPS = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
@@ -116,48 +113,6 @@ def check_memory(needs: Sequence[Need], available: int | None = None) -> None:
             f"this needs at least {_amount(total)} of memory, and there are {_amount(available)}: {listed}. "
             "Lower one of these"
         )
-
-
-def memory_limit() -> int:
-    """Return the most bytes that this process can have: of the machine with its swap, its container, its limits."""
-    limits = [host_memory()[1] + _swap(), *_group_limits()]
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return min(limits if soft == resource.RLIM_INFINITY else [*limits, soft])
-
-
-def _swap() -> int:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("SwapTotal:")), 0)
-
-
-def _group_limits() -> list[int]:
-    """Return the limits of this process's control groups, of versions 1 and 2, and of those around them."""
-    try:
-        lines = Path("/proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return []
-    limits = []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers not in ("", "memory"):
-            continue
-        root = _CGROUPS / controllers
-        name = "memory.limit_in_bytes" if controllers else "memory.max"
-        inside = root / path.lstrip("/")
-        for folder in (inside, *inside.parents):
-            if folder.is_relative_to(root) and (text := _read(folder / name)).isdecimal():
-                limits.append(int(text))
-    return limits
-
-
-def _read(file: Path) -> str:
-    try:
-        return file.read_text().strip()
-    except OSError:
-        return ""
 
 
 def _amount(nbytes: int) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env import parallel
+from libero_env import memory
 from lifelong.cli import main as cli
 from lifelong.cli.evaluate import plan_eval
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
@@ -205,7 +205,7 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     assert (one.environment["robot"], one.environment["models"]) == ("robosuite-1.4.1", "builtin")
     assert cli.main([*command, "--out", "two", "--unit-starts", "5"]) == 2
     assert "unit_starts is 2 there and 5 here" in capsys.readouterr().err
-    monkeypatch.setattr(parallel, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(memory, "available_memory", lambda: 10**9)
     assert cli.main([*command, "--out", "three", "--workers", "3"]) == 2
     assert "by 3 processes needs about 1.8 GB" in capsys.readouterr().err and not Path("three").exists()
 

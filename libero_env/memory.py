@@ -1,0 +1,96 @@
+"""How much memory there is: of the machine, and what control groups and limits leave of it to this process."""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from libero_env.errors import LiberoError
+
+_PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+_NAMES = {  # version of control groups -> files with the limit and with what is used
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes"),
+    2: ("memory.max", "memory.current"),
+}
+
+
+def physical_memory() -> int:
+    """Return the machine's memory without swap, [bytes]."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def available_memory() -> int | None:
+    """Return how much memory a new process could use, [bytes]; None where the system does not say it."""
+    meminfo = _meminfo()
+    found = [meminfo["MemAvailable"]] if "MemAvailable" in meminfo else []
+    found += [free for _, free in _groups() if free is not None]
+    return max(0, min(found)) if found else None
+
+
+def host_memory() -> tuple[int, int]:
+    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
+    total = min([physical_memory(), *(limit for limit, _ in _groups())])
+    free = available_memory()
+    return total // 2 if free is None else min(free, total), total
+
+
+def memory_limit() -> int:
+    """Return the most bytes that this process can have: of the machine with its swap, its container, its limits."""
+    import resource  # not on every system
+
+    limits = [physical_memory() + _meminfo().get("SwapTotal", 0), *(limit for limit, _ in _groups())]
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return min(limits if soft == resource.RLIM_INFINITY else [*limits, soft])
+
+
+def require_memory(needed: float, what: str, remedy: str) -> None:
+    """Check that memory is available before it is asked for; a process that takes too much is killed.
+
+    Args:
+        needed: Estimate of what is needed, [bytes].
+        what: What it is needed for.
+        remedy: What to change.
+
+    Raises:
+        LiberoError: There is less; the message has both figures.
+    """
+    there = available_memory()
+    if there is not None and needed > there:
+        raise LiberoError(
+            f"{what} needs about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are free: {remedy}"
+        )
+
+
+def _meminfo() -> dict[str, int]:
+    """Return what the kernel says of the machine's memory, by name, [bytes]; nothing where there is no such file."""
+    found = re.findall(r"^(\w+): +(\d+) kB$", _read(_PROC / "meminfo"), re.MULTILINE)
+    return {name: 1024 * int(amount) for name, amount in found}
+
+
+def _groups() -> Iterator[tuple[int, int | None]]:
+    """Yield the limits of this process's control groups and of those around them, each with what is free of it."""
+    for line in _read(_PROC / "self" / "cgroup").splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        root, (limit, used) = _GROUPS / controllers, _NAMES[1 if controllers else 2]
+        inside = root / path.lstrip("/")
+        for folder in (inside, *inside.parents):
+            if folder.is_relative_to(root) and (most := _read(folder / limit)).isdecimal():
+                yield int(most), _free(folder, int(most), _read(folder / used))
+
+
+def _free(folder: Path, limit: int, used: str) -> int | None:
+    """Return what is free of a control group's limit; None where the group does not say what is used."""
+    if not used.isdecimal():
+        return None
+    # files that were read count as used; the system drops them first
+    cached = re.search(r"^(?:total_)?inactive_file (\d+)$", _read(folder / "memory.stat"), re.MULTILINE)
+    return limit - int(used) + (int(cached.group(1)) if cached else 0)
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text().strip()
+    except OSError:
+        return ""
