@@ -115,43 +115,51 @@ def relearn(
             f"{source} is not finished: {run.learned + 1} of {len(run.tasks)} tasks are learned"
         )
     config = read_config(run.path / "config.yaml", allow)
-    fit_settings: FitSettings = config.build("train")
-    augment = config.build("augmentation") if "augmentation" in config.values else None
-    log = ResultLog(run.path / FILE_NAME)
+    rate, log = config.build("train").lr, ResultLog(run.path / FILE_NAME)
     for task in _chosen(run, tasks):
-        starts = [s for s in STARTS if not _recorded(log, task, s, settings, fit_settings.lr)]
+        starts = [start for start in STARTS if not _recorded(log, task, start, settings, rate)]
         if not starts:
             continue
-        with restore(run.path, after=_stage(run, task)[-1], device=device, allow=allow).acting(
-            run.tasks[task]
-        ) as then:
+        before = restore(run.path, after=_stage(run, task)[-1], device=device, allow=allow)
+        with before.acting(run.tasks[task]) as then:
             lesson = _lesson(run, then, task, settings, config)
         for start in starts:
-            began, seed = time.perf_counter(), (run.seed, RELEARN, task)
             acting = run.acting(run.tasks[task]) if start == "final" else nullcontext(initial)
             with acting as policy:
-                steps, errors = steps_until(
-                    copy.deepcopy(policy).to(run.device),
-                    lesson,
-                    settings=settings,
-                    fit_settings=fit_settings,
-                    seed=seed,
-                    augment=augment,
-                )
-            log.append(
-                RelearnRecord(
-                    task=task,
-                    start=start,
-                    learned_error=lesson.learned_error,
-                    tolerance=settings.tolerance,
-                    held_out=settings.held_out,
-                    rate=fit_settings.lr,
-                    steps=tuple(steps),
-                    errors=tuple(errors),
-                    seconds=time.perf_counter() - began,
-                )
-            )
+                log.append(_measure(run, policy, start, lesson, settings, config))
     return log.path
+
+
+def _measure(
+    run: LoadedRun,
+    policy: Policy,
+    start: Start,
+    lesson: Lesson,
+    settings: RelearnSettings,
+    config: Configuration,
+) -> RelearnRecord:
+    """Fine-tune a copy of a policy until a task is back; return the record."""
+    fit_settings: FitSettings = config.build("train")
+    began = time.perf_counter()
+    steps, errors = steps_until(
+        copy.deepcopy(policy).to(run.device),
+        lesson,
+        settings=settings,
+        fit_settings=fit_settings,
+        seed=(run.seed, RELEARN, lesson.task),
+        augment=config.build("augmentation") if "augmentation" in config.values else None,
+    )
+    return RelearnRecord(
+        task=lesson.task,
+        start=start,
+        learned_error=lesson.learned_error,
+        tolerance=settings.tolerance,
+        held_out=settings.held_out,
+        rate=fit_settings.lr,
+        steps=tuple(steps),
+        errors=tuple(errors),
+        seconds=time.perf_counter() - began,
+    )
 
 
 def steps_until(
