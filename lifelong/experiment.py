@@ -30,7 +30,8 @@ from lifelong.pretraining import INIT, load_initial_weights, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.conditions import changed_conditions, present_conditions, recorded_threads
 from lifelong.results.log import ResultLog
-from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord, start_record, utc_now
+from lifelong.results.provenance import start_record, utc_now
+from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.seeding import seeded

@@ -5,12 +5,13 @@ import io
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from libero_env.cli import arguments, ending
 from libero_env.memory import require_memory
 from libero_env.parallel import cpu_count
+from lifelong.cli import options
+from lifelong.cli.plan import plan_eval
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -21,11 +22,6 @@ POLICY_HELP = (
     "a run's directory, one of its checkpoints, module:function that returns an object with predict, or the "
     "address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://...; or a result, "
     "eval.json, which is run again"
-)
-
-ALLOW_HELP = (
-    "packages of others whose classes a run's configuration, or a result that is run again, may name "
-    "(default: none; their code is executed)"
 )
 
 
@@ -41,11 +37,7 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
 def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
     """Add what decides the numbers: tasks, starts, protocol, models."""
     parser.add_argument("--suite", nargs="+", metavar="SUITE", help="suites or tasks (default: the run's)")
-    parser.add_argument(
-        "--after",
-        type=arguments.whole(0),
-        help="of a run: the policy after this task, from 0 (default: the last)",
-    )
+    options.add_after(parser, "of a run: ")
     parser.add_argument(
         "--starts", choices=("all", "reporting", "selection"), default="all", help="(default: all 50)"
     )
@@ -115,8 +107,7 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="further attempts after an error (default: 1)",
     )
-    parser.add_argument("--device", type=arguments.device, default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
+    options.add_loading(parser)
     parser.add_argument(
         "--threads",
         type=arguments.processes_or_all,
@@ -211,85 +202,6 @@ def help_eval(args: argparse.Namespace) -> None:
             sys.exit(ending.report(error, who="a worker ended: "))
 
 
-def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
-    """Return the evaluation that the arguments describe.
-
-    Raises:
-        LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
-    """
-    from libero_env.cli.tasks import find_tasks
-    from lifelong.evaluation.candidates import PolicyUnderTest, RunPolicy, UserPolicy
-    from lifelong.evaluation.card_files import load_card
-    from lifelong.evaluation.protocol_env import resolve_world
-    from lifelong.evaluation.protocols import choose_init_states
-    from lifelong.evaluation.repeat import check_same, is_result, repeated, repeated_card
-    from lifelong.evaluation.suite import SuiteEvaluation
-    from lifelong.evaluation.units import UNIT_STARTS
-    from lifelong.results.evaluation_file import EvaluationResult
-    from lifelong.results.records import installed_versions
-
-    earlier = None
-    if is_result(args.policy):
-        earlier, where = EvaluationResult.read(args.policy), args.policy
-        args, card = repeated(args, earlier), repeated_card(earlier, where)
-    else:
-        card = load_card(args.protocol)
-    _check_idle(args, earlier)
-    policy: PolicyUnderTest
-    if "://" in args.policy:
-        from lifelong.evaluation.servers.policy import ServerPolicy
-
-        policy = ServerPolicy(args)
-    else:
-        policy = UserPolicy(args) if _is_callable(args.policy) else RunPolicy(args)
-    tasks = find_tasks(args.suite) if args.suite else policy.tasks
-    if not tasks:
-        raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
-    protocol, notes = resolve_world(policy.protocol(card), tasks, args.assets)
-    if args.horizon:
-        protocol = protocol.changed({"episode.horizon": args.horizon})
-    if args.robot:
-        protocol = protocol.changed({"world.robot": args.robot})
-    protocol.require()
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr, flush=True)
-    identity, versions = {**policy.identity, "seed": args.seed}, installed_versions(args.assets)
-    if earlier is None:
-        init_states = choose_init_states(args.starts, args.episodes, policy.selection)
-    else:
-        init_states = earlier.init_states
-        check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=args.despite)
-    return SuiteEvaluation(
-        identity=identity,
-        tasks=tuple(dict.fromkeys(tasks)),
-        init_states=init_states,
-        protocol=protocol,
-        out=args.out or policy.out,
-        env=lambda task, count: policy.env(task, count, protocol),
-        actor=lambda task, states: policy.actor(task, states, protocol),
-        unit_starts=UNIT_STARTS if args.unit_starts is None else args.unit_starts,
-        retries=args.retries,
-        errors_are_failures=protocol.episode.errors == "failure",
-        videos=args.videos,
-        progress=sys.stderr.isatty() and args.workers == 1,
-        versions=versions,
-        policy_threads=args.policy_threads or (1 if policy.on_cpu else None),
-    )
-
-
-def _check_idle(args: argparse.Namespace, earlier: "EvaluationResult | None") -> None:
-    """Check that no option is given that means nothing for this kind of policy.
-
-    Raises:
-        ConfigError: One is; the message says what it is of.
-    """
-    own_run = "://" not in args.policy and not _is_callable(args.policy)
-    if args.after is not None and not own_run:
-        raise ConfigError(f"--after is of runs, and {args.policy} is none")
-    if args.despite and earlier is None:
-        raise ConfigError(f"--despite is of results that are run again, and {args.policy} is none")
-
-
 @contextmanager
 def policy_threads(plan: "SuiteEvaluation") -> Iterator[None]:
     """Give PyTorch the number of threads that the evaluation names; their number changes the bits of a policy."""
@@ -307,7 +219,3 @@ def _print_progress(progress: object) -> None:
     from tqdm import tqdm
 
     tqdm.write(str(progress), file=sys.stderr)  # above the bar of a terminal
-
-
-def _is_callable(text: str) -> bool:
-    return ":" in text and not Path(text).exists()

@@ -4,7 +4,7 @@ import argparse
 
 from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers
-from lifelong.cli.evaluate import ALLOW_HELP
+from lifelong.cli import options
 
 
 def register(subparsers: Subparsers) -> None:
@@ -42,8 +42,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="RUN",
         help="the pretrained weights that the run began with: a finished run, or one of its checkpoints",
     )
-    parser.add_argument("--device", type=arguments.device, default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
+    options.add_loading(parser)
     parser.set_defaults(
         run=run_relearn, go_on="what is measured is kept: the same command goes on with the rest"
     )

@@ -4,21 +4,17 @@ import argparse
 
 from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers
-from lifelong.cli.evaluate import ALLOW_HELP
+from lifelong.cli import options
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the command `libero saliency RUN`."""
     parser = subparsers.add_parser("saliency", help="images of where a policy looks during a rollout")
-    parser.add_argument(
-        "policy", type=arguments.path, metavar="RUN", help="a run's directory, or one of its checkpoints"
-    )
+    options.add_run(parser)
     parser.add_argument(
         "--task", type=arguments.whole(0), default=0, help="position in the run's sequence (default: 0)"
     )
-    parser.add_argument(
-        "--after", type=arguments.whole(0), help="the policy after this task, from 0 (default: the last)"
-    )
+    options.add_after(parser)
     parser.add_argument(
         "--start", type=arguments.whole(0, 49), default=0, help="initial state of the rollout (default: 0)"
     )
@@ -37,8 +33,7 @@ def register(subparsers: Subparsers) -> None:
         default=200,
         help="maximum number of control steps (default: 200)",
     )
-    parser.add_argument("--device", type=arguments.device, default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
+    options.add_loading(parser)
     parser.set_defaults(run=run_saliency)
 
 

@@ -5,18 +5,14 @@ import asyncio
 import contextlib
 
 from libero_env.cli import arguments
-from lifelong.cli.evaluate import ALLOW_HELP
+from lifelong.cli import options
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
     """Add the command `libero serve RUN`."""
     parser = subparsers.add_parser("serve", help="serve a run's policy in openpi's WebSocket protocol")
-    parser.add_argument(
-        "policy", type=arguments.path, metavar="RUN", help="a run's directory, or one of its checkpoints"
-    )
-    parser.add_argument(
-        "--after", type=arguments.whole(0), help="the policy after this task, from 0 (default: the last)"
-    )
+    options.add_run(parser)
+    options.add_after(parser)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument(
         "--port",
@@ -30,8 +26,7 @@ def register(subparsers: "argparse._SubParsersAction") -> None:
         default=0,
         help="seed of stochastic policies, for clients that send none (default: 0)",
     )
-    parser.add_argument("--device", type=arguments.device, default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument("--allow", nargs="+", default=[], metavar="PACKAGE", help=ALLOW_HELP)
+    options.add_loading(parser)
     parser.add_argument(
         "--policy-threads",
         type=arguments.processes,

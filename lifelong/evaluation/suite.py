@@ -27,7 +27,7 @@ from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_an
 from lifelong.evaluation.units import UNIT_STARTS, Unit, partition
 from lifelong.evaluation.work_folder import PLAN_FORMAT, UnitResult, WorkFolder, describe, this_process
 from lifelong.results.evaluation_file import EvaluationResult, TaskResult
-from lifelong.results.records import installed_versions
+from lifelong.results.provenance import installed_versions
 from lifelong.results.summary import json_safe
 
 # Memory, as measured with libero_10/0

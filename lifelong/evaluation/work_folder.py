@@ -27,7 +27,7 @@ from lifelong.errors import ConfigError, LifelongError, ResultsError
 from lifelong.evaluation.claims import LEASE, Claim, Claims, Held
 from lifelong.evaluation.units import Unit
 from lifelong.results.evaluation_file import FILE_NAME, TaskResult, task_result
-from lifelong.results.records import utc_now
+from lifelong.results.provenance import utc_now
 from lifelong.results.summary import json_safe
 
 PLAN_NAME = "evaluation.json"

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from lifelong.results.check import examine
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
+from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     CostRecord,
     EvalRecord,
@@ -18,7 +19,6 @@ from lifelong.results.records import (
     PhaseRecord,
     RunEndRecord,
     TaskEndRecord,
-    start_record,
     to_line,
 )
 from lifelong.results.summary import summarize

@@ -18,7 +18,7 @@ from libero_env.assets.published import (
 from libero_env.cli.doctor import check_models
 from libero_env.errors import MissingPackageError
 from lifelong.cli.main import main
-from lifelong.results.records import installed_versions
+from lifelong.results.provenance import installed_versions
 
 pytestmark = pytest.mark.unit
 

@@ -14,7 +14,8 @@ from lifelong.evaluation.restore import LoadedRun
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Curve, Scores, lifelong_metrics
-from lifelong.results.records import EvalRecord, RunRecord, TaskEndRecord, from_line, start_record, to_line
+from lifelong.results.provenance import start_record
+from lifelong.results.records import EvalRecord, RunRecord, TaskEndRecord, from_line, to_line
 from lifelong.results.results import after_base_stage
 from lifelong.results.summary import summarize
 from lifelong.streams import StreamSettings

@@ -8,7 +8,8 @@ import yaml
 
 from lifelong.cli.main import main
 from lifelong.results.check import examine
-from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, from_line, start_record
+from lifelong.results.provenance import start_record
+from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, from_line
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from tests.harness.sequences import run_context, sequence

@@ -16,7 +16,8 @@ from lifelong.results.conditions import (
     source_digest,
 )
 from lifelong.results.log import ResultLog
-from lifelong.results.records import from_line, start_record, to_line
+from lifelong.results.provenance import start_record
+from lifelong.results.records import from_line, to_line
 from lifelong.settings import RunSettings
 
 pytestmark = pytest.mark.unit

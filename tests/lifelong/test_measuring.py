@@ -16,7 +16,8 @@ from lifelong.report import write_report
 from lifelong.results.check import examine
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
-from lifelong.results.records import EvalRecord, start_record
+from lifelong.results.provenance import start_record
+from lifelong.results.records import EvalRecord
 from lifelong.results.summary import summarize
 from lifelong.seeding import seeded
 from lifelong.sequence import is_measured

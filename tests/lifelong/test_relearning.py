@@ -16,7 +16,8 @@ from lifelong.evaluation import relearning
 from lifelong.evaluation.relearning import Lesson, RelearnSettings, error_on, relearn, steps_until
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.records import RelearnRecord, from_line, start_record, to_line
+from lifelong.results.provenance import start_record
+from lifelong.results.records import RelearnRecord, from_line, to_line
 from lifelong.results.relearning import FILE_NAME, read_relearning, savings, savings_rows, savings_table
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
@@ -237,6 +238,11 @@ def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(fin
         with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
             RelearnSettings(**change)
     assert build_parser().parse_args(["relearn", str(folder), "--tasks", "0", "2"]).tasks == [0, 2]
+
+
+def test_the_options_of_the_command_default_to_the_settings() -> None:
+    args = build_parser().parse_args(["relearn", "run"])
+    assert RelearnSettings(args.steps, args.every, args.tolerance, args.held_out) == RelearnSettings()
 
 
 def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:

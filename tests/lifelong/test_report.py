@@ -21,6 +21,7 @@ from lifelong.report.statistics import statistics
 from lifelong.results.episode_table import read_episodes
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import METRIC_NAMES, METRIC_RANGES
+from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     CostRecord,
     EvalRecord,
@@ -28,7 +29,6 @@ from lifelong.results.records import (
     PhaseRecord,
     RunEndRecord,
     TaskEndRecord,
-    start_record,
 )
 from lifelong.results.samples import Member
 from lifelong.results.summary import json_safe, summarize

@@ -9,6 +9,7 @@ import pytest
 
 from lifelong.errors import ResultsError
 from lifelong.results.log import ResultLog
+from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     RECORD_TYPES,
     CostRecord,
@@ -19,7 +20,6 @@ from lifelong.results.records import (
     RunEndRecord,
     TaskEndRecord,
     from_line,
-    start_record,
     to_line,
 )
 from lifelong.results.results import Results

@@ -23,14 +23,8 @@ from lifelong.pretraining import load_initial_weights, pretraining_context, pret
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
-from lifelong.results.records import (
-    EvalRecord,
-    LossRecord,
-    RunEndRecord,
-    TaskEndRecord,
-    start_record,
-    utc_now,
-)
+from lifelong.results.provenance import start_record, utc_now
+from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.saved_config import upgrade_config
 from lifelong.sequence import TaskSequence

@@ -9,7 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from torch import distributions, nn
 
 from lifelong.nn import GMMHead, ResNetFiLMEncoder
-from lifelong.results.records import EvalRecord, TaskEndRecord, start_record
+from lifelong.results.provenance import start_record
+from lifelong.results.records import EvalRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.summary import summarize
 

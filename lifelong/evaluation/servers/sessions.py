@@ -20,7 +20,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.errors import PolicyError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.restore import LoadedRun
-from lifelong.results.records import installed_versions
+from lifelong.results.provenance import installed_versions
 from lifelong.seeding import generator
 
 SERVER, FORMAT = "libero-lifelong", 1  # the first entries of what is announced

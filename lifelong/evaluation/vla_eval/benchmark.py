@@ -20,7 +20,7 @@ from lifelong.evaluation.card_files import load_card
 from lifelong.evaluation.inputs import Obs
 from lifelong.evaluation.protocol_env import ProtocolEnv, make_env, resolve_world, run_protocol
 from lifelong.evaluation.vla_eval.harness import StepBenchmark, StepResult, require
-from lifelong.results.records import installed_versions
+from lifelong.results.provenance import installed_versions
 
 ADJUSTABLE = ("vla-eval", "libero")  # cards that leave some fields to what a policy asks for
 IMAGES = {"agentview": "agentview", "robot0_eye_in_hand": "wrist"}  # camera -> key

@@ -1,0 +1,117 @@
+"""From the arguments of `libero eval` to the evaluation that they describe."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lifelong.errors import ConfigError
+
+if TYPE_CHECKING:
+    from libero_env.tasks import Task
+    from lifelong.evaluation.candidates import PolicyUnderTest
+    from lifelong.evaluation.card import Card
+    from lifelong.evaluation.suite import SuiteEvaluation
+    from lifelong.results.evaluation_file import EvaluationResult
+
+
+def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
+    """Return the evaluation that the arguments describe.
+
+    Raises:
+        LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
+    """
+    from libero_env.cli.tasks import find_tasks
+    from lifelong.evaluation.protocols import choose_init_states
+    from lifelong.evaluation.repeat import check_same
+    from lifelong.evaluation.suite import SuiteEvaluation
+    from lifelong.evaluation.units import UNIT_STARTS
+    from lifelong.results.provenance import installed_versions
+
+    args, card, earlier = _what_to_repeat(args)
+    _check_idle(args, earlier)
+    policy = _policy(args)
+    tasks = find_tasks(args.suite) if args.suite else policy.tasks
+    if not tasks:
+        raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
+    protocol = _protocol(args, policy.protocol(card), tasks)
+    identity, versions = {**policy.identity, "seed": args.seed}, installed_versions(args.assets)
+    if earlier is None:
+        init_states = choose_init_states(args.starts, args.episodes, policy.selection)
+    else:
+        init_states = earlier.init_states
+        check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=args.despite)
+    return SuiteEvaluation(
+        identity=identity,
+        tasks=tuple(dict.fromkeys(tasks)),
+        init_states=init_states,
+        protocol=protocol,
+        out=args.out or policy.out,
+        env=lambda task, count: policy.env(task, count, protocol),
+        actor=lambda task, states: policy.actor(task, states, protocol),
+        unit_starts=UNIT_STARTS if args.unit_starts is None else args.unit_starts,
+        retries=args.retries,
+        errors_are_failures=protocol.episode.errors == "failure",
+        videos=args.videos,
+        progress=sys.stderr.isatty() and args.workers == 1,
+        versions=versions,
+        policy_threads=args.policy_threads or (1 if policy.on_cpu else None),
+    )
+
+
+def _what_to_repeat(
+    args: argparse.Namespace,
+) -> "tuple[argparse.Namespace, Card, EvaluationResult | None]":
+    """Return arguments, protocol and result, those of the result where one is run again; otherwise None for it."""
+    from lifelong.evaluation.card_files import load_card
+    from lifelong.evaluation.repeat import is_result, repeated, repeated_card
+    from lifelong.results.evaluation_file import EvaluationResult
+
+    if not is_result(args.policy):
+        return args, load_card(args.protocol), None
+    earlier = EvaluationResult.read(args.policy)
+    return repeated(args, earlier), repeated_card(earlier, args.policy), earlier
+
+
+def _policy(args: argparse.Namespace) -> "PolicyUnderTest":
+    """Return the policy that the arguments name: a server's, a user's own, or a run's."""
+    from lifelong.evaluation.candidates import RunPolicy, UserPolicy
+
+    if "://" in args.policy:
+        from lifelong.evaluation.servers.policy import ServerPolicy
+
+        return ServerPolicy(args)
+    return UserPolicy(args) if _is_callable(args.policy) else RunPolicy(args)
+
+
+def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -> "Card":
+    """Return the protocol on this machine, with what the arguments change; what was chosen is printed."""
+    from lifelong.evaluation.protocol_env import resolve_world
+
+    protocol, notes = resolve_world(card, tasks, args.assets)
+    if args.horizon:
+        protocol = protocol.changed({"episode.horizon": args.horizon})
+    if args.robot:
+        protocol = protocol.changed({"world.robot": args.robot})
+    protocol.require()
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr, flush=True)
+    return protocol
+
+
+def _check_idle(args: argparse.Namespace, earlier: "EvaluationResult | None") -> None:
+    """Check that no option is given that means nothing for this kind of policy.
+
+    Raises:
+        ConfigError: One is; the message says what it is of.
+    """
+    own_run = "://" not in args.policy and not _is_callable(args.policy)
+    if args.after is not None and not own_run:
+        raise ConfigError(f"--after is of runs, and {args.policy} is none")
+    if args.despite and earlier is None:
+        raise ConfigError(f"--despite is of results that are run again, and {args.policy} is none")
+
+
+def _is_callable(text: str) -> bool:
+    return ":" in text and not Path(text).exists()
