@@ -5,6 +5,7 @@ Shape legend: B batch, T time, V views, H W C image, A action, D size of a readi
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Annotated
 
 import torch
@@ -72,6 +73,12 @@ class Observation:
     proprio: Mapping[str, Tensor]
     language: Tensor
 
+    def to(self, device: torch.device | str) -> "Observation":
+        """Return the observation on another device."""
+        move = partial(Tensor.to, device=device, non_blocking=True)
+        proprio = {name: move(reading) for name, reading in self.proprio.items()}
+        return Observation(move(self.images), proprio, move(self.language))
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -94,11 +101,8 @@ class Batch:
 
     def to(self, device: torch.device | str) -> "Batch":
         """Return the batch on another device."""
-        move = lambda x: x.to(device, non_blocking=True)  # noqa: E731
-        obs = self.observation
-        moved = Observation(
-            move(obs.images), {k: move(v) for k, v in obs.proprio.items()}, move(obs.language)
-        )
+        move = partial(Tensor.to, device=device, non_blocking=True)
+        moved = self.observation.to(device)
         return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids))
 
     def rows(self, rows: slice | Tensor) -> "Batch":

@@ -16,7 +16,7 @@ from lifelong.nn.experts import (
     matrix_of,
 )
 from lifelong.nn.routing import Discriminator, groups_of_rows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.types import Count, Natural, NonNegative, Positive, Width
 
 BASE = -1  # in place of a task whose adapter is used: none
@@ -159,20 +159,17 @@ class CLARE(RoutedExperts):
     ) -> Samples:
         """Return inputs of the layers on some of a task's windows, with its adapters or, without it, chosen ones."""
         found: dict[str, list[Tensor]] = {}
-        device, was_training = next(policy.parameters()).device, policy.training
+        device = device_of(policy)
         chosen = torch.randperm(len(dataset), generator=draws)[: self.windows]
 
         def added(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
             found.setdefault(name, []).append(_samples(layer, x)[: max(1, _ROWS * _CHUNK // len(chosen))])
             return self._added(name, layer, x)
 
-        policy.eval()
-        try:
-            with self._using(task, policy, adaptable_modules(policy, self.adapted), added):
-                for part in chosen.split(_CHUNK):
-                    policy.predict(dataset.batch(part).to(device))
-        finally:
-            policy.train(was_training)
+        layers = adaptable_modules(policy, self.adapted)
+        with in_mode(policy, training=False), self._using(task, policy, layers, added):
+            for part in chosen.split(_CHUNK):
+                policy.predict(dataset.batch(part).to(device))
         return {name: torch.cat(parts) for name, parts in found.items()}
 
     def state_dict(self) -> dict[str, Any]:

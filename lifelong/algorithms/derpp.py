@@ -9,7 +9,7 @@ from torch import Tensor
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.types import Batch, Count, NonNegative
 
 _CHUNK = 32  # windows per forward pass at the end of a task
@@ -62,7 +62,7 @@ class DERpp(Rehearsal):
         """Return `alpha D(z, h(x))` on the drawn windows, a scalar; None during the first task."""
         if self._replayed is None:
             return None
-        batch, self._replayed = self._replayed.to(_device(policy)), None
+        batch, self._replayed = self._replayed.to(device_of(policy)), None
         return self.alpha * policy.divergence(batch, self.stored_outputs(batch)).mean()
 
     def stored_outputs(self, batch: Batch) -> dict[str, Tensor]:
@@ -116,12 +116,6 @@ def _outputs(policy: Policy, dataset: TaskWindows, windows: Tensor, only_means: 
     def answers(batch: Batch) -> dict[str, Tensor]:
         return {"mean": policy.predict(batch)} if only_means else policy.answers(batch)
 
-    was_training, device = policy.training, _device(policy)
-    policy.eval()
-    parts = [answers(dataset.batch(i).to(device)) for i in windows.split(_CHUNK)]
-    policy.train(was_training)
+    with in_mode(policy, training=False):
+        parts = [answers(dataset.batch(i).to(device_of(policy))) for i in windows.split(_CHUNK)]
     return {name: torch.cat([part[name].float() for part in parts]) for name in parts[0]}
-
-
-def _device(policy: Policy) -> torch.device:
-    return next(policy.parameters()).device

@@ -15,7 +15,7 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.nn.experts import ExpertLibrary, adapted_layers, expert_output, weights_of
 from lifelong.nn.routing import SigmoidRouter
 from lifelong.nn.tokens import standardise
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of
 from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Positive, Width
 
 _QUERY = "routing_query"  # key among the readings of a batch; policies read only those of their spec
@@ -107,7 +107,7 @@ class DMPEL(RoutedExperts):
         """Store the episodes' contexts; after the base, add experts and build a new router."""
         layers = adapted_layers(policy, self.adapted)
         queries, of_window = of_episodes(dataset, lambda batch: self.query(batch.observation))
-        queries = queries.to(next(policy.parameters()).device)
+        queries = queries.to(device_of(policy))
         self._episodes = {"queries": queries, "of_window": of_window}
         draws = self._begin(task_index, policy)
         if draws is None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lifelong.data.windows import WindowDataset
 from lifelong.errors import ConfigError
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, in_mode
 from lifelong.types import Batch, Count, Natural
 
 
@@ -72,18 +72,16 @@ class ImportanceEstimator(ABC):
         named = {n: p for n, p in policy.named_parameters() if p.requires_grad}
         total = {n: torch.zeros_like(p, memory_format=torch.preserve_format) for n, p in named.items()}
         device = next(iter(named.values())).device
-        was_training = policy.training
-        policy.train(self.training)
-        for indices in batches:
-            batch = dataset.batch(indices)
-            if self.augment and augment is not None:
-                batch = augment(batch, generator)
-            objective = self.objective(policy, batch.to(device))
-            grads = torch.autograd.grad(objective, list(named.values()), allow_unused=True)
-            for name, grad in zip(named, grads, strict=True):
-                if grad is not None:
-                    self.accumulate(total[name], grad, 1 / len(batches))
-        policy.train(was_training)
+        with in_mode(policy, training=self.training):
+            for indices in batches:
+                batch = dataset.batch(indices)
+                if self.augment and augment is not None:
+                    batch = augment(batch, generator)
+                objective = self.objective(policy, batch.to(device))
+                grads = torch.autograd.grad(objective, list(named.values()), allow_unused=True)
+                for name, grad in zip(named, grads, strict=True):
+                    if grad is not None:
+                        self.accumulate(total[name], grad, 1 / len(batches))
         return total
 
 

@@ -16,7 +16,7 @@ from lifelong.nn.experts import (
     weights_of,
 )
 from lifelong.nn.routing import cluster_centres, groups_of_rows, nearest_key
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.types import Count, Natural, NonNegative, Observation, Width
 
 _CHUNK = 32  # windows per forward pass of the base
@@ -123,15 +123,11 @@ class IsCiL(RoutedExperts):
     @torch.no_grad()
     def _embed_windows(self, dataset: TaskWindows, policy: Policy, draws: torch.Generator) -> Tensor:
         """Return the embeddings of some of a task's windows, (n, F), in evaluation mode."""
-        device, was_training = next(policy.parameters()).device, policy.training
-        policy.eval()
+        device, encode = device_of(policy), policy.encode  # type: ignore[attr-defined]
         chosen = torch.randperm(len(dataset), generator=draws)[: self.states]
-        encode: Any = policy.encode  # type: ignore[attr-defined]
-        found = [
-            _embedding(encode(dataset.batch(part).to(device).observation)) for part in chosen.split(_CHUNK)
-        ]
-        policy.train(was_training)
-        return torch.cat(found)
+        with in_mode(policy, training=False):
+            seen = (dataset.batch(part).to(device).observation for part in chosen.split(_CHUNK))
+            return torch.cat([_embedding(encode(observation)) for observation in seen])
 
     def state_dict(self) -> dict[str, Any]:
         """Return all adapters and prototypes."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of
 from lifelong.types import Batch, NonNegative
 
 
@@ -59,7 +59,7 @@ class LwF(Algorithm):
         """Return `strength * D(h_old, h)`, a scalar; None during the first task."""
         if self._distilled is None:
             return None
-        batch, self._distilled = self._distilled.to(next(policy.parameters()).device), None
+        batch, self._distilled = self._distilled.to(device_of(policy)), None
         with torch.no_grad():
             teacher = self._build_teacher(policy).answers(batch)
         return self.strength * policy.divergence(batch, teacher).mean()

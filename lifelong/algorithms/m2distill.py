@@ -11,7 +11,7 @@ from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.checkpoints import Weights
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of
 from lifelong.policies.history import HistoryPolicy, with_features
 from lifelong.types import Batch, Count, NonNegative, Observation
 
@@ -82,7 +82,7 @@ class M2Distill(Rehearsal):
         if self._distilled is None:
             return None
         student = with_features(policy)
-        observation = self._distilled.to(next(student.parameters()).device).observation
+        observation = self._distilled.to(device_of(student)).observation
         self._distilled = None
         found = distances(student, self._build_teacher(student), observation)
         return torch.stack([getattr(self, name) * distance for name, distance in found.items()]).sum()

@@ -12,7 +12,7 @@ from torch.nn import functional
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.latents import LATENTS_FORM, LatentMemory
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.policies.history import HistoryPolicy, with_features
 from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Share
 
@@ -78,23 +78,17 @@ class MLR(Algorithm):
             base_tasks: Number of tasks (stages, where tasks are learned together) that train the whole policy; 0 for
                 a pretrained policy.
         """
-        self._ratio, self.keep, self.adjustment, self.margin = (
-            ratio,
-            keep,
-            adjustment,
-            margin,
-        )  # no images are replayed
+        self.keep, self.adjustment, self.margin = keep, adjustment, margin
+        self._ratio = ratio  # not `ratio`, by which replayed images are counted: there are none
         self.memory = LatentMemory(budget)
         self._base_left = base_tasks
-        self._frozen: list[
-            str
-        ] = []  # names of parameters that the features depend on; empty while the base is learned
+        self._frozen: list[str] = []  # parameters that features depend on; empty while the base is learned
         self._instructions = torch.zeros(0, 0)  # (K, F) directions of the features of all instructions so far
         self._images = torch.zeros(0, 0)  # (K, G) mean directions of the first camera's features
         self._near = torch.zeros(0, 0)  # (J, F) of earlier instructions that are similar to the present ones
         self._present: Observation | None = None  # set by `mix`, used by `penalty`
         self._replayed: tuple[Tensor, Tensor] | None = (
-            None  # latents (B, T, ...) and actions (B, T, A), as _present
+            None  # latents (B, T, ...), actions (B, T, A), likewise
         )
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
@@ -136,12 +130,12 @@ class MLR(Algorithm):
         """Return the loss of the drawn latents and the adjustment of the present features, a scalar."""
         if self._replayed is None:
             return None
-        policy, device = with_features(policy), _device(policy)
+        policy, device = with_features(policy), device_of(policy)
         latents, actions = (x.to(device) for x in self._replayed)
         losses = policy.head.losses(policy.head(policy.over_time(latents)), actions)
         total = self._ratio * losses.mean()
         if self._present is not None:
-            total = total + self.adjustment * self._adjust(policy, _to(self._present, device))
+            total = total + self.adjustment * self._adjust(policy, self._present.to(device))
         self._replayed = self._present = None
         return total
 
@@ -204,23 +198,19 @@ def feature_parameters(policy: HistoryPolicy, batch: Batch) -> list[str]:
         policy: Policy.
         batch: Windows whose features are computed, one at least.
     """
-    was_training = policy.training
-    policy.eval()
     named = {name: p for name, p in policy.named_parameters() if p.requires_grad}
-    with torch.enable_grad():
-        features = policy.encode(batch.to(_device(policy)).observation)
+    with in_mode(policy, training=False), torch.enable_grad():
+        features = policy.encode(batch.to(device_of(policy)).observation)
         gradients = torch.autograd.grad(features.float().sum(), list(named.values()), allow_unused=True)
-    policy.train(was_training)
     return [name for name, gradient in zip(named, gradients, strict=True) if gradient is not None]
 
 
 @torch.no_grad()
 def encoded(policy: HistoryPolicy, dataset: TaskWindows, windows: Tensor) -> Tensor:
     """Return the features of windows in evaluation mode, on the CPU, (n,) -> (n, T, ...)."""
-    was_training, device = policy.training, _device(policy)
-    policy.eval()
-    parts = [policy.encode(dataset.batch(rows).to(device).observation) for rows in windows.split(_CHUNK)]
-    policy.train(was_training)
+    device = device_of(policy)
+    with in_mode(policy, training=False):
+        parts = [policy.encode(dataset.batch(rows).to(device).observation) for rows in windows.split(_CHUNK)]
     return torch.cat([part.float().cpu() for part in parts])
 
 
@@ -300,13 +290,3 @@ def _direction(x: Tensor) -> Tensor:
 def _actions(dataset: TaskWindows, windows: Tensor) -> Tensor:
     """Return the actions of windows on the CPU, (n,) -> (n, T, A)."""
     return torch.cat([dataset.batch(rows).actions.cpu() for rows in windows.split(_CHUNK)])
-
-
-def _to(observation: Observation, device: torch.device) -> Observation:
-    """Return the observation on a device."""
-    proprio = {name: x.to(device) for name, x in observation.proprio.items()}
-    return Observation(observation.images.to(device), proprio, observation.language.to(device))
-
-
-def _device(policy: Policy) -> torch.device:
-    return next(policy.parameters()).device

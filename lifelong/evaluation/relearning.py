@@ -26,7 +26,7 @@ from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows, WindowDataset
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.evaluation.restore import LoadedRun, read_config, restore
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord
 from lifelong.results.relearning import FILE_NAME
@@ -205,7 +205,7 @@ def steps_until(
             Algorithm(),
             settings=constant,
             seed=seed,
-            device=next(policy.parameters()).device,
+            device=device_of(policy),
             augment=augment,
             on_epoch=look,
             label=f"task {lesson.task + 1}",
@@ -220,14 +220,11 @@ def error_on(policy: Policy, batch: Batch) -> float:
         policy: Policy; its mode is left as it is.
         batch: Windows to measure on.
     """
-    was_training, device = policy.training, next(policy.parameters()).device
-    policy.eval()
-    errors = []
-    with torch.no_grad():
+    device, errors = device_of(policy), []
+    with torch.no_grad(), in_mode(policy, training=False):
         for rows in torch.arange(len(batch)).split(_CHUNK):
             part = batch.rows(rows).to(device)
             errors.append((policy.predict(part).float() - part.actions).abs().mean((1, 2)).cpu())
-    policy.train(was_training)
     return float(torch.cat(errors).mean())
 
 

@@ -17,7 +17,7 @@ from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.inputs import Obs
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, in_mode
 from lifelong.seeding import generator
 
 
@@ -109,9 +109,8 @@ def rollout(
         ConfigError: The numbers of simulations and of initial states differ.
     """
     draws = [generator(*seed, state) for state in init_states]
-    was_training, before = policy.training, _states(draws)
-    policy.eval()
-    try:
+    before = _states(draws)
+    with in_mode(policy, training=False):
         done = run_episodes(
             PolicyActor(policy, language, torch.device(device), precision, draws),
             env,
@@ -122,8 +121,6 @@ def rollout(
             label=label,
             progress=progress,
         )
-    finally:
-        policy.train(was_training)
     return replace(done, random=not torch.equal(before, _states(draws)))
 
 

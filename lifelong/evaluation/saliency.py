@@ -11,8 +11,7 @@ policy: where blurring changes nothing (a plain surface), the saliency is zero.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lifelong.errors import ConfigError
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, in_mode
 from lifelong.types import Batch
 
 _CHUNK = 32  # [windows] per batch of the policy
@@ -82,7 +81,7 @@ def saliency(
     scale = height / 128
     rows, cols = (_places(n, settings.stride * scale) for n in (height, width))
     blurred = _blur(images, settings.blur * scale)
-    with _evaluating(policy):
+    with in_mode(policy, training=False):
         reference = _outputs(policy, batch, measure)
         maps = []
         for view in range(images.shape[2]):
@@ -213,13 +212,3 @@ def _interpolate(values: Tensor, rows: Tensor, cols: Tensor, size: tuple[int, in
     if (len(rows), len(cols)) == size:
         return values
     return functional.interpolate(values, size=size, mode="bilinear", align_corners=False)
-
-
-@contextmanager
-def _evaluating(policy: Policy) -> Iterator[None]:
-    was_training = policy.training
-    policy.eval()
-    try:
-        yield
-    finally:
-        policy.train(was_training)

@@ -4,7 +4,8 @@ Shape legend: B batch, T time, V views, H W C image, A action, L language embedd
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -127,3 +128,24 @@ class Policy(nn.Module, ABC):
         missing = [name for name in self.spec.proprio if name not in observation.proprio]
         if missing:
             raise PolicyError(f"the observation lacks {missing}; it has {sorted(observation.proprio)}")
+
+
+def device_of(policy: nn.Module) -> torch.device:
+    """Return the device of a policy's weights."""
+    return next(policy.parameters()).device
+
+
+@contextmanager
+def in_mode(policy: nn.Module, *, training: bool) -> Iterator[None]:
+    """Put a policy in training or in evaluation mode within the context; its own mode is restored.
+
+    Args:
+        policy: Policy.
+        training: Whether the mode is that of training.
+    """
+    before = policy.training
+    policy.train(training)
+    try:
+        yield
+    finally:
+        policy.train(before)

@@ -41,9 +41,8 @@ class RunRecord:
     group_size: Annotated[int, Field(ge=1, le=1000)] = 1  # tasks learned together as one step of the sequence
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.conditions`
     cells: MatrixCells = "all"  # of the success matrix, which are measured
-    group_sizes: tuple[
-        Annotated[int, Field(ge=1)], ...
-    ] = ()  # of each group, where they are not all of group_size
+    # of each group, where they are not all of group_size
+    group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
     transfer: Transfer | Literal[""] = ""  # estimate of forward transfer; older records do not say
 
     def __post_init__(self) -> None:
@@ -107,12 +106,10 @@ class EvalRecord:
     atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
-    decided_by: str = (
-        ""  # digest of all that the rollouts depend on; empty where they also depend on random draws
-    )
-    same_as: tuple[Literal["curve", "matrix"], Count, Count] | None = (
-        None  # phase, learned, epoch of the original
-    )
+    # digest of all that the rollouts depend on; empty where they also depend on random draws
+    decided_by: str = ""
+    # phase, learned, epoch of the original
+    same_as: tuple[Literal["curve", "matrix"], Count, Count] | None = None
 
     def __post_init__(self) -> None:
         if self.phase not in ("curve", "matrix"):

@@ -20,7 +20,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.data.fake import fake_batch
 from lifelong.data.memory import ReplayMemory
 from lifelong.data.windows import WindowDataset
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.seeding import generator, seeded
 
 COSTS: Mapping[str, str] = {
@@ -63,7 +63,7 @@ def step_costs(
 
 
 def _step_flops(policy: Policy, algorithm: Algorithm, windows: WindowDataset, size: int) -> float:
-    device, policy, algorithm = _device(policy), copy.deepcopy(policy), copy.copy(algorithm)
+    device, policy, algorithm = device_of(policy), copy.deepcopy(policy), copy.copy(algorithm)
     batch = windows.batch(torch.arange(size) % len(windows))
     trained = algorithm.trained(policy)
     algorithm.mode_train(policy)
@@ -83,16 +83,15 @@ def action_costs(policy: Policy) -> dict[str, float]:
     Args:
         policy: Policy to measure. Its history is reset; its mode and weights stay.
     """
-    was_training, draws, steps = policy.training, generator(0), policy.spec.seq_len
-    policy.eval()
+    draws, steps = generator(0), policy.spec.seq_len
     policy.reset(1)
-    observation = fake_batch(policy.spec, 1, draws, steps=1).to(_device(policy)).observation
-    for _ in range(steps):
-        policy.act(observation, [draws])
-    with count_flops() as counter:
+    observation = fake_batch(policy.spec, 1, draws, steps=1).to(device_of(policy)).observation
+    with in_mode(policy, training=False):
         for _ in range(steps):
             policy.act(observation, [draws])
-    policy.train(was_training)
+        with count_flops() as counter:
+            for _ in range(steps):
+                policy.act(observation, [draws])
     return {"flops_per_action": counter.get_total_flops() / steps}
 
 
@@ -148,10 +147,6 @@ def peak_costs(device: torch.device) -> dict[str, float]:
     if device.type == "cuda":
         found["peak_gpu_bytes"] = float(torch.cuda.max_memory_allocated(device))
     return found
-
-
-def _device(policy: Policy) -> torch.device:
-    return next(policy.parameters()).device
 
 
 def _count_bytes(node: Any) -> int:
