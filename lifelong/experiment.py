@@ -18,7 +18,6 @@ from libero_env.memory import memory_limit
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
-from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
@@ -26,7 +25,7 @@ from lifelong.errors import ConfigError
 from lifelong.evaluation.environment_record import renderer_name_or_none
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.pretraining import INIT, load_initial_weights, pretraining_context, pretraining_directory
+from lifelong.pretraining import policy_at_start, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
 from lifelong.results.conditions import changed_conditions, present_conditions, recorded_threads
 from lifelong.results.log import ResultLog
@@ -34,7 +33,6 @@ from lifelong.results.provenance import start_record, utc_now
 from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
-from lifelong.seeding import seeded
 from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, RunSettings, plain_data
 from lifelong.streams import StreamSettings
@@ -132,18 +130,13 @@ def _build_contexts(
         lambda: config.build("language").embed([t.language for t in (*first, *tasks)])
     )
     spec = data.spec(languages.shape[1])
-    with seeded(settings.seed, INIT):
-        policy = config.build("policy", spec=spec).to(device)
-    if settings.init_from is not None:
-        weights, file = load_initial_weights(Path(settings.init_from).expanduser())
-        load_weights(policy, weights, file)
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
     context = RunContext(
         tasks=tasks,
         languages=languages[len(first) :],
         demos=demos,
         data=data,
-        policy=policy,
+        policy=policy_at_start(config, spec, settings.seed, settings.init_from).to(device),
         algorithm=algorithm,
         fit=fit,
         eval=evaluation,

@@ -21,9 +21,10 @@ from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import RunDirectory, result_relevant
 from lifelong.results.saved_config import read_saved_config, upgrade_config
 from lifelong.seeding import seeded
-from lifelong.settings import PretrainSettings
+from lifelong.settings import Configuration, PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
+from lifelong.types import PolicySpec
 
 INIT = 0  # first word of the seed of the policy's initial weights, see `lifelong.sequence`
 
@@ -63,15 +64,30 @@ def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[st
         CheckpointError: There are no such weights, or they are those of another policy.
     """
     loaded, config = restore(run, device="cpu", allow=allow), read_config(run / "config.yaml", allow)
-    with seeded(loaded.seed, INIT):
-        policy: Policy = config.build("policy", spec=loaded.policy.spec)
     before = weights or config.values.get("init_from")
     if before is None and "pretrain" in config.values and config.build("pretrain").sequence():
         raise ConfigError(
             f"{run} began with pretrained weights; name them with --initial, such as a folder in runs/pretrain"
         )
-    if before is not None:
-        found, file = load_initial_weights(Path(before).expanduser())
+    return policy_at_start(config, loaded.policy.spec, loaded.seed, before)
+
+
+def policy_at_start(config: Configuration, spec: PolicySpec, seed: int, weights: str | Path | None) -> Policy:
+    """Build a policy with the weights that a run begins with.
+
+    Args:
+        config: Configuration of the run.
+        spec: What the policy observes and does.
+        seed: Seed of the run.
+        weights: A finished run or a checkpoint with the weights. None: drawn by the seed.
+
+    Raises:
+        CheckpointError: There are no such weights, or they are those of another policy.
+    """
+    with seeded(seed, INIT):
+        policy: Policy = config.build("policy", spec=spec)
+    if weights is not None:
+        found, file = load_initial_weights(Path(weights).expanduser())
         checkpoints.load_weights(policy, found, file)
     return policy
 

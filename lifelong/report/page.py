@@ -146,24 +146,7 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
     found = compare(groups)
     write_comparison(found, folder / "comparison.json")
     write_episodes(folder / "episodes.csv.gz", [(g.label, run.results) for g in groups for run in g.runs])
-    panels, heatmaps, lines = [], [], []
-    for group in groups:
-        labels = group.labels
-        matrices = np.stack([r.results.success_matrix()[0] for r in group.runs])
-        present = ~np.isnan(matrices)
-        mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
-        panels.append(Panel(group.label, mean, labels))
-        single = len(group.runs) == 1
-        heatmap = (
-            run_heatmap(group.runs[0].results, labels) if single else mean_heatmap(matrices, mean, labels)
-        )
-        heatmaps.append(heatmap | {"title": group.label, "seeds": [r.record.seed for r in group.runs]})
-        values = np.full((len(group.runs), matrices.shape[1]), np.nan)
-        for row, run in zip(values, group.runs, strict=True):
-            row[: run.learned] = average_success(
-                run.results.success_matrix()[0][: run.learned, : run.learned]
-            )
-        lines.append(Line(group.label, values))
+    panels, heatmaps, lines = zip(*map(_success_of, groups), strict=True)
     save(heatmap_figure(panels), folder / "heatmap")
     save(forgetting_figure(lines), folder / "forgetting")
     benchmarks = sorted({r.record.benchmark for r in runs})
@@ -191,6 +174,20 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "forgetting": as_svg(forgetting_figure(lines)),
         "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
     }
+
+
+def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
+    """Return a method's success: mean over its runs as a panel and as a table, and of each run task by task."""
+    labels, runs = group.labels, group.runs
+    matrices = np.stack([run.results.success_matrix()[0] for run in runs])
+    present = ~np.isnan(matrices)
+    mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
+    table = run_heatmap(runs[0].results, labels) if len(runs) == 1 else mean_heatmap(matrices, mean, labels)
+    values = np.full((len(runs), matrices.shape[1]), np.nan)
+    for row, run, rates in zip(values, runs, matrices, strict=True):
+        row[: run.learned] = average_success(rates[: run.learned, : run.learned])
+    titled = table | {"title": group.label, "seeds": [run.record.seed for run in runs]}
+    return Panel(group.label, mean, labels), titled, Line(group.label, values)
 
 
 def _facts(record: RunRecord) -> list[tuple[str, Any]]:
