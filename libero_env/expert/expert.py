@@ -66,7 +66,7 @@ class Expert:
 
     @property
     def noise_scale(self) -> float:
-        """Factor on the action noise that the phase tolerates, in [0, 1]; 0 while the fingers move."""
+        """Factor on the action noise that the phase tolerates, in [0, 1]."""
         return 0.0 if self.skill is None else self.skill.noise_scale
 
     @property

@@ -24,7 +24,7 @@ class MotionStyle:
         carry_clearance: Height of a carried object over what it passes, [m].
         place_shift: Shift of the place, (x, y), [m].
         drop_depth: Depth below the rim of a container at which an object is released, [m].
-        pause: Steps of waiting before lifting and before releasing.
+        pause: Steps of waiting before lifting, and before dropping into a container.
     """
 
     gain: float = 1.6

@@ -268,6 +268,21 @@ def test_a_failed_grasp_is_not_planned_again(view_of):
 
 
 @pytest.mark.sim
+def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped():
+    """A choice that small differences make is one that a clone averages over."""
+    task = get_task("libero_goal/1")
+    env = BatchEnv(task, 6, cameras=())
+    env.reset(options={"init_state": range(6)})
+    shapes = Shapes(env.world.scene)
+    for view in env.world.views:
+        (step,) = plan_goal(task.problem.goal, view)
+        plan = plan_pick(view, shapes, step.atom)
+        bowl = view.body_pos("akita_black_bowl_1")
+        assert (plan.grasp.pos_world - bowl)[:2] @ (plan.place.pos - bowl)[:2] > 0
+    env.close()
+
+
+@pytest.mark.sim
 def test_another_place_is_found_for_what_is_in_the_hand(view_of):
     view = view_of("libero_goal/1")
     shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
@@ -380,6 +395,34 @@ def test_walls_plates_mugs_and_books(task_id):
     (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(0))], max_steps=300)
     env.close()
     assert attempt.success, attempt.reason
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("task_id", ["libero_goal/1", "libero_spatial/0"])
+def test_a_hand_lets_go_in_motion(task_id):
+    """A clone of a hand that comes to rest before it lets go comes to rest and stays there."""
+    task = get_task(task_id)
+    env = BatchEnv(task, 1, cameras=())
+    env.reset(options={"init_state": 3})
+    expert, noise = Expert(task, np.random.default_rng(1)), ActionNoise(np.random.default_rng(2))
+    (attempt,) = run_experts(env, [expert], [noise], max_steps=200)
+    env.close()
+    assert attempt.success and attempt.retries == 0
+    opens = int(np.flatnonzero(np.diff(attempt.actions[:, 6]) < 0)[-1]) + 1
+    down = attempt.actions[opens - 4 : opens + 2, 2]  # the fingers need two steps to begin to open
+    assert (down < -0.1).all(), down
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("task_id, start, most", [("libero_goal/3", 0, 240), ("libero_goal/5", 2, 110)])
+def test_a_hand_does_not_wait_for_what_cannot_happen(task_id, start, most):
+    """A tilted hand leaves its line faster than it descends; a fixture keeps a hand from going lower."""
+    task = get_task(task_id)
+    env = BatchEnv(task, 1, cameras=())
+    env.reset(options={"init_state": start})
+    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(start))], max_steps=400)
+    env.close()
+    assert attempt.success and len(attempt) < most
 
 
 @pytest.mark.sim

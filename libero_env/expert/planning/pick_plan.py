@@ -81,6 +81,8 @@ class PickSearch:
         reach_tolerance: Error of inverse kinematics that counts as reached, [m].
         unreachable_error: Error from which on similar pairs are skipped, [m].
         retry_cost: Cost of a grasp or a place that failed before.
+        side_cost: Cost of a grasp for each [m] that it is farther from the place than the middle of the object, so that
+            all demonstrations take the same side of a symmetric one.
         same_distance: Distance between grasps or places that count as the same, [m].
         same_angle: Angle between them, [rad].
     """
@@ -99,6 +101,7 @@ class PickSearch:
     reach_tolerance: float = 1e-4
     unreachable_error: float = 0.03
     retry_cost: float = 0.5
+    side_cost: float = 1.5
     same_distance: float = 0.02
     same_angle: float = 0.4
 

@@ -44,13 +44,14 @@ def plan_pick(
     placement = Placement.from_view(view, shapes, atom, slot)
     places = _candidate_places(placement, failures)
     tilts = _entry_tilts(places, placement.object_pose)
-    grasps = _candidate_grasps(placement, [None, *tilts], failures)
+    near = places[0].pos
+    grasps = _candidate_grasps(placement, [None, *tilts], failures, near)
     pairs = _rank_pairs(placement, grasps, places)
     best, error = first_reachable(view, shapes, pairs)
     if grasps[0].cost < SEARCH.collision_limit and error <= SEARCH.reach_tolerance:
         return best
     try:  # tilt the hand away from obstacles, or towards the arm
-        tilted = _candidate_grasps(placement, _ALL_TILTS, failures)
+        tilted = _candidate_grasps(placement, _ALL_TILTS, failures, near)
     except GraspError:
         return best
     pairs = sorted([*pairs, *_rank_pairs(placement, tilted, places)], key=lambda plan: plan.cost)
@@ -112,7 +113,10 @@ def _candidate_places(placement: Placement, failures: Sequence[FailedAttempt]) -
 
 
 def _candidate_grasps(
-    placement: Placement, tilts: Sequence[np.ndarray | None], failures: Sequence[FailedAttempt]
+    placement: Placement,
+    tilts: Sequence[np.ndarray | None],
+    failures: Sequence[FailedAttempt],
+    near: np.ndarray,
 ) -> list[Grasp]:
     """Return grasps for some approaches, best first; collisions, a poor grip and failed attempts cost.
 
@@ -120,14 +124,19 @@ def _candidate_grasps(
         placement: Object and scene.
         tilts: Rotations (3, 3) from straight down to an approach; None for straight down.
         failures: Attempts that failed before.
+        near: Position (3,) to which the side of a symmetric object that is grasped is the near one, so that all
+            demonstrations choose the same.
 
     Raises:
         GraspError: There is no grasp.
     """
     view, voxels, cloud, name = placement.view, placement.voxels, placement.cloud, placement.atom.args[0]
-    distance = np.linalg.norm(voxels.points - cloud.mean(axis=0), axis=1)
+    middle = cloud.mean(axis=0)
+    distance = np.linalg.norm(voxels.points - middle, axis=1)
     obstacles = voxels.points[distance < SEARCH.obstacle_radius]
     axis, error = finger_axis(view.eef_mat), None
+    towards = (near - middle) * [1, 1, 0]
+    towards /= max(float(np.linalg.norm(towards)), 1e-9)
     found: list[Grasp] = []
     for tilt in tilts:
         tilt_cost = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
@@ -148,6 +157,7 @@ def _candidate_grasps(
         for grasp in grasps:
             extra = collision_cost(voxels, obstacles, grasp) + grip_cost(cloud, grasp)
             extra = extra + _retry_cost(placement.object_pose, grasp, failures)
+            extra = extra + SEARCH.side_cost * float((middle - grasp.pos_world) @ towards)
             found.append(replace(grasp, cost=grasp.cost + tilt_cost + extra))
     if not found:
         raise error or GraspError(f"{name} cannot be grasped")

@@ -16,6 +16,7 @@ MAX_RETRIES = 5
 HOLLOW_RADIUS, MIN_HOLLOW = 0.02, 0.006  # [m] around the origin, and its depth below the rim
 HOVER = 0.07  # [m] of the fingertips over the object on the way to it
 LEAD = 0.035  # [m] of the target ahead of the hand while it drags
+NEAR = 0.02  # [m] above where the hand presses on the object, from which on it counts as blocked
 PRESS = -0.006  # [m] of the fingertips over the bottom of the hollow: the hand presses, and friction helps
 DRAG_SPEED = 0.6  # factor on the speed
 
@@ -36,6 +37,7 @@ class Drag(Skill):
     def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes):
         super().__init__(style)
         self.atom, self.shapes = atom, shapes
+        self._still_steps = 0  # just above the object, where something keeps the hand from going lower
 
     @staticmethod
     def applies(view: StateView, shapes: Shapes, atom: Atom) -> bool:
@@ -60,9 +62,11 @@ class Drag(Skill):
         """Move over the middle of the object, then down into the hollow."""
         pos, goal = view.eef_pos, self._contact_pos(view)
         target = goal.copy()
+        still = np.linalg.norm(self._velocity) < 0.01 and pos[2] < goal[2] + NEAR
+        self._still_steps = self._still_steps + 1 if still else 0
         if np.linalg.norm(goal[:2] - pos[:2]) > 0.015 or gripper_opening(view) > 0.01:
             target[2] = float(self.shapes.cloud(view, self.atom.args[0])[:, 2].max()) + HOVER
-        elif pos[2] < goal[2] + 0.006 or self._steps > 90:
+        elif pos[2] < goal[2] + 0.006 or self._still_steps > 1 or self._steps > 90:
             self._enter("carry")
         return self._push(view, target, lateral_scale=lateral_ramp(pos[2], target[2], 0.0, 0.06))
 

@@ -46,7 +46,7 @@ class MoveJoint(Skill):
         style: Motion style; the default one if None.
     """
 
-    NOISE_SCALES = {"reach": 1.0, "withdraw": 0.7, "move": 0.4}
+    NOISE_SCALES = {"reach": 1.0, "close": 0.3, "withdraw": 0.7, "move": 0.4}
 
     def __init__(self, address: str, state: JointState, *, style: MotionStyle | None = None):
         super().__init__(style or MotionStyle())

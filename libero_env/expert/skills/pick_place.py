@@ -13,7 +13,7 @@ from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.skills.approach import BackOff, funnel_lift
 from libero_env.expert.skills.skill import Skill, gripper_opening
-from libero_env.expert.skills.transport import Move, Transport
+from libero_env.expert.skills.transport import SINKING, Move, Transport
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -27,10 +27,15 @@ ARRIVED, ARRIVED_TURN = 0.012, 0.12  # [m], [rad]
 STANDING = 0.008  # [m] by which a hand that does not move is too high: a finger stands on something
 FINGER_CLEARANCE = 0.03  # [m] of the fingertips over what they pass
 OBSTACLE_RADIUS = 0.08  # [m] around the hand
+# distance from the line of an approach, within which a hand joins it and beyond which it leaves it again: with one for
+# both, a tilted hand that descends faster than the line does goes up and down for ever
+ON_LINE = 0.05, 0.10  # [m]
 LEVEL = 0.45  # vertical part of an approach, below which it counts as level
 MAX_VERTICAL_SCALE = 0.05  # lateral scale up to which a hand rises without moving sideways
 MAX_WAITING_STEPS = 25  # for an object to come to rest
 PARTIAL_OPENING = 0.016  # [m] that the fingers open where there is no room for more
+OPENED = 0.002  # [m] from which on the fingers are seen to open
+SLOW = 0.35  # factor on the speed near a place
 MAX_PHASE_STEPS = 130
 
 
@@ -47,7 +52,7 @@ class PickPlace(Skill):
         slot: (k, n): the object is number k of n that go to the same place.
     """
 
-    NOISE_SCALES = {"reach": 1.0, "carry": 0.7, "withdraw": 0.7}
+    NOISE_SCALES = {"reach": 1.0, "close": 0.3, "carry": 0.7, "withdraw": 0.7}
 
     def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes, slot: tuple[int, int] = (0, 1)):
         super().__init__(style)
@@ -61,7 +66,10 @@ class PickPlace(Skill):
         self._transport: Transport | None = None
         self._replans = 0
         self._opens_partially = False  # others are where the fingers would open to
+        self._sinks = False  # the hand goes on down while the fingers begin to open
+        self._closed_opening = 0.0  # [m] between the fingers when they began to
         self._back_off = BackOff()
+        self._on_line = False  # of the approach; else the hand passes over obstacles to it
         self._stuck_steps = 0
         self._previous_turn = 0.0  # [rad] between hand and grasp one step ago
         self._rise_xy: np.ndarray | None = None  # where the hand rises before it moves sideways, (2,)
@@ -113,7 +121,7 @@ class PickPlace(Skill):
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
-        self._back_off, self._stuck_steps = BackOff(), 0
+        self._back_off, self._on_line, self._stuck_steps = BackOff(), False, 0
 
     def _retry(self, placed: bool = False) -> None:
         """Begin again with another plan; `placed`: the object was released at its place."""
@@ -171,8 +179,9 @@ class PickPlace(Skill):
         """
         target = goal + lift * back
         level = back[2] < LEVEL
-        far = float(np.linalg.norm((target - view.eef_pos)[:2])) > 0.03 if level else lateral_error > 0.05
-        if not (far and lateral_error > 0.05):
+        self._on_line = lateral_error < (ON_LINE[1] if self._on_line else ON_LINE[0])
+        far = not level or float(np.linalg.norm((target - view.eef_pos)[:2])) > 0.03
+        if self._on_line or not far:
             return target, False
         obstacles, surface = self.shapes.obstacles(view, self._object), view.scene.workspace.surface_height
         height = obstacle_height(obstacles, view.eef_pos, target, OBSTACLE_RADIUS, surface)
@@ -201,7 +210,7 @@ class PickPlace(Skill):
         move = self._transport.next_move(view, self._velocity)
         if isinstance(move, Move):
             return self._toward(
-                view, move.pos, move.mat, CLOSE, move.lateral_scale, 0.35 if move.slow else 1.0
+                view, move.pos, move.mat, CLOSE, move.lateral_scale, SLOW if move.slow else 1.0
             )
         if move == "lost":
             self._retry()
@@ -209,6 +218,7 @@ class PickPlace(Skill):
         if move != "arrived" and self._replan_place(view, self._transport, blocked=move == "blocked"):
             return self._toward(view, view.eef_pos, view.eef_mat, CLOSE)
         self._hold_pose = Pose(view.eef_pos, view.eef_mat)
+        self._sinks = move == "arrived" and self._transport.sinks
         return self._start("release", view)
 
     def _make_transport(self, view: StateView, exit_pose: Pose | None = None) -> Transport:
@@ -233,14 +243,16 @@ class PickPlace(Skill):
 
     def _release(self, view: StateView) -> np.ndarray:
         pose = self._hold_pose
-        if self._steps <= self.style.pause:
-            return self._toward(view, pose.pos, pose.mat, CLOSE)
-        if self._steps == self.style.pause + 1:
+        if self._steps == 0:
+            self._closed_opening = gripper_opening(view)
             obstacles = self.shapes.obstacles(view, self._object, spacing=DENSE)
             self._opens_partially = collision_depth(obstacles, view.eef_pos, view.eef_mat) > 0.0
         if self._steps > 10:
             self._enter("withdraw")
-        return self._toward(view, pose.pos, pose.mat, self._gripper_opening_action(view))
+        target, speed = pose.pos, 1.0
+        if self._sinks and gripper_opening(view) < self._closed_opening + OPENED:
+            target, speed = pose.pos - [0, 0, SINKING], SLOW
+        return self._toward(view, target, pose.mat, self._gripper_opening_action(view), speed_scale=speed)
 
     def _gripper_opening_action(self, view: StateView) -> float:
         """Return the gripper's entry that opens it; where others are in the way, only as far as the object needs."""

@@ -30,7 +30,7 @@ class Skill(ABC):
         failure_reason: Why the skill cannot continue, or "".
     """
 
-    NOISE_SCALES: ClassVar[Mapping[str, float]] = {}  # phase -> noise scale; 0 where the fingers move
+    NOISE_SCALES: ClassVar[Mapping[str, float]] = {}  # phase -> noise scale; 0 without
 
     def __init__(self, style: MotionStyle):
         self.style = style

@@ -27,6 +27,8 @@ MIN_WALL = 0.05  # [m] of walls around a place, from which on an object goes dow
 ALIGNED, ALIGNED_TURN = 0.008, 0.1  # [m], [rad] from the middle, where it goes down
 MISALIGNED, MISALIGNED_TURN = 0.03, 0.4  # [m], [rad] from the middle, where it goes up again
 MAX_SAG = 0.01  # [m] that a hand is commanded to be higher, as its load draws it down
+# a hand that brakes before it lets go cannot be cloned: the clone comes to rest just short of where the fingers open
+SINKING = 0.02  # [m] below its place, where the hand is commanded to
 BLOCKED_DISTANCE = 0.03  # [m] before its place, at which an object that stops is blocked
 MAX_IDLE_STEPS = 20  # steps without motion after which a place is out of reach
 MAX_EXIT_STEPS = 30  # steps to back out of where something blocks the way
@@ -81,6 +83,11 @@ class Transport:
         self._blocked_steps = 0  # in which something resisted the way in
         self._idle_steps, self._previous_turn = 0, 0.0  # without motion; [rad] that the hand had to rotate
         self._inserting = False  # on the last part of the way: down between walls, or in from a side
+
+    @property
+    def sinks(self) -> bool:
+        """Whether the object is lowered onto its place, not dropped or pushed in from a side."""
+        return self.plan.place.from_above and self.plan.drop_height <= MIN_DROP
 
     def next_move(self, view: StateView, velocity: np.ndarray) -> Move | Outcome:
         """Return the next target of the hand, or how the transport ended.
@@ -146,20 +153,29 @@ class Transport:
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
         self._blocked_steps = self._blocked_steps + 1 if slow and away < 0.04 else 0
         aligned = away < (0.025 if drops else 0.014) and turn < 0.2
-        if aligned and pos[2] < goal[2] + (0.02 if drops else 0.006):
+        if aligned and pos[2] < goal[2] + (0.02 if drops else 0.012):
             return "arrived"
-        if self._blocked_steps > 6:
+        if self._blocked_steps > 1:
             return "blocked" if pos[2] - goal[2] > BLOCKED_DISTANCE else "arrived"
         walls = obstacle_height(self._obstacles(view), goal, goal, 0.05, self._surface_height(view))
         over_walls = walls + below + style.carry_clearance
         target = goal.copy()
         target[2] += funnel_lift(style.funnel_slope, away - (0.03 if drops else 0.012), turn - 0.12, 0.04)
+        if aligned and not drops:
+            target[2] -= SINKING
         deep = over_walls - style.carry_clearance - goal[2] > MIN_WALL and not drops
         if self._stays_above(away, turn, deep, slow):
             over_path = self._path_height(view, goal) + below + 0.7 * style.carry_clearance
             target[2] = max(target[2], over_walls, over_path)
         lateral_scale = lateral_ramp(pos[2], target[2], 0.0, 0.05)
-        return Move(target, self._mat, lateral_scale, slow=bool(pos[2] - goal[2] < 0.04 and away < 0.05))
+        mat = view.eef_mat if lateral_scale == 0.0 and self._is_beside_obstacles(view) else self._mat
+        return Move(target, mat, lateral_scale, slow=bool(pos[2] - goal[2] < 0.04 and away < 0.05))
+
+    def _is_beside_obstacles(self, view: StateView) -> bool:
+        """Return whether something near the hand is higher than its fingertips: a hand that rotates there hits it."""
+        pos, surface = view.eef_pos, self._surface_height(view)
+        height = obstacle_height(self._obstacles(view), pos, pos, 2 * HAND_RADIUS, surface)
+        return height > pos[2] - hand_extent_below(view.eef_mat)
 
     def _stays_above(self, away: float, turn: float, deep: bool, slow: bool) -> bool:
         """Return whether the object stays above the obstacles around its place.
