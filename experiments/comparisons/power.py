@@ -53,7 +53,14 @@ def main() -> None:
             cells.append(f"{100 * power(other, replace(design, seeds=needed), args.simulations, rng):.0f} %")
             rows.append([f"{first} seeds", *cells])
             print("|", " | ".join(rows[-1]), "|", flush=True)
-    heads = ["first comparison", "difference", "told apart", "these show", "asks for, if not", "of the true one"]
+    heads = [
+        "first comparison",
+        "difference",
+        "told apart",
+        "these show",
+        "asks for, if not",
+        "of the true one",
+    ]
     print(*table([*heads, "power with these"], rows), sep="\n")
 
 
