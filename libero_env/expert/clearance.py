@@ -182,9 +182,22 @@ def obstacle_height(
     """
     path = goal[:2] - start[:2]
     path = path * min(1.0, 0.10 / max(float(np.linalg.norm(path)), 1e-9))
-    along = np.clip((points[:, :2] - start[:2]) @ path / max(path @ path, 1e-12), 0.0, 1.0)
-    near = np.linalg.norm(points[:, :2] - start[:2] - along[:, None] * path, axis=1) < radius
-    return float(points[near, 2].max(initial=default))
+    return float(_highest_near(points, start[:2], path, radius, default))
+
+
+@compiled
+def _highest_near(
+    points: np.ndarray, start: np.ndarray, path: np.ndarray, radius: float, default: float
+) -> float:
+    length = max(path[0] * path[0] + path[1] * path[1], 1e-12)
+    highest = default
+    for i in range(len(points)):
+        x, y = points[i, 0] - start[0], points[i, 1] - start[1]
+        along = min(max((x * path[0] + y * path[1]) / length, 0.0), 1.0)
+        x, y = x - along * path[0], y - along * path[1]
+        if points[i, 2] > highest and np.sqrt(x * x + y * y) < radius:
+            highest = points[i, 2]
+    return highest
 
 
 def _box_points(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE_CELL) -> np.ndarray:
