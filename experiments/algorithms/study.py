@@ -56,7 +56,7 @@ OBJECT = (
     "clare",
     "omla",
 )
-OBJECT += ("compressed_er", "mlr", "derpp", "agem", "lwf", "mas", "si", "averaging")
+OBJECT += ("compressed_er", "mlr", "m2distill", "derpp", "agem", "lwf", "mas", "si", "averaging")
 STUDIES = {"libero_object": (OBJECT, 5), "libero_goal": (("sequential", "er", "ewc", "packnet"), 3)}
 
 

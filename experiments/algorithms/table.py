@@ -1,6 +1,6 @@
-"""Put the numbers of a comparison into the README beside it.
+"""Put the numbers of the comparisons into the README beside them.
 
-python experiments/algorithms/table.py          # reads comparison.json, which `libero report` writes
+python experiments/algorithms/table.py          # reads SUITE/comparison.json, which `study.py report` writes
 """
 
 import json
@@ -50,13 +50,19 @@ def costs(values: dict) -> list[str]:
     ]
 
 
+def insert(text: str, name: str, lines: list[str]) -> str:
+    """Return a text with lines in place of what stands between the marks of a name."""
+    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    before, rest = text.split(start)
+    return before + start + "\n".join([*lines, end]) + rest.split(end)[1]
+
+
 def main() -> None:
     readme = HERE / "README.md"
     text = readme.read_text(encoding="utf-8")
-    for name, lines in tables(json.loads((HERE / "comparison.json").read_text(encoding="utf-8"))):
-        start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-        before, rest = text.split(start)
-        text = before + start + "\n".join([*lines, end]) + rest.split(end)[1]
+    for path in sorted(HERE.glob("*/comparison.json")):
+        for name, lines in tables(json.loads(path.read_text(encoding="utf-8"))):
+            text = insert(text, f"{path.parent.name}: {name}", lines)
     readme.write_text(text, encoding="utf-8")
 
 
