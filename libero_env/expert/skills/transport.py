@@ -149,7 +149,7 @@ class Transport:
             below: Extent of object and hand below the grip site, [m].
             slow: Whether the hand hardly moves.
         """
-        pos, style, drops = view.eef_pos, self.style, self.plan.drop_height > MIN_DROP
+        pos, style, drops = view.eef_pos, self.style, not self.sinks
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
         self._blocked_steps = self._blocked_steps + 1 if slow and away < 0.04 else 0
         aligned = away < (0.025 if drops else 0.014) and turn < 0.2
