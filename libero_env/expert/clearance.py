@@ -189,11 +189,11 @@ def obstacle_height(
 def _highest_near(
     points: np.ndarray, start: np.ndarray, path: np.ndarray, radius: float, default: float
 ) -> float:
-    length = max(path[0] * path[0] + path[1] * path[1], 1e-12)
+    squared = max(path[0] * path[0] + path[1] * path[1], 1e-12)
     highest = default
     for i in range(len(points)):
         x, y = points[i, 0] - start[0], points[i, 1] - start[1]
-        along = min(max((x * path[0] + y * path[1]) / length, 0.0), 1.0)
+        along = min(max((x * path[0] + y * path[1]) / squared, 0.0), 1.0)
         x, y = x - along * path[0], y - along * path[1]
         if points[i, 2] > highest and np.sqrt(x * x + y * y) < radius:
             highest = points[i, 2]
