@@ -46,6 +46,7 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
     """Open an offscreen OpenGL context.
 
     The environment variable `MUJOCO_GL` chooses the backend where it is set; otherwise EGL is tried, then OSMesa.
+    Mesa's software renderer draws in the calling thread unless `LP_NUM_THREADS` is set; images do not depend on it.
 
     Args:
         width: Width of the framebuffer, pixels.
@@ -63,6 +64,9 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
         raise RenderError(FORKED)
     if chosen and chosen not in BACKENDS:
         raise RenderError(f"MUJOCO_GL={chosen} is not a backend; valid: {', '.join(BACKENDS)}. Or unset it")
+    os.environ.setdefault(
+        "LP_NUM_THREADS", "0"
+    )  # small images gain nothing from threads, which wait for each other
     failures = []
     for name in (chosen,) if chosen else ("egl", "osmesa"):
         try:

@@ -1,6 +1,9 @@
 """Scene, placement, predicates and images."""
 
 import json
+import os
+import subprocess
+import sys
 
 import mujoco
 import numpy as np
@@ -194,6 +197,29 @@ def test_contexts_are_freed():
     cycle(4)
     before = cycle(4)
     assert cycle(12) - before < 60_000  # kB
+
+
+PICTURE = """
+import hashlib, os
+from libero_env import LiberoEnv
+env = LiberoEnv("libero_object/0", camera_size=(96, 96))
+pictures, _ = env.reset(options={"init_state": 0})
+print(hashlib.sha256(b"".join(v.tobytes() for k, v in pictures.items() if k.endswith("rgb"))).hexdigest())
+print(os.environ["LP_NUM_THREADS"])
+"""
+
+
+def test_images_do_not_depend_on_the_threads_of_the_software_renderer():
+    def draw(threads: str | None) -> list[str]:
+        environment = {k: v for k, v in os.environ.items() if k != "LP_NUM_THREADS"}
+        environment |= {} if threads is None else {"LP_NUM_THREADS": threads}
+        command = [sys.executable, "-c", PICTURE]
+        return subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    (default, without), (threaded, three) = draw(None), draw("3")
+    assert (without, three) == ("0", "3") and default == threaded
 
 
 def test_too_large_images_and_unknown_backends_are_errors(scene, monkeypatch):
