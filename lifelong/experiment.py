@@ -18,6 +18,7 @@ from libero_env.memory import memory_limit
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos
 from lifelong.data.settings import CAMERAS, DataSettings
@@ -198,11 +199,9 @@ def _check_memory(
 ) -> None:
     """Refuse what cannot fit into memory, and sizes of a policy that do not work together."""
     weights = policy_bytes(config, data.spec(EXAMPLE_DIM))
-    ratio = getattr(algorithm, "ratio", 0.0)
     episodes = max(evaluation.episodes, evaluation.curve_episodes)
-    needs = training_needs(
-        data, fit, weights, demos, episodes, ratio if isinstance(ratio, int | float) else 0.0
-    )
+    replayed = algorithm.ratio if isinstance(algorithm, Rehearsal) else 0.0
+    needs = training_needs(data, fit, weights, demos, episodes, replayed)
     available = None if device.type != "cuda" else torch.cuda.get_device_properties(device).total_memory
     check_memory(needs, memory_limit() + (available or 0))
 

@@ -20,13 +20,11 @@ from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import RunDirectory, result_relevant
 from lifelong.results.saved_config import read_saved_config, upgrade_config
-from lifelong.seeding import seeded
+from lifelong.seeding import INIT, seeded
 from lifelong.settings import Configuration, PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
 from lifelong.types import PolicySpec
-
-INIT = 0  # first word of the seed of the policy's initial weights, see `lifelong.sequence`
 
 
 def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:

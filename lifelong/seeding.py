@@ -1,10 +1,21 @@
-"""Random generators from lists of integers; the global generators are left unchanged."""
+"""Random generators from lists of integers; the global generators are left unchanged.
+
+A run's seed is followed by a word that says what is drawn with it.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 import torch
+
+INIT = 0  # the policy's first weights
+FIT = 1  # batches of training
+END_TASK = 2  # what an algorithm draws when a task ends
+ROLLOUT = 3  # actions of a policy that draws them
+BLUR = 4  # windows of other tasks at blurred boundaries
+RELEARN = 5  # batches of relearning
+EVALUATION = 4  # the same as ROLLOUT in `libero eval`, whose seed is not a run's
 
 
 def generator(*seed: int, device: torch.device | str = "cpu") -> torch.Generator:

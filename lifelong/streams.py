@@ -17,10 +17,8 @@ from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
 from lifelong.errors import ConfigError
-from lifelong.seeding import generator
+from lifelong.seeding import BLUR, generator
 from lifelong.types import Batch, Count
-
-BLUR = 4  # first word of the seeds of blurred boundaries, see `lifelong.sequence`
 
 Stages = tuple[tuple[int, ...], ...]
 

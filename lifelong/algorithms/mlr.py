@@ -79,7 +79,7 @@ class MLR(Algorithm):
                 a pretrained policy.
         """
         self.keep, self.adjustment, self.margin = keep, adjustment, margin
-        self._ratio = ratio  # not `ratio`, by which replayed images are counted: there are none
+        self.ratio = ratio
         self.memory = LatentMemory(budget)
         self._base_left = base_tasks
         self._frozen: list[str] = []  # parameters that features depend on; empty while the base is learned
@@ -122,7 +122,7 @@ class MLR(Algorithm):
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; latents of earlier windows are drawn."""
         if self._frozen and len(self.memory):
-            self._replayed = self.memory.sample(max(1, round(self._ratio * len(batch))), generator)
+            self._replayed = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
             self._present = batch.observation if len(self._near) else None
         return batch
 
@@ -133,7 +133,7 @@ class MLR(Algorithm):
         policy, device = with_features(policy), device_of(policy)
         latents, actions = (x.to(device) for x in self._replayed)
         losses = policy.head.losses(policy.head(policy.over_time(latents)), actions)
-        total = self._ratio * losses.mean()
+        total = self.ratio * losses.mean()
         if self._present is not None:
             total = total + self.adjustment * self._adjust(policy, self._present.to(device))
         self._replayed = self._present = None

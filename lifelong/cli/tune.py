@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,6 +29,7 @@ examples:
   libero tune algo=er train.lr=5e-4,1e-3,2e-3              any key of the configuration
   libero tune algo=ewc --write my_configs                  write the chosen value, for libero train
                                                            --config-dir my_configs algo=ewc tuned@algo=HEAD/ewc"""
+SUITE, STEPS, HELD_OUT, BESIDE = "libero_90", 160, 0.25, ["er"]  # the defaults
 MEASUREMENT = (
     "for each value, the geometric mean over the streams of the factor on the error that fine-tuning leaves on a task "
     "it has just learned"
@@ -44,7 +46,7 @@ def register(subparsers: Subparsers) -> None:
     )
     add = parser.add_argument
     add("overrides", nargs="+", metavar="OVERRIDE", help="as of `libero train`; KEY=V1,V2,... is swept")
-    add("--suite", default="libero_90", help="suite of the streams' tasks (default: libero_90)")
+    add("--suite", default=SUITE, help="suite of the streams' tasks (default: libero_90)")
     add(
         "--stream",
         action="append",
@@ -56,17 +58,17 @@ def register(subparsers: Subparsers) -> None:
     add(
         "--steps",
         type=arguments.whole(1, 1_000_000),
-        default=160,
+        default=STEPS,
         help="optimiser steps a task (default: 160)",
     )
     add(
         "--held-out",
         type=arguments.number(0, 1, open_ends=True),
-        default=0.25,
+        default=HELD_OUT,
         help="share of the demonstrations that is measured on (default: 0.25)",
     )
     add(
-        "--beside", nargs="*", default=["er"], metavar="ALGO", help="algorithms to compare with (default: er)"
+        "--beside", nargs="*", default=BESIDE, metavar="ALGO", help="algorithms to compare with (default: er)"
     )
     add(
         "--out",
@@ -227,7 +229,7 @@ def _about(
     from libero_env.demos.config import GENERATOR
 
     return {
-        "command": " ".join(["libero tune", *args.overrides]),
+        "command": shlex.join(["libero", "tune", *args.overrides, *_options(args)]),
         "preset": choices.get("preset"),
         "policy": choices["policy"],
         "head": choices.get("policy/head"),
@@ -242,6 +244,18 @@ def _about(
             "demonstrations": GENERATOR,
         },
     }
+
+
+def _options(args: argparse.Namespace) -> list[str]:
+    """Return the options that results depend on and that are not the default ones."""
+    seeds = ",".join(map(str, args.seeds))
+    options = {"--suite": args.suite, "--seeds": seeds, "--steps": str(args.steps)}
+    options |= {"--held-out": f"{args.held_out:g}"}
+    defaults = {"--suite": SUITE, "--seeds": "1", "--steps": str(STEPS), "--held-out": f"{HELD_OUT:g}"}
+    chosen = [(name, value) for name, value in options.items() if value != defaults[name]]
+    chosen += [("--stream", tasks) for tasks in args.stream or ()]
+    beside = [] if args.beside == BESIDE else ["--beside", *args.beside]
+    return [*(word for pair in chosen for word in pair), *beside]
 
 
 def _comment(about: dict[str, Any], score: float) -> str:

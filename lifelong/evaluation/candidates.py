@@ -26,10 +26,9 @@ from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.protocol_env import OBSERVATIONS, make_env, run_protocol
 from lifelong.evaluation.protocols import SELECTION
 from lifelong.evaluation.restore import restore
-from lifelong.seeding import generator
+from lifelong.seeding import EVALUATION, generator
 
 _WRITE = "write module:function, such as my_policy:make"
-ROLLOUT = 4  # first word of the seeds of stochastic policies; those of runs are in lifelong.sequence
 
 _Side = Annotated[int, Field(ge=1, le=4096)]  # pixels
 
@@ -101,7 +100,7 @@ class RunPolicy(PolicyUnderTest):
     def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
 
         run = self.run
-        draws = [generator(self.args.seed, ROLLOUT, task.index, state) for state in states]
+        draws = [generator(self.args.seed, EVALUATION, task.index, state) for state in states]
         with run.acting(task) as policy:
             yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws)
 

@@ -30,6 +30,7 @@ from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord
 from lifelong.results.relearning import FILE_NAME
+from lifelong.seeding import RELEARN
 from lifelong.settings import Configuration
 from lifelong.streams import StreamSettings
 from lifelong.training.fit import EpochEnd, fit
@@ -39,7 +40,6 @@ from lifelong.types import Batch, Count, NonNegative
 
 Start = Literal["final", "initial"]
 STARTS: tuple[Start, ...] = ("final", "initial")
-RELEARN = 5  # first word of the seeds, see `lifelong.sequence`
 MEASURED = 512  # largest number of held-out windows of a task
 _CHUNK = 128  # windows of a forward pass
 

@@ -24,7 +24,7 @@ from lifelong.context import RunContext
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, DamagedCheckpointError
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
-from lifelong.seeding import generator, seeded
+from lifelong.seeding import END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
 from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missing_points, training_phases
 from lifelong.streams import StageData, learning_stages
@@ -33,9 +33,6 @@ from lifelong.training.fit import EpochEnd, fit
 
 State = dict[str, Any]  # of a checkpoint
 
-# First words of the seeds derived from the run's seed, one for each use; `lifelong.streams` and
-# `lifelong.sequence.measuring` have others.
-FIT, END_TASK = 1, 2
 SAVE_EVERY = 60.0  # [s] between two saves during training, besides those at points of the learning curve
 
 

@@ -20,8 +20,8 @@ from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.policies.base import Policy
 from lifelong.results.conditions import all_conditions
 from lifelong.results.records import EvalRecord, RunRecord
+from lifelong.seeding import ROLLOUT
 
-ROLLOUT = 3  # first word of the seeds of rollouts; `lifelong.sequence.learning` has the others
 Kind = Literal["curve", "matrix"]
 
 

@@ -19,7 +19,7 @@ from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
-from lifelong.seeding import generator, seeded
+from lifelong.seeding import END_TASK, FIT, INIT, generator, seeded
 from lifelong.settings import Configuration
 from lifelong.training.fit import fit
 from lifelong.training.precision import autocast
@@ -28,7 +28,6 @@ from lifelong.types import Batch, PolicySpec
 
 FORMAT = 1  # of a trial's record; another one is measured again
 MEASURED = 512  # largest number of held-out windows of a task
-INIT, FIT, END_TASK = 0, 1, 2  # first words of the seeds, as in a run
 _CHUNK = 128  # windows of a forward pass
 _GROUPS = ("algo", "policy", "data", "augmentation", "train", "language")  # that a trial depends on
 # Tasks of libero_90, in scenes that no other suite has: packages into a tray, packages into a basket

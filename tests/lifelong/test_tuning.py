@@ -1,6 +1,7 @@
 """Tuning chooses by what is kept and learned, goes on where it was stopped, and writes what a run then reads."""
 
 import json
+import shlex
 
 import pytest
 import torch
@@ -128,6 +129,7 @@ def test_a_sweep_is_measured_once_and_its_choice_is_what_a_run_reads(tmp_path, f
     assert "| 1000 " in said and "| sequential " in said and "**chosen**" in said
     record = json.loads((out / "ewc-deterministic_small-strength.json").read_text())
     assert [row["label"] for row in record["values"]] == ["10", "1000"]
+    assert record["command"] == shlex.join(["libero", "tune", *WORDS, "algo.strength=10,1e3", *FAST])
     assert (out / "ewc-deterministic_small-strength.png").stat().st_size > 1000
     tuned = own / "tuned" / "deterministic_small" / "ewc.yaml"
     assert yaml.safe_load(tuned.read_text()) == {"strength": record["chosen"]["algo.strength"]}

@@ -13,7 +13,7 @@ from lifelong.data.settings import CAMERAS
 from lifelong.errors import ProtocolError, ServerError
 from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.adapter import CardAdapter
-from lifelong.evaluation.candidates import ROLLOUT, PolicyUnderTest
+from lifelong.evaluation.candidates import PolicyUnderTest
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.protocol_env import make_env, run_protocol
@@ -34,6 +34,7 @@ from lifelong.evaluation.servers.wires import (
     same,
     summary,
 )
+from lifelong.seeding import EVALUATION
 
 # scheme of an address -> scheme of the transport, and what the server's announcement says about the protocol
 SCHEMES = {
@@ -141,7 +142,7 @@ class ServerPolicy(PolicyUnderTest):
         """
         episodes = [EpisodeStart(task, state) for state in states]
         if self.own:
-            seeds = [(self.args.seed, ROLLOUT, task.index, state) for state in states]
+            seeds = [(self.args.seed, EVALUATION, task.index, state) for state in states]
             served = ServedActor(self.args.policy, self.announced, episodes, seeds, self.limits)
             try:
                 yield served

@@ -16,8 +16,7 @@ from lifelong.errors import PolicyError
 from lifelong.evaluation.restore import restore
 from lifelong.evaluation.servers.sessions import PREFIX, ServedPolicy, Session
 from lifelong.evaluation.vla_eval.harness import PredictModelServer, require
-
-ROLLOUT = 4  # first word of the seeds of stochastic policies, as in `lifelong.evaluation.candidates`
+from lifelong.seeding import EVALUATION
 
 
 class RunServer(PredictModelServer):
@@ -86,7 +85,7 @@ class RunServer(PredictModelServer):
                 f"an episode has a task with suite, task_id and episode_idx; got {sorted(about) or 'nothing'}"
             )
         task: Task = get_suite(about["suite"]).tasks[int(about["task_id"])]
-        words = [self.seed, ROLLOUT, task.index, int(about["episode_idx"])]
+        words = [self.seed, EVALUATION, task.index, int(about["episode_idx"])]
         self._begins[ctx.session_id] = {
             "reset": True,
             "task": task.id,
