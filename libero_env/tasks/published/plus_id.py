@@ -1,0 +1,189 @@
+"""Ids of LIBERO-Plus, which say what a variant changes (arXiv 2510.13626; github.com/sylvestf/LIBERO-plus, 4976dc3).
+
+A variant is the name of a task of LIBERO with an ending; `k`, `n`, ... are whole numbers:
+
+    _view_<azimuth>_<elevation>_<distance>_<turn>_<tilt>_initstate_<pose>    camera, or joints of the robot
+        ..._noise_<n>                                                       the same with noise on the picture
+        _language_<n>_view_...                                              the same with another instruction
+    _light_<n>                                                              lights
+    _table_<n>                                                              texture of the table, or of the floor
+    _tb_<n>                                                                 that, and of the wall
+    _add_<n>                                                                further objects
+    _level<n>_sample<n>                                                     objects in other places
+    _moved_level<n>_sample<n>                                               the goal's objects in other places
+
+What is in the task file of a variant (lights, textures, objects, instruction) its id only numbers.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from libero_env.errors import InvalidInputError
+
+Kind = Literal["camera", "robot", "noise", "language", "light", "background", "layout"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+# Kind -> category in LIBERO-Plus' task_classification.json
+CATEGORIES: dict[Kind, str] = {
+    "camera": "Camera Viewpoints",
+    "robot": "Robot Initial States",
+    "noise": "Sensor Noise",
+    "language": "Language Instructions",
+    "light": "Light Conditions",
+    "background": "Background Textures",
+    "layout": "Objects Layout",
+}
+NoiseKind = Literal["motion", "gaussian", "zoom", "fog", "glass"]
+NOISES: tuple[NoiseKind, ...] = get_args(NoiseKind)  # in the order of their numbers, ten severities each
+SEVERITIES, POSES = 10, 500
+_Scenery = Literal["light", "table", "table_and_wall", "added", "moved", "goal_moved"]
+_SCENERY_KINDS: dict[_Scenery, Kind] = {
+    "light": "light",
+    "table": "background",
+    "table_and_wall": "background",
+    "added": "layout",
+    "moved": "layout",
+    "goal_moved": "layout",
+}
+_NUMBERED: dict[str, _Scenery] = {"light": "light", "table": "table", "tb": "table_and_wall", "add": "added"}
+_VIEW = re.compile(
+    r"(?:_language_(?P<language>\d{1,4}))?"
+    r"_view_(?P<view>-?\d{1,4}_-?\d{1,4}_\d{1,4}_-?\d{1,4}_-?\d{1,4})"
+    r"_initstate_(?P<pose>\d{1,4})(?:_noise_(?P<noise>\d{1,4}))?",
+    re.ASCII,
+)
+_SCENE = re.compile(r"_(?P<what>light|table|tb|add)_\d{1,4}", re.ASCII)
+_PLACES = re.compile(r"_(?P<goal>moved_)?level\d{1,4}_sample\d{1,4}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class ViewChange:
+    """How the camera `agentview` moves, in the order of the id. Angles are positive where the sense says.
+
+    Attributes:
+        azimuth: Rotation of the camera's position and axes about the world's z axis, [degrees].
+        elevation: Rotation of both upwards about the y axis through (0, 0, 0.8) m, before the azimuth's, [degrees].
+        distance: Factor of the distance from the point (0, 0, 0.8) m.
+        turn: Rotation of the camera's axes alone about the world's z axis, [degrees].
+        tilt: Rotation of its axes alone about the world's y axis, after that, positive as the elevation, [degrees].
+    """
+
+    azimuth: int = 0
+    elevation: int = 0
+    distance: float = 1.0
+    turn: int = 0
+    tilt: int = 0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise on the pictures of `agentview`.
+
+    Attributes:
+        kind: Function of the noise, see `libero_env.perturbations.corruptions`.
+        severity: Severity, 1 to 10.
+    """
+
+    kind: NoiseKind
+    severity: int
+
+
+@dataclass(frozen=True)
+class PlusVariant:
+    """What the id of a variant says.
+
+    Attributes:
+        name: The id.
+        base: Name of the task of LIBERO that is varied.
+        file: Stem of the variant's task file.
+        view: Move of the camera.
+        pose: Number of the arm's pose, 1 to 500; 0 is that of LIBERO.
+        noise: Noise on the pictures, or None.
+        language: Number of the instruction; None is that of the base task.
+        scenery: What else the task file changes: `light`, `table`, `table_and_wall`, `added` objects, objects `moved`,
+            the `goal_moved`; None for nothing.
+    """
+
+    name: str
+    base: str
+    file: str
+    view: ViewChange = ViewChange()
+    pose: int = 0
+    noise: Noise | None = None
+    language: int | None = None
+    scenery: _Scenery | None = None
+
+    @property
+    def kind(self) -> Kind:
+        """Dimension of LIBERO-Plus that the variant belongs to; of several, the one that is counted there."""
+        if self.scenery is not None:
+            return _SCENERY_KINDS[self.scenery]
+        if self.noise is not None:
+            return "noise"
+        if self.language is not None:
+            return "language"
+        return "robot" if self.pose else "camera"
+
+    @property
+    def category(self) -> str:
+        """Name of the dimension in LIBERO-Plus' files."""
+        return CATEGORIES[self.kind]
+
+    @property
+    def has_own_start(self) -> bool:
+        """Whether objects are others, or elsewhere, than in the base task: then the initial state is its own."""
+        return self.kind == "layout"
+
+
+def parse_plus_id(name: str) -> PlusVariant:
+    """Return what an id of LIBERO-Plus says.
+
+    Args:
+        name: Id without an ending for files, such as `turn_on_the_stove_view_0_0_100_0_0_initstate_7`.
+
+    Raises:
+        InvalidInputError: It has none of the endings, or a number that their code cannot run.
+    """
+    for pattern in (_VIEW, _SCENE, _PLACES):
+        for match in pattern.finditer(name):
+            if match.end() == len(name) and match.start():
+                return _variant(name, match)
+    raise InvalidInputError(
+        f"{name!r:.120} is no id of LIBERO-Plus; expected a task's name and _view_0_0_100_0_0_initstate_0, _light_1, "
+        "_table_1, _tb_1, _add_1, _level1_sample1 or _moved_level1_sample1 with other numbers"
+    )
+
+
+def _variant(name: str, match: re.Match[str]) -> PlusVariant:
+    """Return the variant of an id whose ending matches one of the patterns."""
+    base, found = name[: match.start()], match.groupdict()
+    if "what" in found:
+        return PlusVariant(name, base, file=name, scenery=_NUMBERED[found["what"]])
+    if "goal" in found:
+        return PlusVariant(name, base, file=name, scenery="goal_moved" if found["goal"] else "moved")
+    azimuth, elevation, percent, turn, tilt = map(int, found["view"].split("_"))
+    language, pose = found["language"], int(found["pose"])
+    if not 0 <= pose <= POSES:
+        raise InvalidInputError(
+            f"{name!r:.120}: pose {pose}; LIBERO-Plus has 1 to {POSES}, and 0 for LIBERO's"
+        )
+    return PlusVariant(
+        name,
+        base,
+        file=base if language is None else f"{base}_language_{language}",
+        view=ViewChange(azimuth, elevation, percent / 100, turn, tilt),
+        pose=pose,
+        noise=_noise(name, int(found["noise"] or 0)),
+        language=None if language is None else int(language),
+    )
+
+
+def _noise(name: str, number: int) -> Noise | None:
+    if not number:
+        return None
+    if number > SEVERITIES * len(NOISES):
+        raise InvalidInputError(
+            f"{name!r:.120}: noise {number}; LIBERO-Plus has 1 to {SEVERITIES * len(NOISES)}"
+        )
+    kind, severity = divmod(number - 1, SEVERITIES)
+    return Noise(NOISES[kind], severity + 1)
