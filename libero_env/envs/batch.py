@@ -100,7 +100,8 @@ class BatchEnv(LiberoVectorEnv):
         Args:
             seed: One seed for each simulation, or one number from which they count up.
             options: `init_state`: index of one stored state, or of one for each simulation, (num_envs,).
-                `start`: instead of it, a state for each simulation, [time, qpos, qvel, poses of the fixtures].
+                `start`: instead of it, a state for each simulation, [time, qpos, qvel, poses of the fixtures], of the
+                task without perturbations; where both are given, the index only names what perturbations draw.
                 `outdated_controller`: whether the controller takes the arm to be in its rest pose at first, as that of
                 the original, see `libero_env.sim.simulation.Simulations.outdate_controller`.
                 `reset_mask`: which simulations to reset, (num_envs,) bool; by default all.
@@ -129,7 +130,8 @@ class BatchEnv(LiberoVectorEnv):
             if (new_seed := request.seeds[i]) is not None:
                 self._generators[i] = np.random.Generator(np.random.PCG64(new_seed))
         if rows is not None:
-            self.world.reset_to(ids, rows)
+            named = request.init_states
+            self.world.reset_to(ids, rows, None if named is None else named[ids])
         else:
             self.world.reset_random(ids, [self._generators[i] for i in ids])
         if outdated:
@@ -149,7 +151,8 @@ class BatchEnv(LiberoVectorEnv):
         Returns:
             Observations, rewards (num_envs,), terminations, truncations, and infos: `success` (num_envs,) bool and
             `progress` (num_envs, natoms) bool, the truth of each of the goal's `atoms`. Both keep the outcome of
-            episodes that are over.
+            episodes that are over. With perturbations also `attempts` (num_envs, n): how many draws of each were not
+            valid at the reset.
 
         Raises:
             ActionError: The shape is wrong, or a value is no finite number; no state has changed.
@@ -225,4 +228,7 @@ class BatchEnv(LiberoVectorEnv):
         return {**images, **(self.world.proprioception() if state is None else state)}
 
     def _info(self) -> dict[str, Any]:
-        return {"success": self._success.copy(), "progress": self._progress.copy()}
+        found = {"success": self._success.copy(), "progress": self._progress.copy()}
+        if (perturbed := self.world.perturbed) is not None:
+            found["attempts"] = perturbed.attempts.copy()
+        return found

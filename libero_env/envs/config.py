@@ -12,6 +12,7 @@ from pydantic import Field
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
@@ -43,6 +44,8 @@ class EnvConfig:
         robot: Model of the arm: `libero`, or `robosuite-1.4.1`, see `libero_env.assets.robot`.
         observed: When a step is observed: `after` it, or in its last `substep` but one, as by the original: joints
             2 ms, poses and images 4 ms before the end.
+        perturb: Perturbations, as text such as `camera=0.3,light=0.5` or as values, see `libero_env.perturbations`; the
+            default is none.
 
     Raises:
         InvalidInputError: A value is of another kind or outside of its range.
@@ -62,6 +65,7 @@ class EnvConfig:
     drawing: str | None = None
     robot: str = DEFAULT_ROBOT
     observed: str = AFTER
+    perturb: str | Sequence[Any] = ()
 
     def __post_init__(self) -> None:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -71,6 +75,7 @@ class EnvConfig:
         if isinstance(values["camera_size"], tuple):
             values["camera_size"] = tuple(map(_whole, values["camera_size"]))
         values["horizon"] = _whole(self.horizon)
+        values["perturb"] = checked_perturbations(self.perturb)
         validate_arguments(EnvConfig, values)
         assets = values["assets"]
         if not (assets is None or isinstance(assets, str | Path) or hasattr(assets, "add_arena")):
@@ -132,6 +137,7 @@ class EnvOptions(TypedDict, total=False):
     drawing: str | None
     robot: str
     observed: str
+    perturb: str | Sequence[Any]
 
 
 def show_options(constructor: Constructor) -> Constructor:

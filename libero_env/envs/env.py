@@ -104,13 +104,14 @@ class LiberoEnv(gymnasium.Env):
         """
         self._check_open()
         seed, options, rows = checked_seed(seed), checked_options(options, valid=("init_state",)), None
+        chosen = None
         if "init_state" in options:
-            chosen = whole_numbers(options["init_state"], "init_state", ((), (1,)))
-            rows = self.world.init_rows(np.atleast_1d(chosen))
+            chosen = np.atleast_1d(whole_numbers(options["init_state"], "init_state", ((), (1,))))
+            rows = self.world.init_rows(chosen)
         super().reset(seed=seed)
         self._running = False  # until it is done: an error or an interruption ends the episode
         if rows is not None:
-            self.world.reset_to([0], rows)
+            self.world.reset_to([0], rows, chosen)
         else:
             self.world.reset_random([0], [self.np_random])
         self._steps, self._running = 0, True
@@ -195,4 +196,6 @@ class LiberoEnv(gymnasium.Env):
 
     def _info(self) -> dict[str, Any]:
         success, progress = self.world.check_goal(0)
-        return {"success": success, "progress": progress}
+        if (perturbed := self.world.perturbed) is None:
+            return {"success": success, "progress": progress}
+        return {"success": success, "progress": progress, "attempts": perturbed.attempts[0].copy()}

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Unpack
 
@@ -15,10 +16,14 @@ from pydantic import Field
 from libero_env.assets.pack import select_pack
 from libero_env.envs.checks import checked_numbers
 from libero_env.envs.config import AFTER, EnvConfig, EnvOptions, show_options
-from libero_env.errors import InvalidInputError
+from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
 from libero_env.memory import require_memory
+from libero_env.perturbations.drawing import start_name
+from libero_env.perturbations.episodes import TRIES, PerturbedEpisodes, checked_perturbations, scene_problem
+from libero_env.perturbations.problem import perturb_task
+from libero_env.perturbations.value import Perturbation
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.observations import Observer, is_of_joints
@@ -47,8 +52,11 @@ class World:
 
     Attributes:
         config: Configuration.
-        task: Task that is simulated.
+        task: Task that is simulated, as the perturbations of the configuration change it.
         scene: Compiled scene of the task.
+        base_task: The task without perturbations, to which initial states belong.
+        base_scene: Compiled scene of that task.
+        perturbed: Draws and filters of the perturbations; None without any.
         simulations: Physics and controllers.
         views: State view of each simulation.
         observer: Observer of the simulations.
@@ -76,11 +84,19 @@ class World:
                 f"task is {shown(task)}; expected a Task, or a text such as libero_object/3"
             )
         self.controller = get_controller(config.controller, config.control_delta)
-        self.task = get_task(task) if isinstance(task, str) else task
+        self.base_task = self.task = get_task(task) if isinstance(task, str) else task
         assets = config.assets
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
         self.num, self.threads = num, threads
-        self.scene = build_scene(self.task.problem, pack, drawing=config.drawing, robot=config.robot)
+        style: dict[str, Any] = {"drawing": config.drawing, "robot": config.robot}
+        self.base_scene = self.scene = build_scene(self.task.problem, pack, **style)
+        self.perturbed: PerturbedEpisodes | None = None
+        if changes := checked_perturbations(config.perturb):
+            drawn = [one for one in changes if isinstance(one, Perturbation)]
+            self.task = perturb_task(self.task, drawn, pack)
+            self.scene = build_scene(scene_problem(self.task, self.base_task), pack, **style)
+            own = (self.base_task, self.base_scene, self.scene, num)
+            self.perturbed = PerturbedEpisodes(changes, *own)
         self._check_memory()
         self.simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
         self.simulations.controller_state = ControllerState(num, self.controller)
@@ -98,8 +114,8 @@ class World:
 
     @property
     def init_states(self) -> np.ndarray:
-        """Stored initial states of the task, rows as of `libero_env.init_states.generate_init_states`."""
-        return load_init_states(self.task, self.scene)
+        """Stored initial states of `base_task`, rows as of `libero_env.init_states.generate_init_states`."""
+        return load_init_states(self.base_task, self.base_scene)
 
     def reset_to_init(self, ids: Indices, init_states: Indices) -> None:
         """Start simulations from stored initial states.
@@ -111,7 +127,7 @@ class World:
         Raises:
             InvalidInputError: An initial state does not exist.
         """
-        self.reset_to(ids, self.init_rows(np.asarray(init_states)))
+        self.reset_to(ids, self.init_rows(np.asarray(init_states)), init_states)
 
     def init_rows(self, init_states: np.ndarray) -> np.ndarray:
         """Return stored initial states by index, (k,) integers -> (k, n).
@@ -126,18 +142,52 @@ class World:
             )
         return stored[init_states]
 
-    def reset_to(self, ids: Indices, rows: np.ndarray) -> None:
-        """Start simulations from given states.
+    def reset_to(self, ids: Indices, rows: np.ndarray, init_states: Indices | None = None) -> None:
+        """Start simulations from given states, or from those that the perturbations make of them.
 
         Args:
             ids: Indices of the simulations, (k,).
-            rows: States [time, qpos, qvel, pose of each fixture], (k, 1 + nq + nv + 7 nfixtures).
+            rows: States [time, qpos, qvel, pose of each fixture] of `base_task`, (k, 1 + nq + nv + 7 nfixtures).
+            init_states: Indices of the initial states, (k,), which name the draws of perturbations; by default the
+                states themselves do.
 
         Raises:
             InvalidInputError: The states have another length, or numbers that no physics has.
+            PlacementError: Perturbations make no valid start of a state.
         """
-        qpos, qvel, poses = split_row(self.scene.model, self.checked_starts(rows))
+        rows = self.checked_starts(rows)
+        if self.perturbed is not None:
+            names = map(start_name, rows) if init_states is None else map(int, init_states)
+            for i, name, row in zip(ids, names, rows, strict=True):
+                self._begin_perturbed(self.perturbed, int(i), name, row)
+            return
+        qpos, qvel, poses = split_row(self.scene.model, rows)
         self.simulations.reset(ids, qpos, qvel, fixtures=poses)
+
+    def _begin_perturbed(
+        self, perturbed: PerturbedEpisodes, i: int, name: object, base_row: np.ndarray
+    ) -> None:
+        """Start simulation i from what the perturbations make of a state; the goal does not hold there."""
+        paired, again = perturbed.paired(name, base_row), 0
+        while True:
+            row = perturbed.begin(i, name, paired, again)
+            qpos, qvel, poses = split_row(self.scene.model, row[None])
+            self.simulations.reset([i], qpos, qvel, fixtures=poses)
+            if not perturbed.is_physical or not self.check_goal(i)[0]:
+                break
+            again += 1
+            if not perturbed.draws_starts or again == TRIES:
+                raise PlacementError(
+                    f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
+                )
+        self.observer.set_look(i, perturbed.look(name))
+        if perturbed.has_memory:
+            self.render_cameras([i], self._unseen)
+
+    @cached_property
+    def _unseen(self) -> dict[str, np.ndarray]:
+        """Images that are drawn for perturbations that remember them, where nobody else wants them."""
+        return self.observer.empty_images()
 
     def checked_starts(self, rows: np.ndarray) -> np.ndarray:
         """Return states for `reset_to`, (k, n), after a check of their length and range.
@@ -145,7 +195,7 @@ class World:
         Raises:
             InvalidInputError: They are not of this task, or not of any physics.
         """
-        model, fixtures = self.scene.model, len(self.scene.fixtures)
+        model, fixtures = self.base_scene.model, len(self.base_scene.fixtures)
         size = 1 + model.nq + model.nv + 7 * fixtures
         if rows.ndim != 2 or rows.shape[1] != size:
             raise InvalidInputError(
@@ -178,9 +228,13 @@ class World:
         """Restore a state of `checked_state` in simulation i, and return the number of steps of its episode."""
         if state.size == self.simulations.state_size + 1:
             self.simulations.set_state(i, state[:-1])
-            return int(state[-1])
-        self.set_physics_state(i, state)
-        return 0
+            steps = int(state[-1])
+        else:
+            self.set_physics_state(i, state)
+            steps = 0
+        if self.perturbed is not None:
+            self.perturbed.resume(i, steps)
+        return steps
 
     def _check_range(self, states: np.ndarray) -> None:
         """Raise unless MuJoCo takes the numbers: it resets a simulation with larger ones, without an error."""
@@ -208,6 +262,9 @@ class World:
         Raises:
             PlacementError: The objects do not fit, or do not come to rest.
         """
+        if self.perturbed is not None:
+            self._reset_random_perturbed(ids, generators)
+            return
         simulations, controller_state = self.simulations, self.simulations.controller_state
         simulations.controller_state = ControllerState(self.num)  # the default one holds the pose
         try:
@@ -220,6 +277,17 @@ class World:
         qpos = np.stack([start.qpos for start in starts])
         fixtures = np.stack([start.fixtures for start in starts])
         simulations.reset(ids, qpos, np.zeros((len(ids), self.scene.model.nv)), fixtures=fixtures)
+
+    def _reset_random_perturbed(self, ids: Indices, generators: Sequence[np.random.Generator]) -> None:
+        """Start simulations from what the perturbations make of new placements of the task without them."""
+        simulations = make_simulations(self.base_scene.model, 1, 1, self.base_scene.fixture_bodies)
+        try:
+            starts = [sample_settled(self.base_scene, simulations, 0, rng) for rng in generators]
+        finally:
+            simulations.close()
+        speed = np.zeros(1 + self.base_scene.model.nv)
+        rows = [np.concatenate([speed[:1], s.qpos, speed[1:], s.fixtures.ravel()]) for s in starts]
+        self.reset_to(ids, np.stack(rows))
 
     def step(self, ids: Indices, actions: np.ndarray) -> None:
         """Advance simulations by one control period of 50 ms.
@@ -243,6 +311,10 @@ class World:
         Returns:
             All observations except images, see `proprioception`.
         """
+        if self.perturbed is not None:
+            actions = self.perturbed.act(ids, actions)
+            if images is None and self.perturbed.has_memory:
+                images = self._unseen
         if self.config.observed == AFTER:
             self.step(ids, actions)
             if images is not None:
@@ -297,7 +369,8 @@ class World:
 
     def proprioception(self) -> dict[str, np.ndarray]:
         """Return all observations except images: name -> (num, length) float64."""
-        return self.observer.state()
+        entries = self.observer.state()
+        return entries if self.perturbed is None else self.perturbed.see_state(entries)
 
     def empty_images(self) -> dict[str, np.ndarray]:
         """Return zero arrays for `render_cameras`: name -> (num, height, width, ...)."""
@@ -306,6 +379,8 @@ class World:
     def render_cameras(self, ids: Indices, images: dict[str, np.ndarray]) -> None:
         """Render the observed images of simulations into rows `ids` of arrays of `empty_images`."""
         self.observer.render_cameras(ids, images)
+        if self.perturbed is not None:
+            self.perturbed.see_images(ids, images)
 
     def render(self, i: int, camera: str, kind: str = "rgb") -> np.ndarray:
         """Render one image of simulation i, from any camera of the model; see `Observer.render`."""

@@ -219,7 +219,7 @@ def _sample_on_carrier(
     """Sample a point (x, y) over an object, or around the middle of a site, and return it with the surface's height."""
     if place.region is None:
         x, y = data.xpos[scene.model.body(f"{place.carrier}_{ROOT_BODY}").id][:2]
-        return float(x), float(y), max(top for _, _, top in _collision_boxes(scene, data, place.carrier))
+        return float(x), float(y), max(top for _, _, top in collision_boxes(scene, data, place.carrier))
     site = scene.model.site(place.region.address).id
     mat = data.site_xmat[site].reshape(3, 3)
     half = np.abs(mat @ scene.model.site_size[site])
@@ -227,13 +227,13 @@ def _sample_on_carrier(
     highest = z if place.inside else z + half[2] + _OVER_SITE
     under = [
         top
-        for centre, reach, top in _collision_boxes(scene, data, place.carrier)
+        for centre, reach, top in collision_boxes(scene, data, place.carrier)
         if (np.abs(centre - (x, y)) <= reach).all() and top <= highest
     ]
     return float(x), float(y), max(under, default=float(z - half[2]))
 
 
-def _collision_boxes(
+def collision_boxes(
     scene: Scene, data: mujoco.MjData, name: str
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
     """Yield the collision geoms of an entity seen from above: centre (2,), half size (2,), height of the top; m."""

@@ -36,6 +36,7 @@ class Culling:
         aspect: float,
         geoms: Sequence[mujoco.MjvGeom],
         mirrors: bool = True,
+        fovy: float | None = None,
     ) -> list[tuple[mujoco.MjvGeom, int]]:
         """Remove from a scene what the picture of a camera cannot show.
 
@@ -45,11 +46,12 @@ class Culling:
             aspect: Width of the image over its height.
             geoms: Elements of the scene; those to leave out lose their type.
             mirrors: Whether reflections are drawn.
+            fovy: Vertical field of view, [degrees]; by default that of the model.
 
         Returns:
             Geoms that were left out, with the types that they had.
         """
-        normals = self._frustum(data, camera, aspect)
+        normals = self._frustum(data, camera, aspect, fovy)
         if normals is None:
             return []
         elements = [(i, g.objid) for i, g in enumerate(geoms) if g.objtype == _GEOM]
@@ -70,13 +72,15 @@ class Culling:
             geom.type = _NONE
         return left_out
 
-    def _frustum(self, data: mujoco.MjData, camera: int, aspect: float) -> np.ndarray | None:
+    def _frustum(
+        self, data: mujoco.MjData, camera: int, aspect: float, fovy: float | None
+    ) -> np.ndarray | None:
         """Return the inward normals (5, 3) of the planes through the camera that bound its view, None for others."""
         model = self._model
         projection = getattr(model, "cam_projection", getattr(model, "cam_orthographic", None))
         if (projection is not None and projection[camera]) or model.cam_sensorsize[camera].any():
             return None
-        y = float(np.tan(np.deg2rad(model.cam_fovy[camera]) / 2))
+        y = float(np.tan(np.deg2rad(model.cam_fovy[camera] if fovy is None else fovy) / 2))
         x = y * aspect
         local = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, -1]])
         normals = local / np.linalg.norm(local, axis=1, keepdims=True)

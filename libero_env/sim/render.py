@@ -18,6 +18,7 @@ import numpy as np
 
 from libero_env.errors import RenderError, UnknownNameError
 from libero_env.sim.culling import Culling
+from libero_env.sim.look import SceneLook
 
 BACKENDS = ("egl", "osmesa", "glfw")
 REMEDY = (
@@ -174,7 +175,11 @@ class Renderer:
         return index
 
     def render(
-        self, data: mujoco.MjData, targets: Sequence[RenderTarget], glowing_sites: Iterable[int] = ()
+        self,
+        data: mujoco.MjData,
+        targets: Sequence[RenderTarget],
+        glowing_sites: Iterable[int] = (),
+        look: SceneLook | None = None,
     ) -> None:
         """Render images of one state.
 
@@ -182,6 +187,7 @@ class Renderer:
             data: State whose kinematics, cameras and lights are up to date.
             targets: Cameras, and the arrays to write their images to.
             glowing_sites: Indices of the sites to show.
+            look: What is drawn otherwise; poses of cameras are in `data` already.
 
         Raises:
             RenderError: No OpenGL backend works here, or the context belongs to another thread or process.
@@ -202,9 +208,12 @@ class Renderer:
                 )
                 for site in glowing_sites:
                     self._add_site(data, site)
+                if look is not None:
+                    look.apply(self._scene, self._geoms[: self._scene.ngeom])
             else:  # without the headlight, which stays at the first camera
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
-            left_out = self._leave_out(data, target.camera)
+            fovy = None if look is None else look.apply_to_camera(self._scene, target.camera)
+            left_out = self._leave_out(data, target.camera, fovy)
             if any(out is not None for out in (target.rgb, target.depth, target.depth_buffer)):
                 self._render_rgb_and_depth(target)
             if target.segmentation is not None:
@@ -212,12 +221,14 @@ class Renderer:
             for geom, kind in left_out:
                 geom.type = kind
 
-    def _leave_out(self, data: mujoco.MjData, camera: int) -> list[tuple[mujoco.MjvGeom, int]]:
+    def _leave_out(
+        self, data: mujoco.MjData, camera: int, fovy: float | None = None
+    ) -> list[tuple[mujoco.MjvGeom, int]]:
         """Remove from the scene what the camera cannot show; return it with its types."""
         if self._culling is None:
             return []
         aspect, geoms = self._width / self._height, self._geoms[: self._scene.ngeom]
-        return self._culling.apply(data, camera, aspect, geoms, self._faithful)
+        return self._culling.apply(data, camera, aspect, geoms, self._faithful, fovy)
 
     def _render_rgb_and_depth(self, target: RenderTarget) -> None:
         mujoco.mjr_render(self._viewport, self._scene, self._context)

@@ -53,6 +53,14 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
         help="libero, openpi, ..., see `libero protocols list`; or a card of your own, my.yaml (default: libero)",
     )
     parser.add_argument(
+        "--perturb",
+        metavar="KIND=SEVERITY,...",
+        help="perturbations, such as camera=0.3,light=0.5, see `libero perturb list` (default: the protocol's, none)",
+    )
+    parser.add_argument(
+        "--perturb-seed", type=arguments.seed, default=0, help="seed of what --perturb draws (default: 0)"
+    )
+    parser.add_argument(
         "--horizon", type=arguments.horizon, help="maximum number of control steps (default: the protocol's)"
     )
     parser.add_argument(

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from libero_env.cli import arguments, assets, demos, ending, objects, tasks, teleop
+from libero_env.cli import arguments, assets, demos, ending, objects, perturb, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
 from lifelong.cli import check, compare, evaluate, protocols, relearn, saliency, serve, tune
@@ -171,6 +171,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     tune.register,
     register_doctor,
     tasks.register,
+    perturb.register,
     demos.register,
     assets.register,
     objects.register,

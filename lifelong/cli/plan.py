@@ -87,11 +87,15 @@ def _policy(args: argparse.Namespace) -> "PolicyUnderTest":
 
 def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -> "Card":
     """Return the protocol on this machine, with what the arguments change; what was chosen is printed."""
+    from libero_env.perturbations import format_perturbations, parse_perturbations
     from lifelong.evaluation.protocol_env import resolve_world
 
     protocol, notes = resolve_world(card, tasks, args.assets)
     if args.horizon:
         protocol = protocol.changed({"episode.horizon": args.horizon})
+    if args.perturb is not None:
+        perturbations = parse_perturbations(args.perturb, args.perturb_seed)
+        protocol = protocol.changed({"world.perturb": format_perturbations(perturbations)})
     if args.robot:
         protocol = protocol.changed({"world.robot": args.robot})
     protocol.require()

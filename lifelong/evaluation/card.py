@@ -42,6 +42,8 @@ class World:
         controller: Name of the controller, see `libero_env.sim.controller`.
         delta: Whether actions are relative to the present pose.
         predicates: Semantics of the goals, see `libero_env.sim.predicates`.
+        perturb: Perturbations, such as `camera=0.3,light=0.5`, see `libero_env.perturbations`; empty for none. A card
+            without it has none.
     """
 
     models: Literal["original", "builtin", "any"]
@@ -61,6 +63,7 @@ class World:
     controller: Literal["osc_pose"]
     delta: bool
     predicates: Literal["original", "strict"]
+    perturb: str = ""
 
 
 @dataclass(frozen=True)
@@ -265,12 +268,17 @@ class Card:
 
     def resolved(self) -> dict[str, Any]:
         """Return the card as plain data, with a digest of everything that decides a result."""
-        return {**asdict(self), "digest": self.digest}
+        plain = asdict(self)
+        if not self.world.perturb:  # as cards were before there were perturbations
+            del plain["world"]["perturb"]
+        return {**plain, "digest": self.digest}
 
     @property
     def digest(self) -> str:
         """Digest of all values, 16 hex digits; names and sources are not part of it."""
         values = {k: v for k, v in self.flat().items() if "." in k and not k.startswith("sources")}
+        if not self.world.perturb:
+            del values["world.perturb"]
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
     def steps(self, task: Task) -> int:

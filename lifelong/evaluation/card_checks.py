@@ -6,6 +6,9 @@ from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from libero_env.errors import LiberoError
+from libero_env.perturbations.value import format_perturbations, parse_perturbations
+
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 ACTION_DIM = 7
 _MOST = {  # what no protocol means, and no machine does in a life
@@ -155,6 +158,11 @@ def _action(v: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _world(v: Mapping[str, Any]) -> Iterator[str]:
+    try:
+        if v["world.perturb"] != (plain := format_perturbations(parse_perturbations(v["world.perturb"]))):
+            yield f"world.perturb is {v['world.perturb']!r}; in the order of application it is {plain!r}"
+    except LiberoError as error:
+        yield f"world.perturb: {error}"
     if v["world.fixture_poses"] == "stored" and v["world.env_seed"] is not None:
         yield f"world.env_seed is {v['world.env_seed']}, but world.fixture_poses are stored: nothing is drawn"
     if v["world.fixture_poses"] == "drawn" and "reset" not in v["episode.reset_order"]:

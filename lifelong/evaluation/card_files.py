@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -153,7 +153,8 @@ def _key_problems(values: Mapping[str, Any]) -> Iterator[str]:
             continue
         names = [field.name for field in fields(kind)]
         yield from (_unknown(str(key), names, f"{section}.") for key in values[section] if key not in names)
-        missing = [f"{section}.{name}" for name in names if name not in values[section]]
+        needed = [field.name for field in fields(kind) if field.default is MISSING]
+        missing = [f"{section}.{name}" for name in needed if name not in values[section]]
         if missing:
             yield f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing (null: not stated)"
     yield from _source_problems(values.get("sources") or {})

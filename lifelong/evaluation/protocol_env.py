@@ -42,6 +42,11 @@ class ProtocolEnv:
         return self.env.world
 
     @property
+    def task(self) -> Task:
+        """Task that is simulated, as the protocol's perturbations change it."""
+        return self.env.task
+
+    @property
     def config(self) -> EnvConfig:
         """Configuration of the simulations."""
         return self.env.config
@@ -72,8 +77,9 @@ class ProtocolEnv:
         options["outdated_controller"] = "reset" in self.card.episode.reset_order
         if self.card.world.fixture_poses == "stored":
             return self.env.reset(seed=seed, options=options)
-        starts = np.broadcast_to(options.pop("init_state"), (self.num_envs,)).tolist()
-        rows = start_rows(self.env.task, self.env.world.scene, self.card, starts, self._stored())
+        starts = np.broadcast_to(options["init_state"], (self.num_envs,)).tolist()
+        world = self.env.world
+        rows = start_rows(world.base_task, world.base_scene, self.card, starts, self._stored())
         return self.env.reset(seed=seed, options={**options, "start": rows})
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -88,7 +94,8 @@ class ProtocolEnv:
         """Return the initial states of the task that the protocol names, rows that begin with [time, qpos, qvel]."""
         if self.card.world.init_states == "builtin":
             return self.env.world.init_states
-        states = load_original_states(self.env.task, self.env.world.scene)
+        world = self.env.world
+        states = load_original_states(world.base_task, world.base_scene)
         if states is None:
             raise ConfigError(
                 f"{self.env.task.id}: protocol {self.card.name} starts from the states that LIBERO publishes, which "
@@ -138,6 +145,7 @@ def make_env(
         drawing=world.drawing if drawing == "protocol" else drawing,
         robot=world.robot or DEFAULT_ROBOT,
         observed=protocol.episode.observed,
+        perturb=world.perturb,
     )
     return ProtocolEnv(env, protocol)
 

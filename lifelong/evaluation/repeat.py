@@ -66,6 +66,7 @@ def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Nam
         "policy_threads": args.policy_threads or _threads(result),
         "horizon": None,
         "robot": None,
+        "perturb": None,
         "size": None,
         "out": args.out or folder / "again",
     }

@@ -67,10 +67,12 @@ class LoadedRun:
             LanguageError: The instruction cannot be embedded.
             LifelongError: The run's embedding is defined for its own tasks only (one-hot).
         """
-        names = [t.name for t in self.tasks]
-        if task.name in names:
-            found = self.language.embed(self.instructions)[names.index(task.name) - len(names)]
-        else:
+        names = [(t.name, t.language) for t in self.tasks]
+        if (task.name, task.language) in names:
+            found = self.language.embed(self.instructions)[
+                names.index((task.name, task.language)) - len(names)
+            ]
+        else:  # another task, or one of its own in other words
             found = self.language.embed([*self.instructions, task.language])[-1]
         if len(found) != self.policy.spec.language_dim:
             raise LifelongError(

@@ -34,6 +34,7 @@ class Episode:
         ever: Whether each atom held at any time from then on.
         at_end: Whether each atom held at the end.
         actions: Digest of the actions, (length, 7) float64: two episodes agree to the bit where it is the same.
+        attempts: Number of draws of each perturbation that were not valid; empty without perturbations.
     """
 
     init_state: int
@@ -43,6 +44,7 @@ class Episode:
     ever: tuple[bool, ...] = ()
     at_end: tuple[bool, ...] = ()
     actions: str = ""
+    attempts: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,7 @@ def run_episodes(
     actor.reset(env.num_envs)
     _draw(env, not settle_steps)
     obs, info = env.reset(options={"init_state": np.asarray(init_states)})
+    attempts = [tuple(map(int, row)) for row in info.get("attempts", [()] * env.num_envs)]
     tracker = EpisodeTracker(env, info)
     settling = np.zeros(actor.action_dim) if settle_action is None else np.asarray(settle_action, float)
     for left in reversed(range(settle_steps)):
@@ -194,7 +197,8 @@ def run_episodes(
     bar.close()
     _draw(env, True)
     _tell(actor, tracker)
-    episodes = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
+    done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
+    episodes = tuple(replace(one, attempts=tries) for one, tries in zip(done, attempts, strict=True))
     return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
 
 

@@ -195,7 +195,7 @@ class SuiteEvaluation:
 
     def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
         filmed = [i for i, start in enumerate(unit.starts) if start in self.init_states[: self.videos]]
-        with self.actor(unit.task, unit.starts) as actor:
+        with self.actor(_acted_task(env, unit), unit.starts) as actor:
             return run_episodes(
                 actor,
                 env,
@@ -220,7 +220,7 @@ class SuiteEvaluation:
         result = TaskResult(
             task=unit.task.id,
             name=unit.task.name,
-            instruction=unit.task.language,
+            instruction=_acted_task(env, unit).language,
             init_states=tuple(e.init_state for e in done.episodes),
             successes=tuple(e.success for e in done.episodes),
             lengths=tuple(e.length for e in done.episodes),
@@ -229,6 +229,9 @@ class SuiteEvaluation:
             atoms_at_end=tuple(e.at_end for e in done.episodes),
             errors=errors if any(errors) else (),
             actions=tuple(e.actions for e in done.episodes),
+            attempts=tuple(e.attempts for e in done.episodes)
+            if any(e.attempts for e in done.episodes)
+            else (),
         )
         environment = describe_environment(env)
         return UnitResult(result, environment, self.versions, this_process(), started, time.time())
@@ -262,6 +265,12 @@ class SuiteEvaluation:
                 save_animation(frames, folder / name, seconds_per_frame=seconds)
 
 
+def _acted_task(env: VectorEnv, unit: Unit) -> Task:
+    """Return the task that a policy is told: that of the environment, which perturbations may have changed."""
+    task = getattr(env, "task", None)
+    return task if isinstance(task, Task) else unit.task
+
+
 def _joined(parts: Sequence[TaskResult]) -> TaskResult:
     """Return the results of a task from those of parts of its episodes, in order."""
     first = parts[0]
@@ -278,6 +287,7 @@ def _joined(parts: Sequence[TaskResult]) -> TaskResult:
         atoms_at_end=tuple(row for part in parts for row in part.atoms_at_end),
         errors=tuple(e for p in parts for e in (p.errors or (None,) * len(p.init_states))) if raised else (),
         actions=tuple(digest for part in parts for digest in part.actions),
+        attempts=tuple(row for part in parts for row in part.attempts),
     )
 
 

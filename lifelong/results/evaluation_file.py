@@ -51,6 +51,7 @@ class _TaskRow(TypedDict):
     atoms_at_end: NotRequired[list[list[bool]]]
     errors: NotRequired[list[str | None]]
     actions: NotRequired[list[str]]
+    attempts: NotRequired[list[list[_Count]]]
 
 
 class _Content(TypedDict):
@@ -83,6 +84,8 @@ class TaskResult:
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
         actions: Digest of the actions of each episode, by which episodes can be compared to the bit; empty if they
             were not recorded.
+        attempts: Number of draws that were not valid of each perturbation of the protocol, (episodes, perturbations);
+            empty without perturbations.
 
     Raises:
         EvaluationFileError: The arrays have different lengths, or values of the wrong kind.
@@ -99,6 +102,7 @@ class TaskResult:
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
     errors: tuple[str | None, ...] = ()
     actions: tuple[str, ...] = ()
+    attempts: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         for problem in self._problems():
@@ -122,6 +126,7 @@ class TaskResult:
         rows: dict[str, Sequence[Any]] = {"successes": self.successes, "lengths": self.lengths}
         rows |= {"errors": self.errors} if self.errors else {}
         rows |= {"actions": self.actions} if self.actions else {}
+        rows |= {"attempts": self.attempts} if self.attempts else {}
         rows |= {"atoms_ever": self.atoms_ever, "atoms_at_end": self.atoms_at_end} if self.atoms else {}
         found = [
             f"{name} has {len(values)} entries, init_states has {count}"
@@ -188,7 +193,7 @@ class EvaluationResult:
     @property
     def outcomes(self) -> str:
         """Digest of everything that was measured, without actions, times, versions and the environment."""
-        rows = [{k: v for k, v in asdict(r).items() if k != "actions"} for r in self.tasks]
+        rows = [_measured(r) for r in self.tasks]
         return _digest(sorted(rows, key=lambda row: row["task"]))
 
     @property
@@ -322,6 +327,12 @@ def _from_plain(values: Any) -> EvaluationResult:
     if written_as == FORMAT and values.get("outcomes") != result.outcomes:
         raise EvaluationFileError("the digest `outcomes` is not that of the tasks: the file was edited")
     return result
+
+
+def _measured(result: TaskResult) -> dict[str, Any]:
+    """Return what was measured, as plain data; without perturbations as before there were any."""
+    left_out = {"actions"} if result.attempts else {"actions", "attempts"}
+    return {k: v for k, v in asdict(result).items() if k not in left_out}
 
 
 def _digest(rows: Any) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.tasks import get_task
 from lifelong.errors import ServerError
 from lifelong.evaluation.actors import Obs
 from lifelong.evaluation.servers.codecs import OPENPI
@@ -42,8 +43,11 @@ class ServedActor:
             "reset": True,
             "seed": [list(words) for words in seeds],
         }
-        if episodes[0].task.suite == "file":  # the server does not have it
+        task = episodes[0].task
+        if task.suite == "file":  # the server does not have it
             del self._first["task"]
+        elif task.language != get_task(task.id).language:
+            self._first["instruction"] = self._first.pop("prompt")
         self._begun = False
         self._loop = LoopThread()
         self._connection: Connection | None = None

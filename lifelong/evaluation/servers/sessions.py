@@ -136,7 +136,10 @@ class ServedPolicy:
         return Request(obs, rows, task, bool(message.get("reset", False)), seeds)
 
     def _task(self, message: Mapping[str, Any], before: Task | None) -> Task:
-        """Return the task that a request names by `task`, `suite/index`, or by its instruction, `prompt`."""
+        """Return the task that a request names by `task`, `suite/index`, or by its instruction, `prompt`.
+
+        `instruction` is what the policy is told instead of the task's own words.
+        """
         prompt, name = message.get("prompt"), message.get("task")
         if prompt is None and name is None and before is not None:
             return before
@@ -147,7 +150,8 @@ class ServedPolicy:
             found = [t for t in self.run.tasks if t.language == prompt]
             found = found or [t for t in _tasks() if t.language == prompt]
         if len(found) == 1 and prompt in (None, found[0].language):
-            return found[0]
+            told = message.get("instruction")
+            return replace(found[0], language=told) if isinstance(told, str) else found[0]
         if len(found) > 1:
             ids = ", ".join(t.id for t in found)
             raise PolicyError(

@@ -1,0 +1,209 @@
+"""How one simulation is drawn otherwise than its model says: cameras, lights, materials and colours.
+
+A `Look` changes what is drawn and nothing else. The compiled model, which many simulations share, is never written to:
+poses of cameras go to the kinematics that are drawn, the rest to the elements of MuJoCo's abstract scene.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import reduce
+from typing import Any, TypeVar
+
+import mujoco
+import numpy as np
+
+from libero_env.errors import UnknownNameError
+from libero_env.geometry import quat_to_mat
+from libero_env.sim.scene import Scene
+
+HEADLIGHT = "headlight"  # name of the light at the camera, which models do not name
+_GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
+Part = TypeVar("Part", "CameraView", "Lamp")
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """Where a camera is and what it sees. None keeps what the model has.
+
+    Attributes:
+        pos: Position in the world frame, [m].
+        quat: Orientation in the world frame, wxyz; the camera looks along its -z, its y is up.
+        fovy: Vertical field of view, [degrees].
+    """
+
+    pos: tuple[float, float, float] | None = None
+    quat: tuple[float, float, float, float] | None = None
+    fovy: float | None = None
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A light. None keeps what the model has.
+
+    Attributes:
+        pos: Position in the world frame, [m].
+        dir: Direction in the world frame, of length 1.
+        ambient: Colour that it gives to everything, RGB.
+        diffuse: Colour that it gives to what faces it, RGB.
+        specular: Colour of its reflections, RGB.
+    """
+
+    pos: tuple[float, float, float] | None = None
+    dir: tuple[float, float, float] | None = None
+    ambient: tuple[float, float, float] | None = None
+    diffuse: tuple[float, float, float] | None = None
+    specular: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one simulation is drawn otherwise than its model says.
+
+    Attributes:
+        cameras: Views by the camera's name in the model, such as `agentview`.
+        lights: Lights by their name in the model; `headlight` is the one at the first camera.
+        materials: Name of a material in the model -> name of the material that is drawn instead.
+        colours: Name of an object or fixture -> colour (RGB, 0 to 1) and share of its own colour that it replaces.
+    """
+
+    cameras: Mapping[str, CameraView] = field(default_factory=dict)
+    lights: Mapping[str, Lamp] = field(default_factory=dict)
+    materials: Mapping[str, str] = field(default_factory=dict)
+    colours: Mapping[str, tuple[tuple[float, float, float], float]] = field(default_factory=dict)
+
+    def __or__(self, other: "Look") -> "Look":
+        """Return both looks at once; where both change the same, the other's counts."""
+        return Look(
+            cameras=_joined(self.cameras, other.cameras),
+            lights=_joined(self.lights, other.lights),
+            materials={**self.materials, **other.materials},
+            colours={**self.colours, **other.colours},
+        )
+
+
+def joined(looks: Iterable[Look]) -> Look:
+    """Return several looks as one; later ones take precedence."""
+    return reduce(Look.__or__, looks, Look())
+
+
+def _joined(first: Mapping[str, Part], second: Mapping[str, Part]) -> dict[str, Part]:
+    both = dict(first)
+    for name, part in second.items():
+        own = {f.name: getattr(part, f.name) for f in fields(part) if getattr(part, f.name) is not None}
+        both[name] = replace(both[name], **own) if name in both else part
+    return both
+
+
+class SceneLook:
+    """A look of one scene, with the indices of its model.
+
+    Args:
+        look: Look.
+        scene: Scene that is drawn.
+
+    Raises:
+        UnknownNameError: A camera, a light, a material or an object does not exist.
+    """
+
+    def __init__(self, look: Look, scene: Scene):
+        model = scene.model
+        self.look = look
+        self._views = [
+            (_index(model, "camera", name), view, None if view.quat is None else _matrix(view.quat))
+            for name, view in look.cameras.items()
+        ]
+        self._fovy = {index: view.fovy for index, view, _ in self._views if view.fovy is not None}
+        self._lamps = {
+            -1 if name == HEADLIGHT else _index(model, "light", name): lamp
+            for name, lamp in look.lights.items()
+        }
+        self._active_lights = np.flatnonzero(model.light_active).tolist()
+        self._materials = {
+            _index(model, "material", old): _material(model, _index(model, "material", new))
+            for old, new in look.materials.items()
+        }
+        self._colours: dict[int, tuple[np.ndarray, float]] = {}
+        for name, (colour, share) in look.colours.items():
+            if name not in scene.entities:
+                raise UnknownNameError("object or fixture", name, scene.entities)
+            own = np.asarray(colour, float), float(share)
+            geoms = np.flatnonzero(np.isin(model.geom_bodyid, scene.bodies[name]))
+            self._colours |= dict.fromkeys(geoms.tolist(), own)
+
+    def place_cameras(self, data: mujoco.MjData) -> None:
+        """Write the poses of the cameras to kinematics that are drawn."""
+        for index, view, mat in self._views:
+            if view.pos is not None:
+                data.cam_xpos[index] = view.pos
+            if mat is not None:
+                data.cam_xmat[index] = mat
+
+    def fovy(self, camera: int) -> float | None:
+        """Return the field of view of a camera, [degrees]; None where it is the model's."""
+        return self._fovy.get(camera)
+
+    def apply(self, drawn: mujoco.MjvScene, geoms: Sequence[mujoco.MjvGeom]) -> None:
+        """Change the lights and geoms of an abstract scene.
+
+        Args:
+            drawn: Scene after `mjv_updateScene`.
+            geoms: Its elements.
+        """
+        if self._lamps:
+            self._apply_lights(drawn)
+        if not (self._materials or self._colours):
+            return
+        for geom in geoms:
+            if geom.objtype != _GEOM:
+                continue
+            if (material := self._materials.get(geom.matid)) is not None:
+                for name, value in material.items():
+                    setattr(geom, name, value)
+            if (colour := self._colours.get(geom.objid)) is not None:
+                rgb, share = colour
+                geom.rgba[:3] = (1.0 - share) * geom.rgba[:3] + share * rgb
+
+    def apply_to_camera(self, drawn: mujoco.MjvScene, camera: int) -> float | None:
+        """Set the field of view of the camera that an abstract scene is drawn from, and return it; see `fovy`."""
+        if (fovy := self._fovy.get(camera)) is not None:
+            for eye in drawn.camera:
+                eye.frustum_top = eye.frustum_near * float(np.tan(np.deg2rad(fovy) / 2))
+                eye.frustum_bottom = -eye.frustum_top
+        return fovy
+
+    def _apply_lights(self, drawn: mujoco.MjvScene) -> None:
+        numbers = iter(self._active_lights)
+        for light in drawn.lights[: drawn.nlight]:
+            lamp = self._lamps.get(-1 if light.headlight else next(numbers))
+            if lamp is None:
+                continue
+            for name in ("ambient", "diffuse", "specular"):
+                if (colour := getattr(lamp, name)) is not None:
+                    getattr(light, name)[:] = colour
+            for name in ("pos", "dir"):
+                if (vector := getattr(lamp, name)) is not None and not light.headlight:
+                    getattr(light, name)[:] = vector
+
+
+def _index(model: mujoco.MjModel, what: str, name: str) -> int:
+    kind = getattr(mujoco.mjtObj, f"mjOBJ_{what.upper()}")
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        count = {"camera": model.ncam, "light": model.nlight, "material": model.nmat}[what]
+        names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count)]
+        raise UnknownNameError(what, name, [*filter(None, names), *([HEADLIGHT] if what == "light" else [])])
+    return index
+
+
+def _matrix(quat: Sequence[float]) -> np.ndarray:
+    return quat_to_mat(np.asarray(quat, float) / np.linalg.norm(quat)).ravel()
+
+
+def _material(model: mujoco.MjModel, index: int) -> dict[str, Any]:
+    """Return what elements of an abstract scene have of a material, by attribute."""
+    names = ("emission", "specular", "shininess", "reflectance")
+    return {
+        "matid": index,
+        "rgba": model.mat_rgba[index],
+        **{name: float(getattr(model, f"mat_{name}")[index]) for name in names},
+    }

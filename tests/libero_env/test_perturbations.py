@@ -1,0 +1,276 @@
+"""Perturbations: each kind does something, nothing at severity 0, and the same for the same seed in any batch."""
+
+import numpy as np
+import pytest
+
+from libero_env import BatchEnv, LiberoEnv
+from libero_env.envs import EnvConfig
+from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.perturbations import (
+    KINDS,
+    LAYERS,
+    Perturbation,
+    RobotJoints,
+    format_perturbations,
+    parse_perturbations,
+)
+from libero_env.perturbations.instructions import edit_distance, reword, split_clauses
+from libero_env.perturbations.looks import CAMERA, pivot_of
+from libero_env.sim.look import CameraView, Lamp, Look
+from libero_env.tasks import get_suite
+
+TASK = "libero_goal/3"
+SMALL = {"camera_size": (32, 32), "cameras": ("agentview",)}
+SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
+
+
+def world_of(perturb, start=0, task=TASK, **options):
+    env = LiberoEnv(task, perturb=perturb, **{**SMALL, **options})
+    observation, info = env.reset(options={"init_state": start})
+    return env, observation, info
+
+
+def episode(env, start=0, steps=3):
+    """Return the observations of a reset and of some steps."""
+    rng = np.random.default_rng(start)
+    seen = [env.reset(options={"init_state": start})[0]]
+    seen += [env.step(rng.uniform(-1, 1, 7))[0] for _ in range(steps)]
+    return seen
+
+
+def same(a, b):
+    return all(
+        x.keys() == y.keys() and all(np.array_equal(x[k], y[k]) for k in x) for x, y in zip(a, b, strict=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def plain():
+    env = LiberoEnv(TASK, **SMALL)
+    yield env, episode(env, steps=10)
+    env.close()
+
+
+@pytest.mark.unit
+def test_a_text_gives_values_in_the_order_of_application():
+    found = parse_perturbations(" noise=0.25, camera=0.3@7 ,fov=0", seed=2)
+    assert found == (
+        Perturbation("camera", 0.3, 7),
+        Perturbation("fov", 0, 2),
+        Perturbation("noise", 0.25, 2),
+    )
+    assert format_perturbations(found) == "camera=0.3@7,noise=0.25@2"
+    assert parse_perturbations(format_perturbations(found)) == (found[0], found[2])
+    assert [k.layer for k in KINDS.values()] == sorted((k.layer for k in KINDS.values()), key=LAYERS.index)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("text", ["camera", "camera=", "camera=x", "camera=1.1", "camera=-0.1", "camera=nan",
+                                  "camera=0.1@x", "camera=0.1@-1", "camera=0.1,camera=0.2"])  # fmt: skip
+def test_what_is_typed_wrongly_is_one_line(text):
+    with pytest.raises(InvalidInputError, match="camera") as error:
+        parse_perturbations(text)
+    assert "\n" not in str(error.value)
+    with pytest.raises(UnknownNameError, match="'camera'"):
+        EnvConfig(perturb="camra=0.1")
+    with pytest.raises(InvalidInputError, match="perturb"):
+        EnvConfig(perturb=[0.3])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_does_something(kind, plain):
+    base, seen = plain
+    env = LiberoEnv(TASK, perturb=f"{kind}=0.8", **SMALL)
+    changed = episode(env, steps=10)
+    assert env.task.language != base.task.language or not same(seen, changed)
+    env.close()
+
+
+def test_severity_0_changes_no_bit(plain):
+    _, seen = plain
+    nothing = ",".join(f"{kind}=0" for kind, definition in KINDS.items() if not definition.exclusive)
+    env = LiberoEnv(TASK, perturb=nothing, **SMALL)
+    assert same(episode(env, steps=10), seen) and env.config.perturb == () and env.world.perturbed is None
+    env.close()
+    empty = LiberoEnv(TASK, perturb=[Look()], **SMALL)
+    assert same(episode(empty, steps=10), seen)
+    empty.close()
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_draws_do_not_depend_on_the_batch_or_its_order(layer):
+    perturb = ",".join(f"{k}=0.5" for k, kind in KINDS.items() if kind.layer == layer and not kind.exclusive)
+    actions = np.random.default_rng(0).uniform(-1, 1, (3, 3, 7))
+
+    def run(starts):
+        env = BatchEnv(TASK, len(starts), perturb=perturb, **SMALL)
+        seen = [env.reset(options={"init_state": starts})[0]]
+        seen += [env.step(np.stack([a[s] for s in starts]))[0] for a in actions]
+        env.close()
+        return {s: [{k: v[i] for k, v in o.items()} for o in seen] for i, s in enumerate(starts)}
+
+    together, apart = run([2, 0, 1]), run([1, 2])
+    assert all(same(together[s], apart[s]) for s in apart)
+    alone = LiberoEnv(TASK, perturb=perturb, **SMALL)
+    seen = [alone.reset(options={"init_state": 2})[0], *(alone.step(a[2])[0] for a in actions)]
+    assert same(seen, together[2])
+    alone.close()
+
+
+def test_kinds_do_not_disturb_each_other_and_another_seed_is_another_draw():
+    def joints(perturb):
+        env, observation, _ = world_of(perturb, cameras=())
+        env.close()
+        return observation["joint_states"]
+
+    alone = joints("robot=0.4")
+    assert np.array_equal(alone, joints("robot=0.4,gain=0.2,delay=0.1"))
+    assert not np.array_equal(alone, joints("robot=0.4@1"))
+    rest = joints("")
+    step = alone - rest
+    assert np.allclose(joints("robot=0.8") - rest, 2 * step)  # further in the same direction
+
+
+def test_absolute_changes_can_be_given_as_they_are():
+    qpos = (0.1, -0.2, 0.0, -2.3, 0.0, 2.2, 0.7)
+    view = CameraView(pos=(1.0, 0.1, 1.5), quat=(0.6, 0.35, 0.35, 0.63), fovy=50.0)
+    env, observation, _ = world_of([RobotJoints(qpos), Look(cameras={CAMERA: view})])
+    assert np.array_equal(observation["joint_states"], qpos)
+    pose = env.world.observer.camera_to_world(0, CAMERA)
+    assert np.array_equal(pose[:3, 3], view.pos)
+    assert env.world.observer.intrinsics(CAMERA)[0, 0] == pytest.approx(16 / np.tan(np.deg2rad(25)))
+    env.close()
+    with pytest.raises(UnknownNameError, match="lamp"):
+        world_of([Look(lights={"lamp": Lamp()})])
+
+
+@pytest.mark.parametrize("severity", [0.2, 1.0])
+def test_the_camera_orbits_by_degrees(severity, plain):
+    base, _ = plain
+    env, _, _ = world_of(f"camera={severity}", start=3)
+    before, after = (e.world.observer.camera_to_world(0, CAMERA) for e in (base, env))
+    pivot = pivot_of(env.world.scene)
+    rays = [pose[:3, 3] - pivot for pose in (before, after)]
+    cosine = rays[0] @ rays[1] / np.linalg.norm(rays[0]) / np.linalg.norm(rays[1])
+    assert np.rad2deg(np.arccos(cosine)) == pytest.approx(KINDS["camera"].at_one * severity, abs=1e-6)
+    assert np.cross(after[:3, 2], rays[1] / np.linalg.norm(rays[1])) == pytest.approx(np.zeros(3), abs=1e-6)
+    env.close()
+
+
+def test_light_is_a_ratio_of_all_lights_and_the_field_of_view_is_in_degrees(plain):
+    base, _ = plain
+    env, _, _ = world_of("light=0.5,fov=0.5")
+    drawn = [e.world.observer.renderer._scene for e in (base, env)]
+    ratios = [
+        np.asarray(getattr(b, name)).sum() / max(np.asarray(getattr(a, name)).sum(), 1e-9)
+        for a, b in zip(*(list(s.lights[: s.nlight]) for s in drawn), strict=True)
+        for name in ("diffuse", "specular")
+    ]
+    ratio = KINDS["light"].amount(0.5)
+    assert np.allclose(ratios, ratio) or np.allclose(ratios, 1 / ratio)
+    fovy = [np.rad2deg(2 * np.arctan2(16, e.world.observer.intrinsics(CAMERA)[0, 0])) for e in (base, env)]
+    assert abs(fovy[1] - fovy[0]) == pytest.approx(KINDS["fov"].amount(0.5))
+    eye = drawn[1].camera[0]
+    assert np.rad2deg(2 * np.arctan(eye.frustum_top / eye.frustum_near)) == pytest.approx(fovy[1], rel=1e-5)
+    env.close()
+
+
+@pytest.mark.parametrize("severity", [0.2, 0.6, 1.0])
+def test_the_robot_is_at_an_exact_distance_within_limits_and_touches_nothing(severity):
+    base, observation, _ = world_of("", start=1, cameras=())
+    env, moved, info = world_of(f"robot={severity}", start=1, cameras=())
+    offset = moved["joint_states"] - observation["joint_states"]
+    assert np.linalg.norm(offset) == pytest.approx(KINDS["robot"].at_one * severity, rel=1e-12)
+    low, high = env.world.scene.model.jnt_range[:7].T
+    assert ((moved["joint_states"] > low) & (moved["joint_states"] < high)).all()
+    assert not any(env.view.in_contact("robot", name) for name in env.world.scene.entities)
+    assert info["attempts"].shape == (1,) and not info["success"]
+    nq = env.world.scene.nq_robot
+    rest = [e.world.simulations.fields["qpos"][0, nq:] for e in (base, env)]
+    assert np.array_equal(*rest)
+    base.close()
+    env.close()
+
+
+def test_noise_is_in_grey_levels():
+    pictures = []
+    for perturb in ("", "noise=0.2"):
+        env, observation, _ = world_of(perturb, camera_size=(96, 96))
+        pictures.append(observation["agentview_rgb"].astype(float))
+        env.close()
+    middle = (pictures[0] > 60) & (pictures[0] < 195)  # where nothing is clipped
+    difference = (pictures[1] - pictures[0])[middle]
+    assert np.std(difference) == pytest.approx(KINDS["noise"].amount(0.2), rel=0.03)
+
+
+def test_actions_are_delayed_by_steps():
+    delay, action = int(KINDS["delay"].amount(0.25)), np.array([0.5, 0, 0, 0, 0, 0, -1.0])
+    late, _, _ = world_of("delay=0.25", cameras=())
+    plain, _, _ = world_of("", cameras=())
+    for _ in range(delay):
+        plain.step(np.zeros(7))
+        late.step(action)
+    for _ in range(3):
+        now, then = plain.step(action)[0], late.step(action)[0]
+    assert delay == 2 and same([now], [then])
+    late.close()
+    plain.close()
+
+
+def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are():
+    base, _, _ = world_of("", start=4, cameras=())
+    env, _, info = world_of("distractors=0.5", start=4, cameras=())
+    scene, old = env.world.scene, env.world.base_scene
+    added = [name for name in scene.objects if name not in old.objects]
+    assert len(added) == KINDS["distractors"].amount(0.5) == 3 and not info["success"]
+    assert env.task.id == base.task.id and env.task.problem.goal == base.task.problem.goal
+    for name in old.entities:
+        assert np.array_equal(env.view.body_pos(name), base.view.body_pos(name))
+        assert not any(env.view.in_contact(name, other) for other in added)
+    before = [env.view.body_pos(name) for name in added]
+    for _ in range(10):
+        env.step(np.zeros(7))
+    assert np.allclose(before, [env.view.body_pos(name) for name in added], atol=1e-3)
+    base.close()
+    env.close()
+
+
+@pytest.mark.unit
+def test_every_instruction_of_the_benchmark_can_be_reworded_at_a_given_distance():
+    full = KINDS["instruction"].at_one
+    for language in sorted({task.language for suite in SUITES for task in get_suite(suite).tasks})[::16]:
+        assert reword(language, 0.0, np.random.default_rng(0)) == language
+        for severity in (0.25, 1.0):
+            said = reword(language, full * severity, np.random.default_rng(0))
+            assert said == reword(language, full * severity, np.random.default_rng(0)) != language
+            assert edit_distance(language, said) == pytest.approx(full * severity, abs=0.1)
+            assert said.isascii() and "{" not in said
+
+
+@pytest.mark.unit
+def test_the_edit_distance_counts_tokens_and_clauses_are_split_at_and():
+    assert edit_distance("a b c", "a b c") == 0 and edit_distance("a b c d", "a x c") == 0.5
+    assert split_clauses("open the top drawer and put the bowl inside") == [
+        "open the top drawer",
+        "put the bowl inside",
+    ]
+    for whole in (
+        "put the yellow and white mug in the microwave",
+        "pick up the milk and place it in the basket",
+        "put both the butter and the milk in the basket",
+    ):
+        assert split_clauses(whole) == [whole]
+
+
+def test_an_episode_from_a_seed_is_paired_with_the_same_placement():
+    plain, perturbed = (
+        LiberoEnv(TASK, cameras=()),
+        LiberoEnv(TASK, cameras=(), perturb="robot=0.3,distractors=0.2"),
+    )
+    plain.reset(seed=5)
+    first = perturbed.reset(seed=5)[0]
+    for name in plain.world.scene.entities:
+        assert np.array_equal(plain.view.body_pos(name), perturbed.view.body_pos(name))
+    assert same([first], [perturbed.reset(seed=5)[0]])
+    plain.close()
+    perturbed.close()
