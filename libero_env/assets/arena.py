@@ -9,7 +9,7 @@ import mujoco
 
 from libero_env.assets.furniture import add_furniture, add_visual_mesh, furniture, solid_mesh
 from libero_env.assets.robot import load_robosuite, robosuite_assets
-from libero_env.assets.styles import add_material, furniture_of, styles_of
+from libero_env.assets.styles import add_material, furniture_of, load_styles, styles_of
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import delete
 from libero_env.objects.builtin.mesh import Mesh, merge
@@ -24,6 +24,7 @@ WORKSPACES: Mapping[str, str] = {
     "coffee_table": "coffee_table",
     "floor": "floor",
 }
+SPARE = "spare_"  # prefix of materials that nothing has
 _ROOM = "room"  # file with the parameters that all workspaces share
 _MOUNT_LIFT = 0.01  # [m] height of the mount's origin above the arm's
 _SHARED = ("cameras", "lights", "walls", "floor")
@@ -132,6 +133,21 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
             specular=[light.get("specular", 0.3)] * 3,
             directional=light.get("directional", False),
         )
+
+
+def surface_styles() -> dict[str, Mapping[str, Any]]:
+    """Return the styles of floors, walls and tables by a name of their own, such as `floor_dark`."""
+    known = {
+        f"{kind}_{name}": style for kind in ("floor", "wall") for name, style in load_styles()[kind].items()
+    }
+    tables = {name: load_workspace(name).parameters.get("table") for name in WORKSPACES}
+    return known | {f"table_{name}": table["style"] for name, table in tables.items() if table is not None}
+
+
+def add_spare_materials(spec: mujoco.MjSpec) -> None:
+    """Add the styles of all surfaces as materials that nothing has: a picture can be drawn with one of them instead."""
+    for name, style in surface_styles().items():
+        add_material(spec, SPARE + name, style)
 
 
 def add_light(

@@ -21,7 +21,13 @@ from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
 from libero_env.memory import require_memory
 from libero_env.perturbations.drawing import start_name
-from libero_env.perturbations.episodes import TRIES, PerturbedEpisodes, checked_perturbations, scene_problem
+from libero_env.perturbations.episodes import (
+    TRIES,
+    PerturbedEpisodes,
+    checked_perturbations,
+    needs_materials,
+    scene_problem,
+)
 from libero_env.perturbations.problem import perturb_task
 from libero_env.perturbations.value import Perturbation
 from libero_env.sim.back_ends import make_simulations
@@ -93,7 +99,8 @@ class World:
         self.perturbed: PerturbedEpisodes | None = None
         if changes := checked_perturbations(config.perturb):
             drawn = [one for one in changes if isinstance(one, Perturbation)]
-            self.task = perturb_task(self.task, drawn, pack)
+            style["spare_materials"] = needs_materials(changes)
+            self.task = perturb_task(self.task, drawn, self.base_scene)
             self.scene = build_scene(scene_problem(self.task, self.base_task), pack, **style)
             own = (self.base_task, self.base_scene, self.scene, num)
             self.perturbed = PerturbedEpisodes(changes, *own)
@@ -168,7 +175,7 @@ class World:
         self, perturbed: PerturbedEpisodes, i: int, name: object, base_row: np.ndarray
     ) -> None:
         """Start simulation i from what the perturbations make of a state; the goal does not hold there."""
-        paired, again = perturbed.paired(name, base_row), 0
+        paired, again = perturbed.paired(i, name, base_row), 0
         while True:
             row = perturbed.begin(i, name, paired, again)
             qpos, qvel, poses = split_row(self.scene.model, row[None])

@@ -53,6 +53,16 @@ def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
     return (*(one for one in drawn if one.severity), *fixed)
 
 
+def needs_materials(changes: Iterable[Perturbation | Change]) -> bool:
+    """Return whether scenes need materials to draw with."""
+    return any(
+        one.definition.draws_materials
+        if isinstance(one, Perturbation)
+        else isinstance(one, Look) and one.materials
+        for one in changes
+    )
+
+
 class PerturbedEpisodes:
     """Draws and filters of the episodes of several simulations.
 
@@ -96,18 +106,23 @@ class PerturbedEpisodes:
         """Whether starts are drawn, so that another draw may be valid where one is not."""
         return bool(self._of("start"))
 
-    def paired(self, start: object, row: np.ndarray) -> np.ndarray:
+    def paired(self, i: int, start: object, row: np.ndarray) -> np.ndarray:
         """Return the start of the perturbed task that belongs to one of the task without perturbations.
 
         Args:
+            i: Index of the simulation.
             start: Index of the initial state, or another name.
             row: State of the task without perturbations.
 
         Raises:
             PlacementError: There is none.
         """
-        seeds = [self.perturbations[k].seed for k in self._of("problem")]
-        return self._pairing.row(row, draw_key("pairing", sum(seeds), self._task.id, start))
+        problem = self._of("problem")
+        seeds = [self.perturbations[k].seed for k in problem]
+        paired, attempt = self._pairing.row(row, draw_key("pairing", sum(seeds), self._task.id, start))
+        self.attempts[i] = 0
+        self.attempts[i, problem] = attempt
+        return paired
 
     def begin(self, i: int, start: object, row: np.ndarray, again: int = 0) -> np.ndarray:
         """Begin an episode: draw all that is drawn for it, and return the state that it starts in.
@@ -121,7 +136,6 @@ class PerturbedEpisodes:
         Raises:
             PlacementError: No draw of a start is valid.
         """
-        self.attempts[i] = 0
         for k in self._of("start"):
             row = self._drawn_start(i, k, start, row, again)
         for change in self._fixed:

@@ -1,8 +1,11 @@
-"""Kinds that change how a scene is drawn: the agent's camera and the lights."""
+"""Kinds that change how a scene is drawn: the agent's camera, the lights, surfaces, colours of objects."""
+
+import colorsys
 
 import mujoco
 import numpy as np
 
+from libero_env.assets.arena import SPARE, surface_styles
 from libero_env.geometry import quat_multiply, quat_to_mat, rotation_about
 from libero_env.perturbations.drawing import direction, sign
 from libero_env.perturbations.kind import Kind
@@ -78,6 +81,69 @@ def _scaled(ambient: np.ndarray, diffuse: np.ndarray, specular: np.ndarray, fact
     return Lamp(ambient=colours[0], diffuse=colours[1], specular=colours[2])
 
 
+# Names of the materials of surfaces: the builtin models', then the original's.
+_MATERIALS = {
+    "floor": ("floor", "room_floorplane"),
+    "wall": ("wall", "room_walls_mat"),
+    "table": ("table", "room_table_texture", "room_living_room_table", "room_desk", "room_coffee_table"),
+}
+_FURNITURE = ("furniture_colours", "room_living_room", "room_kitchen_background", "room_office_book_shelf")
+_LIKE = 0.08  # styles whose distances differ by less are drawn from
+_COLOUR_WORDS = ("black", "white", "red", "yellow")
+
+
+def _table(distance: float, rng: np.random.Generator, scene: Scene) -> Look:
+    on_floor = not scene.workspace.parameters.get("table")
+    return Look(materials=_other_style(scene, "floor" if on_floor else "table", distance, rng))
+
+
+def _background(distance: float, rng: np.random.Generator, scene: Scene) -> Look:
+    on_floor = not scene.workspace.parameters.get("table")
+    kinds = ("wall",) if on_floor else ("wall", "floor")
+    styles = [_other_style(scene, kind, distance, rng) for kind in kinds]
+    tint = colorsys.hsv_to_rgb(rng.uniform(), 0.8, 0.9), min(1.0, distance)
+    names = {scene.model.material(i).name for i in range(scene.model.nmat)}
+    furniture = dict.fromkeys(names & set(_FURNITURE), tint)
+    return Look(materials={k: v for style in styles for k, v in style.items()}, colours=furniture)
+
+
+def _other_style(scene: Scene, kind: str, distance: float, rng: np.random.Generator) -> dict[str, str]:
+    """Return the material of a surface -> one whose mean colour is about as far from its own, in RGB."""
+    model = scene.model
+    names = {model.material(i).name: i for i in range(model.nmat)}
+    own = [name for name in _MATERIALS[kind] if name in names]
+    if not own:
+        return {}
+    colour = _mean_colour(model, names[own[0]])
+    spare = [SPARE + name for name in surface_styles()]
+    away = {name: float(np.linalg.norm(_mean_colour(model, names[name]) - colour)) for name in spare}
+    away = {name: far for name, far in away.items() if far > 0.02}  # the same style is among them
+    nearest = min(abs(far - distance) for far in away.values())
+    chosen = [name for name, far in away.items() if abs(far - distance) <= nearest + _LIKE * min(1, distance)]
+    return {own[0]: chosen[rng.integers(len(chosen))]}
+
+
+def _mean_colour(model: mujoco.MjModel, material: int) -> np.ndarray:
+    """Return the mean colour of a material, RGB from 0 to 1."""
+    texture = max(model.mat_texid[material])
+    if texture < 0:
+        return model.mat_rgba[material, :3]
+    start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+    size = model.tex_height[texture] * model.tex_width[texture] * channels
+    pixels = model.tex_data[start : start + size].reshape(-1, channels)
+    return pixels[:, :3].mean(axis=0) / 255 * model.mat_rgba[material, :3]
+
+
+def _colour(share: float, rng: np.random.Generator, scene: Scene) -> Look:
+    said = {word for word in _COLOUR_WORDS if word in scene.problem.language.lower().split()}
+    colours = {}
+    for name, category in scene.problem.objects.items():
+        colour = colorsys.hsv_to_rgb(rng.uniform(), 0.8, 0.9)
+        if not said & set(category.split("_")):  # what the instruction calls black stays so
+            colours[name] = (colour, share)
+    return Look(colours=colours)
+
+
 KINDS = (
     Kind(
         "camera",
@@ -97,5 +163,33 @@ KINDS = (
         "all lights are brighter or darker by this factor, and turned by up to 60 degrees",
         _light,
         scale="ratio",
+    ),
+    Kind(
+        "table",
+        "look",
+        "RGB distance",
+        0.8,
+        "the surface that objects stand on has the material whose mean colour is nearest to this distance from its own",
+        _table,
+        draws_materials=True,
+    ),
+    Kind(
+        "background",
+        "look",
+        "RGB distance",
+        0.8,
+        "walls and floor have materials whose mean colours are nearest to this distance from their own; furniture has "
+        "another colour to that share",
+        _background,
+        draws_materials=True,
+    ),
+    Kind(
+        "colour",
+        "look",
+        "share",
+        0.7,
+        "this share of the colour of each movable object is replaced by another; colours that the instruction names "
+        "stay",
+        _colour,
     ),
 )

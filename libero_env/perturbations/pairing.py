@@ -4,7 +4,7 @@ What both tasks have stays where it is, unless its region was moved; then it mov
 it moves along. What is new finds a free place in its region, and is simulated until it is at rest.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import mujoco
 import numpy as np
@@ -22,6 +22,7 @@ from libero_env.tasks.problem import Problem, Region, atoms_of
 _GAP = 0.02  # [m] between a new object and what is there, seen from above
 _LIFT = 0.001  # [m] above the surface, from where it settles
 _TRIES = 300
+_ATTEMPTS = 30  # draws of all places
 
 
 class Pairing:
@@ -34,14 +35,16 @@ class Pairing:
 
     def __init__(self, base: Scene, scene: Scene):
         self.base, self.scene = base, scene
-        self.added = [name for name in scene.objects if name not in base.objects]
+        old, new = base.problem.objects, scene.problem.objects
+        self.added = [name for name in new if name not in old]
+        self.exchanged = [name for name in new if name in old and old[name] != new[name]]
         self._shifts = dict(moved(base.problem, scene.problem))
-        self._is_same = base.problem.objects == scene.problem.objects and not self._shifts
+        self._is_same = old == new and not self._shifts
         self._simulations: LoopSimulations | None = None
-        self._known: dict[bytes, np.ndarray] = {}
+        self._known: dict[bytes, tuple[np.ndarray, int]] = {}
 
-    def row(self, row: np.ndarray, key: DrawKey) -> np.ndarray:
-        """Return the start that belongs to a start of the scene without perturbations.
+    def row(self, row: np.ndarray, key: DrawKey) -> tuple[np.ndarray, int]:
+        """Return the start that belongs to a start of the scene without perturbations, and how many draws were invalid.
 
         Args:
             row: State [time, qpos, qvel, poses of the fixtures] of that scene.
@@ -51,13 +54,28 @@ class Pairing:
             PlacementError: What is new finds no free place, or a moved object collides.
         """
         if self._is_same:
-            return row
+            return row, 0
         name = row.tobytes()
         if name not in self._known:
-            self._known[name] = self._paired(row, key)
-        return self._known[name].copy()
+            self._known[name] = self._first_valid(row, key)
+        paired, attempt = self._known[name]
+        return paired.copy(), attempt
 
-    def _paired(self, row: np.ndarray, key: DrawKey) -> np.ndarray:
+    def _first_valid(self, row: np.ndarray, key: DrawKey) -> tuple[np.ndarray, int]:
+        paired, before = self._paired(row), contacts(self.base, row)
+        if not (self.added or self.exchanged):
+            if self._shifts and len(contacts(self.scene, paired)) > len(before):
+                raise PlacementError(f"{self.scene.problem.language!r}: a moved object touches another")
+            return paired, 0
+        for attempt in range(_ATTEMPTS):
+            try:
+                return self._settled(self._placed(paired, key.generator("places", attempt))), attempt
+            except PlacementError as error:
+                reason = error
+        raise reason
+
+    def _paired(self, row: np.ndarray) -> np.ndarray:
+        """Return the start with everything that both scenes have; what is new is at its model's origin."""
         base, model = self.base, self.scene.model
         qpos, qvel, fixtures = (part[0].copy() for part in split_row(base.model, row[None]))
         now, speed = model.qpos0.copy(), np.zeros(model.nv)
@@ -73,36 +91,41 @@ class Pairing:
         for name, shift in self._shifts.items():
             address = model.joint(f"{name}_joint0").qposadr[0]
             now[address : address + 2] += shift
-        paired = np.concatenate([row[:1], now, speed, fixtures.ravel()])
-        if not self.added:
-            return paired
-        return self._settled(self._with_added(paired, key))
+        return np.concatenate([row[:1], now, speed, fixtures.ravel()])
 
-    def _with_added(self, row: np.ndarray, key: DrawKey) -> np.ndarray:
-        """Return a state in which each new object hovers over a free place of its region."""
-        scene, rng, row = self.scene, key.generator("places"), row.copy()
+    def _placed(self, row: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return a state in which what was exchanged stands in its place, and what is new over a free place."""
+        scene, row = self.scene, row.copy()
+        for name in self.exchanged:
+            self._stand(row, name, rng)
         surface, offset = scene.workspace.surface_height, np.asarray(scene.workspace.offset)[:2]
-        taken = list(self._taken(row))
+        taken = _stacked(self._taken(row))
         for name in self.added:
-            region, address = self._region(name), 1 + scene.model.joint(f"{name}_joint0").qposadr[0]
+            region, quat = self._region(name), scene.objects[name].rest_quat(rng)
+            address = 1 + scene.model.joint(f"{name}_joint0").qposadr[0]
+            row[address : address + 7] = (0.0, 0.0, surface - lowest_point(scene, name, quat) + _LIFT, *quat)
+            own = _stacked(self._boxes(row, name))  # about the origin
             for _ in range(_TRIES):
-                quat = scene.objects[name].rest_quat(rng)
                 x0, y0, x1, y1 = region.ranges[rng.integers(len(region.ranges))]
                 place = rng.uniform((x0, y0), (x1, y1)) + offset
-                row[address : address + 7] = (
-                    *place,
-                    surface - lowest_point(scene, name, quat) + _LIFT,
-                    *quat,
-                )
-                boxes = list(self._boxes(row, name))
-                if _is_free(boxes, taken):
-                    taken += boxes
+                moved = own + (place, (0.0, 0.0))
+                if _is_free(moved, taken):
+                    row[address : address + 2] = place
+                    taken = np.concatenate([taken, moved])
                     break
             else:
                 raise PlacementError(
                     f"{scene.problem.language!r}: {name} finds no free place in {region.address} after {_TRIES} tries"
                 )
         return row
+
+    def _stand(self, row: np.ndarray, name: str, rng: np.random.Generator) -> None:
+        """Let an object of another category stand where the one before stood, on the workspace."""
+        quat = self.scene.objects[name].rest_quat(rng)
+        address = 1 + self.scene.model.joint(f"{name}_joint0").qposadr[0]
+        surface = self.scene.workspace.surface_height
+        row[address + 2] = surface - lowest_point(self.scene, name, quat) + _LIFT
+        row[address + 3 : address + 7] = quat
 
     def _region(self, name: str) -> Region:
         atom = next(a for a in self.scene.problem.init if a.args[0] == name)
@@ -135,36 +158,42 @@ class Pairing:
             self._simulations = LoopSimulations(model, fixture_bodies=scene.fixture_bodies)
         qpos, _, fixtures = split_row(model, row[None])
         rest, settled = settle(self._simulations, 0, qpos[0], scene.nq_robot, fixtures[0]), row.copy()
-        for name in self.added:
+        new = [*self.added, *self.exchanged]
+        for name in new:
             address = model.joint(f"{name}_joint0").qposadr[0]
             settled[1 + address : 8 + address] = rest[address : address + 7]
-        own = {int(scene.bodies[name][0]) for name in self.added}
-        others = {
-            int(body) for name in scene.entities if name not in self.added for body in scene.bodies[name]
-        }
+        own = {int(scene.bodies[name][0]) for name in new}
+        others = {int(body) for name in scene.entities if name not in new for body in scene.bodies[name]}
         if any(pair & own and pair & others for pair in map(set, contacts(scene, settled))):
             raise PlacementError(f"{scene.problem.language!r}: a new object has come to rest against another")
         return settled
 
 
-def _is_free(boxes: list[tuple[np.ndarray, np.ndarray]], taken: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Return whether boxes, seen from above, keep the gap to others."""
-    return all((np.abs(a - b) > p + q + _GAP).any() for a, p in boxes for b, q in taken)
+def _stacked(boxes: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return boxes seen from above as an array (n, 2, 2): centre and half size of each."""
+    return np.array(list(boxes)).reshape(-1, 2, 2)
+
+
+def _is_free(boxes: np.ndarray, taken: np.ndarray) -> bool:
+    """Return whether boxes (n, 2, 2), seen from above, keep the gap to others (m, 2, 2)."""
+    apart = np.abs(boxes[:, None, 0] - taken[None, :, 0]) > boxes[:, None, 1] + taken[None, :, 1] + _GAP
+    return bool(apart.any(axis=-1).all())
 
 
 def moved(base: Problem, problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the objects whose region was moved, or that stand on one of those, and by how much, (2,) [m]."""
     shifts: dict[str, np.ndarray] = {}
-    waiting = [a for a in problem.init if len(a.args) == 2 and a.args[0] in base.objects]
+    waiting = [a for a in base.init if len(a.args) == 2 and a.args[0] in base.objects]
     for atom in waiting:
-        before, after = base.region(atom.args[1]), problem.region(atom.args[1])
+        now = next((a for a in problem.init if len(a.args) == 2 and a.args[0] == atom.args[0]), atom)
+        before, after = base.region(atom.args[1]), problem.region(now.args[1])
         if before is not None and after is not None and before.ranges and after.ranges:
             shift = np.array(after.ranges[0][:2]) - before.ranges[0][:2]
             if shift.any():
                 shifts[atom.args[0]] = shift
     for _ in waiting:  # what stands on what stands on something
         for atom in waiting:
-            region = problem.region(atom.args[1])
+            region = base.region(atom.args[1])
             carrier = atom.args[1] if region is None else region.target
             if carrier in shifts:
                 shifts.setdefault(atom.args[0], shifts[carrier])

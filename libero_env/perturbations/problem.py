@@ -1,29 +1,36 @@
 """Kinds that change the problem: what the task says, and which objects are there. A perturbed task is a task."""
 
-from collections.abc import Iterable
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
-from libero_env.assets.pack import Pack
+from libero_env.errors import InvalidInputError
 from libero_env.perturbations.drawing import draw_key
+from libero_env.perturbations.goals import is_named, other_goals
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kind import Kind
+from libero_env.perturbations.layouts import move_layout
+from libero_env.perturbations.starts import carried
+from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
-from libero_env.tasks.problem import Atom, Problem, Region
+from libero_env.tasks.problem import Atom, Problem, Region, atoms_of
 from libero_env.tasks.task import Task
 
 if TYPE_CHECKING:
     from libero_env.perturbations.value import Perturbation
 
+_REACH = (-0.2, -0.25, 0.1, 0.25)  # [m] rectangle that the arm reaches easily on every workspace
 _MARGIN = 0.05  # [m] by which the distractors' region is larger than that of the task's own objects
+_MAX_KNOWN = 256
+_known: OrderedDict[Any, Task] = OrderedDict()  # perturbed tasks
 DISTRACTOR_REGION = "distractor_region"
 
 
-def perturb_task(task: Task, perturbations: "Iterable[Perturbation]", pack: Pack) -> Task:
+def perturb_task(task: Task, perturbations: "Iterable[Perturbation]", scene: Scene) -> Task:
     """Return a task as perturbations change it; those of other layers are ignored.
 
     Suite, index and name stay, so that its results can be paired with those of the task without perturbations.
@@ -31,23 +38,56 @@ def perturb_task(task: Task, perturbations: "Iterable[Perturbation]", pack: Pack
     Args:
         task: Task.
         perturbations: Perturbations in the order in which they are applied.
-        pack: Asset pack of the models.
+        scene: Compiled scene of the task.
+
+    Raises:
+        InvalidInputError: The task has no other goal.
+        PlacementError: Objects cannot be moved so far.
     """
-    return _perturbed(
-        task, tuple(p for p in perturbations if p.definition.layer == "problem" and p.severity), pack
-    )
+    found = [one for one in perturbations if one.definition.layer == "problem" and one.severity]
+    key = (task, tuple(found), scene.pack, scene.robot)
+    if key not in _known:
+        _known[key] = _perturbed(task, found, scene)
+        while len(_known) > _MAX_KNOWN:
+            _known.popitem(last=False)
+    return _known[key]
 
 
-@lru_cache(maxsize=256)
-def _perturbed(task: Task, perturbations: "tuple[Perturbation, ...]", pack: Pack) -> Task:
+def _perturbed(task: Task, perturbations: "Iterable[Perturbation]", scene: Scene) -> Task:
     changed = task
     for one in perturbations:
         rng = draw_key(one.kind, one.seed, task.id).generator()
-        changed = one.definition.draw(one.amount, rng, changed, pack)
+        changed = one.definition.draw(one.amount, rng, changed, scene)
     return changed
 
 
-def _instruction(distance: float, rng: np.random.Generator, task: Task, pack: Pack) -> Task:
+def _goal(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
+    goals = other_goals(task)
+    return goals[rng.integers(len(goals))]
+
+
+def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
+    """Return the task with others in the place of objects that neither goal nor instruction are about."""
+    problem = task.problem
+    used = {
+        n
+        for atom in atoms_of(problem.goal)
+        for arg in atom.args
+        for n in problem.objects
+        if arg.startswith(n)
+    }
+    free = _unnamed(task, scene)
+    roots = carried(problem)
+    told = f"{task.language} {task.bddl_language}".lower()
+    alone = [n for n in roots if not roots[n] and n not in used and not is_named(problem.objects[n], told)]
+    chosen = [alone[i] for i in rng.permutation(len(alone))][: max(1, round(share * len(alone)))]
+    others = {name: free[i] for name, i in zip(chosen, rng.permutation(len(free)), strict=False)}
+    if not others:
+        raise InvalidInputError(f"{task.id} has no object that could be another: all are part of the task")
+    return replace(task, problem=replace(problem, objects={**problem.objects, **others}))
+
+
+def _instruction(distance: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
     """Return the task with other words for the same; both of its instructions are reworded in the same way."""
     name_words = reword(task.language, distance, rng)
     return with_instruction(task, name_words)
@@ -59,16 +99,10 @@ def with_instruction(task: Task, instruction: str) -> Task:
     return replace(task, language=instruction, bddl_language=instruction, problem=problem)
 
 
-def _distractors(count: float, rng: np.random.Generator, task: Task, pack: Pack) -> Task:
+def _distractors(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
     """Return the task with more objects, of categories that it neither has nor names."""
-    problem, words = task.problem, set(f"{task.language} {task.bddl_language}".lower().split())
+    problem, free = task.problem, _unnamed(task, scene)
     entities = {*problem.objects, *problem.fixtures}
-    known = {**problem.objects, **problem.fixtures}.values()
-    free = [
-        category
-        for category in read_yaml("perturbations/data/distractors.yaml")["categories"]
-        if category not in known and category in pack.categories() and not words & _nouns(category)
-    ]
     chosen = [free[i] for i in rng.permutation(len(free))][: int(count)]
     names = {_free_name(category, entities): category for category in chosen}
     workspace = next(name for name, category in problem.fixtures.items() if category in WORKSPACES)
@@ -82,10 +116,23 @@ def _distractors(count: float, rng: np.random.Generator, task: Task, pack: Pack)
     return replace(task, problem=changed)
 
 
+def _unnamed(task: Task, scene: Scene) -> list[str]:
+    """Return categories of objects that the task neither has nor could mean."""
+    known = {**task.problem.objects, **task.problem.fixtures}.values()
+    there = scene.pack.categories()
+    return [c for c in _distractor_words() if c not in known and c in there and not _words(task) & _nouns(c)]
+
+
+def _words(task: Task) -> set[str]:
+    return set(f"{task.language} {task.bddl_language}".lower().split())
+
+
+def _distractor_words() -> Mapping[str, list[str]]:
+    return read_yaml("perturbations/data/distractors.yaml")["categories"]
+
+
 def _nouns(category: str) -> set[str]:
-    return set(
-        read_yaml("perturbations/data/distractors.yaml")["categories"][category] or category.split("_")
-    )
+    return set(_distractor_words().get(category) or category.split("_"))
 
 
 def _free_name(category: str, taken: Iterable[str]) -> str:
@@ -93,15 +140,43 @@ def _free_name(category: str, taken: Iterable[str]) -> str:
 
 
 def _around(problem: Problem, workspace: str) -> tuple[float, float, float, float]:
-    """Return the rectangle around all regions on the workspace, and a margin."""
-    ranges = np.array([r for region in problem.regions if region.target == workspace for r in region.ranges])
-    if not ranges.size:
-        ranges = np.array([[-0.1, -0.1, 0.1, 0.1]])
+    """Return the rectangle around all regions on the workspace and the middle of its reach, and a margin."""
+    own = [r for region in problem.regions if region.target == workspace for r in region.ranges]
+    ranges = np.array([*own, _REACH])
     low, high = ranges[:, :2].min(axis=0) - _MARGIN, ranges[:, 2:].max(axis=0) + _MARGIN
     return (*low.round(6).tolist(), *high.round(6).tolist())
 
 
 KINDS = (
+    Kind(
+        "goal",
+        "problem",
+        "goals",
+        1,
+        "the scene has another goal, with its instruction; the severity does not matter",
+        _goal,
+        scale="count",
+        physical=True,
+        exclusive=True,
+    ),
+    Kind(
+        "layout",
+        "problem",
+        "m",
+        0.1,
+        "the places of objects are moved so far; what the goal puts them on or in, and fixtures, stay",
+        move_layout,
+        physical=True,
+    ),
+    Kind(
+        "objects",
+        "problem",
+        "share",
+        1.0,
+        "this share of the objects that the task is not about are others, in the same places",
+        _objects,
+        physical=True,
+    ),
     Kind(
         "distractors",
         "problem",

@@ -9,11 +9,16 @@ from weakref import WeakKeyDictionary
 import mujoco
 import numpy as np
 
+from libero_env.assets.arena import WORKSPACES
+from libero_env.geometry import quat_from_axis_angle, quat_multiply
 from libero_env.init_states.store import split_row
-from libero_env.perturbations.drawing import direction
+from libero_env.perturbations.drawing import direction, sign
 from libero_env.perturbations.kind import Kind
 from libero_env.sim.scene import Scene
+from libero_env.tasks.problem import Problem
 
+_DIRECTIONS = 60  # tries for each object
+_FULL_STEP, _FULL_TURN = 0.05, np.deg2rad(30.0)  # [m], [rad] at severity 1
 _LIMIT_MARGIN = 0.02  # [rad] between a drawn joint and the end of its range
 
 
@@ -65,6 +70,72 @@ class RobotOffset(StartChange):
         return moved if contacts(scene, moved) <= contacts(scene, row) else None
 
 
+@dataclass(frozen=True)
+class ScatteredObjects(StartChange):
+    """Each object that stands on the workspace is moved by the same distance and turned, without new contacts.
+
+    What stands on it or lies in it moves along; what the benchmark keeps in its place, fixtures, stays.
+
+    Attributes:
+        distance: Distance, [m].
+        angle: Angle about the vertical, [rad].
+        seed: Seed of the directions.
+    """
+
+    distance: float
+    angle: float
+    seed: int
+
+    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
+        """Return the state with the objects moved; see `StartChange`."""
+        rng, before, moved = np.random.default_rng(self.seed), contacts(scene, row), row
+        for name, load in carried(scene.problem).items():
+            for _ in range(_DIRECTIONS):
+                step, angle = self.distance * direction(rng, 2), self.angle * sign(rng)
+                tried = shifted(scene, moved, (name, *load), step, angle)
+                if contacts(scene, tried) <= before:
+                    moved = tried
+                    break
+            else:
+                return None
+        return moved
+
+
+def carried(problem: Problem) -> dict[str, list[str]]:
+    """Return the objects that stand on the workspace, each with those that stand on it or lie in it."""
+    places: dict[str, str] = {}
+    for atom in problem.init:
+        if len(atom.args) == 2 and atom.args[0] in problem.objects:
+            region = problem.region(atom.args[1])
+            places[atom.args[0]] = atom.args[1] if region is None else region.target
+    roots: dict[str, list[str]] = {
+        name: [] for name, on in places.items() if problem.fixtures.get(on) in WORKSPACES
+    }
+    for name in places:
+        below = name
+        while places.get(below) in places:
+            below = places[below]
+        if below != name and below in roots:
+            roots[below].append(name)
+    return roots
+
+
+def shifted(
+    scene: Scene, row: np.ndarray, names: Sequence[str], step: np.ndarray, angle: float = 0.0
+) -> np.ndarray:
+    """Return a state in which objects are moved by (2,) [m] and turned about the vertical through the first, [rad]."""
+    moved, turn = row.copy(), quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), angle)
+    addresses = [1 + scene.model.joint(f"{name}_joint0").qposadr[0] for name in names]
+    centre = row[addresses[0] : addresses[0] + 2].copy()
+    cosine, sine = np.cos(angle), np.sin(angle)
+    for a in addresses:
+        x, y = row[a : a + 2] - centre
+        moved[a : a + 2] = centre + (cosine * x - sine * y, sine * x + cosine * y) + step
+        if angle:
+            moved[a + 3 : a + 7] = quat_multiply(turn[None], row[a + 3 : a + 7][None])[0]
+    return moved
+
+
 def _with_arm(row: np.ndarray, arm: np.ndarray) -> np.ndarray:
     moved = row.copy()
     moved[1 : 1 + len(arm)] = arm
@@ -101,6 +172,10 @@ def _robot(radians: float, rng: np.random.Generator, scene: Scene) -> RobotOffse
     return RobotOffset(tuple((radians * direction(rng, 7)).tolist()))
 
 
+def _object_pose(metres: float, rng: np.random.Generator, scene: Scene) -> ScatteredObjects:
+    return ScatteredObjects(metres, _FULL_TURN * metres / _FULL_STEP, int(rng.integers(2**63)))
+
+
 KINDS = (
     Kind(
         "robot",
@@ -109,6 +184,15 @@ KINDS = (
         0.5,
         "the arm starts elsewhere, at this distance in joint space, within its limits and touching nothing",
         _robot,
+        physical=True,
+    ),
+    Kind(
+        "object_pose",
+        "start",
+        "m",
+        _FULL_STEP,
+        "each object starts this far from its place and turned by up to 30 degrees, each start otherwise",
+        _object_pose,
         physical=True,
     ),
 )

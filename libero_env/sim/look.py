@@ -63,7 +63,8 @@ class Look:
         cameras: Views by the camera's name in the model, such as `agentview`.
         lights: Lights by their name in the model; `headlight` is the one at the first camera.
         materials: Name of a material in the model -> name of the material that is drawn instead.
-        colours: Name of an object or fixture -> colour (RGB, 0 to 1) and share of its own colour that it replaces.
+        colours: Name of an object, a fixture or a material -> colour (RGB, 0 to 1) and share of its own colour that it
+            replaces.
     """
 
     cameras: Mapping[str, CameraView] = field(default_factory=dict)
@@ -124,10 +125,11 @@ class SceneLook:
         }
         self._colours: dict[int, tuple[np.ndarray, float]] = {}
         for name, (colour, share) in look.colours.items():
-            if name not in scene.entities:
-                raise UnknownNameError("object or fixture", name, scene.entities)
             own = np.asarray(colour, float), float(share)
-            geoms = np.flatnonzero(np.isin(model.geom_bodyid, scene.bodies[name]))
+            if name in scene.entities:
+                geoms = np.flatnonzero(np.isin(model.geom_bodyid, scene.bodies[name]))
+            else:
+                geoms = np.flatnonzero(model.geom_matid == _index(model, "material", name))
             self._colours |= dict.fromkeys(geoms.tolist(), own)
 
     def place_cameras(self, data: mujoco.MjData) -> None:
@@ -202,8 +204,10 @@ def _matrix(quat: Sequence[float]) -> np.ndarray:
 def _material(model: mujoco.MjModel, index: int) -> dict[str, Any]:
     """Return what elements of an abstract scene have of a material, by attribute."""
     names = ("emission", "specular", "shininess", "reflectance")
-    return {
-        "matid": index,
-        "rgba": model.mat_rgba[index],
-        **{name: float(getattr(model, f"mat_{name}")[index]) for name in names},
-    }
+    found = {"matid": index, "rgba": model.mat_rgba[index]}
+    found |= {name: float(getattr(model, f"mat_{name}")[index]) for name in names}
+    if hasattr(mujoco.MjvGeom, "texid"):  # some versions of MuJoCo read these from the material
+        found["texid"] = int(model.mat_texid[index, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+        found["texuniform"] = int(model.mat_texuniform[index])
+        found["texrepeat"] = model.mat_texrepeat[index]
+    return found

@@ -14,7 +14,7 @@ from threading import RLock
 import mujoco
 import numpy as np
 
-from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, load_workspace
+from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, add_spare_materials, load_workspace
 from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
@@ -47,6 +47,7 @@ class Scene:
         fixtures: Fixtures by name, without the workspace, in the order of the task file.
         drawing: How images are drawn, one of `DRAWINGS`.
         robot: Model of the arm, one of `libero_env.assets.robot.ROBOTS`.
+        spare_materials: Whether the model has materials that nothing has, see `build_scene`.
     """
 
     problem: Problem
@@ -58,6 +59,7 @@ class Scene:
     fixtures: Mapping[str, ObjectModel]
     drawing: str
     robot: str
+    spare_materials: bool = False
 
     @property
     def nq_robot(self) -> int:
@@ -114,7 +116,12 @@ class Scene:
 
 
 def build_scene(
-    problem: Problem, pack: Pack | None = None, *, drawing: str | None = None, robot: str = DEFAULT_ROBOT
+    problem: Problem,
+    pack: Pack | None = None,
+    *,
+    drawing: str | None = None,
+    robot: str = DEFAULT_ROBOT,
+    spare_materials: bool = False,
 ) -> Scene:
     """Compile a problem; the result is cached for the process.
 
@@ -123,6 +130,8 @@ def build_scene(
         pack: Asset pack of the models; by default that of `select_pack`.
         drawing: One of `DRAWINGS`; by default that of `default_drawing`.
         robot: One of `libero_env.assets.robot.ROBOTS`.
+        spare_materials: Whether the model also has the styles of all floors, walls and tables as materials, for a
+            `libero_env.sim.look.Look`. Nothing else depends on it.
 
     Raises:
         ProblemError: The problem is not valid, see `libero_env.tasks.checks`; or a region is no site of its target's
@@ -132,7 +141,7 @@ def build_scene(
     """
     check_problem(problem)
     pack = pack or select_pack()
-    return _build_scene(problem, pack, drawing or default_drawing(pack), robot)
+    return _build_scene(problem, pack, drawing or default_drawing(pack), robot, spare_materials)
 
 
 def default_drawing(pack: Pack) -> str:
@@ -140,10 +149,12 @@ def default_drawing(pack: Pack) -> str:
     return FAITHFUL if isinstance(pack, OriginalPack) and pack.lod is None else FAST
 
 
-def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
+def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
     spec = scene_spec(problem, pack, entities, drawing=drawing, robot=robot)
+    if spare_materials:
+        add_spare_materials(spec)
     log_warnings()
     try:
         model = spec.compile()
@@ -155,7 +166,7 @@ def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str) -> Sc
         ) from error
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
-    scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot)
+    scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot, spare_materials)
     check_models(scene)
     return scene
 
@@ -168,9 +179,11 @@ class _SceneCache:
         self._scenes: OrderedDict[Hashable, Scene] = OrderedDict()
         self._lock = RLock()
 
-    def __call__(self, problem: Problem, pack: Pack, drawing: str, robot: str) -> Scene:
+    def __call__(
+        self, problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool
+    ) -> Scene:
         """Return the scene of these arguments; it is compiled if it is not there."""
-        key = (problem, pack, drawing, robot)
+        key = (problem, pack, drawing, robot, spare_materials)
         with self._lock:
             if key not in self._scenes:
                 self._scenes[key] = scene = _compile_scene(*key)

@@ -6,11 +6,13 @@ import pytest
 from libero_env import BatchEnv, LiberoEnv
 from libero_env.envs import EnvConfig
 from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.geometry import quat_to_axis_angle
 from libero_env.perturbations import (
     KINDS,
     LAYERS,
     Perturbation,
     RobotJoints,
+    draw_key,
     format_perturbations,
     parse_perturbations,
 )
@@ -274,3 +276,147 @@ def test_an_episode_from_a_seed_is_paired_with_the_same_placement():
     assert same([first], [perturbed.reset(seed=5)[0]])
     plain.close()
     perturbed.close()
+
+
+def test_another_goal_of_the_scene_comes_with_its_instruction():
+    goals = {task.language: task.problem.goal for task in get_suite("libero_goal").tasks}
+    env, _, info = world_of("goal=1", cameras=())
+    assert env.task.language != env.world.base_task.language
+    assert env.task.problem.goal == goals[env.task.language] and not info["success"]
+    assert env.task.id == TASK and env.world.scene.problem.objects == env.world.base_scene.problem.objects
+    env.close()
+    env, _, _ = world_of("goal=1", task="libero_object/0", cameras=())  # where no task begins in the same way
+    carried = env.task.problem.goal.parts[0].args[0]
+    assert env.task.problem.objects[carried].replace("_", " ").removeprefix("new ") in env.task.language
+    env.close()
+    with pytest.raises(InvalidInputError, match="goal cannot be combined with"):
+        EnvConfig(perturb="goal=1,instruction=0.5")
+
+
+@pytest.mark.parametrize("severity", [0.3, 1.0])
+def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(severity):
+    base, _, _ = world_of("", task="libero_object/3", start=9, cameras=())
+    env, _, info = world_of(f"layout={severity}", task="libero_object/3", start=9, cameras=())
+    before, after = ({n: e.view.body_pos(n) for n in e.world.scene.objects} for e in (base, env))
+    moved = {
+        n: np.linalg.norm(after[n] - before[n]) for n in before if not np.array_equal(after[n], before[n])
+    }
+    assert set(before) - set(moved) == {"basket_1"} and not info["success"]
+    assert np.allclose(list(moved.values()), KINDS["layout"].amount(severity), atol=1e-9)
+    for name, region in ((a.args[0], env.task.problem.region(a.args[1])) for a in env.task.problem.init):
+        x0, y0, x1, y1 = region.ranges[0]
+        x, y, _ = after[name] - env.world.scene.workspace.offset
+        assert x0 - 0.02 < x < x1 + 0.02 and y0 - 0.02 < y < y1 + 0.02  # the task says where they are
+    base.close()
+    env.close()
+
+
+def test_objects_that_places_tell_apart_move_together():
+    base, _, _ = world_of("", task="libero_spatial/1", cameras=())
+    env, _, _ = world_of("layout=0.5", task="libero_spatial/1", cameras=())
+    steps = [env.view.body_pos(n) - base.view.body_pos(n) for n in env.world.scene.objects]
+    assert np.allclose(steps, steps[0], atol=1e-9) and np.linalg.norm(steps[0]) == pytest.approx(0.05)
+    base.close()
+    env.close()
+
+
+def test_other_objects_stand_where_those_were_that_the_task_is_not_about():
+    base, _, _ = world_of("", task="libero_object/3", cameras=())
+    env, _, _ = world_of("objects=1", task="libero_object/3", cameras=())
+    old, new = base.task.problem.objects, env.task.problem.objects
+    exchanged = [name for name in old if old[name] != new[name]]
+    assert set(old) - set(exchanged) == {"bbq_sauce_1", "basket_1"}
+    for name in exchanged:
+        assert np.allclose(env.view.body_pos(name)[:2], base.view.body_pos(name)[:2], atol=0.01)
+    assert np.array_equal(env.view.body_pos("bbq_sauce_1"), base.view.body_pos("bbq_sauce_1"))
+    base.close()
+    env.close()
+    with pytest.raises(InvalidInputError, match="no object that could be another"):
+        world_of("objects=1", task="libero_90/12")
+
+
+def test_objects_start_at_a_distance_from_their_places_and_carry_what_stands_on_them():
+    task, start = "libero_spatial/3", 2  # the bowl stands on the cookie box
+    base, _, _ = world_of("", task=task, start=start, cameras=())
+    env, _, _ = world_of("object_pose=0.6", task=task, start=start, cameras=())
+    steps = {n: (env.view.body_pos(n) - base.view.body_pos(n))[:2] for n in env.world.scene.objects}
+    lengths = {n: np.linalg.norm(step) for n, step in steps.items()}
+    assert lengths["cookies_1"] == pytest.approx(KINDS["object_pose"].amount(0.6))
+    assert env.view.in_contact("akita_black_bowl_1", "cookies_1")
+    for a, b in (("akita_black_bowl_1", "cookies_1"),):
+        apart = [np.linalg.norm(e.view.body_pos(a) - e.view.body_pos(b)) for e in (base, env)]
+        assert apart[0] == pytest.approx(apart[1])
+    base.close()
+    env.close()
+
+
+def test_surfaces_and_colours_change_in_the_picture_only(plain):
+    _, seen = plain
+    for perturb in ("table=0.5", "background=0.8", "colour=0.5"):
+        env, observation, _ = world_of(perturb)
+        assert not np.array_equal(observation["agentview_rgb"], seen[0]["agentview_rgb"])
+        assert np.array_equal(observation["joint_states"], seen[0]["joint_states"])
+        env.close()
+
+
+def filtered(perturb, steps=4, **options):
+    """Return the pictures of an episode with and without a perturbation."""
+    found = []
+    for text in ("", perturb):
+        env = LiberoEnv(TASK, perturb=text, camera_size=(64, 64), **options)
+        found.append([obs["agentview_rgb"].astype(float) for obs in episode(env, steps=steps)])
+        env.close()
+    return found
+
+
+def test_pictures_are_blurred_hidden_late_and_lost():
+    plain, blurred = filtered("blur=0.5", steps=0)
+    assert np.abs(np.diff(blurred[0], axis=0)).mean() < 0.6 * np.abs(np.diff(plain[0], axis=0)).mean()
+    plain, hidden = filtered("occlusion=0.5", steps=2)
+    covered = [(a != b).any(axis=-1) for a, b in zip(plain, hidden, strict=True)]
+    assert covered[0].mean() == pytest.approx(KINDS["occlusion"].amount(0.5), abs=0.02)
+    plain, late = filtered("latency=0.2", steps=5)
+    assert KINDS["latency"].amount(0.2) == 2
+    assert all(np.array_equal(late[t], plain[max(0, t - 2)]) for t in range(6))
+    plain, lost = filtered("dropped_frames=0.7", steps=12)
+    kept = [np.array_equal(a, b) for a, b in zip(plain, lost, strict=True)]
+    assert kept[0] and 0 < sum(kept[1:]) < 10
+    assert all(now or np.array_equal(lost[t], lost[t - 1]) for t, now in enumerate(kept) if t)
+
+
+def test_late_pictures_do_not_depend_on_which_are_looked_at():
+    env = LiberoEnv(TASK, perturb="latency=0.2", **SMALL)
+    seen = episode(env, steps=4)[-1]
+    env.render_images = False
+    env.reset(options={"init_state": 0})
+    rng = np.random.default_rng(0)
+    for step in range(4):
+        env.render_images = step == 3
+        last = env.step(rng.uniform(-1, 1, 7))[0]
+    assert same([seen], [last])
+    env.close()
+
+
+def test_sensors_are_off_by_metres_and_radians():
+    entries = ("proprioception", "ee_quat")
+    base, right, _ = world_of("", observations=entries)
+    env, wrong, _ = world_of("proprio_bias=0.5", observations=entries)
+    amount = KINDS["proprio_bias"].amount(0.5)
+    for name in ("joint_states", "ee_pos"):
+        assert np.linalg.norm(wrong[name] - right[name]) == pytest.approx(amount)
+    cosine = abs(wrong["ee_quat"] @ right["ee_quat"])
+    assert 2 * np.arccos(cosine) == pytest.approx(amount, rel=1e-6)
+    assert quat_to_axis_angle(wrong["ee_quat"][None])[0] == pytest.approx(wrong["ee_ori"], abs=1e-9)
+    assert np.array_equal(env.view.eef_pos, base.view.eef_pos)
+    base.close()
+    env.close()
+
+
+def test_actions_are_scaled_and_noisy_but_not_the_gripper():
+    key, action = draw_key("x", 0, TASK), np.full(7, 0.5)
+    gain = KINDS["gain"].draw(2.0, key.generator()).open(key).act(action, 0)
+    assert gain[6] == 0.5 and np.allclose(gain[:6], gain[0]) and gain[0] in (0.25, 1.0)
+    noisy = KINDS["action_noise"].draw(0.2, key.generator()).open(key)
+    acted = np.array([noisy.act(action, step) for step in range(500)])
+    assert (acted[:, 6] == 0.5).all() and acted[:, :6].std() == pytest.approx(0.2, rel=0.05)
+    assert np.array_equal(acted[3], noisy.act(action, 3))
