@@ -6,7 +6,10 @@ from pathlib import Path
 from libero_env.errors import LiberoError
 from libero_env.validation import read_yaml_file, validate
 
-_KEYS = ("benchmark_root", "bddl_files", "init_states", "datasets", "assets", "objects", "robot")
+_KEYS = (
+    *("benchmark_root", "bddl_files", "init_states", "datasets", "assets", "objects", "robot"),
+    *("libero_plus", "libero_pro"),
+)
 
 
 def cache_dir() -> Path:

@@ -1,8 +1,8 @@
 """Initial states in the original's files: one array in a pickle, which is in a zip; nothing is executed.
 
 What is read, and no more: a zip as `torch.save` writes it, or a bare pickle; in it one array of NumPy or one tensor of
-torch, of two dimensions, with finite numbers of 4 or 8 bytes, at most 10,000 states of at most 10,000 numbers and 16
-million numbers in all. Sizes are compared with the file before memory is asked for.
+torch, of two dimensions or of one for a single state, with finite numbers of 4 or 8 bytes, at most 10,000 states of at
+most 10,000 numbers and 16 million numbers in all. Sizes are compared with the file before memory is asked for.
 """
 
 import io
@@ -170,6 +170,8 @@ def _pair(found: object, what: str = "(states, size)") -> tuple[int, int]:
     match found:
         case (int(rows), int(columns)):
             return rows, columns
+        case (int(columns),):
+            return 1, columns
     raise StateFileError(f"expected an array (states, size) of numbers; {what} are no two numbers")
 
 

@@ -4,6 +4,7 @@ from functools import cache
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks.builder import build_problem, language_from_name, load_data, load_scene
+from libero_env.tasks.published.suites import is_published, published_suite
 from libero_env.tasks.task import Suite, Task
 
 
@@ -20,24 +21,35 @@ def _parts() -> dict[str, list[str]]:
     return found
 
 
-@cache
+def is_suite(name: str) -> bool:
+    """Return whether a name is that of a suite, whether its files are here or not."""
+    return name in suite_names() or ("/" not in name and is_published(name))
+
+
 def get_suite(name: str) -> Suite:
-    """Return a suite of the benchmark.
+    """Return a suite of the benchmark, or of LIBERO-Plus or LIBERO-PRO.
 
     Args:
-        name: Name such as `libero_object`; `suite_names()` lists them.
+        name: Name such as `libero_object`; `suite_names()` lists them. Those of others, such as `libero_plus_goal`, are
+            in `libero_env.tasks.published.suites`.
 
     Returns:
         The suite with its tasks in their published order; the same object at each call.
 
     Raises:
         UnknownNameError: No suite has this name; the message lists them.
+        MissingPackageError: The suite is one of others, and its files are not here.
     """
+    return published_suite(name) if is_published(name) else _own_suite(name)
+
+
+@cache
+def _own_suite(name: str) -> Suite:
     parts = _parts()
     if name not in parts:
         raise UnknownNameError("suite", name, parts)
     if parts[name]:
-        return Suite(name, tuple(task for part in parts[name] for task in get_suite(part).tasks))
+        return Suite(name, tuple(task for part in parts[name] for task in _own_suite(part).tasks))
     definition = load_data(f"{name}.yaml")
     return Suite(
         name, tuple(_task(name, i, {**definition, **task}) for i, task in enumerate(definition["tasks"]))

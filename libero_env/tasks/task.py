@@ -64,6 +64,16 @@ class Task:
         return f"{self.suite}/{self.index}"
 
     @property
+    def start_task(self) -> "Task":
+        """Task whose stored initial states it starts in: itself, unless it is a variant of another."""
+        return self
+
+    @property
+    def num_starts(self) -> int:
+        """Number of stored initial states."""
+        return 50
+
+    @property
     def bddl_text(self) -> str:
         """Text of the task file in BDDL, generated from `problem`."""
         return bddl.write(self.problem)

@@ -147,6 +147,11 @@ def test_errors_name_the_broken_file(tmp_path):
             assert str(tmp_path / "bad") in str(error)
     with pytest.raises(StateFileError, match="absent"):
         read_states(tmp_path / "absent")
-    write_states(tmp_path / "flat", np.zeros(3))
+    write_states(tmp_path / "cube", np.zeros((3, 4, 5)))
     with pytest.raises(StateFileError, match=r"\(states, size\)"):
-        read_states(tmp_path / "flat")
+        read_states(tmp_path / "cube")
+
+
+def test_a_single_state_may_be_an_array_of_one_dimension(tmp_path):
+    write_states(tmp_path / "flat", np.arange(5.0))
+    np.testing.assert_array_equal(read_states(tmp_path / "flat"), [np.arange(5.0)])

@@ -1,0 +1,234 @@
+"""Suites of LIBERO-Plus and LIBERO-PRO by name.
+
+    libero_plus_goal            2,591 variants of the tasks of LIBERO-Goal; likewise spatial, object and 10
+    libero_plus_goal_skipped    the same, without setting the initial state after the reset
+    libero_pro_goal_swap        the ten tasks with objects exchanged; likewise object, language and task
+
+An ending chooses some of their tasks, which keep suite and index: `libero_plus_goal:camera` those of a kind, and
+`libero_plus_goal:available` those whose files can be had.
+"""
+
+import ast
+import re
+from collections.abc import Collection, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from libero_env.assets.arena import WORKSPACES
+from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.objects import object_names
+from libero_env.tasks import bddl
+from libero_env.tasks.problem import Problem
+from libero_env.tasks.published.folders import PLUS, PRO, find_folder, require_folder
+from libero_env.tasks.published.plus_id import KINDS, PlusVariant, parse_plus_id
+from libero_env.tasks.published.task import PublishedTask, RobotState, lacking
+from libero_env.tasks.task import Suite, Task
+
+PREFIXES = ("libero_plus_", "libero_pro_")
+AVAILABLE = "available"
+PRO_KINDS = {"swap": "swap", "object": "object", "language": "lan", "task": "task"}  # kind -> their ending
+_BASES = ("spatial", "object", "goal", "10")
+_SKIPPED = "_skipped"
+_TASK_MAP = Path("benchmark", "libero_suite_task_map.py")
+_MAP_NAME = "libero_task_map"
+_SAME = 1e-9  # [m], [rad] between numbers of task files that were written in other ways
+_REWORDED = ("language", "task")  # kinds whose instruction is that of the task file
+_PROBLEM = re.compile(r"(\(\s*problem\s+libero_\w+?_manipulation)_\w+", re.IGNORECASE)
+
+
+def is_published(name: str) -> bool:
+    """Return whether a name is that of a suite of this module, whether its files are here or not."""
+    return name.startswith(PREFIXES)
+
+
+def published_names() -> tuple[str, ...]:
+    """Return the names of the suites whose files are here, without endings."""
+    plus = _plus_names() if find_folder(PLUS) else ()
+    return (*plus, *(_pro_names() if find_folder(PRO) else ()))
+
+
+def published_suite(name: str) -> Suite:
+    """Return a suite of LIBERO-Plus or LIBERO-PRO.
+
+    Args:
+        name: Name, see the module.
+
+    Raises:
+        UnknownNameError: There is no suite, or no kind, of this name.
+        MissingPackageError: Its files are not here; the message says what brings them.
+        InvalidInputError: Its files are not as expected.
+    """
+    whole, colon, choice = name.partition(":")
+    known = (*_plus_names(), *_pro_names())
+    if whole not in known:
+        raise UnknownNameError("suite", whole, known)
+    if whole in _pro_names():
+        suite, valid = _pro_suite(whole, require_folder(PRO)), (AVAILABLE,)
+    else:
+        suite, valid = _plus_suite(whole, require_folder(PLUS)), (*KINDS, AVAILABLE)
+    if not colon:
+        return suite
+    if choice not in valid:
+        raise UnknownNameError(f"part of {whole}", choice, valid)
+    return Suite(name, tuple(task for task in suite.tasks if _is_chosen(task, choice)))
+
+
+def _is_chosen(task: Task, choice: str) -> bool:
+    assert isinstance(task, PublishedTask)
+    return not task.lacks if choice == AVAILABLE else task.kind == choice
+
+
+def _plus_names() -> tuple[str, ...]:
+    return tuple(f"libero_plus_{base}{end}" for base in _BASES for end in ("", _SKIPPED))
+
+
+def _pro_names() -> tuple[str, ...]:
+    return tuple(f"libero_pro_{base}_{kind}" for base in _BASES for kind in PRO_KINDS)
+
+
+@cache
+def _plus_suite(name: str, folder: Path) -> Suite:
+    short = name.removesuffix(_SKIPPED)
+    base_suite = short.replace("libero_plus_", "libero_")
+    bases, known = _base_tasks(base_suite), _known_categories()
+    reading: RobotState = "skipped" if short != name else "overwritten"
+    tasks = []
+    for index, variant in enumerate(map(parse_plus_id, _their_names(folder, base_suite))):
+        if variant.base not in bases:
+            raise InvalidInputError(f"{folder / _TASK_MAP}: {variant.base!r:.80} is no task of {base_suite}")
+        tasks.append(_plus_task(name, index, variant, bases[variant.base], folder, reading, known))
+    return Suite(name, tuple(tasks))
+
+
+def _plus_task(
+    suite: str,
+    index: int,
+    variant: PlusVariant,
+    base: Task,
+    folder: Path,
+    reading: RobotState,
+    known: Collection[str],
+) -> PublishedTask:
+    file = folder / "bddl_files" / base.suite / f"{variant.file}.bddl"
+    states = folder / "init_files"
+    own = variant.has_own_start
+    states = (
+        states / "libero_newobj" / base.suite / f"{variant.name}.pruned_init"
+        if own
+        else states / base.suite / f"{base.name}.pruned_init"
+    )
+    problem = _read(file) if own or variant.language is not None else base.problem
+    language = problem.language.lower() if variant.language is not None else base.language
+    return PublishedTask(
+        suite,
+        index,
+        variant.name,
+        language,
+        problem.language,
+        problem,
+        base=base,
+        kind=variant.kind,
+        file=file,
+        states_file=states,
+        has_own_start=own,
+        variant=variant,
+        robot_state=reading,
+        lacks=lacking(variant, problem, known),
+    )
+
+
+@cache
+def _pro_suite(name: str, folder: Path) -> Suite:
+    base_suite, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
+    theirs = f"{base_suite}_{PRO_KINDS[kind]}"
+    bases, known = _base_tasks(base_suite), _known_categories()
+    tasks = []
+    for index, base_name in enumerate(_their_names(folder, theirs)):
+        if base_name not in bases:
+            raise InvalidInputError(f"{folder / _TASK_MAP}: {base_name!r:.80} is no task of {base_suite}")
+        base, file = bases[base_name], folder / "bddl_files" / theirs / f"{base_name}.bddl"
+        problem = _read(file)
+        states = folder / "init_files" / theirs / f"{base_name}.pruned_init"
+        tasks.append(
+            PublishedTask(
+                name,
+                index,
+                f"{base_name}_{kind}",
+                problem.language.lower() if kind in _REWORDED else base.language,
+                problem.language,
+                problem,
+                base=base,
+                kind=kind,
+                file=file,
+                states_file=states if states.is_file() else states.with_name(f"{states.name}.npz"),
+                has_own_start=not _starts_alike(problem, base.problem),
+                lacks=lacking(None, problem, known),
+            )
+        )
+    return Suite(name, tuple(tasks))
+
+
+def _starts_alike(one: Problem, other: Problem) -> bool:
+    """Return whether two problems place the same objects in the same regions, up to the rounding of their files."""
+    same = (one.objects, one.fixtures, one.init) == (other.objects, other.fixtures, other.init)
+    pairs = list(zip(one.regions, other.regions, strict=False))
+    return (
+        same
+        and len(one.regions) == len(other.regions)
+        and all(
+            (a.address, len(a.ranges), len(a.yaw)) == (b.address, len(b.ranges), len(b.yaw)) for a, b in pairs
+        )
+        and all(np.allclose(a.ranges, b.ranges, atol=_SAME) for a, b in pairs)
+        and all(np.allclose(a.yaw, b.yaw, atol=_SAME) for a, b in pairs)
+    )
+
+
+def _base_tasks(suite: str) -> dict[str, Task]:
+    from libero_env.tasks.suites import get_suite  # which finds the suites of this module
+
+    return {task.name: task for task in get_suite(suite).tasks}
+
+
+def _known_categories() -> frozenset[str]:
+    return frozenset((*object_names(), *WORKSPACES))
+
+
+def _read(file: Path) -> Problem:
+    """Return the problem of a task file; a problem class of a variant is read as the one that it varies.
+
+    Raises:
+        InvalidInputError: The file does not exist.
+        BDDLError: It is not valid.
+    """
+    if not file.is_file():
+        raise InvalidInputError(f"{file} does not exist; is the distribution complete?")
+    return bddl.parse(_PROBLEM.sub(r"\1", bddl.read_text(file)), str(file))
+
+
+def _their_names(folder: Path, suite: str) -> Sequence[str]:
+    """Return the names of the tasks of a suite in their order, from a Python file that is read and not run."""
+    names = _their_map(folder).get(suite)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InvalidInputError(f"{folder / _TASK_MAP} has no suite {suite}; is it another version?")
+    return names
+
+
+@cache
+def _their_map(folder: Path) -> dict[str, object]:
+    path = folder / _TASK_MAP
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        assigned = next(
+            node.value
+            for node in tree.body
+            if isinstance(node, ast.Assign)
+            and any(isinstance(target, ast.Name) and target.id == _MAP_NAME for target in node.targets)
+        )
+        found = ast.literal_eval(assigned)
+    except (OSError, SyntaxError, ValueError, StopIteration, RecursionError) as error:
+        raise InvalidInputError(f"{path} is no list of tasks: {type(error).__name__} {error}") from None
+    if not isinstance(found, dict):
+        raise InvalidInputError(f"{path}: {_MAP_NAME} is no dictionary")
+    return found
