@@ -111,7 +111,7 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
     Raises:
         LiberoError: A suite, task or file does not exist, or a file is not a task.
     """
-    from libero_env.tasks import get_suite, get_task, suite_names
+    from libero_env.tasks import get_suite, get_task, is_suite
     from libero_env.tasks.files import read_yaml_tasks
 
     found: dict[tuple[str, str], Task] = {}
@@ -119,7 +119,7 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
         if name.endswith((".yaml", ".yml")):
             tasks: Sequence[Task] = read_yaml_tasks(name)
         else:
-            tasks = get_suite(name).tasks if name in suite_names() else (get_task(name),)
+            tasks = get_suite(name).tasks if is_suite(name) else (get_task(name),)
         found |= {(name if task.suite == "file" else task.suite, task.name): task for task in tasks}
     return list(found.values())
 
@@ -187,13 +187,19 @@ def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
 
 
 def run_tasks_list(args: argparse.Namespace) -> None:
-    """Print a line for each task."""
+    """Print a line for each task; of the variants that others have published, one for each suite unless it is named."""
     from libero_env.tasks import get_suite, suite_names
+    from libero_env.tasks.published import PublishedTask, published_sizes
 
     names = [args.suite] if args.suite else suite_names()
     tasks = {task.id: task for name in names for task in get_suite(name).order(args.order)}
     for task in tasks.values():
-        print(f"{task.id:18} {task.language}")
+        if isinstance(task, PublishedTask):
+            print(f"{task.id:24} {task.kind:10} {task.language}  ({task.name})")
+        else:
+            print(f"{task.id:18} {task.language}")
+    for name, size in {} if args.suite else published_sizes().items():
+        print(f"{name:28} {size} variants: libero tasks list {name}")
 
 
 def run_tasks_show(args: argparse.Namespace) -> None:
@@ -205,14 +211,21 @@ def run_tasks_show(args: argparse.Namespace) -> None:
 
 def run_tasks_init_states(args: argparse.Namespace) -> None:
     """Write the files, one for each suite of the tasks, and print their paths."""
+    from libero_env.errors import InvalidInputError
     from libero_env.init_states.store import cache_init_states, shipped_path, write_suite
     from libero_env.tasks import get_suite
     from libero_env.tasks.files import ENDINGS
+    from libero_env.tasks.published import is_published
 
     if args.suite.endswith(ENDINGS) and not args.out:
         for task in find_tasks([args.suite]):
             print(cache_init_states(task))
         return
+    if is_published(args.suite):
+        raise InvalidInputError(
+            f"{args.suite} starts from the states of the tasks that it varies, or from its own, made when they "
+            "are needed; there is nothing to generate"
+        )
     tasks = find_tasks([args.suite]) if args.suite.endswith(ENDINGS) else get_suite(args.suite).tasks
     for suite in dict.fromkeys(task.suite for task in tasks):
         path = args.out / f"{suite}.npz" if args.out else shipped_path(suite)

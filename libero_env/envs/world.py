@@ -29,6 +29,7 @@ from libero_env.perturbations.episodes import (
     scene_problem,
 )
 from libero_env.perturbations.problem import perturb_task
+from libero_env.perturbations.published import published_changes, rest_of
 from libero_env.perturbations.value import Perturbation
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.controller import ControllerState, get_controller
@@ -39,6 +40,7 @@ from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.problem import And, atoms_of
+from libero_env.tasks.published.task import require_available
 from libero_env.validation import validate
 from libero_env.validation.messages import shown
 
@@ -91,13 +93,14 @@ class World:
             )
         self.controller = get_controller(config.controller, config.control_delta)
         self.base_task = self.task = get_task(task) if isinstance(task, str) else task
+        require_available([self.task])
         assets = config.assets
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
         self.num, self.threads = num, threads
         style: dict[str, Any] = {"drawing": config.drawing, "robot": config.robot}
         self.base_scene = self.scene = build_scene(self.task.problem, pack, **style)
         self.perturbed: PerturbedEpisodes | None = None
-        if changes := checked_perturbations(config.perturb):
+        if changes := (*checked_perturbations(config.perturb), *published_changes(self.base_task)):
             drawn = [one for one in changes if isinstance(one, Perturbation)]
             style["spare_materials"] = needs_materials(changes)
             self.task = perturb_task(self.task, drawn, self.base_scene)
@@ -107,6 +110,7 @@ class World:
         self._check_memory()
         self.simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
         self.simulations.controller_state = ControllerState(num, self.controller)
+        self.simulations.rest = rest_of(self.base_task)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
         self.observer = Observer(
             self.scene,

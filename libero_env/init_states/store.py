@@ -11,13 +11,15 @@ import numpy as np
 
 from libero_env.assets.pack import BUILTIN
 from libero_env.errors import BrokenFileError, LiberoError
+from libero_env.init_states.pickle_reader import StateFileError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import sample_settled
 from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.scene import Scene, build_scene
-from libero_env.storage import atomic_write_npz, cached_arrays, read_packaged_npz
+from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
+from libero_env.tasks.published.task import PublishedTask
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50
@@ -86,12 +88,12 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
         scene: Compiled scene of the task.
 
     Returns:
-        Rows as of `generate_init_states`, (50, ...).
+        Rows as of `generate_init_states`, (50, ...); of a variant that leaves objects in place, those of its base task.
 
     Raises:
         LiberoError: The states of the package were made for another model, or their file is damaged.
     """
-    digest = scene_digest(scene)
+    task, digest = task.start_task, scene_digest(scene)
     packaged = packaged_states(task.suite).get(task.name)
     if packaged is not None and (packaged[0] == digest or scene.pack.name == BUILTIN):
         if packaged[0] != digest:
@@ -103,8 +105,8 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
     width = 1 + scene.model.nq + scene.model.nv + 7 * len(scene.fixtures)
     return cached_arrays(
         _cached_path(task, digest),
-        lambda: {"states": generate_init_states(task, scene)},
-        lambda stored: set(stored) == {"states"} and stored["states"].shape == (NUM_INIT_STATES, width),
+        lambda: {"states": generate_init_states(task, scene, task.num_starts)},
+        lambda stored: set(stored) == {"states"} and stored["states"].shape == (task.num_starts, width),
     )["states"]
 
 
@@ -121,13 +123,25 @@ def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray |
         StateFileError: The task's file is broken.
         LiberoError: The states are of another model than the scene's.
     """
-    folder = read_config().get("init_states")
-    path = Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init" if folder else None
+    path = task.states_file if isinstance(task, PublishedTask) else _configured_file(task)
     if path is None or not path.is_file():
         return None
-    states = read_states(path)
+    states = _read_npz(path) if path.suffix == ".npz" else read_states(path)
     if scene is not None:
         check_width(scene.model, states, path)
+    return states
+
+
+def _configured_file(task: Task) -> Path | None:
+    folder = read_config().get("init_states")
+    return Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init" if folder else None
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    """Return the states of a file of LIBERO-PRO's distribution, rows [time, qpos, qvel]."""
+    states = read_npz(path).get("states", np.zeros(0))
+    if states.ndim != 2 or states.dtype != np.float64 or not np.isfinite(states).all():
+        raise StateFileError(f"{path}: expected an array `states` (n, size) of finite numbers")
     return states
 
 

@@ -107,7 +107,7 @@ def _fog(image: np.ndarray, level: int, rng: np.random.Generator) -> np.ndarray:
 def _glass(image: np.ndarray, level: int, rng: np.random.Generator) -> np.ndarray:
     """Return an image whose pixels are mixed with their neighbours' between two blurs."""
     sigma, reach, rounds = _GLASS[level]
-    mixed = np.uint8(_blurred(image / 255.0, sigma) * 255)
+    mixed = (_blurred(image / 255.0, sigma) * 255).astype(np.uint8)
     square = min(image.shape[:2])
     side = _GLASS_SIDE if image.shape[:2] == (_SIDE, _SIDE) else square
     for _ in range(rounds):

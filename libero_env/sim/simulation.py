@@ -58,6 +58,7 @@ class Simulations(ABC):
 
     Attributes:
         model: The copy; its fixtures have the poses of the simulation that was used last.
+        rest: Joints of the arm's rest pose, (7,) [rad], as the controller has it; may be set before the first reset.
         num: Number of simulations.
         fixtures: Pose of each fixed body of `fixture_bodies`, (num, nfixtures, 7): position, quaternion wxyz.
         arm: Indices of the arm in the model.
@@ -74,6 +75,7 @@ class Simulations(ABC):
         self.arm = ArmIndex.from_model(model)
         self.controller_state = ControllerState(num)
         self.fields: dict[str, np.ndarray] = {}
+        self.rest = REST
         self._outdated = np.zeros(num, bool)
 
     @abstractmethod
@@ -156,7 +158,7 @@ class Simulations(ABC):
     def _rest_fields(self) -> dict[str, np.ndarray]:
         """Fields of a simulation whose arm is in its rest pose, (1, ...)."""
         data = mujoco.MjData(self.model)
-        data.qpos[: len(REST)] = REST
+        data.qpos[: len(self.rest)] = self.rest
         mujoco.mj_forward(self.model, data)
         found = {name: np.array(getattr(data, name))[None] for name in FIELDS}
         return {**found, "site_xmat": found["site_xmat"].reshape(1, self.model.nsite, 9)}
@@ -244,4 +246,4 @@ class Simulations(ABC):
 
     def _constants(self) -> tuple[np.ndarray, ...]:
         """Return the constants that the kernel of a controller takes."""
-        return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, REST
+        return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, self.rest

@@ -9,7 +9,7 @@ from libero_env.tasks import bddl
 from libero_env.tasks.authoring import FILE, check_keys, task_from_definition
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.source import merged_lines, read_definition
-from libero_env.tasks.suites import get_suite, suite_names
+from libero_env.tasks.suites import get_suite, is_suite, suite_names
 from libero_env.tasks.task import Suite, Task
 
 MAX_TASKS = 1000  # of a file
@@ -104,7 +104,7 @@ def get_task(key: str) -> Task:
     """
     if key.endswith(ENDINGS):
         return read_task(key)
-    if key in suite_names():
+    if is_suite(key):
         last = len(get_suite(key)) - 1
         raise LiberoError(
             f"{key} is a suite of {last + 1} tasks, not a task; write {key}/0 to {key}/{last}, or the name of a task "

@@ -4,7 +4,7 @@ from functools import cache
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks.builder import build_problem, language_from_name, load_data, load_scene
-from libero_env.tasks.published.suites import is_published, published_suite
+from libero_env.tasks.published.folders import is_published
 from libero_env.tasks.task import Suite, Task
 
 
@@ -40,7 +40,11 @@ def get_suite(name: str) -> Suite:
         UnknownNameError: No suite has this name; the message lists them.
         MissingPackageError: The suite is one of others, and its files are not here.
     """
-    return published_suite(name) if is_published(name) else _own_suite(name)
+    if not is_published(name):
+        return _own_suite(name)
+    from libero_env.tasks.published.suites import published_suite  # which needs models of objects
+
+    return published_suite(name)
 
 
 @cache

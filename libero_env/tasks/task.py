@@ -64,6 +64,11 @@ class Task:
         return f"{self.suite}/{self.index}"
 
     @property
+    def origin(self) -> "Task":
+        """Task of the benchmark that it is a variant of, by others: itself, unless it is one."""
+        return self
+
+    @property
     def start_task(self) -> "Task":
         """Task whose stored initial states it starts in: itself, unless it is a variant of another."""
         return self

@@ -23,6 +23,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
         LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
     """
     from libero_env.cli.tasks import find_tasks
+    from libero_env.tasks.published import require_available
     from lifelong.evaluation.protocols import choose_init_states
     from lifelong.evaluation.repeat import check_same
     from lifelong.evaluation.suite import SuiteEvaluation
@@ -35,10 +36,11 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
     tasks = find_tasks(args.suite) if args.suite else policy.tasks
     if not tasks:
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
+    require_available(tasks)
     protocol = _protocol(args, policy.protocol(card), tasks)
     identity, versions = {**policy.identity, "seed": args.seed}, installed_versions(args.assets)
     if earlier is None:
-        init_states = choose_init_states(args.starts, args.episodes, policy.selection)
+        init_states = choose_init_states(args.starts, _episodes(args, tasks), policy.selection)
     else:
         init_states = earlier.init_states
         check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=args.despite)
@@ -83,6 +85,22 @@ def _policy(args: argparse.Namespace) -> "PolicyUnderTest":
 
         return ServerPolicy(args)
     return UserPolicy(args) if _is_callable(args.policy) else RunPolicy(args)
+
+
+def _episodes(args: argparse.Namespace, tasks: "Sequence[Task]") -> int | None:
+    """Return the number of episodes of each task; None for all: LIBERO-Plus has one, from the first initial state.
+
+    Raises:
+        ConfigError: A task has fewer initial states.
+    """
+    scarce = [task for task in tasks if task.num_starts == 1]
+    from_plus = [task for task in tasks if task.suite.startswith("libero_plus_")]
+    count: int | None = args.episodes or (1 if len(from_plus) == len(tasks) else None)
+    if scarce and (count != 1 or args.starts == "selection"):
+        raise ConfigError(
+            f"{scarce[0].id} has one initial state, number 0: --episodes 1, without --starts selection"
+        )
+    return count
 
 
 def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -> "Card":

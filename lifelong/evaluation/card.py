@@ -288,7 +288,7 @@ class Card:
             ProtocolError: The card states none for the task's suite.
         """
         horizon = self.episode.horizon
-        found = horizon.get(task.suite) if isinstance(horizon, Mapping) else horizon
+        found = horizon.get(task.origin.suite) if isinstance(horizon, Mapping) else horizon
         if found is None and isinstance(horizon, Mapping) and not task.suite.startswith("libero_"):
             found = max(horizon.values())  # a user's own suite
         if found is None:

@@ -4,10 +4,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from libero_env.tasks.published import parse_plus_id
 from lifelong.evaluation.work_folder import UnitResult
 from lifelong.results.evaluation_file import TaskResult, overall
 from lifelong.results.metrics import Estimate
 
+PLUS = "libero_plus_"  # beginning of the names of suites of LIBERO-Plus
 RECENT = 50  # units from which the speed is taken
 
 
@@ -108,11 +110,14 @@ def table_row(result: TaskResult) -> str:
 
 
 def total_rows(results: Sequence[TaskResult]) -> list[str]:
-    """Format the rows of each suite, where there are several, and of all tasks together."""
+    """Format the rows of each suite and of each kind of LIBERO-Plus, where there are several, and of all together."""
     suites: dict[str, list[TaskResult]] = {}
+    kinds: dict[str, list[TaskResult]] = {}
     for result in results:
-        suites.setdefault(result.task.partition("/")[0], []).append(result)
-    rows = suites if len(suites) > 1 else {}
+        suites.setdefault(suite := result.task.partition("/")[0], []).append(result)
+        if suite.startswith(PLUS):
+            kinds.setdefault(f"  {parse_plus_id(result.name).kind}", []).append(result)
+    rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
     return [_total_row(name, found) for name, found in {**rows, "mean over tasks": results}.items()]
 
 

@@ -68,10 +68,8 @@ class LoadedRun:
             LifelongError: The run's embedding is defined for its own tasks only (one-hot).
         """
         names = [(t.name, t.language) for t in self.tasks]
-        if (task.name, task.language) in names:
-            found = self.language.embed(self.instructions)[
-                names.index((task.name, task.language)) - len(names)
-            ]
+        if (own := (task.origin.name, task.language)) in names:
+            found = self.language.embed(self.instructions)[names.index(own) - len(names)]
         else:  # another task, or one of its own in other words
             found = self.language.embed([*self.instructions, task.language])[-1]
         if len(found) != self.policy.spec.language_dim:
@@ -90,7 +88,8 @@ class LoadedRun:
     def acting(self, task: Task) -> Iterator[Policy]:
         """Yield the policy that acts on a task; for a task that is not the run's, that of the last task learned."""
         names = [t.name for t in self.tasks]
-        position = names.index(task.name) if task.name in names else self.learned
+        name = task.origin.name
+        position = names.index(name) if name in names else self.learned
         stage = next(stage for stage in self.stages if position in stage)
         with self.algorithm.policy_for(stage[-1], self.policy) as policy:
             yield policy

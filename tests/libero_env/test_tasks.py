@@ -218,7 +218,7 @@ def test_a_task_without_scene_is_refused(monkeypatch):
         suites, "load_data", lambda name: {"tasks": [TASK]} if name == "mine.yaml" else ["mine"]
     )
     with pytest.raises(LiberoError, match="task cook_it: neither it nor mine.yaml has the key 'scene'"):
-        get_suite.__wrapped__("mine")
+        suites._own_suite.__wrapped__("mine")
 
 
 def test_a_task_without_goal_is_refused():

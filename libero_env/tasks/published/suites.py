@@ -26,7 +26,6 @@ from libero_env.tasks.published.plus_id import KINDS, PlusVariant, parse_plus_id
 from libero_env.tasks.published.task import PublishedTask, RobotState, lacking
 from libero_env.tasks.task import Suite, Task
 
-PREFIXES = ("libero_plus_", "libero_pro_")
 AVAILABLE = "available"
 PRO_KINDS = {"swap": "swap", "object": "object", "language": "lan", "task": "task"}  # kind -> their ending
 _BASES = ("spatial", "object", "goal", "10")
@@ -38,15 +37,18 @@ _REWORDED = ("language", "task")  # kinds whose instruction is that of the task 
 _PROBLEM = re.compile(r"(\(\s*problem\s+libero_\w+?_manipulation)_\w+", re.IGNORECASE)
 
 
-def is_published(name: str) -> bool:
-    """Return whether a name is that of a suite of this module, whether its files are here or not."""
-    return name.startswith(PREFIXES)
-
-
 def published_names() -> tuple[str, ...]:
     """Return the names of the suites whose files are here, without endings."""
     plus = _plus_names() if find_folder(PLUS) else ()
     return (*plus, *(_pro_names() if find_folder(PRO) else ()))
+
+
+def published_sizes() -> dict[str, int]:
+    """Return the number of tasks of each of `published_names`."""
+    plus, pro = find_folder(PLUS), find_folder(PRO)
+    found = {name: (plus, _plus_base(name)) for name in _plus_names() if plus}
+    found |= {name: (pro, _pro_theirs(name)) for name in _pro_names() if pro}
+    return {name: len(_their_names(folder, theirs)) for name, (folder, theirs) in found.items() if folder}
 
 
 def published_suite(name: str) -> Suite:
@@ -64,12 +66,11 @@ def published_suite(name: str) -> Suite:
     known = (*_plus_names(), *_pro_names())
     if whole not in known:
         raise UnknownNameError("suite", whole, known)
-    if whole in _pro_names():
-        suite, valid = _pro_suite(whole, require_folder(PRO)), (AVAILABLE,)
-    else:
-        suite, valid = _plus_suite(whole, require_folder(PLUS)), (*KINDS, AVAILABLE)
+    is_plus = whole in _plus_names()
+    suite = _plus_suite(whole, require_folder(PLUS)) if is_plus else _pro_suite(whole, require_folder(PRO))
     if not colon:
         return suite
+    valid = (*(KINDS if is_plus else ()), AVAILABLE)
     if choice not in valid:
         raise UnknownNameError(f"part of {whole}", choice, valid)
     return Suite(name, tuple(task for task in suite.tasks if _is_chosen(task, choice)))
@@ -88,12 +89,22 @@ def _pro_names() -> tuple[str, ...]:
     return tuple(f"libero_pro_{base}_{kind}" for base in _BASES for kind in PRO_KINDS)
 
 
+def _plus_base(name: str) -> str:
+    """Return the suite of LIBERO that a suite of LIBERO-Plus varies, whose name it has there."""
+    return name.removesuffix(_SKIPPED).replace("libero_plus_", "libero_")
+
+
+def _pro_theirs(name: str) -> str:
+    """Return the name of a suite in LIBERO-PRO."""
+    base, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
+    return f"{base}_{PRO_KINDS[kind]}"
+
+
 @cache
 def _plus_suite(name: str, folder: Path) -> Suite:
-    short = name.removesuffix(_SKIPPED)
-    base_suite = short.replace("libero_plus_", "libero_")
+    base_suite = _plus_base(name)
     bases, known = _base_tasks(base_suite), _known_categories()
-    reading: RobotState = "skipped" if short != name else "overwritten"
+    reading: RobotState = "skipped" if name.endswith(_SKIPPED) else "overwritten"
     tasks = []
     for index, variant in enumerate(map(parse_plus_id, _their_names(folder, base_suite))):
         if variant.base not in bases:
@@ -112,13 +123,8 @@ def _plus_task(
     known: Collection[str],
 ) -> PublishedTask:
     file = folder / "bddl_files" / base.suite / f"{variant.file}.bddl"
-    states = folder / "init_files"
     own = variant.has_own_start
-    states = (
-        states / "libero_newobj" / base.suite / f"{variant.name}.pruned_init"
-        if own
-        else states / base.suite / f"{base.name}.pruned_init"
-    )
+    states = Path("libero_newobj", base.suite, variant.name) if own else Path(base.suite, base.name)
     problem = _read(file) if own or variant.language is not None else base.problem
     language = problem.language.lower() if variant.language is not None else base.language
     return PublishedTask(
@@ -131,7 +137,7 @@ def _plus_task(
         base=base,
         kind=variant.kind,
         file=file,
-        states_file=states,
+        states_file=folder / "init_files" / states.with_name(f"{states.name}.pruned_init"),
         has_own_start=own,
         variant=variant,
         robot_state=reading,
@@ -142,7 +148,7 @@ def _plus_task(
 @cache
 def _pro_suite(name: str, folder: Path) -> Suite:
     base_suite, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
-    theirs = f"{base_suite}_{PRO_KINDS[kind]}"
+    theirs = _pro_theirs(name)
     bases, known = _base_tasks(base_suite), _known_categories()
     tasks = []
     for index, base_name in enumerate(_their_names(folder, theirs)):

@@ -49,6 +49,11 @@ class PublishedTask(Task):
     lacks: str = ""
 
     @property
+    def origin(self) -> Task:
+        """Task of LIBERO that it is a variant of."""
+        return self.base
+
+    @property
     def start_task(self) -> Task:
         """Task whose stored initial states it starts in."""
         return self if self.has_own_start else self.base

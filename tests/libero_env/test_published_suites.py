@@ -1,0 +1,265 @@
+"""LIBERO-Plus and LIBERO-PRO as suites: their tasks, instructions, starts and environments.
+
+Most tests read small folders that are made as theirs are; those of the whole suites run where these are installed.
+"""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from libero_env import BatchEnv, LiberoEnv
+from libero_env.errors import BDDLError, InvalidInputError, LiberoError, MissingPackageError, UnknownNameError
+from libero_env.init_states.store import load_init_states, load_original_states
+from libero_env.perturbations.published import published_changes
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import get_suite, get_task, is_suite, suite_names
+from libero_env.tasks.published import camera_pose, joint_pose, published_names
+from libero_env.tasks.published.folders import PLUS, PRO, find_folder
+from libero_env.tasks.published.task import require_available
+from tests.harness.published import BASE, ENDINGS, REWORDED, base_task, write_plus, write_pro
+from tests.harness.published import PRO as PRO_WORDS
+
+BASE_WORDS = "put the bowl on the plate"
+
+
+@pytest.fixture
+def states():
+    """Initial states of the base task, as published ones are: without the poses of fixtures."""
+    scene = build_scene(base_task().problem)
+    return load_init_states(base_task(), scene)[:, : 1 + scene.model.nq + scene.model.nv]
+
+
+@pytest.fixture
+def plus(tmp_path, monkeypatch, states):
+    monkeypatch.setenv(
+        "LIBERO_PLUS", str(write_plus(tmp_path / "plus" / "libero" / "libero", states).parents[1])
+    )
+    return {task.name.removeprefix(f"{BASE}_"): task for task in get_suite("libero_plus_goal").tasks}
+
+
+@pytest.fixture
+def pro(tmp_path, monkeypatch, states):
+    monkeypatch.setenv("LIBERO_PRO", str(write_pro(tmp_path / "pro", states)))
+    return {
+        kind: get_suite(f"libero_pro_goal_{kind}").tasks[0] for kind in ("swap", "object", "language", "task")
+    }
+
+
+@pytest.mark.sim
+def test_tasks_are_the_variants_in_their_order(plus):
+    suite = get_suite("libero_plus_goal")
+    assert [task.name for task in suite.tasks] == [f"{BASE}_{ending}" for ending in ENDINGS]
+    assert [task.id for task in suite.tasks] == [f"libero_plus_goal/{i}" for i in range(len(ENDINGS))]
+    kinds = ["camera", "robot", "noise", "language", "light", "background", "layout", "layout"]
+    assert [task.kind for task in suite.tasks] == kinds
+    assert all(task.origin is base_task() for task in suite.tasks)
+    assert get_suite("libero_plus_goal:noise").tasks == (suite.tasks[2],)
+    assert get_task("libero_plus_goal/2") is suite.tasks[2]
+    assert "libero_plus_goal" in published_names() and not {*published_names()} & {*suite_names()}
+    assert is_suite("libero_plus_goal:noise") and not is_suite("libero_plus_goal/2")
+
+
+@pytest.mark.sim
+def test_instructions_have_no_word_of_a_files_name(plus, pro):
+    words = {ending: task.language for ending, task in plus.items()}
+    assert words.pop("language_7_view_0_0_100_0_0_initstate_0") == REWORDED.lower()
+    assert set(words.values()) == {BASE_WORDS}
+    # what their packages tell a policy: the words of the file's name, its ending and what it does not change included
+    leaked = plus["view_0_0_100_0_0_initstate_451"].name.replace("_", " ")
+    assert leaked == f"{BASE_WORDS} view 0 0 100 0 0 initstate 451"
+    assert {task.file.stem.replace("_", " ") for task in pro.values()} == {BASE_WORDS}
+    assert pro["language"].language == PRO_WORDS["lan"] and pro["task"].language == PRO_WORDS["task"]
+    assert pro["swap"].language == pro["object"].language == BASE_WORDS
+
+
+@pytest.mark.sim
+def test_what_nobody_has_is_told_by_kind(plus):
+    assert {ending: task.lacks for ending, task in plus.items() if task.lacks} == {
+        "light_1": "lights",
+        "tb_2": "the textures of table and wall",
+        "add_3": "models of can_of_soda__1",
+    }
+    available = get_suite("libero_plus_goal:available")
+    assert len(available) == 5 and not any(task.lacks for task in available.tasks)
+    require_available(available.tasks)
+    with pytest.raises(LiberoError, match=r"^3 of 8 tasks .*light 1, background 1, layout 1.*:available$"):
+        require_available(plus.values())
+    with pytest.raises(LiberoError, match="needs lights"):
+        LiberoEnv(plus["light_1"])
+
+
+@pytest.mark.sim
+def test_variants_start_where_their_base_task_does_unless_objects_were_moved(plus, states):
+    moved = plus["moved_level1_sample1"]
+    for task in plus.values():
+        found = load_original_states(task)
+        own = task.has_own_start
+        assert own == (task.kind == "layout") and task.num_starts == (1 if own else 50)
+        np.testing.assert_array_equal(found, states[:1] if own else states)
+    base = load_init_states(base_task(), build_scene(base_task().problem))
+    robot = plus["view_0_0_100_0_0_initstate_451"]
+    np.testing.assert_array_equal(load_init_states(robot, build_scene(robot.problem)), base)
+    scene = build_scene(moved.problem)
+    assert load_init_states(moved, scene).shape == (1, base.shape[1])
+    with LiberoEnvClosing(moved, cameras=()) as env, pytest.raises(InvalidInputError, match="0 to 0"):
+        env.reset(options={"init_state": 1})
+
+
+@pytest.mark.sim
+def test_a_camera_is_moved_in_pictures_and_nowhere_else(plus):
+    task = plus[ENDINGS[0]]
+    before, after = observe(base_task()), observe(task)
+    assert (before["agentview_rgb"] != after["agentview_rgb"]).mean() > 0.3
+    for name in before:
+        if name != "agentview_rgb":
+            np.testing.assert_array_equal(before[name], after[name])
+    (look,) = published_changes(task)
+    pose = camera_pose("table", task.variant.view)
+    np.testing.assert_array_equal(look.cameras["agentview"].pos, pose.pos)
+    np.testing.assert_array_equal(look.cameras["agentview"].quat, pose.quat_wxyz)
+
+
+@pytest.mark.sim
+def test_noise_is_on_one_camera_and_depends_on_no_batch(plus):
+    task = plus["view_0_0_100_0_0_initstate_0_noise_47"]
+    before, after = observe(base_task()), observe(task)
+    assert (before["agentview_rgb"] != after["agentview_rgb"]).mean() > 0.3
+    np.testing.assert_array_equal(before["eye_in_hand_rgb"], after["eye_in_hand_rgb"])
+    env = BatchEnv(task, 2, camera_size=(64, 64), num_threads=1, drawing="faithful")
+    try:
+        both, _ = env.reset(options={"init_state": np.array([1, 0])})
+        np.testing.assert_array_equal(both["agentview_rgb"][1], after["agentview_rgb"])
+        assert (both["agentview_rgb"][0] != both["agentview_rgb"][1]).any()
+    finally:
+        env.close()
+
+
+@pytest.mark.sim
+def test_both_readings_of_the_arms_pose(plus):
+    overwritten = plus["view_0_0_100_0_0_initstate_451"]
+    skipped = get_suite("libero_plus_goal_skipped").tasks[overwritten.index]
+    assert (overwritten.robot_state, skipped.robot_state) == ("overwritten", "skipped")
+    assert overwritten.id != skipped.id
+    rows = {}
+    for task in (base_task(), overwritten, skipped):
+        with LiberoEnvClosing(task, cameras=()) as env:
+            env.reset(options={"init_state": 3})
+            world = env.world
+            rows[task.id] = world.physics_state(0)
+            at_rest = joint_pose(0 if task is base_task() else 451)
+            np.testing.assert_array_equal(world.simulations.rest, at_rest)
+            env.step(np.zeros(7))
+            rows[task.id, "later"] = world.physics_state(0)
+    base, first, second = (rows[task.id] for task in (base_task(), overwritten, skipped))
+    np.testing.assert_array_equal(base, first)
+    assert (
+        rows[base_task().id, "later"] != rows[overwritten.id, "later"]
+    ).any()  # the controller keeps the pose
+    np.testing.assert_array_equal(second[1:8], joint_pose(451))
+    np.testing.assert_array_equal(np.delete(base, range(1, 8)), np.delete(second, range(1, 8)))
+
+
+@pytest.mark.sim
+def test_suites_of_libero_pro_are_read(pro, states):
+    assert {kind: task.name for kind, task in pro.items()} == {kind: f"{BASE}_{kind}" for kind in pro}
+    assert {kind: task.has_own_start for kind, task in pro.items()} == {
+        "swap": True,
+        "object": True,
+        "language": False,
+        "task": False,
+    }
+    assert pro["object"].lacks == "models of yellow_plate" and not pro["swap"].lacks
+    assert pro["task"].problem.goal != pro["language"].problem.goal == base_task().problem.goal
+    np.testing.assert_array_equal(load_original_states(pro["swap"]), states)
+    assert get_suite("libero_pro_goal_object:available").tasks == ()
+
+
+def test_without_their_files_one_line_says_what_brings_them(tmp_path, monkeypatch):
+    for variable in ("LIBERO_PLUS", "LIBERO_PRO"):
+        monkeypatch.setenv(variable, str(tmp_path))
+        name = "libero_plus_goal" if variable == "LIBERO_PLUS" else "libero_pro_goal_swap"
+        with pytest.raises(InvalidInputError, match=rf"{variable}.* pip install"):
+            get_suite(name)
+        monkeypatch.delenv(variable)
+        monkeypatch.setattr("libero_env.tasks.published.folders.metadata.distribution", absent)
+        with pytest.raises(MissingPackageError, match="type pip install --no-deps"):
+            get_suite(name)
+    assert published_names() == ()
+    with pytest.raises(UnknownNameError, match="libero_plus_goal"):
+        get_suite("libero_plus_gaol")
+
+
+@pytest.mark.sim
+def test_files_that_are_not_theirs_are_refused(plus, tmp_path, monkeypatch):
+    with pytest.raises(UnknownNameError, match="camera"):
+        get_suite("libero_plus_goal:camra")
+    for text, what in (
+        ("import os\nlibero_task_map = os.environ\n", "no list of tasks"),
+        ("libero_task_map = [1]\n", "no dictionary"),
+        ("libero_task_map = {'libero_goal': [1]}\n", "no suite libero_goal"),
+        ("libero_task_map = {'libero_goal': ['fly_light_1']}\n", "no task of libero_goal"),
+        (f"libero_task_map = {{'libero_goal': ['{BASE}_snow_1']}}\n", "no id of LIBERO-Plus"),
+        (f"libero_task_map = {{'libero_goal': ['{BASE}_level1_sample1']}}\n", "does not exist"),
+    ):
+        folder = tmp_path / what.replace(" ", "_")
+        (folder / "bddl_files").mkdir(parents=True)
+        (folder / "benchmark").mkdir()
+        (folder / "benchmark" / "libero_suite_task_map.py").write_text(text)
+        monkeypatch.setenv("LIBERO_PLUS", str(folder))
+        with pytest.raises(InvalidInputError, match=what):
+            get_suite("libero_plus_goal")
+    (folder / "bddl_files" / "libero_goal").mkdir()
+    (folder / "bddl_files" / "libero_goal" / f"{BASE}_level1_sample1.bddl").write_text("(define")
+    with pytest.raises(BDDLError):
+        get_suite("libero_plus_goal")
+
+
+@pytest.mark.skipif(find_folder(PLUS) is None, reason="LIBERO-Plus is not installed")
+def test_all_variants_of_libero_plus_are_read():
+    kinds, lacking = Counter(), Counter()
+    for base, count in {"spatial": 2402, "object": 2518, "goal": 2591, "10": 2519}.items():
+        suite = get_suite(f"libero_plus_{base}")
+        assert len(suite) == count
+        kinds.update(task.kind for task in suite.tasks)
+        lacking.update(task.kind for task in suite.tasks if task.lacks)
+        plain = [task for task in suite.tasks if task.kind != "language"]
+        assert all(task.language == task.origin.language for task in plain)
+        assert not any("initstate" in task.language for task in suite.tasks)
+    changed = {"camera": 1599, "robot": 1550, "noise": 1601, "language": 1537}
+    assert kinds == {**changed, "light": 1142, "background": 1076, "layout": 1525}
+    assert lacking == {"light": 1142, "background": 1076, "layout": 829}
+
+
+@pytest.mark.skipif(find_folder(PRO) is None, reason="LIBERO-PRO is not installed")
+def test_all_suites_of_libero_pro_are_read():
+    names = [name for name in published_names() if name.startswith("libero_pro_")]
+    assert len(names) == 16
+    for name in names:
+        suite = get_suite(name)
+        assert len(suite) == 10
+        own = [task.language != task.origin.language for task in suite.tasks]
+        assert all(own) if name.endswith(("_language", "_task")) else not any(own)
+
+
+class LiberoEnvClosing(LiberoEnv):
+    """A `LiberoEnv` that a `with` statement closes."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+def observe(task) -> dict[str, np.ndarray]:
+    """Return the first observation from initial state 0."""
+    with LiberoEnvClosing(task, camera_size=(64, 64), drawing="faithful") as env:
+        return env.reset(options={"init_state": 0})[0]
+
+
+def absent(name: str):
+    """Raise as for a distribution that is not installed."""
+    from importlib.metadata import PackageNotFoundError
+
+    raise PackageNotFoundError(name)
