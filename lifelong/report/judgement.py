@@ -17,12 +17,11 @@ from lifelong.results.differences import (
     Difference,
     count,
     difference,
-    holm,
     mcnemar_exact,
     score_interval,
 )
 from lifelong.results.group_scores import GroupScores, group_scores
-from lifelong.results.metrics import Estimate, wilson_interval
+from lifelong.results.intervals import Estimate, holm, wilson_interval
 from lifelong.results.power import Question, shown_difference
 from lifelong.results.sequential import ALPHA, SequentialTest, sequential_test
 from lifelong.results.summary import json_safe

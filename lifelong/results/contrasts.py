@@ -8,7 +8,7 @@ be estimated from a dozen methods). The p-values of all pairs are adjusted by Ho
 by simulation: experiments/comparisons.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -23,7 +23,7 @@ from lifelong.results.components import (
     p_values,
     quantiles,
 )
-from lifelong.results.intervals import Estimate
+from lifelong.results.intervals import Estimate, holm
 
 PRIOR_DF = 3.0
 
@@ -180,13 +180,3 @@ def _difference(
         least=float(least),
         power=TEST_POWER,
     )
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Return the p-values of a family of tests, adjusted by Holm: p_(i) · (m - i), never falling, at most 1."""
-    p = np.asarray(p_values, dtype=float)
-    order = np.argsort(p, kind="stable")
-    steps = np.minimum(1.0, np.maximum.accumulate(p[order] * (len(p) - np.arange(len(p)))))
-    found = np.empty(len(p))
-    found[order] = steps
-    return [float(value) for value in found]

@@ -282,13 +282,3 @@ def chance_difference(counts: Counts, confidence: float = CONFIDENCE) -> float:
     m = counts.discordant
     most = stats.binom.ppf(0.5 + confidence / 2, m, 0.5)
     return float(abs(2 * most - m) / counts.pairs)
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Return the p-values of a family of tests, adjusted by Holm (1979), as statsmodels computes them."""
-    if not p_values:
-        return []
-    require_package("statsmodels", "judge")
-    from statsmodels.stats.multitest import multipletests
-
-    return [float(p) for p in multipletests(list(p_values), method="holm")[1]]

@@ -1,5 +1,6 @@
-"""Values with their confidence intervals: of success rates, and of weighted sums of independent ones."""
+"""Values with their confidence intervals, and p-values of several tests."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -71,3 +72,13 @@ def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high
     down = np.where(w > 0, w * (p - lo), w * (p - hi))
     up = np.where(w > 0, w * (hi - p), w * (lo - p))
     return Estimate(value, value - float(np.hypot.reduce(down)), value + float(np.hypot.reduce(up)))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return the p-values of a family of tests, adjusted by Holm: p_(i) · (m - i), never falling, at most 1."""
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p, kind="stable")
+    steps = np.minimum(1.0, np.maximum.accumulate(p[order] * (len(p) - np.arange(len(p)))))
+    found = np.empty(len(p))
+    found[order] = steps
+    return [float(value) for value in found]

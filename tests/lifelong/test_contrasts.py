@@ -10,8 +10,9 @@ import pytest
 from lifelong.report.statistics import findings, statistics
 from lifelong.results.clusters import contributions
 from lifelong.results.components import Components, Sample, components, interval, p_values, quantiles
-from lifelong.results.contrasts import contrasts, holm, spreads
+from lifelong.results.contrasts import contrasts, spreads
 from lifelong.results.curves import Curve
+from lifelong.results.intervals import holm
 from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.samples import Member, samples
 from lifelong.results.scores import METRIC_NAMES, METRIC_RANGES, Cell, Scores
@@ -26,10 +27,10 @@ EXPERIMENT = Path(__file__).parents[2] / "experiments" / "comparisons"
 def simulation(monkeypatch):
     """The modules of experiments/comparisons."""
     monkeypatch.syspath_prepend(str(EXPERIMENT))
-    import coverage
+    import interval_coverage
     import model
 
-    return model, coverage
+    return model, interval_coverage
 
 
 def run(rng: np.random.Generator, tasks: int = 5, starts: int = 10, level: float = 0.7, repeat: bool = False):
@@ -179,7 +180,7 @@ def test_the_simulated_samples_are_those_of_runs(simulation):
 
 @pytest.mark.parametrize("seeds", [2, 3, 5])
 def test_intervals_hold(simulation, seeds: int):
-    """A short version of experiments/comparisons/coverage.py; percentiles of two or three seeds cover 60 to 85 %."""
+    """A short version of experiments/comparisons; percentiles of two or three seeds cover 60 to 85 %."""
     model, coverage = simulation
     found = coverage.coverage(model.Design(5, 10, seeds), 40, np.random.default_rng(seeds))
     shares = {(m, n): pair[0] for m, row in found.items() for n, pair in row.items()}

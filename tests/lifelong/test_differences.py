@@ -19,7 +19,6 @@ from lifelong.results.differences import (  # noqa: E402
     bootstrap_tasks,
     chance_difference,
     difference,
-    holm,
     mcnemar_exact,
     score_interval,
     sign_flip_test,
@@ -87,11 +86,6 @@ def test_sign_flips_of_several_runs_are_exact_for_few_starts():
     flips = [np.dot(signs, moved[:4]) for signs in itertools.product((1, -1), repeat=4)]
     expected = np.mean(np.abs(flips) >= abs(moved.sum()) - 1e-12)
     assert sign_flip_test(moved) == pytest.approx(expected)
-
-
-def test_holm_is_in_steps_and_never_falls():
-    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert holm([]) == []
 
 
 def test_the_bootstrap_draws_starts_within_tasks():

@@ -1,6 +1,6 @@
 """Coverage of the intervals and false differences of the tests, on simulated experiments.
 
-python experiments/comparisons/coverage.py --simulations 2000          # prints the tables of the README
+python experiments/comparisons/interval_coverage.py --simulations 2000          # prints the tables of the README
 """
 
 import argparse
