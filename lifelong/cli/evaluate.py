@@ -19,22 +19,43 @@ if TYPE_CHECKING:
     from lifelong.results.evaluation_file import EvaluationResult
 
 POLICY_HELP = (
-    "a run's directory, one of its checkpoints, module:function that returns an object with predict, or the "
-    "address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://...; or a result, "
-    "eval.json, which is run again"
+    "a run's directory, one of its checkpoints, module:function that returns an object with predict, the address of a "
+    "policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://..., or `expert`, the scripted one"
 )
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:
     """Add the command `libero eval POLICY`."""
     parser = subparsers.add_parser("eval", help="success of a policy on tasks; resumes where it was stopped")
-    parser.add_argument("policy", nargs="?", help=POLICY_HELP)
-    _add_episode_options(parser.add_argument_group("what is measured"))
-    _add_work_options(parser.add_argument_group("how it is run"))
+    parser.add_argument(
+        "policy", nargs="?", help=f"{POLICY_HELP}; or a result, eval.json, which is run again"
+    )
+    measured = parser.add_argument_group("what is measured")
+    add_episode_options(measured)
+    measured.add_argument(
+        "--perturb",
+        metavar="KIND=SEVERITY,...",
+        help="perturbations, such as camera=0.3,light=0.5, see `libero perturb list` (default: the protocol's, none)",
+    )
+    work = parser.add_argument_group("how it is run")
+    add_work_options(work)
+    work.add_argument(
+        "--despite",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="of a result that is run again: what may differ from then, such as mujoco (default: nothing)",
+    )
+    work.add_argument(
+        "--status",
+        type=arguments.path,
+        metavar="OUT",
+        help="only say how far the evaluation in this folder is",
+    )
     parser.set_defaults(run=run_eval)
 
 
-def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
+def add_episode_options(parser: argparse._ArgumentGroup) -> None:
     """Add what decides the numbers: tasks, starts, protocol, models."""
     parser.add_argument("--suite", nargs="+", metavar="SUITE", help="suites or tasks (default: the run's)")
     options.add_after(parser, "of a run: ")
@@ -53,12 +74,7 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
         help="libero, openpi, ..., see `libero protocols list`; or a card of your own, my.yaml (default: libero)",
     )
     parser.add_argument(
-        "--perturb",
-        metavar="KIND=SEVERITY,...",
-        help="perturbations, such as camera=0.3,light=0.5, see `libero perturb list` (default: the protocol's, none)",
-    )
-    parser.add_argument(
-        "--perturb-seed", type=arguments.seed, default=0, help="seed of what --perturb draws (default: 0)"
+        "--perturb-seed", type=arguments.seed, default=0, help="seed of what perturbations draw (default: 0)"
     )
     parser.add_argument(
         "--horizon", type=arguments.horizon, help="maximum number of control steps (default: the protocol's)"
@@ -96,7 +112,7 @@ def _add_episode_options(parser: argparse._ArgumentGroup) -> None:
     )
 
 
-def _add_work_options(parser: argparse._ArgumentGroup) -> None:
+def add_work_options(parser: argparse._ArgumentGroup) -> None:
     """Add what does not change the numbers: folder, processes, device."""
     parser.add_argument(
         "--out", type=arguments.path, help="folder of the results (default: in the run, or eval/POLICY)"
@@ -135,19 +151,6 @@ def _add_work_options(parser: argparse._ArgumentGroup) -> None:
         help="requests that a policy server gets before it has answered (default: one for each episode of a batch)",
     )
     parser.add_argument("--again", action="store_true", help="repeat what is done already")
-    parser.add_argument(
-        "--despite",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="of a result that is run again: what may differ from then, such as mujoco (default: nothing)",
-    )
-    parser.add_argument(
-        "--status",
-        type=arguments.path,
-        metavar="OUT",
-        help="only say how far the evaluation in this folder is",
-    )
 
 
 def run_eval(args: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 from libero_env.cli import arguments, assets, demos, ending, objects, perturb, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
-from lifelong.cli import check, compare, evaluate, protocols, relearn, saliency, serve, tune
+from lifelong.cli import check, compare, evaluate, protocols, relearn, robustness, saliency, serve, tune
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -172,6 +172,7 @@ COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     register_doctor,
     tasks.register,
     perturb.register,
+    robustness.register,
     demos.register,
     assets.register,
     objects.register,

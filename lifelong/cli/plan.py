@@ -15,9 +15,15 @@ if TYPE_CHECKING:
     from lifelong.evaluation.suite import SuiteEvaluation
     from lifelong.results.evaluation_file import EvaluationResult
 
+EXPERT = "expert"  # name of the scripted expert among policies
 
-def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
+
+def plan_eval(args: argparse.Namespace, policy: "PolicyUnderTest | None" = None) -> "SuiteEvaluation":
     """Return the evaluation that the arguments describe.
+
+    Args:
+        args: Arguments of `libero eval`.
+        policy: The policy that they name, where it is loaded already.
 
     Raises:
         LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
@@ -32,7 +38,7 @@ def plan_eval(args: argparse.Namespace) -> "SuiteEvaluation":
 
     args, card, earlier = _what_to_repeat(args)
     _check_idle(args, earlier)
-    policy = _policy(args)
+    policy = policy or load_policy(args)
     tasks = find_tasks(args.suite) if args.suite else policy.tasks
     if not tasks:
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
@@ -76,10 +82,14 @@ def _what_to_repeat(
     return repeated(args, earlier), repeated_card(earlier, args.policy), earlier
 
 
-def _policy(args: argparse.Namespace) -> "PolicyUnderTest":
-    """Return the policy that the arguments name: a server's, a user's own, or a run's."""
+def load_policy(args: argparse.Namespace) -> "PolicyUnderTest":
+    """Return the policy that the arguments name: the expert, a server's, a user's own, or a run's."""
     from lifelong.evaluation.candidates import RunPolicy, UserPolicy
 
+    if _is_expert(args.policy):
+        from lifelong.evaluation.expert import ExpertPolicy
+
+        return ExpertPolicy(args)
     if "://" in args.policy:
         from lifelong.evaluation.servers.policy import ServerPolicy
 
@@ -128,11 +138,15 @@ def _check_idle(args: argparse.Namespace, earlier: "EvaluationResult | None") ->
     Raises:
         ConfigError: One is; the message says what it is of.
     """
-    own_run = "://" not in args.policy and not _is_callable(args.policy)
+    own_run = "://" not in args.policy and not _is_callable(args.policy) and not _is_expert(args.policy)
     if args.after is not None and not own_run:
         raise ConfigError(f"--after is of runs, and {args.policy} is none")
     if args.despite and earlier is None:
         raise ConfigError(f"--despite is of results that are run again, and {args.policy} is none")
+
+
+def _is_expert(text: str) -> bool:
+    return text == EXPERT and not Path(text).exists()
 
 
 def _is_callable(text: str) -> bool:

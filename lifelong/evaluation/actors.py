@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from lifelong.evaluation.inputs import Adapter, Obs, PolicyInput
 from lifelong.policies.base import Policy
 from lifelong.training.precision import autocast
 from lifelong.types import Observation, PolicySpec
+
+if TYPE_CHECKING:
+    from libero_env.envs.world import World
 
 ACTION_DIM = 7
 
@@ -43,6 +46,14 @@ class TakesNote(Protocol):
 
     def note(self, over: np.ndarray, success: np.ndarray) -> None:
         """Take note of which episodes are over, (B,) bool, and which have succeeded, (B,) bool."""
+
+
+@runtime_checkable
+class WatchesWorld(Protocol):
+    """An actor that sees the whole state, as no policy does; it is given the simulations before the episodes."""
+
+    def watch(self, world: "World") -> None:
+        """Receive the simulations of the next episodes."""
 
 
 @dataclass

@@ -17,7 +17,7 @@ from libero_env.errors import LiberoError
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Actor
+from lifelong.evaluation.actors import Actor, WatchesWorld
 from lifelong.evaluation.card import Card
 from lifelong.evaluation.claims import LEASE
 from lifelong.evaluation.environment_record import common_environment, describe_environment
@@ -196,6 +196,8 @@ class SuiteEvaluation:
     def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
         filmed = [i for i, start in enumerate(unit.starts) if start in self.init_states[: self.videos]]
         with self.actor(_acted_task(env, unit), unit.starts) as actor:
+            if isinstance(actor, WatchesWorld):
+                actor.watch(env.world)  # type: ignore[attr-defined]  # of every environment of this package
             return run_episodes(
                 actor,
                 env,

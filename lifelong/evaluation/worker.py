@@ -55,6 +55,20 @@ class Worker:
             ConfigError: The folder holds another evaluation.
             EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
         """
+        found = self.work(wait=True)
+        assert found is not None
+        return found
+
+    def work(self, *, wait: bool) -> EvaluationResult | None:
+        """Evaluate units; write `eval.json` and return its content if all are done.
+
+        Args:
+            wait: Whether to wait for units that others work on; otherwise None is returned where no other is left.
+
+        Raises:
+            ConfigError: The folder holds another evaluation.
+            EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
+        """
         evaluation, folder = self._evaluation, self._folder
         folder.join(evaluation.units)
         self._attempts_before = {name: found.attempts for name, found in folder.errors().items()}
@@ -67,6 +81,8 @@ class Worker:
                 choice = self._order(done, errors, held)
                 if taken := folder.take(choice):
                     self._work(*taken)
+                elif not wait:
+                    return None
                 elif choice or held:
                     self._say(done)
                     time.sleep(POLL)
