@@ -156,7 +156,11 @@ class Outcomes:
         weights = _trapezoid(np.array(severities))
         area = _estimate(float(rates @ weights), draws @ weights, self._least, 0.0, 1.0)
         kept = _estimate(
-            _share(rates @ weights, rates[0]), _shares(draws @ weights, draws[:, 0]), self._least, 0.0, np.inf
+            _share(float(rates @ weights), float(rates[0])),
+            _shares(draws @ weights, draws[:, 0]),
+            self._least,
+            0.0,
+            np.inf,
         )
         halves = np.array([half_severity(severities, row) for row in draws])
         low, high = np.quantile(halves, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="nearest")
