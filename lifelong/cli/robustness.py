@@ -32,9 +32,8 @@ examples:
   libero robustness expert --suite libero_goal --out eval/expert         what can be done at all
   libero robustness my_policy:make --suite libero_goal --kinds camera light --beside expert=eval/expert
   libero robustness --report er=eval/er sequential=eval/sequential       only the page, of what is there"""
-KINDS = tuple(
-    "layout distractors instruction camera light table background robot noise occlusion latency gain".split()
-)
+KINDS: tuple[str, ...] = ("layout", "distractors", "instruction", "camera", "light", "table", "background")
+KINDS += ("robot", "noise", "occlusion", "latency", "gain")
 SEVERITIES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PAIRS = ("camera=0.4,light=0.4", "camera=0.4,robot=0.4", "light=0.4,noise=0.4")
 EPISODES = 10
