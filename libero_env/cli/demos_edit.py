@@ -1,6 +1,7 @@
 """`libero demos replay|rerender|filter|export`: replay, render again, filter and convert demonstration files."""
 
 import argparse
+from dataclasses import replace
 
 from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers, modalities
@@ -30,12 +31,21 @@ def _register_replay(commands: Subparsers) -> None:
 
 
 def _register_rerender(commands: Subparsers) -> None:
-    parser = commands.add_parser("rerender", help="render the recorded states again, with other cameras")
+    parser = commands.add_parser(
+        "rerender", help="render the recorded states again, with other cameras or under perturbations"
+    )
     add = parser.add_argument
     add("file", type=arguments.path)
     add("out", type=arguments.path, help="the new file")
-    add("--size", type=arguments.size, default=(128, 128), help="128 or 120x160 (default: 128)")
-    add("--cameras", nargs="+", default=("agentview", "robot0_eye_in_hand"))
+    add(
+        "--perturb",
+        metavar="KIND=SEVERITY,...",
+        help="perturbations that change what is seen or said, such as camera=0.3,light=0.5; each demonstration has a "
+        "draw of its own. Size, cameras and drawing are then by default those of the file",
+    )
+    add("--perturb-seed", type=arguments.seed, default=0, help="seed of the draws (default: 0)")
+    add("--size", type=arguments.size, help="128 or 120x160 (default: 128)")
+    add("--cameras", nargs="+", help="cameras to render (default: agentview robot0_eye_in_hand)")
     add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
     add("--depth", action="store_true", help="render depth too, in metres")
     add("--segmentation", choices=("instance", "class", "element"), help="render a segmentation too")
@@ -116,9 +126,17 @@ def run_rerender(args: argparse.Namespace) -> None:
     """Write the new file and describe it."""
     from libero_env.demos.curate import describe
     from libero_env.demos.observe import RenderConfig
-    from libero_env.demos.replay import rerender
+    from libero_env.demos.replay import recorded_rendering, rerender
+    from libero_env.perturbations import parse_perturbations
 
-    config = RenderConfig(tuple(args.cameras), args.size, modalities(args), args.drawing)
+    config = RenderConfig(drawing=args.drawing)
+    if args.perturb is not None:
+        perturb = parse_perturbations(args.perturb, args.perturb_seed)
+        config = replace(recorded_rendering(args.file), perturb=perturb)
+    chosen = {"cameras": args.cameras and tuple(args.cameras), "size": args.size, "drawing": args.drawing}
+    if args.depth or args.segmentation or args.perturb is None:
+        chosen["modalities"] = modalities(args)
+    config = replace(config, **{key: value for key, value in chosen.items() if value is not None})
     print(describe(rerender(args.file, args.out, config, assets=args.assets)))
 
 

@@ -46,17 +46,20 @@ class DemoStats:
         successes: Number of demonstrations that reached the goal.
         noops: Number of no-op steps, see `noop_steps`.
         faults: What is wrong although it can be read.
+        perturb: Perturbations under which it was rendered, as text.
     """
 
     lengths: tuple[int, ...]
     successes: int
     noops: int
     faults: tuple[str, ...] = ()
+    perturb: str = ""
 
     def __str__(self) -> str:
         steps, n = sum(self.lengths), len(self.lengths)
         length = f"{min(self.lengths)}-{max(self.lengths)} steps (mean {steps / n:.0f})"
-        return f"{length}, {self.successes} of {n} successful, {100 * self.noops / steps:.1f} % no-ops"
+        done = f"{self.successes} of {n} successful, {100 * self.noops / steps:.1f} % no-ops"
+        return f"{length}, {done}" + (f", rendered under {self.perturb}" if self.perturb else "")
 
 
 def recorded_robot(file: Path) -> str:
@@ -181,7 +184,7 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     for key, value in (("num_demos", len(lengths)), ("total", sum(lengths))):
         if (stated := attributes.get(key, value)) != value:
             faults.append(f"attribute {key} is {stated}; expected {value}")
-    return DemoStats(tuple(lengths), successes, noops, tuple(faults))
+    return DemoStats(tuple(lengths), successes, noops, tuple(faults), str(attributes.get("perturb", "")))
 
 
 def _faults(episode: Episode, shapes: dict[str, tuple[int, ...]]) -> Iterator[str]:
@@ -309,4 +312,5 @@ def describe(file: Path) -> str:
     parts = (f"{len(names)} demonstrations", f"{steps} steps", images, f"failed attempts: {failed}")
     pairing = header.get("pairing", "libero")
     more = f"pairing: {pairing}, models: {models}, {show_bytes(file.stat().st_size)}"
+    more += f", rendered under {header['perturb']}" if "perturb" in header else ""
     return f"{file}: {', '.join(parts)}, {more}"

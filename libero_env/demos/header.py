@@ -32,6 +32,7 @@ class _Header(TypedDict, total=False):
     env_args: _Text
     models: _Text
     generator: _Text
+    perturb: _Text
     num_demos: _Count
     total: _Count
     num_failed_attempts: _Count

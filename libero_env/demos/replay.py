@@ -1,23 +1,28 @@
 """Replaying recorded demonstrations by their states or by their actions, and rendering them again."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
+import h5py
 import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.contents import demo_number
+from libero_env.demos.contents import demo_names, demo_number
 from libero_env.demos.curate import read_episodes, recorded_robot, recorded_task
-from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.header import read_header
-from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
+from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
+from libero_env.demos.header import json_attribute, read_header
+from libero_env.demos.observe import PERTURBED_HEADER, RenderConfig, StateRenderer, fixture_poses
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
 from libero_env.sim.observations import image_name
-from libero_env.sim.scene import Scene, default_drawing
+from libero_env.sim.scene import FAST, Scene, default_drawing
+from libero_env.tasks import Task
 
 REPLAY_MODES = ("state", "action")
 
@@ -122,18 +127,24 @@ def rerender(
     config: RenderConfig,
     *,
     assets: Pack | str | Path | None = None,
+    task: Task | None = None,
+    limit: int | None = None,
     progress: bool | None = None,
 ) -> Path:
-    """Write the demonstrations of a file with other observations: cameras, resolution, depth or segmentation.
+    """Write the demonstrations of a file with other observations: cameras, resolution, modalities, perturbations.
 
     The observations are those of the recorded states, so the new file has "aligned" pairing, whatever the old one had.
-    An interrupted call can be repeated: it resumes where it stopped.
+    Perturbations under which the file was rendered are not kept. Each demonstration has a draw of its own, named by its
+    name; actions and states stay as they are to the bit. An interrupted call can be repeated: it resumes where it
+    stopped.
 
     Args:
         file: File to read.
         target: File to write.
         config: What is rendered.
         assets: Where models come from, as for `LiberoEnv`.
+        task: Task that was recorded, which names the draws of perturbations; by default the one that the file states.
+        limit: Largest number of demonstrations to write, the first of the file; None for all.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Returns:
@@ -145,14 +156,14 @@ def rerender(
     """
     if target.exists() and target.samefile(file):
         raise DemoError(f"{target} is the file to read; choose another name")
-    header = {k: v for k, v in read_header(file).items() if k not in ("cameras", "pictures", "drawing")}
     pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
     config = replace(config, drawing=config.drawing or default_drawing(pack))
-    writer = DemoWriter(target, {**header, **config.header(), "pairing": "aligned"})
-    recorded = writer.recorded_states()
-    renderer = _renderer(file, config, assets)
+    renderer = StateRenderer(task or recorded_task(file), config, assets, robot=recorded_robot(file))
+    writer = DemoWriter(target, _rendered_header(file, config, renderer.env.task.language))
     try:
-        for name, episode in progress_bar(read_episodes(file), desc="render", unit="demo", progress=progress):
+        recorded = writer.recorded_states()
+        episodes = islice(read_episodes(file), limit)
+        for name, episode in progress_bar(episodes, desc="render", unit="demo", progress=progress):
             if (index := demo_number(name)) in recorded:
                 if not np.array_equal(recorded[index], episode.states):
                     raise DemoError(
@@ -160,11 +171,43 @@ def rerender(
                     )
             else:
                 fixtures = checked_fixtures(file, name, episode, renderer.scene)
-                obs, robot_states = renderer.render_states(episode.states, fixtures)
+                obs, robot_states = renderer.render_states(episode.states, fixtures, name)
                 writer.write(index, replace(episode, obs=obs, robot_states=robot_states))
     finally:
         renderer.close()
     return writer.finish()
+
+
+def recorded_rendering(file: Path) -> RenderConfig:
+    """Return how the images of a file were rendered, without the perturbations under which they may have been.
+
+    Raises:
+        DemoError: It is not a demonstration file.
+    """
+    header, default = read_header(file), RenderConfig()
+    with open_demo_file(file) as handle:
+        names = demo_names(handle, file)
+        obs = handle["data"][names[0]].get("obs") if names else None
+        views = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
+        size = tuple(map(int, obs[views[0]].shape[1:3])) if views and obs is not None else default.size
+    return RenderConfig(
+        tuple(map(str, header.get("cameras", default.cameras))),
+        (size[0], size[1]),
+        tuple(map(str, header.get("pictures", default.modalities))),
+        header.get("drawing", FAST if "generator" in header else None),
+    )
+
+
+def _rendered_header(file: Path, config: RenderConfig, instruction: str) -> dict[str, Any]:
+    """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it."""
+    before = read_header(file)
+    given_up = ("cameras", "pictures", "drawing", *PERTURBED_HEADER)
+    header = {k: v for k, v in before.items() if k not in given_up}
+    header |= {**config.header(), "pairing": "aligned"}
+    if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":
+        info = json_attribute(before, "problem_info", file)
+        header["problem_info"] = json.dumps({**info, "language_instruction": instruction})
+    return header
 
 
 def rerun_actions(file: Path, target: Path) -> Path:

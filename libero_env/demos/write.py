@@ -48,6 +48,8 @@ _CONFIG_KEYS = (
     "variation",
     "model_digest",
     "filter",
+    "perturb",
+    "perturb_draws",
 )
 
 

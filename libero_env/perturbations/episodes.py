@@ -143,9 +143,13 @@ class PerturbedEpisodes:
                 if (moved := change.apply(self._scene, row)) is None:
                     raise PlacementError(f"{self._task.id}, start {start}: {change} is not possible")
                 row = moved
+        self.open(i, start)
+        return row
+
+    def open(self, i: int, start: object) -> None:
+        """Begin the observations and actions of the episode of a start in simulation i."""
         self._starts[i] = start
         self.resume(i, 0)
-        return row
 
     def resume(self, i: int, steps: int) -> None:
         """Go on with the episode of simulation i after so many steps; filters with a memory begin a new one."""

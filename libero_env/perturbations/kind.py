@@ -38,6 +38,11 @@ class Kind:
     draws_materials: bool = False
     exclusive: bool = False
 
+    @property
+    def is_rendered(self) -> bool:
+        """Whether only what is seen or said changes, so that recorded states can be rendered with it."""
+        return self.layer in ("look", "observation") or (self.layer == "problem" and not self.physical)
+
     def amount(self, severity: float) -> float:
         """Return the amount at a severity in [0, 1], in `unit`."""
         if self.scale == "ratio":

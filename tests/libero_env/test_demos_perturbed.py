@@ -1,0 +1,138 @@
+"""Demonstrations rendered again under perturbations: other pictures and words, the same actions and states."""
+
+import json
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from libero_env.demos.curate import describe, examine, read_episodes
+from libero_env.demos.generate import generate
+from libero_env.demos.observe import RenderConfig, rendered_perturbations
+from libero_env.demos.read import read_demos
+from libero_env.demos.replay import recorded_rendering, rerender
+from libero_env.envs.env import LiberoEnv
+from libero_env.errors import DemoError, InvalidInputError
+from libero_env.perturbations import parse_perturbations
+from libero_env.tasks import get_task
+from lifelong.cli.main import main
+from tests.harness.demos import STEPS, wander
+
+TASK, SIZE = "libero_goal/3", (24, 32)
+MIXED = "instruction=0.6,camera=0.5,light=0.5,noise=0.2,proprio_bias=0.5"
+KEPT = ("actions", "expert_actions", "states", "robot_states")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("libero_env.demos.record.run_experts", wander)
+        out = tmp_path_factory.mktemp("demos") / "goal.hdf5"
+        return generate(TASK, 2, path=out, camera_size=SIZE, workers=1, progress=False)
+
+
+@pytest.fixture(scope="module")
+def other(path, tmp_path_factory):
+    return perturbed(path, tmp_path_factory.mktemp("other") / "other.hdf5", MIXED)
+
+
+def perturbed(path, target, perturb, **more):
+    config = replace(recorded_rendering(path), perturb=perturb)
+    return rerender(path, target, config, progress=False, **more)
+
+
+def contents(file):
+    found = {}
+    with h5py.File(file) as handle:
+        handle["data"].visititems(
+            lambda name, node: found.update({f"{name}@{k}": v for k, v in node.attrs.items()})
+        )
+        handle["data"].visititems(
+            lambda name, node: found.update({name: node[()]}) if isinstance(node, h5py.Dataset) else None
+        )
+        return found | {f"@{k}": v for k, v in handle["data"].attrs.items()}
+
+
+def assert_same(file, other):
+    before, after = contents(file), contents(other)
+    assert before.keys() == after.keys() and "demo_1/obs/agentview_rgb" in before
+    for key, value in before.items():
+        np.testing.assert_array_equal(value, after[key], err_msg=key)
+
+
+@pytest.mark.sim
+def test_severity_0_is_the_file_to_the_bit(path, tmp_path):
+    assert_same(path, perturbed(path, tmp_path / "again.hdf5", "camera=0,noise=0,instruction=0"))
+
+
+@pytest.mark.sim
+def test_what_happened_stays_and_what_is_seen_and_said_changes(path, other):
+    text, target = MIXED, other
+    for (name, old), (_, new) in zip(read_episodes(path), read_episodes(target), strict=True):
+        for key in KEPT:
+            np.testing.assert_array_equal(getattr(old, key), getattr(new, key), err_msg=f"{name} {key}")
+        for key in ("agentview_rgb", "eye_in_hand_rgb", "joint_states", "ee_ori"):
+            assert (old.obs[key] != new.obs[key]).mean() > 0.5, (name, key)
+    with h5py.File(path) as old, h5py.File(target) as new:
+        assert new["data"].attrs["perturb"] == text
+        said = [json.loads(f["data"].attrs["problem_info"])["language_instruction"] for f in (old, new)]
+    env = LiberoEnv(TASK, cameras=(), perturb="instruction=0.6")
+    assert said == [get_task(TASK).language, env.task.language] and said[0] != said[1]
+    assert f"rendered under {text}" in describe(target) and f"rendered under {text}" in str(examine(target))
+    assert "rendered under" not in describe(path) and not examine(target).faults
+    assert len(read_demos(target)) == 2
+
+
+@pytest.mark.sim
+def test_each_demonstration_has_a_draw_of_its_own(path, tmp_path):
+    """It depends on neither the others nor on interruptions, and goes on in the same direction with severity."""
+    whole = perturbed(path, tmp_path / "whole.hdf5", "light=0.8,dropped_frames=0.5")
+    part = perturbed(path, tmp_path / "part.hdf5", "light=0.8,dropped_frames=0.5", limit=1)
+    assert len(read_demos(part)) == 1
+    assert_same(whole, perturbed(path, part, "light=0.8,dropped_frames=0.5"))
+    means = [[e.obs["agentview_rgb"][0].mean() for _, e in read_episodes(file)] for file in (path, whole)]
+    ratios = np.divide(*means)
+    assert abs(ratios[1] - ratios[0]) > 0.05  # each has its own light
+    seeded = perturbed(path, tmp_path / "seeded.hdf5", parse_perturbations("light=0.8", seed=1))
+    for (_, one), (_, two) in zip(read_episodes(whole), read_episodes(seeded), strict=True):
+        assert (one.obs["agentview_rgb"][0] != two.obs["agentview_rgb"][0]).any()
+
+
+@pytest.mark.sim
+def test_filters_with_a_memory_act_along_each_demonstration(path, tmp_path):
+    late = perturbed(path, tmp_path / "late.hdf5", "latency=0.3")  # 3 steps
+    for (_, old), (_, new) in zip(read_episodes(path), read_episodes(late), strict=True):
+        for key in ("agentview_rgb", "eye_in_hand_rgb"):
+            shown = old.obs[key][np.maximum(np.arange(STEPS) - 3, 0)]
+            np.testing.assert_array_equal(new.obs[key], shown)
+        np.testing.assert_array_equal(new.obs["joint_states"], old.obs["joint_states"])
+
+
+@pytest.mark.sim
+def test_it_can_be_undone_and_is_not_mixed(path, other, tmp_path):
+    assert_same(path, rerender(other, tmp_path / "back.hdf5", recorded_rendering(other), progress=False))
+    with pytest.raises(DemoError, match="perturb"):
+        perturbed(path, other, "blur=0.5")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("text", ["robot=0.3", "delay=0.5", "layout=0.2", "camera=0.1,goal=1"])
+def test_what_changes_what_happens_is_refused(text):
+    with pytest.raises(InvalidInputError, match="changes what happens.*valid: .*instruction.*camera"):
+        RenderConfig(perturb=text)
+    assert rendered_perturbations("camera=0.5,robot=0") == parse_perturbations("camera=0.5")
+
+
+@pytest.mark.sim
+def test_the_command(path, tmp_path, capsys):
+    target = tmp_path / "other.hdf5"
+    assert (
+        main(["demos", "rerender", str(path), str(target), "--perturb", "fov=0.5", "--perturb-seed", "3"])
+        == 0
+    )
+    said = capsys.readouterr().out
+    assert "24x32 pixels" in said and "rendered under fov=0.5@3" in said
+    assert main(["demos", "check", str(target)]) == 0 and "fov=0.5@3" in capsys.readouterr().out
+    assert main(["demos", "rerender", str(path), str(tmp_path / "x"), "--perturb", "robot=0.5"]) != 0
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "x").exists()
