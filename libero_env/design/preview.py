@@ -11,6 +11,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError
 from libero_env.expert import Expert
 from libero_env.expert.rollout import MAX_STEPS
+from libero_env.perturbations.value import Perturbation
 from libero_env.sim.observations import image_name
 from libero_env.tasks.task import Task
 from libero_env.timing import CONTROL_HZ
@@ -58,6 +59,46 @@ def contact_sheet(
     path.parent.mkdir(parents=True, exist_ok=True)
     sheet.save(path)
     return path
+
+
+def compare_starts(
+    task: Task,
+    perturbations: Sequence[Perturbation],
+    path: Path,
+    *,
+    start: int = 0,
+    cameras: Sequence[str] = ("agentview", "robot0_eye_in_hand"),
+    size: int = 256,
+) -> Task:
+    """Write a PNG of an initial state as it is, and beside it with perturbations, a row for each camera.
+
+    Args:
+        task: Task of a suite.
+        perturbations: Perturbations.
+        path: File to write; its folder is created.
+        start: Number of the initial state.
+        cameras: Names of cameras.
+        size: Height and width of a picture, [pixels].
+
+    Returns:
+        The task as the perturbations change it.
+
+    Raises:
+        PlacementError: The perturbations make no valid start of it.
+    """
+    check_picture(path)
+    columns = []
+    for perturb in ((), tuple(perturbations)):
+        env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size), perturb=perturb)
+        try:
+            obs = _reset(env, start)
+            columns.append(np.concatenate([obs[image_name(c, "rgb")] for c in cameras]))
+            changed = env.task
+        finally:
+            env.close()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate(columns, axis=1)).save(path)
+    return changed
 
 
 def check_picture(path: Path) -> None:

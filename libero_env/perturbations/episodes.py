@@ -14,6 +14,7 @@ from libero_env.perturbations.channels import (
     ObservationFilter,
 )
 from libero_env.perturbations.drawing import DrawKey, draw_key
+from libero_env.perturbations.draws import first_attempt
 from libero_env.perturbations.kind import Layer
 from libero_env.perturbations.pairing import Pairing
 from libero_env.perturbations.starts import StartChange
@@ -76,7 +77,8 @@ class PerturbedEpisodes:
     Attributes:
         perturbations: Perturbations, which are drawn for each start.
         has_memory: Whether an observation depends on earlier images.
-        attempts: Number of draws that were not valid, of each simulation and perturbation, (num, n).
+        attempts: Number of the draw that is used, from 0, of each simulation and perturbation, (num, n): how many
+            before it were not valid, or not solved.
         steps: Number of control steps of each episode, (num,).
     """
 
@@ -119,9 +121,10 @@ class PerturbedEpisodes:
         """
         problem = self._of("problem")
         seeds = [self.perturbations[k].seed for k in problem]
-        paired, attempt = self._pairing.row(row, draw_key("pairing", sum(seeds), self._task.id, start))
+        first = max((self._first(k, start) for k in problem), default=0)
+        paired, attempt = self._pairing.row(row, draw_key("pairing", sum(seeds), self._task.id, start), first)
         self.attempts[i] = 0
-        self.attempts[i, problem] = attempt
+        self.attempts[i, problem] = [attempt + self._first(k, "") for k in problem]
         return paired
 
     def begin(self, i: int, start: object, row: np.ndarray, again: int = 0) -> np.ndarray:
@@ -136,6 +139,8 @@ class PerturbedEpisodes:
         Raises:
             PlacementError: No draw of a start is valid.
         """
+        for k in self._of("action"):
+            self.attempts[i, k] = self._first(k, start)
         for k in self._of("start"):
             row = self._drawn_start(i, k, start, row, again)
         for change in self._fixed:
@@ -192,18 +197,26 @@ class PerturbedEpisodes:
         """Return the positions of the perturbations of a layer."""
         return [k for k, one in enumerate(self.perturbations) if one.definition.layer == layer]
 
+    def _first(self, k: int, start: object) -> int:
+        """Return the number of the first draw of a perturbation that may be used for a start."""
+        return first_attempt(self.perturbations[k], self._task.id, start)
+
     def _key(self, k: int, start: object, attempt: int = 0) -> DrawKey:
         one = self.perturbations[k]
         return draw_key(one.kind, one.seed, self._task.id, start, attempt)
 
     def _draw(self, k: int, start: object, attempt: int = 0) -> Any:
         """Return the change that a perturbation draws for a start."""
-        one, rng = self.perturbations[k], self._key(k, start, attempt).generator()
+        one = self.perturbations[k]
+        if one.definition.layer == "action":
+            attempt = self._first(k, start)
+        rng = self._key(k, start, attempt).generator()
         needs_scene = one.definition.layer in ("look", "start")
         return one.definition.draw(one.amount, rng, *([self._scene] if needs_scene else []))
 
     def _drawn_start(self, i: int, k: int, start: object, row: np.ndarray, again: int) -> np.ndarray:
-        for attempt in range(again, again + TRIES):
+        first = self._first(k, start) + again
+        for attempt in range(first, first + TRIES):
             moved = self._draw(k, start, attempt).apply(self._scene, row)
             if moved is not None:
                 self.attempts[i, k] = attempt
@@ -215,7 +228,8 @@ class PerturbedEpisodes:
     def _keyed(self, layer: Layer, start: object) -> list[tuple[Any, DrawKey]]:
         """Return the filters of a layer, with the keys of their channels: those that are drawn, then fixed ones."""
         kind = ObservationFilter if layer == "observation" else ActionFilter
-        drawn = [(self._draw(k, start), self._key(k, start)) for k in self._of(layer)]
+        attempts = {k: self._first(k, start) if layer == "action" else 0 for k in self._of(layer)}
+        drawn = [(self._draw(k, start), self._key(k, start, n)) for k, n in attempts.items()]
         fixed = [one for one in self._fixed if isinstance(one, kind)]
         keys = [draw_key(f"fixed {j}", 0, self._task.id, start) for j in range(len(fixed))]
         return [*drawn, *zip(fixed, keys, strict=True)]

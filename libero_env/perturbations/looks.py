@@ -1,6 +1,7 @@
 """Kinds that change how a scene is drawn: the agent's camera, the lights, surfaces, colours of objects."""
 
 import colorsys
+from weakref import WeakKeyDictionary
 
 import mujoco
 import numpy as np
@@ -88,6 +89,7 @@ _MATERIALS = {
     "table": ("table", "room_table_texture", "room_living_room_table", "room_desk", "room_coffee_table"),
 }
 _FURNITURE = ("furniture_colours", "room_living_room", "room_kitchen_background", "room_office_book_shelf")
+_SAME = 0.02  # RGB distance below which a style is the surface's own
 _LIKE = 0.08  # styles whose distances differ by less are drawn from
 _COLOUR_WORDS = ("black", "white", "red", "yellow")
 
@@ -109,23 +111,30 @@ def _background(distance: float, rng: np.random.Generator, scene: Scene) -> Look
 
 def _other_style(scene: Scene, kind: str, distance: float, rng: np.random.Generator) -> dict[str, str]:
     """Return the material of a surface -> one whose mean colour is about as far from its own, in RGB."""
-    model = scene.model
-    names = {model.material(i).name: i for i in range(model.nmat)}
-    own = [name for name in _MATERIALS[kind] if name in names]
+    colours = _mean_colours(scene.model)
+    own = [name for name in _MATERIALS[kind] if name in colours]
     if not own:
         return {}
-    colour = _mean_colour(model, names[own[0]])
     spare = [SPARE + name for name in surface_styles()]
-    away = {name: float(np.linalg.norm(_mean_colour(model, names[name]) - colour)) for name in spare}
-    away = {name: far for name, far in away.items() if far > 0.02}  # the same style is among them
+    away = {name: float(np.linalg.norm(colours[name] - colours[own[0]])) for name in spare}
+    away = {name: far for name, far in away.items() if far > _SAME}
     nearest = min(abs(far - distance) for far in away.values())
     chosen = [name for name, far in away.items() if abs(far - distance) <= nearest + _LIKE * min(1, distance)]
     return {own[0]: chosen[rng.integers(len(chosen))]}
 
 
+_colours: "WeakKeyDictionary[mujoco.MjModel, dict[str, np.ndarray]]" = WeakKeyDictionary()
+
+
+def _mean_colours(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Return the mean colour of each material, RGB from 0 to 1."""
+    if model not in _colours:
+        _colours[model] = {model.material(i).name: _mean_colour(model, i) for i in range(model.nmat)}
+    return _colours[model]
+
+
 def _mean_colour(model: mujoco.MjModel, material: int) -> np.ndarray:
-    """Return the mean colour of a material, RGB from 0 to 1."""
-    texture = max(model.mat_texid[material])
+    texture = int(np.max(model.mat_texid[material]))
     if texture < 0:
         return model.mat_rgba[material, :3]
     start, channels = model.tex_adr[texture], model.tex_nchannel[texture]

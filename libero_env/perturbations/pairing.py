@@ -41,33 +41,34 @@ class Pairing:
         self._shifts = dict(moved(base.problem, scene.problem))
         self._is_same = old == new and not self._shifts
         self._simulations: LoopSimulations | None = None
-        self._known: dict[bytes, tuple[np.ndarray, int]] = {}
+        self._known: dict[tuple[bytes, int], tuple[np.ndarray, int]] = {}
 
-    def row(self, row: np.ndarray, key: DrawKey) -> tuple[np.ndarray, int]:
-        """Return the start that belongs to a start of the scene without perturbations, and how many draws were invalid.
+    def row(self, row: np.ndarray, key: DrawKey, first: int = 0) -> tuple[np.ndarray, int]:
+        """Return the start that belongs to a start of the scene without perturbations, and the number of its draw.
 
         Args:
             row: State [time, qpos, qvel, poses of the fixtures] of that scene.
             key: Key of the places of what is new.
+            first: Number of the first draw of these places that may be used.
 
         Raises:
             PlacementError: What is new finds no free place, or a moved object collides.
         """
         if self._is_same:
             return row, 0
-        name = row.tobytes()
+        name = row.tobytes(), first
         if name not in self._known:
-            self._known[name] = self._first_valid(row, key)
+            self._known[name] = self._first_valid(row, key, first)
         paired, attempt = self._known[name]
         return paired.copy(), attempt
 
-    def _first_valid(self, row: np.ndarray, key: DrawKey) -> tuple[np.ndarray, int]:
+    def _first_valid(self, row: np.ndarray, key: DrawKey, first: int) -> tuple[np.ndarray, int]:
         paired, before = self._paired(row), contacts(self.base, row)
         if not (self.added or self.exchanged):
             if self._shifts and len(contacts(self.scene, paired)) > len(before):
                 raise PlacementError(f"{self.scene.problem.language!r}: a moved object touches another")
             return paired, 0
-        for attempt in range(_ATTEMPTS):
+        for attempt in range(first, first + _ATTEMPTS):
             try:
                 return self._settled(self._placed(paired, key.generator("places", attempt))), attempt
             except PlacementError as error:

@@ -10,6 +10,7 @@ import numpy as np
 from libero_env.assets.arena import WORKSPACES
 from libero_env.errors import InvalidInputError
 from libero_env.perturbations.drawing import draw_key
+from libero_env.perturbations.draws import first_attempt
 from libero_env.perturbations.goals import is_named, other_goals
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kind import Kind
@@ -45,18 +46,19 @@ def perturb_task(task: Task, perturbations: "Iterable[Perturbation]", scene: Sce
         PlacementError: Objects cannot be moved so far.
     """
     found = [one for one in perturbations if one.definition.layer == "problem" and one.severity]
-    key = (task, tuple(found), scene.pack, scene.robot)
+    attempts = [first_attempt(one, task.id) for one in found]
+    key = (task, tuple(found), tuple(attempts), scene.pack, scene.robot)
     if key not in _known:
-        _known[key] = _perturbed(task, found, scene)
+        _known[key] = _perturbed(task, zip(found, attempts, strict=True), scene)
         while len(_known) > _MAX_KNOWN:
             _known.popitem(last=False)
     return _known[key]
 
 
-def _perturbed(task: Task, perturbations: "Iterable[Perturbation]", scene: Scene) -> Task:
+def _perturbed(task: Task, drawn: "Iterable[tuple[Perturbation, int]]", scene: Scene) -> Task:
     changed = task
-    for one in perturbations:
-        rng = draw_key(one.kind, one.seed, task.id).generator()
+    for one, attempt in drawn:
+        rng = draw_key(one.kind, one.seed, task.id, attempt=attempt).generator()
         changed = one.definition.draw(one.amount, rng, changed, scene)
     return changed
 

@@ -1,0 +1,225 @@
+"""Certificates of perturbed tasks: whether the expert solves what was drawn, and which draw it solves otherwise.
+
+The expert reads the state of the simulation, so that only kinds that change physics, start or actions matter to it.
+Results are on disk after each task and perturbation, so that a stopped run resumes.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from libero_env.demos.config import GENERATOR
+from libero_env.design.certify import NO_HORIZON
+from libero_env.envs.batch import BatchEnv
+from libero_env.errors import InvalidInputError, LiberoError, PlacementError
+from libero_env.expert import Expert, Shapes
+from libero_env.expert.rollout import run_experts
+from libero_env.parallel import as_finished, progress_bar, spawn_pool
+from libero_env.perturbations.draws import draw_name, trying
+from libero_env.perturbations.value import Perturbation
+from libero_env.storage import atomic_write_text
+from libero_env.tasks import Task
+
+REDRAWS = 3  # further draws of what the expert does not solve
+
+
+@dataclass(frozen=True)
+class PerturbedCertificate:
+    """Results of one task under one perturbation.
+
+    Attributes:
+        task: Id of the task without perturbations.
+        perturbation: The perturbation as text.
+        digest: Digest of what the results depend on.
+        solved: Index of an initial state -> number of the first draw from which the expert reaches the goal.
+        failures: Index of an initial state -> why the expert reaches it from none of the draws.
+        drawn_again: Number of draws of the whole task that the expert did not solve from most of the starts.
+        impossible: Why the task cannot be perturbed in this way; "" where it can.
+    """
+
+    task: str
+    perturbation: str
+    digest: str
+    solved: Mapping[str, int] = field(default_factory=dict)
+    failures: Mapping[str, str] = field(default_factory=dict)
+    drawn_again: int = 0
+    impossible: str = ""
+
+    @property
+    def starts(self) -> int:
+        """Number of initial states."""
+        return len(self.solved) + len(self.failures)
+
+    @property
+    def at_first(self) -> int:
+        """Number of initial states from which the expert solves the first draw."""
+        return sum(attempt == 0 for attempt in self.solved.values()) if not self.drawn_again else 0
+
+    @property
+    def redraws(self) -> int:
+        """Number of draws that were made again."""
+        return self.drawn_again + sum(self.solved.values())
+
+    def attempts(self, one: Perturbation) -> dict[str, int]:
+        """Return the numbers of the draws to use that are not the first, by their names."""
+        own = {draw_name(one, self.task, start): n for start, n in self.solved.items() if n}
+        return own | ({draw_name(one, self.task): self.drawn_again} if self.drawn_again else {})
+
+
+def certify_perturbed(
+    tasks: Sequence[Task],
+    perturbations: Sequence[Perturbation],
+    starts: int = 10,
+    *,
+    redraws: int = REDRAWS,
+    jobs: int = 1,
+    out: Path,
+    again: bool = False,
+) -> list[PerturbedCertificate]:
+    """Run the expert on perturbed tasks, from the first initial states of each.
+
+    Args:
+        tasks: Tasks of suites.
+        perturbations: Perturbations, each by itself.
+        starts: Number of initial states of each task, at most 50.
+        redraws: Number of further draws where the expert fails.
+        jobs: Number of processes; the results do not depend on it.
+        out: Folder of the results, a file for each task and perturbation.
+        again: Whether to run again what is there.
+
+    Returns:
+        A certificate for each task and perturbation, in order.
+
+    Raises:
+        LiberoError: A file in `out` is no certificate.
+    """
+    units = [(task, one) for task in tasks for one in perturbations]
+    found: dict[int, PerturbedCertificate] = {}
+    for k, (task, one) in enumerate(units):
+        if not again and (stored := _stored(_path(out, task, one), _digest(task, one, starts, redraws))):
+            found[k] = stored
+    left = [k for k in range(len(units)) if k not in found]
+    with progress_bar(total=len(units), initial=len(found), desc="certify", unit="variant") as bar:
+        for k, certificate in _run(units, left, starts, redraws, jobs):
+            found[k] = certificate
+            atomic_write_text(_path(out, *units[k]), json.dumps(asdict(certificate), indent=1) + "\n")
+            bar.update()
+    return [found[k] for k in range(len(units))]
+
+
+def _run(
+    units: Sequence[tuple[Task, Perturbation]], left: Sequence[int], starts: int, redraws: int, jobs: int
+) -> Iterator[tuple[int, PerturbedCertificate]]:
+    if jobs <= 1:
+        for k in left:
+            yield k, attempt_perturbed(*units[k], range(starts), redraws)
+        return
+    with spawn_pool(jobs) as pool:
+        futures = {pool.submit(attempt_perturbed, *units[k], range(starts), redraws): k for k in left}
+        for future in as_finished(futures):
+            yield futures[future], future.result()
+
+
+def attempt_perturbed(
+    task: Task, one: Perturbation, starts: Sequence[int], redraws: int = REDRAWS
+) -> PerturbedCertificate:
+    """Return the certificate of a task under a perturbation.
+
+    What the expert does not solve is drawn again for the start; where it solves less than half of the starts, and the
+    perturbation is drawn for the whole task, that is drawn again first.
+    """
+    digest, whole = _digest(task, one, len(starts), redraws), 0
+    try:
+        outcomes = _outcomes(task, one, starts, 0, whole)
+        while one.definition.layer == "problem" and whole < redraws and 2 * _won(outcomes) < len(starts):
+            whole += 1
+            outcomes = _outcomes(task, one, starts, 0, whole)
+    except InvalidInputError as error:
+        return PerturbedCertificate(task.id, str(one), digest, impossible=str(error))
+    solved = {start: 0 for start, reason in outcomes.items() if not reason}
+    for attempt in range(1, redraws + 1):
+        pending = [start for start in starts if start not in solved]
+        if not pending:
+            break
+        outcomes |= _outcomes(task, one, pending, attempt, whole)
+        solved |= {start: attempt for start in pending if not outcomes[start]}
+    failures = {str(start): outcomes[start] for start in starts if start not in solved}
+    by_start = {str(start): solved[start] for start in starts if start in solved}
+    return PerturbedCertificate(task.id, str(one), digest, by_start, failures, whole)
+
+
+def _won(outcomes: Mapping[int, str]) -> int:
+    return sum(not reason for reason in outcomes.values())
+
+
+def _outcomes(
+    task: Task, one: Perturbation, starts: Sequence[int], attempt: int, whole: int
+) -> dict[int, str]:
+    """Return why the expert fails from each start with the draws of a number; "" where it succeeds."""
+    attempts = {draw_name(one, task.id, start): attempt for start in starts} | {
+        draw_name(one, task.id): whole
+    }
+    try:
+        with trying(attempts):
+            env = BatchEnv(task, len(starts), num_threads=1, cameras=(), horizon=NO_HORIZON, perturb=[one])
+            try:
+                env.reset(options={"init_state": list(starts)})
+                seeds = [np.random.default_rng([task.index, start]) for start in starts]
+                shapes = Shapes(env.world.scene)
+                found = run_experts(env, [Expert(env.task, seed, shapes=shapes) for seed in seeds])
+            finally:
+                env.close()
+    except InvalidInputError:
+        raise
+    except PlacementError as error:
+        if len(starts) == 1:
+            return {starts[0]: str(error)}
+        return {k: v for start in starts for k, v in _outcomes(task, one, [start], attempt, whole).items()}
+    except LiberoError as error:
+        return dict.fromkeys(starts, str(error))
+    return {start: "" if a.success else a.reason for start, a in zip(starts, found, strict=True)}
+
+
+def shares_table(
+    certificates: Sequence[PerturbedCertificate], perturbations: Sequence[Perturbation]
+) -> list[str]:
+    """Return a line for each perturbation: how much of it the expert solves at first, and after draws were repeated."""
+    lines = [
+        f"{'perturbation':22} {'starts':>6} {'at first':>9} {'in the end':>11} {'redraws':>8}  not possible"
+    ]
+    for one in perturbations:
+        own = [c for c in certificates if c.perturbation == str(one)]
+        total, impossible = sum(c.starts for c in own), [c.task for c in own if c.impossible]
+        share = [
+            100 * n / max(total, 1) for n in (sum(c.at_first for c in own), sum(len(c.solved) for c in own))
+        ]
+        again = sum(c.redraws for c in own)
+        words = f"{len(impossible)} of {len(own)} tasks" if impossible else ""
+        lines.append(f"{one!s:22} {total:6d} {share[0]:8.1f}% {share[1]:10.1f}% {again:8d}  {words}".rstrip())
+    return lines
+
+
+def _path(folder: Path, task: Task, one: Perturbation) -> Path:
+    return folder / task.suite / f"{task.index:02d}" / f"{one}.json"
+
+
+def _digest(task: Task, one: Perturbation, starts: int, redraws: int) -> str:
+    kind = one.definition
+    parts = (task.bddl_text, str(one), kind.at_one, starts, redraws, GENERATOR, mujoco.__version__)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+def _stored(path: Path, digest: str) -> PerturbedCertificate | None:
+    """Return the certificate on disk if it is of the same task, perturbation and expert."""
+    if not path.is_file():
+        return None
+    try:
+        found = PerturbedCertificate(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
+    return found if found.digest == digest else None

@@ -1,0 +1,113 @@
+"""Certificates of perturbations: what the expert does not solve is drawn again, counted, and kept."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from libero_env import LiberoEnv
+from libero_env.design import certify_perturbed
+from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
+from libero_env.errors import LiberoError
+from libero_env.perturbations import Perturbation, draws
+from libero_env.tasks import get_suite, get_task
+from lifelong.cli.main import main
+
+TASK = get_task("libero_goal/3")
+ROBOT = Perturbation("robot", 0.4)
+
+
+@pytest.fixture
+def expert(monkeypatch):
+    """An expert that solves what `solves` says, of the starts that it is given."""
+    seen = SimpleNamespace(solves=lambda row: True, joints=[])
+
+    def run(env, experts):
+        rows = env.world.simulations.fields["qpos"][: len(experts), :7]
+        seen.joints.append(rows.copy())
+        return [SimpleNamespace(success=bool(seen.solves(row)), reason="too far") for row in rows]
+
+    monkeypatch.setattr(certify_perturbed, "run_experts", run)
+    monkeypatch.setattr(certify_perturbed, "Shapes", lambda scene: None)
+    return seen
+
+
+def test_what_the_expert_does_not_solve_is_drawn_again_for_that_start(expert):
+    first = attempt_perturbed(TASK, ROBOT, range(3))
+    assert first.solved == {"0": 0, "1": 0, "2": 0} and first.at_first == 3 and first.redraws == 0
+    failing = expert.joints[0][1]
+    expert.solves = lambda row: not np.array_equal(row, failing)
+    found = attempt_perturbed(TASK, ROBOT, range(3))
+    assert found.solved == {"0": 0, "1": 1, "2": 0} and found.redraws == 1 and found.at_first == 2
+    name = draws.draw_name(ROBOT, TASK.id, 1)
+    assert found.attempts(ROBOT) == {name: 1}
+
+    env = LiberoEnv(TASK, cameras=(), perturb=[ROBOT])
+    with draws.trying(found.attempts(ROBOT)):
+        observation, info = env.reset(options={"init_state": 1})
+    assert info["attempts"].tolist() == [1] and not np.array_equal(observation["joint_states"], failing)
+    assert np.array_equal(observation["joint_states"], expert.joints[-1][0])
+    observation, info = env.reset(options={"init_state": 1})
+    assert info["attempts"].tolist() == [0] and np.array_equal(observation["joint_states"], failing)
+    env.close()
+
+
+def test_a_task_that_is_mostly_not_solved_is_drawn_again_as_a_whole(expert):
+    expert.solves = lambda row: len(expert.joints) > 2
+    found = attempt_perturbed(TASK, Perturbation("layout", 0.4), range(2))
+    assert found.drawn_again == 2 and found.solved == {"0": 0, "1": 0}
+    assert list(found.attempts(Perturbation("layout", 0.4)).values()) == [2]
+    expert.solves = lambda row: False
+    found = attempt_perturbed(TASK, ROBOT, range(2))
+    assert found.failures == {"0": "too far", "1": "too far"} and found.at_first == 0 and found.redraws == 0
+    assert len(expert.joints) == 3 + 1 + REDRAWS
+
+
+def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(draws, "kept_path", lambda: tmp_path / "draws.json")
+    words = [
+        "perturb",
+        "certify",
+        "libero_goal/3",
+        "--kinds",
+        "robot",
+        "gain",
+        "--severities",
+        "0.4",
+        "--starts",
+        "2",
+    ]
+    words += ["--jobs", "1", "--out", str(tmp_path)]
+    expert.solves = lambda row: len(expert.joints) > 1
+    assert main([*words, "--keep"]) == 0
+    text = capsys.readouterr().out
+    assert "robot=0.4                   2      0.0%      100.0%        2" in text
+    kept = json.loads((tmp_path / "draws.json").read_text())
+    assert kept == {draws.draw_name(ROBOT, "libero_goal/3", start): 1 for start in (0, 1)}
+    count = len(expert.joints)
+    assert main(words) == 0 and len(expert.joints) == count
+    (file,) = tmp_path.glob("*/*/robot*.json")
+    file.write_text("{}")
+    assert main(words) == 2 and "not a certificate" in capsys.readouterr().err
+
+
+def test_a_task_that_cannot_be_perturbed_is_told(expert):
+    found = attempt_perturbed(get_suite("libero_90").tasks[12], Perturbation("objects", 1.0), range(2))
+    assert "no object" in found.impossible and found.starts == 0
+    assert "1 of 1 tasks" in shares_table([found], [Perturbation("objects", 1.0)])[1]
+
+
+def test_a_picture_shows_both(tmp_path):
+    out = tmp_path / "a.png"
+    assert (
+        main(["perturb", "show", "libero_goal/1", "--perturb", "light=1", "--size", "32", "--out", str(out)])
+        == 0
+    )
+    picture = np.asarray(Image.open(out))
+    assert picture.shape == (64, 64, 3) and not np.array_equal(picture[:, :32], picture[:, 32:])
+    with pytest.raises(LiberoError, match="ends in"):
+        from libero_env.design.preview import compare_starts
+
+        compare_starts(TASK, [], tmp_path / "a.txt")
