@@ -134,6 +134,7 @@ def attempt_perturbed(
     perturbation is drawn for the whole task, that is drawn again first.
     """
     digest, whole = _digest(task, one, len(starts), redraws), 0
+    redraws = redraws if one.definition.is_drawn else 0
     try:
         outcomes = _outcomes(task, one, starts, 0, whole)
         while one.definition.layer == "problem" and whole < redraws and 2 * _won(outcomes) < len(starts):

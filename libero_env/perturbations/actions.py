@@ -91,11 +91,12 @@ KINDS = (
         "delay",
         "action",
         "control steps",
-        8,
+        4,
         "actions are executed this many steps of 50 ms later",
         lambda steps, rng: ActionDelay(int(steps)),
         scale="count",
         physical=True,
+        is_drawn=False,
     ),
     Kind(
         "gain",

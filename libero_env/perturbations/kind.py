@@ -23,6 +23,7 @@ class Kind:
         scale: How the amount grows: `linear`, in proportion to severity; `ratio`, from 1 in equal factors; `count`, in
             whole numbers from 1.
         physical: Whether what can be solved changes: physics, start, or actions.
+        is_drawn: Whether anything is drawn, so that another draw may be solved where one is not.
         draws_materials: Whether scenes need materials to draw with, see `libero_env.sim.scene.build_scene`.
         exclusive: Whether no other kind of its layer may be named beside it.
     """
@@ -35,6 +36,7 @@ class Kind:
     draw: Callable[..., Any]
     scale: Literal["linear", "ratio", "count"] = "linear"
     physical: bool = False
+    is_drawn: bool = True
     draws_materials: bool = False
     exclusive: bool = False
 

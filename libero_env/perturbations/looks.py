@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from libero_env.assets.arena import SPARE, surface_styles
-from libero_env.geometry import quat_multiply, quat_to_mat, rotation_about
+from libero_env.geometry import quat_to_mat, rotation_about
 from libero_env.perturbations.drawing import direction, sign
 from libero_env.perturbations.kind import Kind
 from libero_env.sim.look import HEADLIGHT, CameraView, Lamp, Look
@@ -21,7 +21,7 @@ _FULL_RATIO = 3.0
 
 
 def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float, camera: str = CAMERA) -> CameraView:
-    """Return the view of a camera that was moved on a sphere about the point of the workspace that it looks at.
+    """Return the view of a camera that was moved about the point of the workspace that it looks at, and stays upright.
 
     Args:
         scene: Scene with the camera.
@@ -32,16 +32,18 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float, camera
     """
     model = scene.model
     index = model.camera(camera).id
-    pos, quat = model.cam_pos[index], model.cam_quat[index]
-    mat = quat_to_mat(quat)
+    pos, mat = model.cam_pos[index], quat_to_mat(model.cam_quat[index])
     pivot = pivot_of(scene, camera)
     across = -np.sin(axis_angle) * mat[:, 0] + np.cos(axis_angle) * mat[:, 1]  # axis of the movement
-    turn = rotation_about(across, np.deg2rad(degrees))
-    turn_quat = np.zeros(4)
-    mujoco.mju_mat2Quat(turn_quat, turn.ravel())
-    moved = pivot + factor * turn @ (pos - pivot)
-    turned = quat_multiply(turn_quat[None], quat[None])[0]
-    return CameraView(pos=tuple(moved.tolist()), quat=tuple(turned.tolist()))
+    moved = pivot + factor * rotation_about(across, np.deg2rad(degrees)) @ (pos - pivot)
+    backward = (moved - pivot) / np.linalg.norm(moved - pivot)
+    right = np.cross((0.0, 0.0, 1.0), backward)
+    right /= np.linalg.norm(right)
+    turned = np.zeros(4)
+    mujoco.mju_mat2Quat(turned, np.stack([right, np.cross(backward, right), backward], axis=1).ravel())
+    x, y, z = moved.tolist()
+    w, *axis = turned.tolist()
+    return CameraView(pos=(x, y, z), quat=(w, axis[0], axis[1], axis[2]))
 
 
 def pivot_of(scene: Scene, camera: str = CAMERA) -> np.ndarray:
@@ -159,8 +161,8 @@ KINDS = (
         "look",
         "degrees",
         _FULL_ANGLE,
-        "the agent's camera moves about the point of the workspace that it looks at, and up to 1.2 times nearer or "
-        "farther",
+        "the agent's camera moves about the point of the workspace that it looks at, upright, and up to 1.2 times "
+        "nearer or farther",
         _camera,
     ),
     Kind("fov", "look", "degrees", 20.0, "the agent's camera has a wider or narrower field of view", _fov),

@@ -1,5 +1,8 @@
 """Perturbations: each kind does something, nothing at severity 0, and the same for the same seed in any batch."""
 
+import pickle
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -18,6 +21,7 @@ from libero_env.perturbations import (
 )
 from libero_env.perturbations.instructions import edit_distance, reword, split_clauses
 from libero_env.perturbations.looks import CAMERA, pivot_of
+from libero_env.perturbations.observations import PixelNoise
 from libero_env.sim.look import CameraView, Lamp, Look
 from libero_env.tasks import get_suite
 
@@ -159,6 +163,7 @@ def test_the_camera_orbits_by_degrees(severity, plain):
     cosine = rays[0] @ rays[1] / np.linalg.norm(rays[0]) / np.linalg.norm(rays[1])
     assert np.rad2deg(np.arccos(cosine)) == pytest.approx(KINDS["camera"].at_one * severity, abs=1e-6)
     assert np.cross(after[:3, 2], rays[1] / np.linalg.norm(rays[1])) == pytest.approx(np.zeros(3), abs=1e-6)
+    assert after[2, 0] == pytest.approx(0, abs=1e-9)  # upright
     env.close()
 
 
@@ -209,8 +214,8 @@ def test_noise_is_in_grey_levels():
 
 
 def test_actions_are_delayed_by_steps():
-    delay, action = int(KINDS["delay"].amount(0.25)), np.array([0.5, 0, 0, 0, 0, 0, -1.0])
-    late, _, _ = world_of("delay=0.25", cameras=())
+    delay, action = int(KINDS["delay"].amount(0.5)), np.array([0.5, 0, 0, 0, 0, 0, -1.0])
+    late, _, _ = world_of("delay=0.5", cameras=())
     plain, _, _ = world_of("", cameras=())
     for _ in range(delay):
         plain.step(np.zeros(7))
@@ -421,3 +426,16 @@ def test_actions_are_scaled_and_noisy_but_not_the_gripper():
     acted = np.array([noisy.act(action, step) for step in range(500)])
     assert (acted[:, 6] == 0.5).all() and acted[:, :6].std() == pytest.approx(0.2, rel=0.05)
     assert np.array_equal(acted[3], noisy.act(action, 3))
+
+
+@pytest.mark.unit
+def test_the_page_shows_every_kind():
+    page = (Path(__file__).parents[2] / "docs" / "robustness.md").read_text()
+    assert [kind for kind in KINDS if f"`{kind}`" not in page] == []
+
+
+@pytest.mark.unit
+def test_a_configuration_with_perturbations_goes_to_other_processes():
+    view = CameraView(fovy=50.0)
+    config = EnvConfig(perturb=[Perturbation("noise", 0.5, 3), Look(cameras={CAMERA: view}), PixelNoise(2.0)])
+    assert pickle.loads(pickle.dumps(config)) == config
