@@ -119,7 +119,7 @@ def compare_noise(images: np.ndarray) -> dict[str, dict]:
 
 def compare_files(folder: Path) -> dict[str, dict]:
     """Compare what both readers find in the task file of each variant: parts, and the instruction."""
-    found = defaultdict(lambda: {"compared": 0, "largest_difference": 0, "read_as_another_by_theirs": 0})
+    found = defaultdict(lambda: {"compared": 0, "largest_difference": 0})
     read = {}
     for suite in SUITES:
         for name in libero_task_map[suite]:
@@ -131,6 +131,19 @@ def compare_files(folder: Path) -> dict[str, dict]:
             row["compared"] += 1
             row["largest_difference"] = max(row["largest_difference"], read[path])
     return dict(found)
+
+
+def compare_pro(folder: Path) -> dict[str, dict]:
+    """Compare what both readers find in the task files of LIBERO-PRO."""
+    found = {}
+    for suite in SUITES:
+        for ending in ("swap", "object", "lan", "task"):
+            paths = sorted((folder / "bddl_files" / f"{suite}_{ending}").glob("*.bddl"))
+            key, worst = f"task files of LIBERO-PRO, {ending}", max(map(differences_of, paths))
+            row = found.setdefault(key, {"compared": 0, "largest_difference": 0})
+            row["compared"] += len(paths)
+            row["largest_difference"] = max(row["largest_difference"], worst)
+    return found
 
 
 def differences_of(path: Path) -> int:
@@ -199,6 +212,7 @@ def main() -> None:
     )
     parser.add_argument("--images", type=Path)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--pro", type=Path, help="folder with bddl_files of LIBERO-PRO")
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     folder = Path(get_libero_path("bddl_files"))
@@ -206,6 +220,7 @@ def main() -> None:
         record(folder)
         return
     rows = {**compare_poses(folder), **compare_noise(np.load(args.images)), **compare_files(folder)}
+    rows |= compare_pro(args.pro) if args.pro else {}
     for key, row in rows.items():
         print(f"{key:36} {row}")
     if args.out:

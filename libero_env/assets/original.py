@@ -47,6 +47,31 @@ FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         ),
     }
 )  # fmt: skip
+# Category that LIBERO-PRO adds -> category that it recolours or enlarges, and by how much. Their files are in the
+# distributions of `libero_env.assets.installed`, and in no folder of the original.
+LIBERO_PRO: Mapping[str, tuple[str, float]] = MappingProxyType(
+    {
+        "bigger_akita_black_bowl": ("akita_black_bowl", 1.5),
+        "bigger_alphabet_soup": ("alphabet_soup", 1.5),
+        "black_bowl": ("akita_black_bowl", 1.0),
+        "blue_ketchup": ("ketchup", 1.0),
+        "brown_rack": ("wine_rack", 1.0),
+        "green_bbq_sauce": ("bbq_sauce", 1.0),
+        "green_butter": ("butter", 1.0),
+        "green_chocolate_pudding": ("chocolate_pudding", 1.0),
+        "red_basket": ("basket", 1.0),
+        "red_cream_cheese": ("cream_cheese", 1.0),
+        "red_salad_dressing": ("salad_dressing", 1.0),
+        "white_bottle": ("wine_bottle", 1.0),
+        "yellow_cabinet": ("wooden_cabinet", 1.0),
+        "yellow_milk": ("milk", 1.0),
+        "yellow_moka_pot": ("moka_pot", 1.0),
+        "yellow_plate": ("plate", 1.0),
+        "yellow_stove": ("flat_stove", 1.0),
+        "yellow_tomato_sauce": ("tomato_sauce", 1.0),
+    }
+)
+_OFFSETS = ("bottom_offset", "top_offset", "horizontal_radius")  # fields that grow with an object
 _STEMS = {"rack": "simple_rack"}
 _PHYSICS_FIELDS = (  # fields of `ObjectModel` that the original's files do not contain
     "joint_damping", "rotation", "rotation_axis", "bottom_offset", "top_offset", "horizontal_radius", "articulation",
@@ -98,8 +123,11 @@ class OriginalPack:
         file = self.file(category)
         spec = read_spec(object_xml(file, category, Path(self.root)), file)
         self._simplify(spec)
-        physics = load_physics(category)
+        base, scale = LIBERO_PRO.get(category, (category, 1.0))
+        physics = load_physics(base)
         fields: dict[str, Any] = {name: getattr(physics, name) for name in _PHYSICS_FIELDS}
+        if scale != 1.0:
+            fields |= {name: _scaled(fields[name], scale) for name in _OFFSETS}
         return ObjectModel(category, spec, **fields)
 
     def file(self, category: str) -> Path:
@@ -108,12 +136,19 @@ class OriginalPack:
         Raises:
             UnknownNameError: No object has this name.
         """
-        folder = next((name for name, group in FAMILIES.items() if category in group), None)
+        alike, _ = LIBERO_PRO.get(category, (category, 1.0))
+        folder = next((name for name, group in FAMILIES.items() if alike in group), None)
         if folder is None:
             raise UnknownNameError("object category", category, self.categories())
         stem = _STEMS.get(category, category)
         flat = Path(self.root) / folder / f"{stem}.xml"
-        return flat if folder == "articulated_objects" else flat.with_suffix("") / flat.name
+        file = flat if folder == "articulated_objects" else flat.with_suffix("") / flat.name
+        if category in LIBERO_PRO and not file.is_file():
+            raise LiberoError(
+                f"{file} does not exist: LIBERO-PRO adds {category}, and only its distributions have it "
+                "(`libero assets install`, then --assets original)"
+            )
+        return file
 
     def add_arena(
         self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
@@ -152,6 +187,10 @@ class OriginalPack:
     def _simplify(self, spec: mujoco.MjSpec) -> None:
         if self.lod is not None:
             simplify_visuals(spec, self.lod)
+
+
+def _scaled(value: float | tuple[float, ...], scale: float) -> float | tuple[float, ...]:
+    return tuple(scale * x for x in value) if isinstance(value, tuple) else scale * value
 
 
 def is_original(root: str | os.PathLike) -> bool:

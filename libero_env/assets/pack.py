@@ -13,7 +13,7 @@ import mujoco
 from libero_env.assets.arena import Workspace, add_arena
 from libero_env.assets.download import default_folder
 from libero_env.assets.installed import EXTRA, REMEDY, installed_folder
-from libero_env.assets.original import OriginalPack, is_original
+from libero_env.assets.original import LIBERO_PRO, OriginalPack, is_original
 from libero_env.assets.published import require_published, require_undamaged
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.objects import ObjectModel, get_object, object_names
@@ -80,6 +80,11 @@ class BuiltinPack:
 
     def build(self, category: str) -> ObjectModel:
         """Return a new model of a category; see `Pack`."""
+        if category in LIBERO_PRO and category not in object_names():
+            raise LiberoError(
+                f"the builtin pack has no model of {category}, which LIBERO-PRO adds; the original's distributions do: "
+                "`libero assets install`, then --assets original"
+            )
         return get_object(category)
 
     def categories(self) -> tuple[str, ...]:

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from libero_env import BatchEnv, LiberoEnv
+from libero_env.assets.installed import installed_folder
+from libero_env.assets.original import LIBERO_PRO, OriginalPack
+from libero_env.assets.pack import select_pack
 from libero_env.errors import BDDLError, InvalidInputError, LiberoError, MissingPackageError, UnknownNameError
 from libero_env.init_states.store import load_init_states, load_original_states
 from libero_env.perturbations.published import published_changes
@@ -169,10 +172,30 @@ def test_suites_of_libero_pro_are_read(pro, states):
         "language": False,
         "task": False,
     }
-    assert pro["object"].lacks == "models of yellow_plate" and not pro["swap"].lacks
+    assert not any(task.lacks for task in pro.values())
     assert pro["task"].problem.goal != pro["language"].problem.goal == base_task().problem.goal
     np.testing.assert_array_equal(load_original_states(pro["swap"]), states)
-    assert get_suite("libero_pro_goal_object:available").tasks == ()
+    assert get_suite("libero_pro_goal_object:available").tasks == (pro["object"],)
+    with pytest.raises(LiberoError, match=r"no model of yellow_plate, .*--assets original$"):
+        LiberoEnv(pro["object"], assets="builtin")
+
+
+@pytest.mark.sim
+@pytest.mark.skipif(installed_folder() is None, reason="LIBERO-PRO's models are not installed")
+def test_models_of_libero_pro_are_those_that_they_vary():
+    pack = select_pack("original")
+    assert all(pack.file(category).is_file() for category in LIBERO_PRO)
+    for category in ("red_cream_cheese", "bigger_alphabet_soup"):
+        alike, scale = LIBERO_PRO[category]
+        own, base = pack.build(category), pack.build(alike)
+        masses = [sum(model.body_mass) for model in (own.spec.compile(), base.spec.compile())]
+        assert masses[0] == pytest.approx(masses[1] * scale**3, rel=0.05)
+        assert own.horizontal_radius == pytest.approx(scale * base.horizontal_radius)
+
+
+def test_a_model_of_libero_pro_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(LiberoError, match=r"LIBERO-PRO adds red_basket, .*assets install"):
+        OriginalPack(str(tmp_path)).build("red_basket")
 
 
 def test_without_their_files_one_line_says_what_brings_them(tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
+from libero_env.assets.original import LIBERO_PRO
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.objects import object_names
 from libero_env.tasks import bddl
@@ -198,7 +199,7 @@ def _base_tasks(suite: str) -> dict[str, Task]:
 
 
 def _known_categories() -> frozenset[str]:
-    return frozenset((*object_names(), *WORKSPACES))
+    return frozenset((*object_names(), *WORKSPACES, *LIBERO_PRO))
 
 
 def _read(file: Path) -> Problem:
