@@ -1,6 +1,7 @@
 """Loading of a run's policy, and its saliency."""
 
 from argparse import Namespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,6 +50,15 @@ def test_instructions_are_embedded_as_in_the_run(tmp_path):
     assert found.embed(tasks[1]).tolist() == [0.0, 1.0]
     with pytest.raises(LifelongError, match="not one of its tasks"):
         found.embed(get_task("libero_goal/1"))
+
+
+def test_instructions_in_other_words_are_embedded_as_they_are(tmp_path):
+    tasks, *_ = make_run(tmp_path / "run")
+    found = restore(tmp_path / "run")
+    reworded = replace(tasks[1], language="the same in other words")
+    told = found.embed(reworded)
+    assert not torch.equal(told, found.embed(tasks[1]))
+    assert torch.equal(told, found.language.embed([*found.instructions, reworded.language])[-1])
 
 
 def test_paths_that_are_no_runs_are_named(tmp_path):

@@ -182,7 +182,8 @@ class LiberoBenchmark(StepBenchmark):
         assert self._adapter is not None and self._task is not None, "reset was called"
         if self.observations is not None:
             own = {PREFIX + name: raw_obs[name][0] for name in self.observations}
-            return {"task_description": self._task.language, "task": self._task.id, **own}
+            told = self._task if self._env is None else self._env.task
+            return {"task_description": told.language, "task": told.id, **own}
         (given,) = self._adapter.inputs(raw_obs)
         cameras = [c for c in given.images if c == "agentview" or self.send_wrist_image]
         found: dict[str, Any] = {
@@ -262,6 +263,7 @@ class LiberoBenchmark(StepBenchmark):
                 assets=self.assets,
                 drawing=None if native else "protocol",
             )
+            self._adapter = CardAdapter(self.card, self._env.task)  # as the card's perturbations change it
         return self._env
 
     def _controller_state(self, obs: Obs) -> np.ndarray:
