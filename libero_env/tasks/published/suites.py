@@ -38,18 +38,13 @@ _REWORDED = ("language", "task")  # kinds whose instruction is that of the task 
 _PROBLEM = re.compile(r"(\(\s*problem\s+libero_\w+?_manipulation)_\w+", re.IGNORECASE)
 
 
-def published_names() -> tuple[str, ...]:
-    """Return the names of the suites whose files are here, without endings."""
-    plus = _plus_names() if find_folder(PLUS) else ()
-    return (*plus, *(_pro_names() if find_folder(PRO) else ()))
-
-
 def published_sizes() -> dict[str, int]:
-    """Return the number of tasks of each of `published_names`."""
+    """Return the suites whose files are here, without endings, with the number of their tasks."""
     plus, pro = find_folder(PLUS), find_folder(PRO)
     found = {name: (plus, _plus_base(name)) for name in _plus_names() if plus}
     found |= {name: (pro, _pro_theirs(name)) for name in _pro_names() if pro}
-    return {name: len(_their_names(folder, theirs)) for name, (folder, theirs) in found.items() if folder}
+    sizes = {name: _their_map(folder).get(theirs) for name, (folder, theirs) in found.items() if folder}
+    return {name: len(tasks) for name, tasks in sizes.items() if isinstance(tasks, list)}
 
 
 def published_suite(name: str) -> Suite:
