@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.settings import DataSettings
@@ -25,7 +26,7 @@ class RunContext:
 
     Attributes:
         tasks: The K tasks in learning order.
-        languages: (K, L) embeddings of their instructions.
+        languages: (K, L) embeddings of `instructions`.
         demos: Number of demonstrations of each task.
         data: Settings of the demonstrations and observations.
         policy: Policy, trained in place.
@@ -42,6 +43,7 @@ class RunContext:
         device: Device of the policy.
         progress: Whether to show progress bars; None prints lines where demonstrations are recorded.
         ranks: Rank of this process among those that train together.
+        perturb: Perturbations of each task, under which it is learned and evaluated; () for none at all.
     """
 
     tasks: tuple[Task, ...]
@@ -62,6 +64,18 @@ class RunContext:
     device: torch.device
     progress: bool | None
     ranks: Ranks = Ranks()
+    perturb: tuple[tuple[Perturbation, ...], ...] = ()
+
+    @property
+    def perturbed(self) -> tuple[tuple[Perturbation, ...], ...]:
+        """Perturbations of each task, which may be none."""
+        return self.perturb or ((),) * len(self.tasks)
+
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """Instruction of each task, in the words that its perturbations give it."""
+        pairs = zip(self.tasks, self.perturbed, strict=True)
+        return tuple(reword_task(task, found).language for task, found in pairs)
 
     @property
     def group_sizes(self) -> tuple[int, ...]:

@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 from libero_env.assets.pack import select_pack
 from libero_env.envs.batch import BatchEnv
 from libero_env.memory import memory_limit
+from libero_env.perturbations import Perturbation, format_perturbations, reword_task
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
-from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos
+from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos, perturb_demos
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environment_record import renderer_name_or_none
@@ -124,11 +125,13 @@ def _build_contexts(
     fit: FitSettings = config.build("train")
     evaluation: EvalSettings = config.build("eval")
     augment, tracker = config.build("augmentation"), config.build("wandb")
+    perturb = stream.perturbations(groups)
+    said = tuple(reword_task(task, found).language for task, found in zip(tasks, perturb, strict=True))
     _check_memory(config, data, fit, evaluation, algorithm, max(demos), device)
     if fit.compile != "off":
         check_compiler(device)
     languages = ranks.broadcast(
-        lambda: config.build("language").embed([t.language for t in (*first, *tasks)])
+        lambda: config.build("language").embed([*(task.language for task in first), *said])
     )
     spec = data.spec(languages.shape[1])
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
@@ -144,13 +147,16 @@ def _build_contexts(
         augment=augment,
         stream=stream,
         group_size=benchmark.group_size,
-        envs=EnvPool(partial(_make_env, tasks, spec, evaluation, data), evaluation.open_environments),
+        envs=EnvPool(
+            partial(_make_env, tasks, spec, evaluation, data, perturb=perturb), evaluation.open_environments
+        ),
         directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
         tracker=tracker,
         seed=settings.seed,
         device=device,
         progress=progress if ranks.first else False,
         ranks=ranks,
+        perturb=perturb if stream.perturb else (),
     )
     if not first:
         return context, None
@@ -211,7 +217,13 @@ def _pretraining_config(plain: Any) -> dict[str, Any]:
 
 
 def _make_env(
-    tasks: tuple[Task, ...], spec: PolicySpec, settings: EvalSettings, data: DataSettings, key: Any
+    tasks: tuple[Task, ...],
+    spec: PolicySpec,
+    settings: EvalSettings,
+    data: DataSettings,
+    key: Any,
+    *,
+    perturb: Sequence[Sequence[Perturbation]] = (),
 ) -> BatchEnv:
     task, simulations = key
     return BatchEnv(
@@ -223,6 +235,7 @@ def _make_env(
         horizon=settings.horizon + settings.settle_steps,
         drawing=data.drawing,
         robot=data.robot,
+        perturb=perturb[task] if perturb else (),
     )
 
 
@@ -241,7 +254,8 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             seed=context.seed,
             preset=names.get("preset", ""),
             tasks=[t.name for t in context.tasks],
-            instructions=[t.language for t in context.tasks],
+            instructions=context.instructions,
+            perturbed=[format_perturbations(found) for found in context.perturb],
             config=OmegaConf.to_yaml(OmegaConf.create(plain)),
             group_sizes=context.group_sizes,
             cells=context.eval.cells,
@@ -281,6 +295,9 @@ def _open_datasets(context: RunContext) -> DemoDatasets:
 def _find_demos(context: RunContext) -> list[Path]:
     began = time.perf_counter()
     paths = find_demos(context.tasks, context.demos, context.data, context.progress)
+    paths = perturb_demos(
+        paths, context.tasks, context.demos, context.perturbed, context.data, context.progress
+    )
     seconds = time.perf_counter() - began
     context.directory.log.append(PhaseRecord(phase="demos", seconds=seconds))
     return paths

@@ -133,6 +133,7 @@ def pretraining_context(
         algorithm=Multitask(),
         fit=replace(context.fit, epochs=settings.epochs or context.fit.epochs),
         stream=StreamSettings(),
+        perturb=(),
         group_size=1,
         directory=directory,
         tracker=Tracker(),

@@ -1,4 +1,4 @@
-"""The order in which data arrive: groups of tasks, fewer demonstrations later on, blurred task boundaries.
+"""The order in which data arrive: groups of tasks, fewer demonstrations later, blurred boundaries, growing shifts.
 
 A stage is what is learned at a time: a task, or a group of tasks. It is identified by its last task, in the hooks of
 algorithms, in records and in the names of files.
@@ -13,14 +13,17 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from libero_env.perturbations import Perturbation
 from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
+from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import BLUR, generator
-from lifelong.types import Batch, Count
+from lifelong.types import Batch, Count, Natural
 
 Stages = tuple[tuple[int, ...], ...]
+_SEVERITY_DIGITS = 4  # so that the text of a perturbation, by which files and records name it, is exact
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,10 @@ class StreamSettings:
             of the first.
         blur: Share of each stage's windows that are learned in neighbouring stages instead of their own.
         blur_reach: Number of stages before and after that count as neighbours.
+        perturb: Perturbations that grow as tasks go by, kinds with severities such as `{light: 1}`, or a text such as
+            `light=1`, of kinds that change what is seen or said. The first group of tasks is without them, the last one
+            has the severities that are named, and those between are at equal distances. None: no perturbations.
+        perturb_seed: Seed of what perturbations draw.
 
     With `blur`, a stage's windows are divided at random, once for the whole run: a share of `1 - blur` is learned in
     the stage itself, the rest is distributed evenly over the neighbours. Every window is learned in exactly one
@@ -49,9 +56,32 @@ class StreamSettings:
     demos_later: Count | Annotated[float, Field(gt=0, le=1)] | Sequence[Count] | None = None
     blur: Annotated[float, Field(ge=0, lt=1)] = 0.0
     blur_reach: Count = 1
+    perturb: PerturbSetting | None = None
+    perturb_seed: Natural = 0
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("stream",), error=ConfigError)
+        self._largest_perturbations()
+
+    def perturbations(self, sizes: Sequence[int]) -> tuple[tuple[Perturbation, ...], ...]:
+        """Return the perturbations of each task; those that are learned together have the same.
+
+        Args:
+            sizes: Number of tasks in each group, from `group_sizes`.
+        """
+        largest, last = self._largest_perturbations(), max(1, len(sizes) - 1)
+        return tuple(
+            tuple(
+                replace(one, severity=round(one.severity * number / last, _SEVERITY_DIGITS))
+                for one in largest
+                if number
+            )
+            for number, size in enumerate(sizes)
+            for _ in range(size)
+        )
+
+    def _largest_perturbations(self) -> tuple[Perturbation, ...]:
+        return read_perturbations(self.perturb, "stream.perturb", seed=self.perturb_seed, rendered=True)
 
     def group_sizes(self, tasks: int, group_size: int = 1) -> tuple[int, ...]:
         """Return the number of tasks in each group: those of the base stage, then `group_size` at a time.

@@ -156,7 +156,7 @@ def make_demos(
     missing = [job for job in jobs if not _is_complete(job, n)]
     with ExitStack() as locks:
         for folder in sorted({job.path.parent for job in missing}):
-            locks.enter_context(_recording_lock(folder))
+            locks.enter_context(recording_lock(folder))
         # another process may have recorded some of them before the folders were locked
         missing = [job for job in missing if not _is_complete(job, n)]
         for job in missing if replace else ():
@@ -275,8 +275,8 @@ def _remove_outdated(job: RecordingJob) -> None:
 
 
 @contextmanager
-def _recording_lock(folder: Path) -> Iterator[None]:
-    """Let one process at a time record in a folder; the lock of a process that was killed is free."""
+def recording_lock(folder: Path) -> Iterator[None]:
+    """Let one process at a time record or render in a folder; the lock of a process that was killed is free."""
     lock = FileLock(folder / ".recording.lock")
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -54,6 +54,11 @@ class RenderConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "perturb", rendered_perturbations(self.perturb))
 
+    @property
+    def perturbations(self) -> tuple[Perturbation, ...]:
+        """Perturbations, in the order in which they are applied."""
+        return rendered_perturbations(self.perturb)
+
     def header(self) -> dict[str, Any]:
         """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
         values = {"cameras": list(self.cameras), "pictures": list(self.modalities)}
@@ -61,8 +66,8 @@ class RenderConfig:
         drawing = {} if self.drawing in (None, FAST) else {"drawing": self.drawing}
         changed = {k: v for k, v in values.items() if v != defaults[k]}
         found = {"camera_size": list(self.size), **changed, **drawing}
-        if self.perturb and not isinstance(self.perturb, str):
-            text = format_perturbations(self.perturb)
+        if self.perturb:
+            text = format_perturbations(self.perturbations)
             found |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
         return found
 

@@ -20,6 +20,7 @@ from libero_env.demos.observe import PERTURBED_HEADER, RenderConfig, StateRender
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
+from libero_env.perturbations.problem import reword_task
 from libero_env.sim.observations import image_name
 from libero_env.sim.scene import FAST, Scene, default_drawing
 from libero_env.tasks import Task
@@ -158,10 +159,11 @@ def rerender(
         raise DemoError(f"{target} is the file to read; choose another name")
     pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
     config = replace(config, drawing=config.drawing or default_drawing(pack))
-    renderer = StateRenderer(task or recorded_task(file), config, assets, robot=recorded_robot(file))
-    writer = DemoWriter(target, _rendered_header(file, config, renderer.env.task.language))
+    task = task or recorded_task(file)
+    writer = DemoWriter(target, rendered_header(file, config, task))
+    recorded = writer.recorded_states()
+    renderer = StateRenderer(task, config, assets, robot=recorded_robot(file))
     try:
-        recorded = writer.recorded_states()
         episodes = islice(read_episodes(file), limit)
         for name, episode in progress_bar(episodes, desc="render", unit="demo", progress=progress):
             if (index := demo_number(name)) in recorded:
@@ -198,15 +200,22 @@ def recorded_rendering(file: Path) -> RenderConfig:
     )
 
 
-def _rendered_header(file: Path, config: RenderConfig, instruction: str) -> dict[str, Any]:
-    """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it."""
+def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, Any]:
+    """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it.
+
+    Args:
+        file: File that is read.
+        config: What is rendered; its drawing is named.
+        task: Task that was recorded.
+    """
     before = read_header(file)
     given_up = ("cameras", "pictures", "drawing", *PERTURBED_HEADER)
     header = {k: v for k, v in before.items() if k not in given_up}
     header |= {**config.header(), "pairing": "aligned"}
     if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":
+        said = reword_task(task, config.perturbations).language
         info = json_attribute(before, "problem_info", file)
-        header["problem_info"] = json.dumps({**info, "language_instruction": instruction})
+        header["problem_info"] = json.dumps({**info, "language_instruction": said})
     return header
 
 

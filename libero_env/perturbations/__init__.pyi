@@ -2,9 +2,9 @@ from .catalog import KINDS, get_kind
 from .channels import ActionChannel, ActionFilter, ObservationChannel, ObservationFilter
 from .drawing import draw_key
 from .kind import LAYERS, Kind
-from .problem import perturb_task
+from .problem import perturb_task, reword_task
 from .starts import RobotJoints, StartChange
-from .value import Perturbation, format_perturbations, parse_perturbations
+from .value import Perturbation, format_perturbations, parse_perturbations, replace_perturbations
 
 __all__ = [
     "KINDS",
@@ -22,4 +22,6 @@ __all__ = [
     "get_kind",
     "parse_perturbations",
     "perturb_task",
+    "replace_perturbations",
+    "reword_task",
 ]

@@ -55,6 +55,16 @@ def perturb_task(task: Task, perturbations: "Iterable[Perturbation]", scene: Sce
     return _known[key]
 
 
+def reword_task(task: Task, perturbations: "Iterable[Perturbation]") -> Task:
+    """Return a task in the words that perturbations give it, without its scene; those of other kinds are ignored."""
+    for one in perturbations:
+        if one.kind == "instruction" and one.severity:
+            attempt = first_attempt(one, task.id)
+            rng = draw_key(one.kind, one.seed, task.id, attempt=attempt).generator()
+            return with_instruction(task, reword(task.language, one.amount, rng))
+    return task
+
+
 def _perturbed(task: Task, drawn: "Iterable[tuple[Perturbation, int]]", scene: Scene) -> Task:
     changed = task
     for one, attempt in drawn:

@@ -100,6 +100,18 @@ def in_order(perturbations: Iterable[Perturbation]) -> tuple[Perturbation, ...]:
     return tuple(found)
 
 
+def replace_perturbations(
+    perturbations: Iterable[Perturbation], others: Iterable[Perturbation]
+) -> tuple[Perturbation, ...]:
+    """Return perturbations and others, which take the place of those of the same kind.
+
+    Raises:
+        InvalidInputError: Kinds exclude each other.
+    """
+    by_kind = {one.kind: one for one in (*perturbations, *others)}
+    return in_order(by_kind.values())
+
+
 def format_perturbations(perturbations: Iterable[Perturbation]) -> str:
     """Return the text of perturbations, in the order in which they are applied; without those of severity 0."""
     return ",".join(str(one) for one in in_order(perturbations) if one.severity)

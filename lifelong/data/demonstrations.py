@@ -9,7 +9,10 @@ from weakref import WeakValueDictionary
 import torch
 
 from libero_env.demos.generate import ensure_demos
+from libero_env.demos.observe import RenderConfig
+from libero_env.demos.perturbed import RenderJob, ensure_rendered
 from libero_env.demos.read import demo_lengths
+from libero_env.perturbations import Perturbation
 from libero_env.tasks import Task
 from lifelong.data import DemoSource, open_windows
 from lifelong.data.settings import DataSettings
@@ -89,6 +92,35 @@ def _existing_files(
                     f"{file} has {available} demonstrations and {count} are required; use data.demos={available}"
                 )
             yield task.id, file
+
+
+def perturb_demos(
+    paths: Sequence[Path],
+    tasks: Sequence[Task],
+    counts: Sequence[int],
+    perturb: Sequence[Sequence[Perturbation]],
+    data: DataSettings,
+    progress: bool | None,
+) -> list[Path]:
+    """Return the files of demonstrations as they look under perturbations; what is missing is rendered beside them.
+
+    Args:
+        paths: Demonstration file of each task, from `find_demos`.
+        tasks: Tasks in the same order.
+        counts: Number of demonstrations required of each task.
+        perturb: Perturbations of each task.
+        data: Image size and drawing.
+        progress: As for `find_demos`.
+
+    Raises:
+        DemoError: A file is broken, or cannot be written.
+    """
+    size = (data.image_size, data.image_size)
+    jobs = [
+        RenderJob(path, task, n, RenderConfig(size=size, drawing=data.drawing, perturb=tuple(found)))
+        for path, task, n, found in zip(paths, tasks, counts, perturb, strict=True)
+    ]
+    return ensure_rendered(jobs, progress=progress)
 
 
 @dataclass(frozen=True)

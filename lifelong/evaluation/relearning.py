@@ -21,7 +21,7 @@ from pydantic import Field
 
 from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.demonstrations import DemoDatasets, find_demos
+from lifelong.data.demonstrations import DemoDatasets, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows, WindowDataset
 from lifelong.errors import ConfigError, LifelongError
@@ -264,8 +264,10 @@ def _lesson(
     data: DataSettings = config.build("data")
     stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
     learned_from = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])[task]
-    (path,) = find_demos([run.tasks[task]], [learned_from + settings.held_out], data, None)
-    languages, read = run.embed(run.tasks[task])[None], replace(data, memory="host", backend="native")
+    tasks, counts = [run.tasks[task]], [learned_from + settings.held_out]
+    recorded = find_demos(tasks, counts, data, None)
+    (path,) = perturb_demos(recorded, tasks, counts, [run.perturbations(task)], data, None)
+    languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host", backend="native")
 
     def windows(count: int) -> TaskWindows:
         return DemoDatasets([path], [count], then.spec, languages, read, run.device)[0]

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm, load_algorithm
@@ -31,7 +32,7 @@ class LoadedRun:
     Attributes:
         path: Directory of the run.
         checkpoint: File of the weights.
-        tasks: Tasks of the run in learning order.
+        tasks: Tasks of the run in learning order, without perturbations.
         learned: Position of the last task learned.
         policy: Policy in evaluation mode.
         algorithm: Algorithm with the state that `policy_for` needs.
@@ -43,6 +44,7 @@ class LoadedRun:
         robot: Model of the arm that the run was trained with.
         group_sizes: Number of tasks in each group that was learned together; () for one task at a time.
         drawing: How the images that it learned from were drawn.
+        perturb: Perturbations under which each task was learned and evaluated; () for none at all.
     """
 
     path: Path
@@ -59,6 +61,15 @@ class LoadedRun:
     robot: str
     group_sizes: tuple[int, ...] = ()
     drawing: str | None = None
+    perturb: tuple[tuple[Perturbation, ...], ...] = ()
+
+    def learned_task(self, position: int) -> Task:
+        """Return a task of the run in the words in which it was learned."""
+        return reword_task(self.tasks[position], self.perturbations(position))
+
+    def perturbations(self, position: int) -> tuple[Perturbation, ...]:
+        """Return the perturbations under which a task of the run was learned and evaluated."""
+        return self.perturb[position] if self.perturb else ()
 
     def embed(self, task: Task) -> torch.Tensor:
         """Return the (L,) embedding of a task's instruction, as in training.
@@ -67,7 +78,8 @@ class LoadedRun:
             LanguageError: The instruction cannot be embedded.
             LifelongError: The run's embedding is defined for its own tasks only (one-hot).
         """
-        names = [(t.name, t.language) for t in self.tasks]
+        learned = map(self.learned_task, range(len(self.tasks)))
+        names = [(t.name, t.language) for t in learned]
         if (own := (task.origin.name, task.language)) in names:
             found = self.language.embed(self.instructions)[names.index(own) - len(names)]
         else:  # another task, or one of its own in other words
@@ -121,7 +133,10 @@ def restore(
     data: DataSettings = config.build("data")
     language = config.build("language")
     before: tuple[Task, ...] = config.build("pretrain").sequence() if "pretrain" in config.values else ()
-    instructions = tuple(t.language for t in (*before, *tasks))
+    groups = stream.group_sizes(len(tasks), benchmark.group_size)
+    perturb = stream.perturbations(groups) if stream.perturb else ()
+    learned = tuple(reword_task(*pair) for pair in zip(tasks, perturb, strict=True)) if perturb else tasks
+    instructions = tuple(t.language for t in (*before, *learned))
     spec = data.spec(language.embed(instructions).shape[1])
     weights = policy_bytes(config, spec)
     check_memory([Need(f"the policy's weights ({path / 'config.yaml'})", weights or 0)])
@@ -147,8 +162,9 @@ def restore(
         language=language,
         instructions=instructions,
         robot=data.robot,
-        group_sizes=stream.group_sizes(len(tasks), benchmark.group_size),
+        group_sizes=groups,
         drawing=data.drawing,
+        perturb=perturb,
     )
 
 

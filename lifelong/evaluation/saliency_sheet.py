@@ -95,7 +95,7 @@ def draw_saliency(
     path = folder / f"task_{task:02d}_after_{run.learned:02d}.png"
     Image.fromarray(contact_sheet(pictures, heats, enlarge)).save(path)
     outcome = "success" if success else "failure"
-    caption = f"{run.tasks[task].language}: {outcome}, after learning {run.learned + 1} tasks"
+    caption = f"{run.learned_task(task).language}: {outcome}, after learning {run.learned + 1} tasks"
     path.with_suffix(".txt").write_text(f"{caption}; steps {', '.join(map(str, steps))}\n", encoding="utf-8")
     return path
 
@@ -104,7 +104,7 @@ def _run_episode(
     run: LoadedRun, task: int, start: int, horizon: int
 ) -> tuple[list[dict[str, torch.Tensor]], bool]:
     """Return the policy's observations at each step, (1, 1, ...) tensors by name, and the episode's success."""
-    spec, language = run.policy.spec, run.embed(run.tasks[task])
+    spec, language = run.policy.spec, run.embed(run.learned_task(task))
     env = BatchEnv(
         run.tasks[task],
         1,
@@ -113,6 +113,7 @@ def _run_episode(
         horizon=horizon + run.eval.settle_steps,
         drawing=run.drawing,
         robot=run.robot,
+        perturb=run.perturbations(task),
     )
     try:
         with run.acting(run.tasks[task]) as policy:
@@ -133,7 +134,7 @@ def _saliency_maps(
     settings: SaliencySettings,
 ) -> list[np.ndarray]:
     """Return the saliency (V, H, W) of the windows that end at the steps."""
-    language = run.embed(run.tasks[task]).to(run.device)
+    language = run.embed(run.learned_task(task)).to(run.device)
     with run.acting(run.tasks[task]) as policy:
         windows = [window_at(frames, step, run.policy.spec.seq_len) for step in steps]
         return [

@@ -42,6 +42,7 @@ def start_record(
     conditions: Mapping[str, str] | None = None,
     cells: MatrixCells = "all",
     transfer: Transfer | Literal[""] = "",
+    perturbed: Sequence[str] = (),
 ) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
@@ -58,6 +59,7 @@ def start_record(
         conditions: What decides the bits of its results, see `lifelong.results.conditions`.
         cells: Cells of the success matrix that are measured.
         transfer: Estimate of forward transfer, see `lifelong.results.curves`.
+        perturbed: Perturbations under which each task is learned and evaluated, as text; () for none at all.
     """
     equal = len(set(group_sizes)) < 2  # written as earlier versions did
     return RunRecord(
@@ -78,6 +80,7 @@ def start_record(
         cells=cells,
         group_sizes=() if equal else tuple(group_sizes),
         transfer=transfer,
+        perturbed=tuple(perturbed),
     )
 
 

@@ -44,10 +44,15 @@ class RunRecord:
     # of each group, where they are not all of group_size
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
     transfer: Transfer | Literal[""] = ""  # estimate of forward transfer; older records do not say
+    perturbed: tuple[
+        str, ...
+    ] = ()  # perturbations of each task, in learning and evaluation; () for none at all
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:
             raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.instructions)} instructions")
+        if len(self.perturbed) not in (0, len(self.tasks)):
+            raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.perturbed)} perturbations")
         sizes = self.group_sizes
         if sum(sizes) != len(self.tasks) if sizes else len(self.tasks) % self.group_size:
             raise ValueError(

@@ -82,6 +82,7 @@ _ADDED: Mapping[str, Mapping[str, Any]] = {
     "FitSettings": {"lr_every": "step", "last_batch": "filled", "statistics_first": False},
     "LanguageEncoder": {"numbered": False, "pad_to": 0},
     "FirstWindows": {"batch_size": None},
+    "StreamSettings": {"perturb": None, "perturb_seed": 0},
 }
 _ER, _AGEM = "lifelong.algorithms.er.ER", "lifelong.algorithms.agem.AGEM"
 _EWC, _PACKNET = "lifelong.algorithms.ewc.EWC", "lifelong.algorithms.packnet.PackNet"

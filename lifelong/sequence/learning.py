@@ -143,7 +143,7 @@ class TaskSequence:
         elif saved is None:
             self.prepare()
         dataset = self.data[task]
-        title = f"Task {task + 1}/{len(context.tasks)}: {context.tasks[task].language}"
+        title = f"Task {task + 1}/{len(context.tasks)}: {context.instructions[task]}"
         if len(stage) > 1:
             title = f"Tasks {stage[0] + 1}-{task + 1}/{len(context.tasks)}: together"
         self._log(f"{title} ({len(dataset)} windows)")

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from libero_env.perturbations import format_perturbations
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.context import RunContext
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
@@ -65,7 +66,9 @@ class Evaluator:
         """Return what rollouts depend on besides what acts, within one run."""
         context, settings = self._context, self._context.eval
         starts = self._log.read().of(RunRecord)
+        perturb = format_perturbations(context.perturbed[task])
         return {
+            **({"perturb": perturb} if perturb else {}),
             "task": task,
             "language": context.languages[task],
             "init_states": str(list(settings.init_states(phase))),
@@ -128,7 +131,7 @@ class Evaluator:
 
     def _write_caption(self, path: Path, learned: int, task: int, success: bool) -> None:
         outcome = "success" if success else "failure"
-        caption = f"{self._context.tasks[task].language}: {outcome}, after learning {learned + 1} tasks"
+        caption = f"{self._context.instructions[task]}: {outcome}, after learning {learned + 1} tasks"
         path.with_suffix(".txt").write_text(caption + "\n", encoding="utf-8")
 
 
