@@ -218,9 +218,7 @@ class BatchEnv(LiberoVectorEnv):
 
     def _observe(self, ids: np.ndarray) -> dict[str, np.ndarray]:
         """Return the observations of all simulations, with images rendered of the given ones."""
-        if self.render_images:
-            self.world.render_cameras(ids, self._images)
-        return self._observation(None)
+        return self._observation(self.world.observe(ids, self._images if self.render_images else None))
 
     def _observation(self, state: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
         """Return copies of the images, with the given observations of the state or those of the present one."""

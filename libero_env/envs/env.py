@@ -185,9 +185,7 @@ class LiberoEnv(gymnasium.Env):
             raise ClosedGymEnvironmentError(f"this environment of {self.task.id} is closed; make another")
 
     def _observe(self) -> dict[str, np.ndarray]:
-        if self.render_images:
-            self.world.render_cameras([0], self._images)
-        return self._observation(self.world.proprioception())
+        return self._observation(self.world.observe([0], self._images if self.render_images else None))
 
     def _observation(self, state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return copies of the images, and observations of the state, (1, ...) each, without the first axis."""

@@ -192,8 +192,11 @@ class World:
                     f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
                 )
         self.observer.set_look(i, perturbed.look(name))
-        if perturbed.has_memory:
-            self.render_cameras([i], self._unseen)
+
+    def _drawn(self, images: dict[str, np.ndarray] | None) -> dict[str, np.ndarray] | None:
+        """Return the images to draw: those that are asked for, or unseen ones that perturbations remember."""
+        remembered = self.perturbed is not None and self.perturbed.has_memory
+        return self._unseen if images is None and remembered else images
 
     @cached_property
     def _unseen(self) -> dict[str, np.ndarray]:
@@ -324,8 +327,7 @@ class World:
         """
         if self.perturbed is not None:
             actions = self.perturbed.act(ids, actions)
-            if images is None and self.perturbed.has_memory:
-                images = self._unseen
+        images = self._drawn(images)
         if self.config.observed == AFTER:
             self.step(ids, actions)
             if images is not None:
@@ -377,6 +379,21 @@ class World:
     def action_space(self) -> spaces.Box:
         """Return the action space of one simulation."""
         return spaces.Box(self.controller.low.astype(np.float32), self.controller.high.astype(np.float32))
+
+    def observe(self, ids: Indices, images: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+        """Observe simulations without a step.
+
+        Args:
+            ids: Indices of the simulations.
+            images: Arrays of `empty_images` whose rows `ids` are rendered; None renders nothing.
+
+        Returns:
+            All observations except images, see `proprioception`.
+        """
+        images = self._drawn(images)
+        if images is not None:
+            self.render_cameras(ids, images)
+        return self.proprioception()
 
     def proprioception(self) -> dict[str, np.ndarray]:
         """Return all observations except images: name -> (num, length) float64."""
