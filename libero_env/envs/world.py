@@ -16,26 +16,17 @@ from pydantic import Field
 from libero_env.assets.pack import select_pack
 from libero_env.envs.checks import checked_numbers
 from libero_env.envs.config import AFTER, EnvConfig, EnvOptions, show_options
-from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.envs.perturbed_starts import open_scenes, sample_rows, start_perturbed
+from libero_env.errors import InvalidInputError
 from libero_env.init_states.settle import sample_settled
 from libero_env.init_states.store import load_init_states, split_row
 from libero_env.memory import require_memory
 from libero_env.perturbations.drawing import start_name
-from libero_env.perturbations.episodes import (
-    TRIES,
-    PerturbedEpisodes,
-    checked_perturbations,
-    needs_materials,
-    scene_problem,
-)
-from libero_env.perturbations.problem import perturb_task
-from libero_env.perturbations.published import published_changes, rest_of
-from libero_env.perturbations.value import Perturbation
+from libero_env.perturbations.published import rest_of
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.observations import Observer, is_of_joints
 from libero_env.sim.predicates import evaluate
-from libero_env.sim.scene import build_scene
 from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
@@ -92,21 +83,14 @@ class World:
                 f"task is {shown(task)}; expected a Task, or a text such as libero_object/3"
             )
         self.controller = get_controller(config.controller, config.control_delta)
-        self.base_task = self.task = get_task(task) if isinstance(task, str) else task
-        require_available([self.task])
+        self.base_task = get_task(task) if isinstance(task, str) else task
+        require_available([self.base_task])
         assets = config.assets
         pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
         self.num, self.threads = num, threads
-        style: dict[str, Any] = {"drawing": config.drawing, "robot": config.robot}
-        self.base_scene = self.scene = build_scene(self.task.problem, pack, **style)
-        self.perturbed: PerturbedEpisodes | None = None
-        if changes := (*checked_perturbations(config.perturb), *published_changes(self.base_task)):
-            drawn = [one for one in changes if isinstance(one, Perturbation)]
-            style["spare_materials"] = needs_materials(changes)
-            self.task = perturb_task(self.task, drawn, self.base_scene)
-            self.scene = build_scene(scene_problem(self.task, self.base_task), pack, **style)
-            own = (self.base_task, self.base_scene, self.scene, num)
-            self.perturbed = PerturbedEpisodes(changes, *own)
+        opened = open_scenes(self.base_task, config, pack, num)
+        self.task, self.scene, self.base_scene = opened.task, opened.scene, opened.base_scene
+        self.perturbed = opened.perturbed
         self._check_memory()
         self.simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
         self.simulations.controller_state = ControllerState(num, self.controller)
@@ -170,28 +154,10 @@ class World:
         if self.perturbed is not None:
             names = map(start_name, rows) if init_states is None else map(int, init_states)
             for i, name, row in zip(ids, names, rows, strict=True):
-                self._begin_perturbed(self.perturbed, int(i), name, row)
+                start_perturbed(self, self.perturbed, int(i), name, row)
             return
         qpos, qvel, poses = split_row(self.scene.model, rows)
         self.simulations.reset(ids, qpos, qvel, fixtures=poses)
-
-    def _begin_perturbed(
-        self, perturbed: PerturbedEpisodes, i: int, name: object, base_row: np.ndarray
-    ) -> None:
-        """Start simulation i from what the perturbations make of a state; the goal does not hold there."""
-        paired, again = perturbed.paired(i, name, base_row), 0
-        while True:
-            row = perturbed.begin(i, name, paired, again)
-            qpos, qvel, poses = split_row(self.scene.model, row[None])
-            self.simulations.reset([i], qpos, qvel, fixtures=poses)
-            if not perturbed.is_physical or not self.check_goal(i)[0]:
-                break
-            again += 1
-            if not perturbed.draws_starts or again == TRIES:
-                raise PlacementError(
-                    f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
-                )
-        self.observer.set_look(i, perturbed.look(name))
 
     def _drawn(self, images: dict[str, np.ndarray] | None) -> dict[str, np.ndarray] | None:
         """Return the images to draw: those that are asked for, or unseen ones that perturbations remember."""
@@ -277,7 +243,7 @@ class World:
             PlacementError: The objects do not fit, or do not come to rest.
         """
         if self.perturbed is not None:
-            self._reset_random_perturbed(ids, generators)
+            self.reset_to(ids, sample_rows(self.base_scene, generators))
             return
         simulations, controller_state = self.simulations, self.simulations.controller_state
         simulations.controller_state = ControllerState(self.num)  # the default one holds the pose
@@ -291,17 +257,6 @@ class World:
         qpos = np.stack([start.qpos for start in starts])
         fixtures = np.stack([start.fixtures for start in starts])
         simulations.reset(ids, qpos, np.zeros((len(ids), self.scene.model.nv)), fixtures=fixtures)
-
-    def _reset_random_perturbed(self, ids: Indices, generators: Sequence[np.random.Generator]) -> None:
-        """Start simulations from what the perturbations make of new placements of the task without them."""
-        simulations = make_simulations(self.base_scene.model, 1, 1, self.base_scene.fixture_bodies)
-        try:
-            starts = [sample_settled(self.base_scene, simulations, 0, rng) for rng in generators]
-        finally:
-            simulations.close()
-        speed = np.zeros(1 + self.base_scene.model.nv)
-        rows = [np.concatenate([speed[:1], s.qpos, speed[1:], s.fixtures.ravel()]) for s in starts]
-        self.reset_to(ids, np.stack(rows))
 
     def step(self, ids: Indices, actions: np.ndarray) -> None:
         """Advance simulations by one control period of 50 ms.

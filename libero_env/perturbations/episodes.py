@@ -141,13 +141,13 @@ class PerturbedEpisodes:
         """
         for k in self._of("action"):
             self.attempts[i, k] = self._first(k, start)
-        for k in self._of("start"):
-            row = self._drawn_start(i, k, start, row, again)
         for change in self._fixed:
             if isinstance(change, StartChange):
                 if (moved := change.apply(self._scene, row)) is None:
                     raise PlacementError(f"{self._task.id}, start {start}: {change} is not possible")
                 row = moved
+        for k in self._of("start"):
+            row = self._drawn_start(i, k, start, row, again)
         self.open(i, start)
         return row
 
@@ -163,9 +163,9 @@ class PerturbedEpisodes:
         self._done[i] = [one.open(key) for one, key in self._keyed("action", self._starts[i])]
 
     def look(self, start: object) -> Look:
-        """Return how the episode of a start is drawn."""
+        """Return how the episode of a start is drawn; what is drawn for it goes before absolute changes."""
         drawn = [self._draw(k, start) for k in self._of("look")]
-        return joined([*drawn, *(one for one in self._fixed if isinstance(one, Look))])
+        return joined([*(one for one in self._fixed if isinstance(one, Look)), *drawn])
 
     def act(self, ids: Sequence[int] | np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Return the actions that are executed, for those that were chosen, (num, A), and count the step."""
@@ -226,13 +226,13 @@ class PerturbedEpisodes:
         )
 
     def _keyed(self, layer: Layer, start: object) -> list[tuple[Any, DrawKey]]:
-        """Return the filters of a layer, with the keys of their channels: those that are drawn, then fixed ones."""
+        """Return the filters of a layer, with the keys of their channels: fixed ones, then those that are drawn."""
         kind = ObservationFilter if layer == "observation" else ActionFilter
         attempts = {k: self._first(k, start) if layer == "action" else 0 for k in self._of(layer)}
         drawn = [(self._draw(k, start), self._key(k, start, n)) for k, n in attempts.items()]
         fixed = [one for one in self._fixed if isinstance(one, kind)]
         keys = [draw_key(f"fixed {j}", 0, self._task.id, start) for j in range(len(fixed))]
-        return [*drawn, *zip(fixed, keys, strict=True)]
+        return [*zip(fixed, keys, strict=True), *drawn]
 
 
 def scene_problem(task: Task, base: Task) -> Problem:

@@ -7,7 +7,6 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from libero_env.errors import LiberoError
-from libero_env.perturbations.value import format_perturbations, parse_perturbations
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 ACTION_DIM = 7
@@ -158,11 +157,8 @@ def _action(v: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _world(v: Mapping[str, Any]) -> Iterator[str]:
-    try:
-        if v["world.perturb"] != (plain := format_perturbations(parse_perturbations(v["world.perturb"]))):
-            yield f"world.perturb is {v['world.perturb']!r}; in the order of application it is {plain!r}"
-    except LiberoError as error:
-        yield f"world.perturb: {error}"
+    if v["world.perturb"]:
+        yield from _perturbations(v["world.perturb"])
     if v["world.fixture_poses"] == "stored" and v["world.env_seed"] is not None:
         yield f"world.env_seed is {v['world.env_seed']}, but world.fixture_poses are stored: nothing is drawn"
     if v["world.fixture_poses"] == "drawn" and "reset" not in v["episode.reset_order"]:
@@ -175,3 +171,13 @@ def _world(v: Mapping[str, Any]) -> Iterator[str]:
         yield f"world.env_seed is {v['world.env_seed']}; it must be at least 0"
     if v["world.control_freq"] != 20:
         yield f"world.control_freq is {v['world.control_freq']}; the benchmark runs at 20 Hz"
+
+
+def _perturbations(text: str) -> Iterator[str]:
+    from libero_env.perturbations.value import format_perturbations, parse_perturbations  # slow to import
+
+    try:
+        if text != (plain := format_perturbations(parse_perturbations(text))):
+            yield f"world.perturb is {text!r}; in the order of application it is {plain!r}"
+    except LiberoError as error:
+        yield f"world.perturb: {error}"

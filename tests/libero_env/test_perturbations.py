@@ -149,6 +149,9 @@ def test_absolute_changes_can_be_given_as_they_are():
     assert np.array_equal(pose[:3, 3], view.pos)
     assert env.world.observer.intrinsics(CAMERA)[0, 0] == pytest.approx(16 / np.tan(np.deg2rad(25)))
     env.close()
+    env, moved, _ = world_of([RobotJoints(qpos), Perturbation("robot", 0.4)], cameras=())  # starts from there
+    assert np.linalg.norm(moved["joint_states"] - qpos) == pytest.approx(KINDS["robot"].amount(0.4))
+    env.close()
     with pytest.raises(UnknownNameError, match="lamp"):
         world_of([Look(lights={"lamp": Lamp()})])
 
