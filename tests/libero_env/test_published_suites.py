@@ -12,7 +12,15 @@ from libero_env import BatchEnv, LiberoEnv
 from libero_env.assets.installed import installed_folder
 from libero_env.assets.original import LIBERO_PRO, OriginalPack
 from libero_env.assets.pack import select_pack
-from libero_env.errors import BDDLError, InvalidInputError, LiberoError, MissingPackageError, UnknownNameError
+from libero_env.errors import (
+    BDDLError,
+    InvalidInputError,
+    LiberoError,
+    MissingPackageError,
+    PlacementError,
+    UnknownNameError,
+)
+from libero_env.init_states import store
 from libero_env.init_states.store import load_init_states, load_original_states
 from libero_env.perturbations.published import published_changes
 from libero_env.sim.scene import build_scene
@@ -107,6 +115,22 @@ def test_variants_start_where_their_base_task_does_unless_objects_were_moved(plu
     assert load_init_states(moved, scene).shape == (1, base.shape[1])
     with LiberoEnvClosing(moved, cameras=()) as env, pytest.raises(InvalidInputError, match="0 to 0"):
         env.reset(options={"init_state": 1})
+
+
+@pytest.mark.sim
+def test_objects_that_find_no_place_are_where_the_published_state_has_them(plus, states, monkeypatch):
+    def crowded(*_):
+        raise PlacementError("no place")
+
+    monkeypatch.setattr(store, "generate_init_states", crowded)
+    task = plus["moved_level1_sample1"]
+    scene = build_scene(task.problem)
+    (row,) = store._own_states(task, scene)
+    np.testing.assert_array_equal(row[: states.shape[1]], states[0])
+    poses = row[states.shape[1] :].reshape(-1, 7)
+    assert len(poses) == len(scene.fixtures) and np.abs(poses[:, :2]).max() < 0.5
+    with pytest.raises(PlacementError):
+        store._own_states(base_task(), scene)
 
 
 @pytest.mark.sim
