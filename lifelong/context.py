@@ -10,6 +10,7 @@ from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.settings import DataSettings
 from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.held_out import HeldOutShift
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory
@@ -44,6 +45,7 @@ class RunContext:
         progress: Whether to show progress bars; None prints lines where demonstrations are recorded.
         ranks: Rank of this process among those that train together.
         perturb: Perturbations of each task, under which it is learned and evaluated; () for none at all.
+        shift: Held-out shift under which policies are evaluated besides; None for none.
     """
 
     tasks: tuple[Task, ...]
@@ -65,6 +67,7 @@ class RunContext:
     progress: bool | None
     ranks: Ranks = Ranks()
     perturb: tuple[tuple[Perturbation, ...], ...] = ()
+    shift: HeldOutShift | None = None
 
     @property
     def perturbed(self) -> tuple[tuple[Perturbation, ...], ...]:

@@ -21,11 +21,18 @@ from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
-from lifelong.data.demonstrations import DemoDatasets, check_folder, find_demos, perturb_demos
+from lifelong.data.demonstrations import (
+    DemoDatasets,
+    check_folder,
+    demo_copies,
+    find_demos,
+    perturb_demos,
+)
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environment_record import renderer_name_or_none
 from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.held_out import HeldOutShift, held_out_shift
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.pretraining import policy_at_start, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
@@ -94,7 +101,8 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
 def _is_finished(context: RunContext) -> bool:
     """Return whether nothing is left to do, also where lines of the records are broken."""
     results = context.directory.log.read()
-    return results.finished and (not results.problems or is_measured(context, results))
+    complete = not results.problems and context.shift is None
+    return results.finished and (complete or is_measured(context, results))
 
 
 def _set_threads(settings: RunSettings, directory: Path) -> None:
@@ -127,11 +135,20 @@ def _build_contexts(
     augment, tracker = config.build("augmentation"), config.build("wandb")
     perturb = stream.perturbations(groups)
     said = tuple(reword_task(task, found).language for task, found in zip(tasks, perturb, strict=True))
-    _check_memory(config, data, fit, evaluation, algorithm, max(demos), device)
+    _check_memory(config, data, fit, evaluation, algorithm, max(demos) * (1 + data.copies), device)
     if fit.compile != "off":
         check_compiler(device)
-    languages = ranks.broadcast(
-        lambda: config.build("language").embed([*(task.language for task in first), *said])
+    known = [*(task.language for task in first), *said]
+    languages = ranks.broadcast(lambda: config.build("language").embed(known))
+    shift = ranks.broadcast(
+        lambda: held_out_shift(
+            evaluation.shift_perturbations(),
+            tasks,
+            perturb,
+            languages[len(first) :],
+            data,
+            lambda words: config.build("language").embed([*known, *words])[len(known) :],
+        )
     )
     spec = data.spec(languages.shape[1])
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
@@ -148,7 +165,8 @@ def _build_contexts(
         stream=stream,
         group_size=benchmark.group_size,
         envs=EnvPool(
-            partial(_make_env, tasks, spec, evaluation, data, perturb=perturb), evaluation.open_environments
+            partial(_make_env, tasks, spec, evaluation, data, perturb=perturb, shift=shift),
+            evaluation.open_environments,
         ),
         directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
         tracker=tracker,
@@ -157,6 +175,7 @@ def _build_contexts(
         progress=progress if ranks.first else False,
         ranks=ranks,
         perturb=perturb if stream.perturb else (),
+        shift=shift,
     )
     if not first:
         return context, None
@@ -224,8 +243,11 @@ def _make_env(
     key: Any,
     *,
     perturb: Sequence[Sequence[Perturbation]] = (),
+    shift: HeldOutShift | None = None,
 ) -> BatchEnv:
-    task, simulations = key
+    """Return the environment of a key: position of the task, number of simulations, and the shift if there is one."""
+    task, simulations, *shifted = key
+    perturb = shift.perturb if shifted and shift is not None else perturb
     return BatchEnv(
         tasks[task],
         simulations,
@@ -287,20 +309,20 @@ def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Ma
 
 def _open_datasets(context: RunContext) -> DemoDatasets:
     """Find the tasks' demonstrations, record those that are missing, and return their windows."""
-    paths = context.ranks.broadcast(_find_demos, context)
+    paths, copies = context.ranks.broadcast(_find_demos, context)
     spec = context.policy.spec
-    return DemoDatasets(paths, context.demos, spec, context.languages, context.data, context.device)
+    return DemoDatasets(paths, context.demos, spec, context.languages, context.data, context.device, copies)
 
 
-def _find_demos(context: RunContext) -> list[Path]:
+def _find_demos(context: RunContext) -> tuple[list[Path], list[tuple[Path, ...]]]:
+    """Return the demonstration file of each task, and those of further copies."""
     began = time.perf_counter()
-    paths = find_demos(context.tasks, context.demos, context.data, context.progress)
-    paths = perturb_demos(
-        paths, context.tasks, context.demos, context.perturbed, context.data, context.progress
-    )
+    recorded = find_demos(context.tasks, context.demos, context.data, context.progress)
+    own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
+    paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
     seconds = time.perf_counter() - began
     context.directory.log.append(PhaseRecord(phase="demos", seconds=seconds))
-    return paths
+    return paths, copies
 
 
 def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mapping[str, Any]) -> None:

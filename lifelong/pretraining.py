@@ -134,6 +134,7 @@ def pretraining_context(
         fit=replace(context.fit, epochs=settings.epochs or context.fit.epochs),
         stream=StreamSettings(),
         perturb=(),
+        shift=None,
         group_size=1,
         directory=directory,
         tracker=Tracker(),

@@ -11,16 +11,15 @@ from typing import Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from libero_env.perturbations import Perturbation
 from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
-from lifelong.data.windows import JoinedWindows, TaskWindows, WindowDataset, WindowSubset
+from lifelong.data.windows import StageWindows, TaskWindows, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import BLUR, generator
-from lifelong.types import Batch, Count, Natural
+from lifelong.types import Count, Natural
 
 Stages = tuple[tuple[int, ...], ...]
 _SEVERITY_DIGITS = 4  # so that the text of a perturbation, by which files and records name it, is exact
@@ -144,28 +143,6 @@ def learning_stages(algorithm: Algorithm, sizes: Sequence[int]) -> Stages:
     groups = [tuple(range(end - size, end)) for size, end in zip(sizes, accumulate(sizes), strict=True)]
     stages = algorithm.stages(len(groups))
     return tuple(tuple(task for group in stage for task in groups[group]) for stage in stages)
-
-
-class StageWindows(JoinedWindows):
-    """The windows of a stage with several tasks, as if they were those of its last task.
-
-    Batches have the id of that task, window ids counted through all datasets, and the requested order, so that an
-    algorithm can store windows of a stage by the ids in a batch.
-    """
-
-    def __init__(self, datasets: Sequence[WindowDataset], task_id: int):
-        super().__init__(datasets)
-        self.task_id = task_id
-        self._ends = torch.tensor([len(d) for d in datasets]).cumsum(0)
-
-    def batch(self, indices: Tensor) -> Batch:
-        """Return the windows with these indices ((B,) int64, counted through all datasets) as one batch."""
-        indices = torch.as_tensor(indices, dtype=torch.int64, device="cpu")
-        batch = super().batch(indices)  # ordered by dataset
-        places = torch.bucketize(indices, self._ends, right=True).argsort(stable=True).argsort()
-        batch = batch.rows(places.to(batch.window_ids.device))
-        task_ids = torch.full_like(batch.task_ids, self.task_id)
-        return replace(batch, task_ids=task_ids, window_ids=indices.to(batch.window_ids))
 
 
 @dataclass(frozen=True)

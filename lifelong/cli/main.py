@@ -158,12 +158,12 @@ def register_report(subparsers: Subparsers) -> None:
 
 def run_report(args: argparse.Namespace) -> None:
     """Write the page; print its path and, of several runs, what can be told apart."""
-    from lifelong.report.page import comparison_text, write_report
+    from lifelong.report.page import comparison_text, shift_text, write_report
 
     page = write_report(args.run_dirs, args.out)
     print(page)
-    if len(args.run_dirs) > 1:
-        print(*comparison_text(page), sep="\n")
+    for line in comparison_text(page) if len(args.run_dirs) > 1 else shift_text(args.run_dirs[0]):
+        print(line)
 
 
 COMMANDS: tuple[Callable[[Subparsers], None], ...] = (

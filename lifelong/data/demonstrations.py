@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -12,11 +12,11 @@ from libero_env.demos.generate import ensure_demos
 from libero_env.demos.observe import RenderConfig
 from libero_env.demos.perturbed import RenderJob, ensure_rendered
 from libero_env.demos.read import demo_lengths
-from libero_env.perturbations import Perturbation
+from libero_env.perturbations import Perturbation, replace_perturbations
 from libero_env.tasks import Task
 from lifelong.data import DemoSource, open_windows
 from lifelong.data.settings import DataSettings
-from lifelong.data.windows import TaskWindows
+from lifelong.data.windows import StageWindows, TaskWindows
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
@@ -123,6 +123,36 @@ def perturb_demos(
     return ensure_rendered(jobs, progress=progress)
 
 
+def demo_copies(
+    paths: Sequence[Path],
+    tasks: Sequence[Task],
+    counts: Sequence[int],
+    perturb: Sequence[Sequence[Perturbation]],
+    data: DataSettings,
+    progress: bool | None,
+) -> list[tuple[Path, ...]]:
+    """Return the files of further copies of each task's demonstrations, each copy under draws of its own.
+
+    Args:
+        paths: As for `perturb_demos`.
+        tasks: As for `perturb_demos`.
+        counts: As for `perturb_demos`.
+        perturb: Perturbations of each task; those of `data` replace those of the same kind.
+        data: Perturbations and number of the copies.
+        progress: As for `find_demos`.
+
+    Raises:
+        DemoError: A file is broken, or cannot be written.
+    """
+    found: list[tuple[Path, ...]] = [()] * len(paths)
+    for number in range(data.copies):
+        draws = [replace(one, seed=one.seed + number) for one in data.perturbations()]
+        of_copy = [replace_perturbations(own, draws) for own in perturb]
+        files = perturb_demos(paths, tasks, counts, of_copy, data, progress)
+        found = [(*copies, file) for copies, file in zip(found, files, strict=True)]
+    return found
+
+
 @dataclass(frozen=True)
 class DemoDatasets(Mapping[int, TaskWindows]):
     """The windows of each task, by position; they are read when requested and kept while something refers to them.
@@ -134,6 +164,7 @@ class DemoDatasets(Mapping[int, TaskWindows]):
         languages: Embeddings of the instructions, (K, L) for K tasks.
         data: How the files are read, and where frames are held.
         device: Device of the batches.
+        copies: Files of copies of each task's demonstrations, from which its windows are, too; () for none.
     """
 
     paths: Sequence[Path]
@@ -142,23 +173,27 @@ class DemoDatasets(Mapping[int, TaskWindows]):
     languages: torch.Tensor
     data: DataSettings
     device: torch.device
+    copies: Sequence[Sequence[Path]] = ()
     _held: WeakValueDictionary[int, TaskWindows] = field(default_factory=WeakValueDictionary)
 
     def __getitem__(self, task: int) -> TaskWindows:
         dataset = self._held.get(task)
         if dataset is None:
-            source = DemoSource(
-                self.paths[task], self.spec, self.counts[task], self.data.pairing, self.data.labels
-            )
-            dataset = self._held[task] = open_windows(
-                source,
-                language=self.languages[task],
-                task_id=task,
-                device=self.device,
-                memory=self.data.memory,
-                backend=self.data.backend,
-            )
+            copies = self.copies[task] if self.copies else ()
+            parts = [self._windows(path, task) for path in (self.paths[task], *copies)]
+            dataset = self._held[task] = StageWindows(parts, task) if copies else parts[0]
         return dataset
+
+    def _windows(self, path: Path, task: int) -> TaskWindows:
+        source = DemoSource(path, self.spec, self.counts[task], self.data.pairing, self.data.labels)
+        return open_windows(
+            source,
+            language=self.languages[task],
+            task_id=task,
+            device=self.device,
+            memory=self.data.memory,
+            backend=self.data.backend,
+        )
 
     def __iter__(self) -> Iterator[int]:
         return iter(range(len(self.paths)))

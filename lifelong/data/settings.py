@@ -8,10 +8,12 @@ from pydantic import Field
 
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.demos.contents import LOW_DIM_KEYS
+from libero_env.perturbations import Perturbation
 from libero_env.validation import OneOf, validate_arguments
 from lifelong.data.loading import BACKENDS, MEMORY
+from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
-from lifelong.types import PathText, PolicySpec, Width
+from lifelong.types import Natural, PathText, PolicySpec, Width
 
 CAMERAS = {
     "agentview_rgb": "agentview",
@@ -37,6 +39,10 @@ class DataSettings:
         backend: What reads the windows, see `lifelong.data.loading`; batches do not depend on it.
         drawing: How images are drawn, in the demonstrations and in evaluations of the policy: `fast`, `faithful`, or
             None for the default of the models. The saved configuration of a run has the one that was used.
+        perturb: Perturbations of further copies of the demonstrations, as for `stream.perturb`, from which windows are,
+            too: the recorded states, rendered again. None: no copies.
+        perturb_copies: Number of copies, each with draws of its own.
+        perturb_seed: Seed of the first copy's draws; those of the others follow.
     """
 
     demos: Annotated[int, Field(ge=1, le=100_000)]
@@ -51,6 +57,9 @@ class DataSettings:
     memory: Annotated[str, OneOf(MEMORY)] = "auto"
     backend: Annotated[str, OneOf(BACKENDS)] = "native"
     drawing: Literal["fast", "faithful"] | None = None
+    perturb: PerturbSetting | None = None
+    perturb_copies: Annotated[int, Field(ge=0, le=1000)] = 1
+    perturb_seed: Natural = 0
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("data",), error=ConfigError)
@@ -58,6 +67,23 @@ class DataSettings:
             names = list(getattr(self, key))
             if len(set(names)) < len(names):
                 raise ConfigError(f"data.{key} is {names}; expected each name once")
+        if any(one.kind == "instruction" for one in self.perturbations()):
+            raise ConfigError(
+                "data.perturb has instruction, and copies are learned with the task's own; see stream.perturb"
+            )
+
+    @property
+    def copies(self) -> int:
+        """Number of further copies of each demonstration."""
+        return self.perturb_copies if self.perturbations() else 0
+
+    def perturbations(self) -> tuple[Perturbation, ...]:
+        """Return the perturbations of the first copy.
+
+        Raises:
+            ConfigError: They are not valid.
+        """
+        return read_perturbations(self.perturb, "data.perturb", seed=self.perturb_seed, rendered=True)
 
     def spec(self, language_dim: int) -> PolicySpec:
         """Return the inputs and outputs of a policy for these data.

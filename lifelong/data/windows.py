@@ -1,7 +1,7 @@
 """Datasets of windows, whatever reads and holds them: what they have in common, parts and joins of them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import zip_longest
 from typing import Protocol
@@ -79,6 +79,28 @@ class JoinedWindows:
             start = end
             if len(chosen):
                 yield dataset, chosen
+
+
+class StageWindows(JoinedWindows):
+    """The windows of several datasets as if they were those of one task: of a stage, or of copies of demonstrations.
+
+    Batches have the id of that task, window ids counted through all datasets, and the requested order, so that an
+    algorithm can store windows of a stage by the ids in a batch.
+    """
+
+    def __init__(self, datasets: Sequence[WindowDataset], task_id: int):
+        super().__init__(datasets)
+        self.task_id = task_id
+        self._ends = torch.tensor([len(d) for d in datasets]).cumsum(0)
+
+    def batch(self, indices: Tensor) -> Batch:
+        """Return the windows with these indices ((B,) int64, counted through all datasets) as one batch."""
+        indices = torch.as_tensor(indices, dtype=torch.int64, device="cpu")
+        batch = super().batch(indices)  # ordered by dataset
+        places = torch.bucketize(indices, self._ends, right=True).argsort(stable=True).argsort()
+        batch = batch.rows(places.to(batch.window_ids.device))
+        task_ids = torch.full_like(batch.task_ids, self.task_id)
+        return replace(batch, task_ids=task_ids, window_ids=indices.to(batch.window_ids))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.perturbations import Perturbation
 from libero_env.validation import validate_arguments
+from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
 from lifelong.results.coverage import MatrixCells, measured_tasks
 from lifelong.results.curves import Transfer
@@ -40,6 +42,9 @@ class EvalSettings:
         record_every: Number of control steps between two frames of the recorded rollouts; 0 records none.
         open_environments: Number of environments kept open, of different tasks.
         sim_threads: Number of threads that step simulations; 0 uses all cores.
+        shift: Perturbations under which each task just learned, and all tasks at the end, are evaluated besides, from
+            the same starts; as for `stream.perturb`, of any kinds. It may be chosen when a run is resumed or finished.
+            None: no such evaluation.
     """
 
     episodes: Count = 20
@@ -57,9 +62,11 @@ class EvalSettings:
     record_every: Natural = 4
     open_environments: Count = 4
     sim_threads: Natural = 0
+    shift: PerturbSetting | None = None
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("eval",), error=ConfigError)
+        self.shift_perturbations()
         needed = self.episodes + (self.curve_episodes if self.selection == "apart" else 0)
         if max(needed, self.curve_episodes) > NUM_INIT_STATES:
             raise ConfigError(
@@ -79,9 +86,17 @@ class EvalSettings:
             return "published"
         return "plain" if self.select == "last" else "cross_fitted"
 
-    def init_states(self, phase: Literal["curve", "matrix"]) -> range:
-        """Return the indices of the initial states of a learning curve, or of the success matrix."""
-        if phase == "matrix":
+    def shift_perturbations(self) -> tuple[Perturbation, ...]:
+        """Return the perturbations of the held-out shift; none without one.
+
+        Raises:
+            ConfigError: They are not valid.
+        """
+        return read_perturbations(self.shift, "eval.shift")
+
+    def init_states(self, phase: Literal["curve", "matrix", "shift"]) -> range:
+        """Return the indices of the initial states of a learning curve, or of the success matrix and under a shift."""
+        if phase != "curve":
             return range(self.episodes)
         if self.selection == "reporting":
             return range(self.curve_episodes)
@@ -97,3 +112,9 @@ class EvalSettings:
     def row(self, stage: Sequence[int], tasks: int) -> range:
         """Return the tasks that are measured after a stage of a run of so many tasks."""
         return measured_tasks(self.cells, stage, tasks)
+
+    def shifted_row(self, stage: Sequence[int], tasks: int) -> range:
+        """Return the tasks that are evaluated under the held-out shift after a stage of a run of so many tasks."""
+        if not self.shift_perturbations():
+            return range(0)
+        return measured_tasks("diagonal_and_last_row", stage, tasks)

@@ -24,14 +24,23 @@ from lifelong.report.figures import (
 from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.statistics import findings
-from lifelong.report.tables import atom_rows, cost_table, duration, episodes_text, most_forgotten, task_costs
-from lifelong.report.templates import page_template
+from lifelong.report.tables import (
+    atom_rows,
+    cost_table,
+    duration,
+    episodes_text,
+    most_forgotten,
+    shift_table,
+    task_costs,
+)
+from lifelong.report.templates import page_template, percent
 from lifelong.results.episode_table import write_episodes
 from lifelong.results.metrics import METRIC_NAMES, Metrics, average_success
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import read_relearning, savings, savings_rows
 from lifelong.results.results import after_base_stage
 from lifelong.results.samples import metric_values
+from lifelong.results.shifts import shift_scores
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -91,6 +100,17 @@ def comparison_text(page: Path) -> list[str]:
     return findings(found, {name: text[0] for name, text in METRIC_TEXTS.items()})
 
 
+def shift_text(run_dir: Path) -> list[str]:
+    """Return the success and forgetting of a run under each held-out shift, in sentences."""
+    return [
+        f"under {score.shift}: {percent(score.success('final_shifted').value)} % at the end, "
+        f"{percent(score.success('final').value)} % without; forgotten "
+        f"{percent(score.forgetting(shifted=True).value)} points, {percent(score.forgetting(shifted=False).value)} "
+        "without"
+        for score in shift_scores(load_run(Path(run_dir)).results)
+    ]
+
+
 def _default_folder(paths: Sequence[Path]) -> Path:
     """Return where a page is written: in the only run, or in a folder of its own, which git ignores, for several."""
     if len(paths) == 1:
@@ -128,6 +148,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "total_time": duration(sum(times.values())),
         "episodes": episodes_text(*run.results.episodes()),
         "relearning": savings_rows(savings(read_relearning(run.path))),
+        "shifts": [shift_table(score, labels) for score in shift_scores(run.results)],
         "subgoals": run.results.subgoals().predicates,
         "atoms": atom_rows(run.results.subgoals(), labels),
         "most_forgotten": most_forgotten(run.results.subgoals().atoms),
@@ -192,6 +213,7 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
 
 def _facts(record: RunRecord) -> list[tuple[str, Any]]:
     facts = [("policy", record.policy), ("preset", record.preset), ("seed", record.seed)]
+    facts += [("last task under", record.perturbed[-1])] if any(record.perturbed) else []
     facts += [
         ("tasks", len(record.tasks)),
         ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),

@@ -162,6 +162,7 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
         "data.backend",
         "eval.reuse",
         "eval.transfer",
+        "eval.shift",
     )
     flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(ignored)}
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed

@@ -8,6 +8,7 @@ import numpy as np
 
 from lifelong.report.comparison import costs_of
 from lifelong.report.runs import Run
+from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
 
 
@@ -127,3 +128,26 @@ def most_forgotten(atoms: Iterable[AtomRates], threshold: float = 0.005) -> list
     """Return the atoms that were forgotten most, worst first: at most three, above the given threshold."""
     lost = [a for a in atoms if a.forgotten > threshold and a.at_start < 1]
     return sorted(lost, key=lambda a: -a.forgotten)[:3]
+
+
+def shift_table(score: ShiftScore, labels: Sequence[str]) -> dict[str, Any]:
+    """Return the template's table of success and forgetting under a held-out shift.
+
+    Args:
+        score: Success under the shift.
+        labels: Short names of the run's tasks.
+    """
+    names = ("learned", "learned_shifted", "final", "final_shifted")
+    rows = [
+        {
+            "number": task.task + 1,
+            "label": labels[task.task],
+            "cells": [
+                *(task.rate(name) for name in names),
+                *(task.forgotten(shifted=shifted) for shifted in (False, True)),
+            ],
+        }
+        for task in score.tasks
+    ]
+    means = [*map(score.success, names), *(score.forgetting(shifted=shifted) for shifted in (False, True))]
+    return {"name": score.shift, "rows": rows, "means": means}

@@ -214,7 +214,7 @@ def _false_copies(results: Results) -> Iterator[str]:
         if copy.same_as is None:
             continue
         phase, learned, epoch = copy.same_as
-        original = results.evaluation(phase, learned, copy.task, epoch)
+        original = results.evaluation(phase, learned, copy.task, epoch, shift=copy.shift)
         name = f"the evaluation of task {copy.task} after task {copy.learned}"
         if original is None:
             yield f"{name} is a copy of one that is missing; the run's command measures that again"

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import accumulate
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, WrapValidator
 
@@ -18,6 +18,7 @@ from lifelong.results.curves import Transfer
 _CHECKSUM = "crc32"
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
+Phase = Literal["curve", "matrix", "shift"]
 Number = Annotated[float, WrapValidator(lambda value, parse: math.nan if value is None else parse(value))]
 
 
@@ -90,6 +91,9 @@ class LossRecord:
 class EvalRecord:
     """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
 
+    Rollouts under a held-out shift (`eval.shift`) after learning task `learned` have the phase "shift" and the
+    perturbations as text; all others are under the perturbations of the run's task, see `RunRecord.perturbed`.
+
     The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). For each
     episode the record states which atoms of the goal held before the policy acted, at any time from then on, and at
     the end; older records do not.
@@ -99,7 +103,7 @@ class EvalRecord:
     """
 
     kind: Literal["eval"] = field(default="eval", init=False)
-    phase: Literal["curve", "matrix"]
+    phase: Phase
     learned: Count
     epoch: Count
     task: Count
@@ -114,11 +118,14 @@ class EvalRecord:
     # digest of all that the rollouts depend on; empty where they also depend on random draws
     decided_by: str = ""
     # phase, learned, epoch of the original
-    same_as: tuple[Literal["curve", "matrix"], Count, Count] | None = None
+    same_as: tuple[Phase, Count, Count] | None = None
+    shift: str = ""
 
     def __post_init__(self) -> None:
-        if self.phase not in ("curve", "matrix"):
-            raise ValueError(f"phase of an evaluation is 'curve' or 'matrix', not {self.phase!r}")
+        if self.phase not in get_args(Phase):
+            raise ValueError(f"phase of an evaluation is 'curve', 'matrix' or 'shift', not {self.phase!r}")
+        if (self.phase == "shift") != bool(self.shift):
+            raise ValueError(f"an evaluation of phase {self.phase!r} has the shift {self.shift!r}")
         if not len(self.successes) == len(self.lengths) == len(self.init_states) > 0:
             raise ValueError(
                 "an evaluation needs equal numbers of successes, lengths and initial states, at least one; got "

@@ -63,12 +63,15 @@ class Results:
         """Whether the whole sequence is learned."""
         return bool(self.of(RunEndRecord))
 
-    def evaluation(self, phase: str, learned: int, task: int, epoch: int | None = None) -> EvalRecord | None:
+    def evaluation(
+        self, phase: str, learned: int, task: int, epoch: int | None = None, *, shift: str = ""
+    ) -> EvalRecord | None:
         """Return the evaluation with this key, of any epoch if none is given; None if it is not recorded."""
+        key = (phase, learned, task, shift)
         found = [
             r
             for r in self.of(EvalRecord)
-            if (r.phase, r.learned, r.task) == (phase, learned, task) and epoch in (None, r.epoch)
+            if (r.phase, r.learned, r.task, r.shift) == key and epoch in (None, r.epoch)
         ]
         return found[-1] if found else None
 
@@ -86,8 +89,9 @@ class Results:
         return count[False], count[True]
 
     def evaluations(self) -> list[EvalRecord]:
-        """Return every evaluation once, in the order of the run: the episodes behind all that is reported."""
-        found = {(r.learned, r.phase, r.epoch, r.task): r for r in self.of(EvalRecord)}
+        """Return every evaluation of curves and matrix once, in the order of the run: the episodes behind metrics."""
+        measured = [r for r in self.of(EvalRecord) if r.phase != "shift"]
+        found = {(r.learned, r.phase, r.epoch, r.task): r for r in measured}
         return [found[key] for key in sorted(found, key=lambda k: (k[0], k[1], k[2], k[3]))]
 
     def has_loss(self, task: int, epoch: int) -> bool:

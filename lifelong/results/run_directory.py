@@ -35,6 +35,7 @@ VOLATILE = (
     "data.memory",
     "data.backend",
     "eval.transfer",  # how records are read, not what they hold
+    "eval.shift",  # evaluations besides all others
 )
 # Keys that are not part of a run's digest, which its checkpoints carry. Never changed, so that runs of earlier versions
 # resume: the digest is that of the saved configuration, which stays as the run's first process wrote it.

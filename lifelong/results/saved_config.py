@@ -140,12 +140,13 @@ def _with_added(node: Any) -> Any:
 
 
 def upgrade_data(node: Mapping[str, Any]) -> Node:
-    """Return the node of the data with the drawing and the robot that were the only ones before they had names.
+    """Return the node of the data with what was the only way before it had a key: drawing, robot, no copies.
 
     Args:
         node: The `data` node; one of today comes back unchanged.
     """
-    return {"drawing": "fast", "robot": "robosuite-1.4.1", **node}
+    copies = {"perturb": None, "perturb_copies": 1, "perturb_seed": 0}
+    return {"drawing": "fast", "robot": "robosuite-1.4.1", **copies, **node}
 
 
 def upgrade_evaluation(node: Mapping[str, Any]) -> Node:
@@ -154,7 +155,7 @@ def upgrade_evaluation(node: Mapping[str, Any]) -> Node:
     Args:
         node: The `eval` node; one of today comes back unchanged.
     """
-    return {"curve": "all", "cells": "all", "reuse": True, **node}
+    return {"curve": "all", "cells": "all", "reuse": True, "shift": None, **node}
 
 
 def upgrade_stream(node: Mapping[str, Any]) -> Node:

@@ -17,6 +17,7 @@ from lifelong.results.metrics import METRIC_NAMES, Metrics, lifelong_metrics, wi
 from lifelong.results.records import TaskEndRecord
 from lifelong.results.results import Results, after_base_stage
 from lifelong.results.scores import Scores
+from lifelong.results.shifts import shift_summary
 
 # Grows when the same records give other metrics. 2: intervals of clusters, forward transfer without a held maximum.
 STATISTICS = 2
@@ -83,6 +84,7 @@ def summarize(results: Results) -> dict[str, Any]:
         },
         "best_epochs": {str(task): ends[task] for task in sorted(ends)},
         "subgoals": asdict(results.subgoals()),
+        **({"shifts": shifts} if (shifts := shift_summary(results)) else {}),
         "costs": {
             str(task): results.costs(task)
             | {f"{k}_seconds": v for k, v in results.task_seconds(task).items()}

@@ -301,15 +301,20 @@ class TaskSequence:
         best = first.best_epoch(results, first.epochs)
         columns = self.context.eval.row(stage, len(self.context.tasks))
         row = [self.evaluator.evaluate("matrix", task, seen, best) for seen in columns]
+        shifted = self.context.eval.shifted_row(stage, len(self.context.tasks)) if self.context.shift else ()
+        under = [self.evaluator.evaluate("shift", task, seen, best) for seen in shifted]
         if results.task_end(task) is None:
             spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
-            spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in row)
-            spent += sum(r.seconds for r in row)
+            done = [*row, *under]
+            spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in done)
+            spent += sum(r.seconds for r in done)
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
         new, mean = mean_rate([r for r in row if r.task in stage]), mean_rate(row)
         values = {"success/just_learned": new, "success/mean": mean, "tasks": task + 1}
         self.context.tracker.log({name: value for name, value in values.items() if not math.isnan(value)})
         told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
+        if under and self.context.shift:
+            told += f", {mean_rate(under):.0%} over {len(under)} under {self.context.shift.text}"
         self._log(f"  learned: {told}{self._eta(task)}")
 
     def _eta(self, task: int) -> str:

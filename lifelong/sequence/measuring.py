@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,10 +20,8 @@ from lifelong.context import RunContext
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.policies.base import Policy
 from lifelong.results.conditions import all_conditions
-from lifelong.results.records import EvalRecord, RunRecord
+from lifelong.results.records import EvalRecord, Phase, RunRecord
 from lifelong.seeding import ROLLOUT
-
-Kind = Literal["curve", "matrix"]
 
 
 class Evaluator:
@@ -37,16 +35,19 @@ class Evaluator:
     def __init__(self, context: RunContext, stages: Sequence[Sequence[int]]):
         self._context, self._stages, self._log = context, stages, context.directory.log
 
-    def evaluate(self, phase: Kind, learned: int, task: int, epoch: int) -> EvalRecord:
+    def evaluate(self, phase: Phase, learned: int, task: int, epoch: int) -> EvalRecord:
         """Evaluate a task and record it, or return the record if there is one.
 
         Args:
-            phase: Whether the rollouts are a point of a learning curve, or a cell of the success matrix.
+            phase: Whether the rollouts are a point of a learning curve, a cell of the success matrix, or under the
+                held-out shift.
             learned: Position of the task that was learned last.
             task: Position of the task to act on.
             epoch: Number of epochs trained on the task that was learned last.
         """
-        found = self._log.read().evaluation(phase, learned, task, epoch if phase == "curve" else None)
+        shift = self._shift(phase)
+        known = epoch if phase == "curve" else None
+        found = self._log.read().evaluation(phase, learned, task, known, shift=shift)
         if found is not None:
             return found
         context = self._context
@@ -62,21 +63,35 @@ class Evaluator:
         self._log.append(record)
         return record
 
-    def _circumstances(self, phase: Kind, task: int) -> dict[str, Any]:
+    def _shift(self, phase: Phase) -> str:
+        """Return the held-out shift of rollouts, as text; empty for those without it."""
+        shift = self._context.shift
+        return shift.text if phase == "shift" and shift is not None else ""
+
+    def _language(self, phase: Phase, task: int) -> Tensor:
+        """Return the embedding of what the policy is told on a task."""
+        shift = self._context.shift
+        found = shift.languages if phase == "shift" and shift is not None else self._context.languages
+        return found[task]
+
+    def _circumstances(self, phase: Phase, task: int) -> dict[str, Any]:
         """Return what rollouts depend on besides what acts, within one run."""
         context, settings = self._context, self._context.eval
         starts = self._log.read().of(RunRecord)
         perturb = format_perturbations(context.perturbed[task])
         return {
             **({"perturb": perturb} if perturb else {}),
+            **({"shift": self._shift(phase)} if phase == "shift" else {}),
             "task": task,
-            "language": context.languages[task],
+            "language": self._language(phase, task),
             "init_states": str(list(settings.init_states(phase))),
             "settings": f"{settings.horizon} {settings.settle_steps} {settings.precision}",
             "conditions": all_conditions(starts[-1]) if starts else {},
         }
 
-    def _copied(self, decided_by: str, phase: Kind, learned: int, task: int, epoch: int) -> EvalRecord | None:
+    def _copied(
+        self, decided_by: str, phase: Phase, learned: int, task: int, epoch: int
+    ) -> EvalRecord | None:
         """Return the record of rollouts that would repeat recorded ones; None where there are none."""
         found = self._log.read().original(decided_by)
         if found is None or found.task != task:
@@ -87,16 +102,16 @@ class Evaluator:
         return replace(found, phase=phase, learned=learned, epoch=epoch, seconds=0.0, same_as=origin)
 
     def _measured(
-        self, acting: Policy, decided_by: str, phase: Kind, learned: int, task: int, epoch: int
+        self, acting: Policy, decided_by: str, phase: Phase, learned: int, task: int, epoch: int
     ) -> EvalRecord:
         """Run the rollouts and return their record."""
         context, settings = self._context, self._context.eval
-        states = settings.init_states(phase)
+        states, shift = settings.init_states(phase), self._shift(phase)
         done = rollout(
             acting,
-            context.envs.get((task, len(states))),
+            context.envs.get((task, len(states), shift) if shift else (task, len(states))),
             states,
-            language=context.languages[task],
+            language=self._language(phase, task),
             horizon=settings.horizon,
             settle_steps=settings.settle_steps,
             seed=(context.seed, ROLLOUT, learned, epoch, task),
@@ -110,9 +125,9 @@ class Evaluator:
             path, success = self._video(learned, task), done.episodes[0].success
             save_animation(done.frames, path, seconds_per_frame=CONTROL_PERIOD * context.eval.record_every)
             self._write_caption(path, learned, task, success)
-        return _record(done, phase, learned, epoch, task, "" if done.random else decided_by)
+        return _record(done, phase, learned, epoch, task, "" if done.random else decided_by, shift)
 
-    def _is_filmed(self, phase: Kind, learned: int, task: int) -> bool:
+    def _is_filmed(self, phase: Phase, learned: int, task: int) -> bool:
         last = len(self._context.tasks) - 1
         return bool(self._context.eval.record_every) and phase == "matrix" and learned in (task, last)
 
@@ -167,9 +182,10 @@ def _feed(found: Any, value: Any) -> None:
 
 
 def _record(
-    rollouts: Rollouts, phase: Kind, learned: int, epoch: int, task: int, decided_by: str
+    rollouts: Rollouts, phase: Phase, learned: int, epoch: int, task: int, decided_by: str, shift: str
 ) -> EvalRecord:
     return EvalRecord(
+        shift=shift,
         phase=phase,
         learned=learned,
         epoch=epoch,

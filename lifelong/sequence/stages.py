@@ -97,9 +97,12 @@ def missing_points(context: RunContext, stage: Sequence[int], results: Results) 
 
 
 def lacks_row(context: RunContext, stage: Sequence[int], results: Results) -> bool:
-    """Return whether a stage's row of the success matrix is incomplete, of the cells that are measured."""
+    """Return whether a stage's row of the success matrix is incomplete, of the cells that are measured; see `eval`."""
     columns = context.eval.row(stage, len(context.tasks))
     row = [results.evaluation("matrix", stage[-1], seen) for seen in columns]
+    if context.shift is not None:
+        for seen in context.eval.shifted_row(stage, len(context.tasks)):
+            row.append(results.evaluation("shift", stage[-1], seen, shift=context.shift.text))
     return None in row or results.task_end(stage[-1]) is None
 
 

@@ -309,5 +309,5 @@ def test_the_summary_is_strict_json_and_complete(log: ResultLog, tmp_path: Path)
 def test_evaluations_without_episodes_are_refused():
     with pytest.raises(ValueError, match="at least one"):
         evaluation("curve", 0, 0, 0, 0, episodes=0)
-    with pytest.raises(ValueError, match="'curve' or 'matrix'"):
+    with pytest.raises(ValueError, match="'curve', 'matrix' or 'shift'"):
         evaluation("test", 0, 0, 0, 0)

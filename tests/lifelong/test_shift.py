@@ -1,6 +1,7 @@
 """Perturbations in lifelong learning: streams whose tasks are perturbed more and more."""
 
 import hashlib
+import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -17,11 +18,15 @@ from libero_env.demos.perturbed import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
 from libero_env.tasks import get_suite
 from lifelong import experiment
+from lifelong.cli.main import main
+from lifelong.data import demonstrations
 from lifelong.errors import ConfigError
 from lifelong.evaluation.restore import restore
 from lifelong.language import encoder
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord, RunRecord, from_line, to_line
+from lifelong.results.results import Results
+from lifelong.results.shifts import shift_scores
 from lifelong.sequence.learning import TaskSequence
 from lifelong.settings import build
 from lifelong.streams import StreamSettings
@@ -96,7 +101,7 @@ def outcomes(path: Path):
         ):
             continue
         values = {k: v for k, v in asdict(record).items() if k not in ("seconds", "decided_by")}
-        key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch", "perturb"))
+        key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch", "shift"))
         assert kept.setdefault(key, values) == values
     return kept
 
@@ -230,6 +235,79 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
 
 
 @pytest.mark.sim
+def test_held_out_shifts_are_measured_besides(folder, tmp_path, quick, monkeypatch, capsys):
+    """Also when a finished run is asked for them, to the same bits."""
+    seen, make = [], experiment._make_env
+    monkeypatch.setattr(
+        experiment, "_make_env", lambda *a, **k: seen.append((a[4], make(*a, **k))) or seen[-1][1]
+    )
+    stream, shift = ("stream=shift", f"stream.perturb='{LOOKS}'"), "eval.shift={robot:0.3,light:0.4}"
+    plain = run(folder, tmp_path, *stream)
+    before = outcomes(plain)
+    assert not any(len(key) > 2 for key, _ in seen) and not any(key[1] == "shift" for key in before)
+    numbers = json.loads((plain / "results.json").read_text())
+    assert "shifts" not in numbers and "<h2>Under " not in (plain / "report.html").read_text()
+    assert run(folder, tmp_path, *stream, shift) == plain
+    after = outcomes(plain)
+    added = {key: r for key, r in after.items() if key not in before}
+    assert {(r["phase"], r["learned"], r["task"]) for r in added.values()} == {
+        ("shift", 0, 0), ("shift", 1, 0), ("shift", 1, 1)
+    }  # fmt: skip
+    assert {key: after[key] for key in before} == before
+    text, matrix = "light=0.4,robot=0.3", [r for r in after.values() if r.get("phase") == "matrix"]
+    for record in added.values():
+        assert record["shift"] == text and record["init_states"] == matrix[0]["init_states"]
+    words = reword_task(TASKS[1], parse_perturbations(LOOKS)).language
+    under = {task: env for (task, *more), env in seen if more[1:]}
+    assert under[0].config.perturb == parse_perturbations(text)
+    assert under[1].config.perturb == parse_perturbations(f"{text},instruction=0.6")
+    assert (under[0].task.language, under[1].task.language) == (TASKS[0].language, words)
+    with_shifts = json.loads((plain / "results.json").read_text())
+    assert [one["shift"] for one in with_shifts["shifts"]] == [text]
+    for key in ("metrics", "success_matrix", "evaluations", "curves"):
+        assert with_shifts[key] == numbers[key]
+    assert f"<h2>Under {text}</h2>" in (plain / "report.html").read_text()
+    capsys.readouterr()
+    assert main(["report", str(plain)]) == 0 and f"under {text}: " in capsys.readouterr().out
+    assert outcomes(run(folder, tmp_path / "both", *stream, shift)) == after
+    with pytest.raises(ConfigError, match="know.* by their position"):
+        run(folder, tmp_path / "onehot", "language=onehot", "eval.shift={instruction:0.5}")
+
+
+def record(phase, learned, task, wins, shift=""):
+    return EvalRecord(
+        phase=phase, learned=learned, epoch=1, task=task, shift=shift, init_states=(0, 1, 2, 3), lengths=(9,) * 4,
+        successes=tuple(i < wins for i in range(4)), seconds=1.0,
+    )  # fmt: skip
+
+
+@pytest.mark.unit
+def test_forgetting_under_shift_is_just_learned_minus_final():
+    first = RunRecord(
+        algo="er", benchmark="b", policy="p", seed=1, preset="", tasks=("a", "b"), instructions=("a", "b"),
+        config_digest="", versions={}, commit=None, cpu_count=1, started="",
+    )  # fmt: skip
+    matrix = [record("matrix", 0, 0, 4), record("matrix", 1, 0, 3), record("matrix", 1, 1, 4)]
+    shifted = [record("shift", *key, "light=0.5") for key in ((0, 0, 3), (1, 0, 0), (1, 1, 2))]
+    results = Results((first, *matrix, *shifted))
+    assert Results((first, *matrix)).success_matrix()[0].tolist()[1] == [0.75, 1.0]
+    np.testing.assert_array_equal(results.success_matrix()[0], Results((first, *matrix)).success_matrix()[0])
+    assert results.evaluations() == matrix and shift_scores(Results((first, *matrix))) == []
+    (score,) = shift_scores(results)
+    names = ("learned", "learned_shifted", "final", "final_shifted")
+    assert [score.success(name).value for name in names] == [1.0, 0.625, 0.875, 0.25]
+    assert score.forgetting(shifted=False).value == 0.25 and score.forgetting(shifted=True).value == 0.75
+    low, high = score.forgetting(shifted=True).low, score.forgetting(shifted=True).high
+    assert 0 < low < 0.75 < high <= 1.2
+    (part,) = shift_scores(Results((first, *matrix, shifted[0])))
+    assert np.isnan(part.success("final_shifted").value) and np.isnan(part.forgetting(shifted=True).value)
+    line = to_line(shifted[0])
+    assert from_line(line) == shifted[0]
+    with pytest.raises(ValueError, match="has the shift"):
+        record("matrix", 0, 0, 1, "light=0.5")
+
+
+@pytest.mark.sim
 def test_without_perturbations_nothing_changes(folder, tmp_path, quick):
     plain, zero = (run(folder, tmp_path / name, *more) for name, more in
                    (("plain", ()), ("zero", ("stream=shift", "stream.perturb='light=0,camera=0'"))))  # fmt: skip
@@ -246,3 +324,45 @@ def test_a_run_of_before_is_restored(tmp_path):
     file.write_text("".join(x for x in file.read_text().splitlines(True) if "perturb" not in x))
     found = restore(tmp_path / "run", device="cpu")
     assert found.perturb == () and found.learned_task(1) == tasks[1]
+
+
+@pytest.mark.sim
+def test_copies_are_further_windows_of_the_same_actions(folder, tmp_path, quick):
+    text = ("data.perturb={camera:0.5,light:0.5}", "data.perturb_copies=2")
+    config = build(composed(*TINY, f"data.folder={folder}", *text).data)
+    tasks, counts, none = TASKS[:1], [2], [()]
+    paths = demonstrations.find_demos(tasks, counts, config, False)
+    copies = demonstrations.demo_copies(paths, tasks, counts, none, config, False)
+    assert [path.parent.name for path in copies[0]] == [
+        "under-camera=0.5,light=0.5-32x32-fast", "under-camera=0.5@1,light=0.5@1-32x32-fast"
+    ]  # fmt: skip
+    languages = torch.zeros(1, 384)
+    spec = config.spec(384)
+    plain = demonstrations.DemoDatasets(paths, counts, spec, languages, config, torch.device("cpu"))[0]
+    joined = demonstrations.DemoDatasets(paths, counts, spec, languages, config, torch.device("cpu"), copies)[
+        0
+    ]
+    n = len(plain)
+    assert len(joined) == 3 * n and joined.task_id == 0
+    mixed = torch.tensor([2 * n + 5, 5, n + 5])
+    batch, own = joined.batch(mixed), plain.batch(torch.tensor([5, 5, 5]))
+    assert torch.equal(batch.actions, own.actions) and batch.window_ids.tolist() == mixed.tolist()
+    for name, reading in batch.observation.proprio.items():
+        assert torch.equal(reading, own.observation.proprio[name])
+    images = batch.observation.images.float()
+    assert torch.equal(images[1], own.observation.images[1].float())
+    for i, k in ((0, 1), (0, 2), (1, 2)):
+        assert (images[i] - images[k]).abs().mean() > 1
+    path = run(folder, tmp_path, *text)  # replay, training and evaluation take them
+    assert ResultLog(path / "results.jsonl").read().finished
+    (said,) = [x for x in ResultLog(path / "results.jsonl").read().records if isinstance(x, RunRecord)]
+    assert said.perturbed == ()
+
+
+@pytest.mark.unit
+def test_settings_of_copies():
+    assert build(composed().data).copies == 0 and build(composed("data.perturb={light:1}").data).copies == 1
+    assert build(composed("data.perturb={light:1}", "data.perturb_copies=0").data).copies == 0
+    for wrong, said in (("{instruction:1}", "instruction"), ("{robot:1}", "changes what happens")):
+        with pytest.raises(ConfigError, match=f"data.perturb.*{said}"):
+            build(composed(f"data.perturb={wrong}").data)
