@@ -83,6 +83,7 @@ def run_list(args: argparse.Namespace) -> None:
     """Print a line for each kind, in the order in which they are applied."""
     from libero_env.perturbations import KINDS
 
+    print(f"{'layer':12} {'kind':14} {'at 1':>5} {'unit':22} what changes")
     for kind in KINDS.values():
         print(f"{kind.layer:12} {kind.name:14} {kind.at_one:5g} {kind.unit:22} {kind.what}")
 

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from libero_env.perturbations import KINDS
+from libero_env.tasks import get_task
 from lifelong.cli.main import main
 from lifelong.errors import ComparisonError, ProtocolError
 from lifelong.evaluation.card_files import load_card, parse_card
+from lifelong.evaluation.protocol_env import ProtocolEnv, make_env
 from lifelong.report.comparability import Side, check_comparable, match
 from lifelong.results.evaluation_file import EvaluationResult
 
@@ -81,3 +84,23 @@ def test_a_units_episodes_do_not_depend_on_the_unit(tmp_path, monkeypatch):
         assert main([*EVAL, *perturb, "--unit-starts", size, "--out", size]) == 0
     found = [EvaluationResult.read(tmp_path / size).tasks[0] for size in ("1", "3")]
     assert found[0].lengths == found[1].lengths and found[0].actions == found[1].actions
+
+
+def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypatch):
+    monkeypatch.setattr(
+        ProtocolEnv, "_stored", lambda self: self.env.world.init_states
+    )  # LIBERO's may not be here
+    card = load_card("openpi").changed({"pixels.render_size": (32, 32)})
+    found = []
+    for perturb in ("", "layout=0.3,distractors=0.3,robot=0.4"):
+        env = make_env(
+            get_task("libero_goal/3"), 2, card.changed({"world.perturb": perturb}), cameras=(), threads=1
+        )
+        env.reset(options={"init_state": np.array([3, 7])})
+        plate = [view.body_pos("plate_1") for view in env.world.views]
+        found.append((env.world.simulations.fixtures.copy(), np.array(plate)))
+        assert env.task.language == env.world.base_task.language and len(env.step(np.zeros((2, 7)))) == 5
+        env.close()
+    assert np.array_equal(found[0][0], found[1][0])
+    moved = np.linalg.norm(found[1][1] - found[0][1], axis=1)
+    assert moved == pytest.approx(KINDS["layout"].amount(0.3))  # the same for all starts
