@@ -180,7 +180,7 @@ class _SceneCache:
         self._lock = RLock()
 
     def __call__(
-        self, problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool
+        self, problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool = False
     ) -> Scene:
         """Return the scene of these arguments; it is compiled if it is not there."""
         key = (problem, pack, drawing, robot, spare_materials)
