@@ -133,6 +133,13 @@ def compare_files(folder: Path) -> dict[str, dict]:
     return dict(found)
 
 
+def compare_categories(path: Path) -> dict[str, dict]:
+    """Compare the dimension of each id with that of `task_classification.json`, which only their repository has."""
+    entries = [entry for found in json.loads(path.read_text()).values() for entry in found]
+    wrong = sum(parse_plus_id(entry["name"]).category != entry["category"] for entry in entries)
+    return {"dimension of each id": {"compared": len(entries), "largest_difference": wrong}}
+
+
 def compare_pro(folder: Path) -> dict[str, dict]:
     """Compare what both readers find in the task files of LIBERO-PRO."""
     found = {}
@@ -213,6 +220,7 @@ def main() -> None:
     parser.add_argument("--images", type=Path)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--pro", type=Path, help="folder with bddl_files of LIBERO-PRO")
+    parser.add_argument("--classification", type=Path, help="task_classification.json of LIBERO-Plus")
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     folder = Path(get_libero_path("bddl_files"))
@@ -221,6 +229,7 @@ def main() -> None:
         return
     rows = {**compare_poses(folder), **compare_noise(np.load(args.images)), **compare_files(folder)}
     rows |= compare_pro(args.pro) if args.pro else {}
+    rows |= compare_categories(args.classification) if args.classification else {}
     for key, row in rows.items():
         print(f"{key:36} {row}")
     if args.out:
