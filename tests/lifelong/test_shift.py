@@ -21,7 +21,9 @@ from lifelong import experiment
 from lifelong.cli.main import main
 from lifelong.data import demonstrations
 from lifelong.errors import ConfigError
-from lifelong.evaluation.restore import restore
+from lifelong.evaluation import relearning
+from lifelong.evaluation.relearning import RelearnSettings
+from lifelong.evaluation.restore import read_config, restore
 from lifelong.language import encoder
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord, RunRecord, from_line, to_line
@@ -201,7 +203,8 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
         "__getitem__",
         lambda self, k: read.append((k, self.paths[k], self.languages[k])) or opened(self, k),
     )
-    path = run(folder, tmp_path, "stream=shift", f"stream.perturb='{LOOKS}'")
+    stream = ("stream=shift", f"stream.perturb='{LOOKS}'", "stream.demos_later=1")
+    path = run(folder, tmp_path, *stream)
     largest = parse_perturbations(LOOKS)
     words = [TASKS[0].language, reword_task(TASKS[1], largest).language]
     assert words[1] != TASKS[1].language
@@ -223,10 +226,18 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
     )  # without the shift
     assert (path / "report.html").is_file()
 
+    settings, config = RelearnSettings(held_out=1), read_config(path / "config.yaml", ())
+    lesson = relearning._lesson(loaded, loaded.policy, 1, settings, config)
+    shifted = next(folder.rglob(f"under-instruction=0.6*/{TASKS[1].name}_demo.hdf5"))
+    (_, first), (_, other) = read_episodes(shifted)  # learned from, and held out
+    assert len(lesson.training) == len(first) and len(lesson.held_out) == len(other)
+    np.testing.assert_array_equal(lesson.held_out.observation.images[0, 0, 0], other.obs["agentview_rgb"][0])
+    assert torch.equal(lesson.held_out.observation.language[0], embedded[1])
+
     def stop(self, *args):
         raise Stop
 
-    killed = (folder, tmp_path / "killed", "stream=shift", f"stream.perturb='{LOOKS}'")
+    killed = (folder, tmp_path / "killed", *stream)
     with monkeypatch.context() as patch:
         patch.setattr(TaskSequence, "_evaluate_seen_tasks", stop)
         with pytest.raises(Stop):
