@@ -25,6 +25,7 @@ from libero_env.perturbations.value import Perturbation
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
 
+_FORMAT = 2  # of the files; those of another are made again
 REDRAWS = 3  # further draws of what the expert does not solve
 
 
@@ -37,6 +38,7 @@ class PerturbedCertificate:
         perturbation: The perturbation as text.
         digest: Digest of what the results depend on.
         solved: Index of an initial state -> number of the first draw from which the expert reaches the goal.
+        at_first: Number of initial states from which the expert solves the first draw.
         failures: Index of an initial state -> why the expert reaches it from none of the draws.
         drawn_again: Number of draws of the whole task that the expert did not solve from most of the starts.
         impossible: Why the task cannot be perturbed in this way; "" where it can.
@@ -46,6 +48,7 @@ class PerturbedCertificate:
     perturbation: str
     digest: str
     solved: Mapping[str, int] = field(default_factory=dict)
+    at_first: int = 0
     failures: Mapping[str, str] = field(default_factory=dict)
     drawn_again: int = 0
     impossible: str = ""
@@ -54,11 +57,6 @@ class PerturbedCertificate:
     def starts(self) -> int:
         """Number of initial states."""
         return len(self.solved) + len(self.failures)
-
-    @property
-    def at_first(self) -> int:
-        """Number of initial states from which the expert solves the first draw."""
-        return sum(attempt == 0 for attempt in self.solved.values()) if not self.drawn_again else 0
 
     @property
     def redraws(self) -> int:
@@ -137,6 +135,7 @@ def attempt_perturbed(
     redraws = redraws if one.definition.is_drawn else 0
     try:
         outcomes = _outcomes(task, one, starts, 0, whole)
+        at_first = _won(outcomes)
         while one.definition.layer == "problem" and whole < redraws and 2 * _won(outcomes) < len(starts):
             whole += 1
             outcomes = _outcomes(task, one, starts, 0, whole)
@@ -151,7 +150,7 @@ def attempt_perturbed(
         solved |= {start: attempt for start in pending if not outcomes[start]}
     failures = {str(start): outcomes[start] for start in starts if start not in solved}
     by_start = {str(start): solved[start] for start in starts if start in solved}
-    return PerturbedCertificate(task.id, str(one), digest, by_start, failures, whole)
+    return PerturbedCertificate(task.id, str(one), digest, by_start, at_first, failures, whole)
 
 
 def _won(outcomes: Mapping[int, str]) -> int:
@@ -211,7 +210,7 @@ def _path(folder: Path, task: Task, one: Perturbation) -> Path:
 
 def _digest(task: Task, one: Perturbation, starts: int, redraws: int) -> str:
     kind = one.definition
-    parts = (task.bddl_text, str(one), kind.at_one, starts, redraws, GENERATOR, mujoco.__version__)
+    parts = (_FORMAT, task.bddl_text, str(one), kind.at_one, starts, redraws, GENERATOR, mujoco.__version__)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
