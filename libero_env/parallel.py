@@ -7,6 +7,7 @@ import pickle
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import suppress
@@ -91,12 +92,14 @@ def _start_worker(initializer: Callable[[], None] | None) -> None:
 
 def end_with_parent() -> None:
     """End this process when its parent is gone; the workers of a killed process would otherwise wait forever."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
+    parent, number = multiprocessing.parent_process(), os.getppid()
 
     def watch() -> None:
-        connection.wait([parent.sentinel])
+        while os.getppid() == number:
+            if parent is None or parent.sentinel is None:  # as in the processes of joblib
+                time.sleep(1.0)
+            elif connection.wait([parent.sentinel], timeout=1.0):
+                break
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

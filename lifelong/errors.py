@@ -13,6 +13,10 @@ class ConfigError(LifelongError, ValueError):
     """Raised for a configuration that is invalid, or differs from the one of the run directory."""
 
 
+class RunLockedError(LifelongError):
+    """Another process writes the run."""
+
+
 class CheckpointError(LifelongError, ValueError):
     """Raised for a checkpoint that is missing, broken, or does not fit the model."""
 
@@ -89,5 +93,9 @@ def require_package(name: str, extra: str) -> None:
     Raises:
         MissingPackageError: It is not; the message has the command that installs it.
     """
-    if find_spec(name) is None:
+    try:
+        found = find_spec(name)
+    except ModuleNotFoundError:  # not even the package that it is part of
+        found = None
+    if found is None:
         raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")

@@ -1,10 +1,12 @@
 """From the command line to a run: the configuration is composed, errors take one line, sweeps get a report."""
 
 import difflib
+import math
 import os
 import re
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,34 +18,53 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.cli import ending
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError, printable
+from libero_env.parallel import end_with_parent
 from lifelong import experiment
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, require_package
 from lifelong.report.page import write_report
 from lifelong.results.saved_config import upgrade_config
+from lifelong.settings import plain_data
+from lifelong.sweeps import (
+    FOLDER,
+    JOB_FILE,
+    JobRecord,
+    begin_sweep,
+    config_key,
+    read_sweep,
+    run_job,
+    status_lines,
+    sweep_name,
+)
 from lifelong.training.distributed import Ranks, process_group, rank
 
+# launcher -> package of its plug-in, and the extra that installs it
+LAUNCHERS = {
+    "joblib": ("hydra_plugins.hydra_joblib_launcher", "joblib"),
+    "submitit_local": ("hydra_plugins.hydra_submitit_launcher", "submitit"),
+    "submitit_slurm": ("hydra_plugins.hydra_submitit_launcher", "submitit"),
+    "ray": ("hydra_plugins.hydra_ray_launcher", "ray"),
+}
+_process: dict[str, Any] = {}  # of the process that was started: its ranks, and the folder of its sweep
 
-class CombinedReport(Callback):
-    """Hydra callback that writes one report for all runs of a sweep (`-m`)."""
 
-    def __init__(self) -> None:
-        self._runs: list[Path] = []
+class SweepStart(Callback):
+    """Hydra callback that notes what a sweep (`-m`) is asked for, in the process that starts it."""
 
-    def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
-        """Note the directory of a run that has succeeded."""
-        if isinstance(job_return._return_value, Path):
-            self._runs.append(job_return._return_value)
-
-    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare the runs that have succeeded; of several processes that train together, only the first writes."""
-        if len(self._runs) > 1 and rank() == 0:
-            page = write_report(self._runs, Path(config.runs_dir) / "sweep" / "report.html")
-            print(f"{len(self._runs)} runs compared: {page}")
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write the sweep's file."""
+        folder = Path(config.hydra.sweep.dir).resolve()
+        words, ranks = list(config.hydra.overrides.task), _process.get("ranks") or Ranks()
+        planned = math.prod(len(values) for values in swept(words).values())
+        own = "BasicSweeper" in str(config.hydra.sweeper._target_)  # another one chooses its jobs as it goes
+        if ranks.first:
+            begin_sweep(folder, words, planned if own else None)
+        _process["sweep"] = folder
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -140,11 +161,31 @@ def check_choices(overrides: Sequence[str], folders: Sequence[Path]) -> None:
     """
     for override in overrides:
         group, _, names = override.partition("=")
+        if group == "hydra/launcher":
+            _check_launcher(names)
+            continue
         found = [folder / group for folder in folders if group and names and (folder / group).is_dir()]
         valid = sorted({file.stem for folder in found for file in folder.glob("*.yaml")})
         for name in names.split(",") if found else ():
             if name not in valid:
                 raise UnknownNameError(group, name, valid)
+
+
+def _check_launcher(name: str) -> None:
+    """Check that the package of a launcher is installed.
+
+    Raises:
+        MissingPackageError: It is not; the message says what to install.
+    """
+    for launcher, (package, extra) in LAUNCHERS.items():
+        if name == launcher or launcher in _launcher_defaults(name):
+            require_package(package, extra)
+
+
+def _launcher_defaults(name: str) -> list[str]:
+    """Return the launchers that a file of the package's configuration builds on."""
+    file = config_folder() / "hydra" / "launcher" / f"{name}.yaml"
+    return list(OmegaConf.load(file).get("defaults", [])) if file.is_file() else []
 
 
 def _user_folders(words: Sequence[str]) -> list[Path]:
@@ -160,29 +201,82 @@ def _user_folders(words: Sequence[str]) -> list[Path]:
 
 def _compose_and_run(words: list[str], folder: Path, ranks: Ranks) -> int:
     """Run the jobs of the command line, several after `-m`; return the worst exit status."""
-    status, began = 0, False
-
-    def job(config: DictConfig) -> Path | None:
-        nonlocal status, began
-        began = True
-        try:
-            return experiment.run(config, HydraConfig.get().runtime.choices, ranks)
-        except Exception as error:  # noqa: BLE001 - told by kind; the other jobs of a sweep go on
-            status = max(status, _report(error))
-            if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
-                raise SystemExit(status) from error
-            return None
-
-    sys.argv[1:] = words  # where Hydra reads them
+    sys.argv[1:] = [*words, *_sweep_folder(words)]  # where Hydra reads them
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
+    _process.clear()
+    _process.update(ranks=ranks, status=0)
     try:
-        hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(job)()
+        hydra.main(version_base="1.3", config_path=str(folder), config_name="config")(_job)()
     except (AssertionError, AttributeError, OSError, TypeError, ValueError) as error:
-        if began or isinstance(error, LiberoError):
+        if "began" in _process or isinstance(error, LiberoError):
             raise
         # raised by Hydra for overrides that it cannot apply, or a folder of its own that cannot be made
         raise ConfigError(f"the configuration cannot be composed: {error}") from error
-    return status
+    except Exception:
+        if "sweep" not in _process:
+            raise
+        _end_sweep(ranks)  # a launcher lost a job, such as one that its cluster has killed
+        raise
+    return _end_sweep(ranks) if "sweep" in _process else _process["status"]
+
+
+def _job(config: DictConfig) -> Path | None:
+    """Run one job, in whatever process Hydra's launcher calls it."""
+    hydra_config = HydraConfig.get()
+    ranks = _process.get("ranks")
+    if ranks is None:  # a process of a launcher, which knows the configuration alone
+        end_with_parent()
+        with ending.interruptible(), process_group() as own:
+            _process.update(ranks=own, status=0)
+            return _job(config)
+    _process["began"] = True
+    learn = partial(experiment.run, config, hydra_config.runtime.choices, ranks)
+    if hydra_config.mode != RunMode.MULTIRUN or not ranks.first:
+        try:
+            return learn()
+        except Exception as error:  # noqa: BLE001 - told by kind
+            _process["status"] = _report(error)
+            if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
+                raise SystemExit(_process["status"]) from error
+            return None
+    file = Path(hydra_config.runtime.output_dir) / JOB_FILE
+    key = config_key(plain_data(config))
+    job = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
+    done = run_job(file, job, learn, _report_line)
+    if done.exit_status and ranks.size > 1:
+        raise SystemExit(done.exit_status)
+    return Path(done.run) if done.run else None
+
+
+def _sweep_folder(words: Sequence[str]) -> list[str]:
+    """Return the override that gives a sweep a folder of its own, by which the same command finds it again."""
+    several = {"-m", "--multirun"} & set(words)
+    if not several or any(word.startswith("hydra.sweep.dir=") for word in words):
+        return []
+    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    name = sweep_name(sorted(overrides), list(swept(overrides)))
+    return [f"hydra.sweep.dir='${{runs_dir}}/{FOLDER}/{name}'"]
+
+
+def _end_sweep(ranks: Ranks) -> int:
+    """Say what became of the jobs, compare the runs that are finished, and return the exit status."""
+    if not ranks.first:
+        return 0
+    sweep = read_sweep(_process["sweep"])
+    if len(sweep.runs) > 1:
+        page = write_report(sweep.runs, sweep.folder / "report.html")
+        print(f"{len(sweep.runs)} runs compared: {page}")
+    if sweep.exit_status:
+        print("\n".join(status_lines(sweep)), file=sys.stderr)
+    return sweep.exit_status
+
+
+def _report_line(error: BaseException) -> tuple[int, str]:
+    """Print an error; return the exit status and the error in one line."""
+    cause = _cause(error)
+    text = " ".join(str(cause).split()) or type(cause).__name__
+    named = text if isinstance(cause, LiberoError) else f"{type(cause).__name__}: {text}"
+    return _report(error), printable(named)
 
 
 def _with_suggestion(error: Exception, words: Sequence[str]) -> LiberoError | None:
@@ -244,8 +338,13 @@ def _is_choice(word: str) -> bool:
 
 def _report(error: BaseException) -> int:
     """Print an error in one line; where Hydra wraps an error of ours, the message of ours."""
+    who = f"rank {rank()}: " if rank() else ""
+    return ending.report(_cause(error), who=who, mistakes=(HydraException, OmegaConfBaseException))
+
+
+def _cause(error: BaseException) -> BaseException:
+    """Return the error of ours that caused another one, or that one."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LiberoError):
         cause = cause.__cause__
-    who = f"rank {rank()}: " if rank() else ""
-    return ending.report(cause or error, who=who, mistakes=(HydraException, OmegaConfBaseException))
+    return cause or error

@@ -9,7 +9,18 @@ from typing import Any, NoReturn
 from libero_env.cli import arguments, assets, demos, ending, objects, perturb, tasks, teleop
 from libero_env.cli.arguments import Subparsers
 from libero_env.errors import InvalidInputError
-from lifelong.cli import check, compare, evaluate, protocols, relearn, robustness, saliency, serve, tune
+from lifelong.cli import (
+    check,
+    compare,
+    evaluate,
+    protocols,
+    relearn,
+    robustness,
+    saliency,
+    serve,
+    sweep,
+    tune,
+)
 
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
@@ -168,6 +179,7 @@ def run_report(args: argparse.Namespace) -> None:
 
 COMMANDS: tuple[Callable[[Subparsers], None], ...] = (
     register_train,
+    sweep.register,
     tune.register,
     register_doctor,
     tasks.register,

@@ -51,7 +51,7 @@ class Claim:
     @property
     def is_gone(self) -> bool:
         """Whether the holder ran on this machine and has ended. False where that cannot be known."""
-        return self.machine == this_machine() and not _is_running(self.pid, self.process_start)
+        return self.machine == this_machine() and not is_running(self.pid, self.process_start)
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Claims:
     def _create(self, unit: str) -> Claim | None:
         pid = os.getpid()
         claim = Claim(
-            unit, socket.gethostname(), this_machine(), pid, _process_start(pid), secrets.token_hex(8)
+            unit, socket.gethostname(), this_machine(), pid, process_start(pid), secrets.token_hex(8)
         )
         path = self._path(unit)
         try:
@@ -216,7 +216,7 @@ def this_machine() -> str:
     return " ".join(parts)
 
 
-def _process_start(pid: int) -> int | None:
+def process_start(pid: int) -> int | None:
     """Return when a process started, in ticks since the boot; None if it has ended, or without /proc."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
@@ -226,9 +226,15 @@ def _process_start(pid: int) -> int | None:
     return None if state in "ZX" else int(rest[18])
 
 
-def _is_running(pid: int, process_start: int | None) -> bool:
-    if process_start is not None:
-        return _process_start(pid) == process_start
+def is_running(pid: int, start: int | None) -> bool:
+    """Return whether a process of this machine runs.
+
+    Args:
+        pid: Its number.
+        start: When it started, of `process_start`; tells processes with the same number apart.
+    """
+    if start is not None:
+        return process_start(pid) == start
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 
 from libero_env.storage import PART_SUFFIX, atomic_write_text
-from lifelong.errors import ConfigError, LifelongError
+from lifelong.errors import ConfigError, RunLockedError
 from lifelong.results.checkpoint_folder import CheckpointFolder
 from lifelong.results.log import ResultLog
 from lifelong.results.saved_config import read_saved_config, upgrade_config
@@ -65,7 +65,7 @@ class RunDirectory:
 
         Raises:
             ConfigError: The existing run has another configuration.
-            LifelongError: Another process is writing there.
+            RunLockedError: Another process is writing there.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(self.path.with_name(f".{self.path.name}.lock")):
@@ -123,7 +123,7 @@ def _locked(path: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise LifelongError(
+            raise RunLockedError(
                 f"another process is writing to {path.parent / path.name[1:-5]}; wait for it, or give this "
                 "run another name with run_id=NAME"
             ) from error

@@ -11,7 +11,8 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
 
 
-FILES = sorted(f.relative_to(CONFIGS) for f in CONFIGS.rglob("*/*.yaml"))
+FOUND = (f.relative_to(CONFIGS) for f in CONFIGS.rglob("*/*.yaml"))
+FILES = sorted(f for f in FOUND if f.parts[0] != "hydra")  # launchers are of other packages
 
 
 def composed(*overrides: str) -> DictConfig:

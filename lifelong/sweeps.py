@@ -1,0 +1,303 @@
+"""Sweeps: what became of each job is kept in a file, whatever process or machine ran it.
+
+Hydra's launchers run the jobs of a sweep (`-m`) in this process, in others, or on other machines, to which functions
+and callbacks are copied: what a job returns or a callback collects may never come back. So each job keeps a record, and
+the process that started the sweep reads them all. A sweep that is started again runs what is missing.
+
+    <runs_dir>/sweep/<name>/sweep.json             what was asked: the words of the command, the number of jobs
+    <runs_dir>/sweep/<name>/jobs/<number>/job.json what became of a job
+    <runs_dir>/sweep/<name>/report.html            the runs that are finished, compared
+"""
+
+import hashlib
+import json
+import math
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from libero_env.storage import atomic_write_text
+from libero_env.validation import validate
+from lifelong.errors import ResultsError, RunLockedError
+from lifelong.evaluation.claims import is_running, process_start, this_machine
+from lifelong.results.provenance import utc_now
+from lifelong.results.run_directory import result_relevant
+from lifelong.results.summary import json_safe
+
+SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
+Status = Literal["running", "done", "failed", "interrupted"]
+_POLL = 5.0  # s between two looks at a run that another process writes
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """What became of a job.
+
+    Attributes:
+        number: Number of the job in the sweep, from 0.
+        key: Digest of what its results depend on.
+        words: Its overrides of the configuration.
+        status: `running`; `done`; `failed`, with an error; `interrupted`, by a signal.
+        host: Name of the machine.
+        machine: Identity of the machine's process numbers.
+        pid: Process.
+        process_start: When the process started, in the machine's ticks.
+        started: When it began, UTC.
+        seconds: Time that it took, [s].
+        run: Directory of the run; None before there is one.
+        metrics: Metrics of the run that is done, by name.
+        error: The error in one line.
+        exit_status: Exit status that the error calls for; 0 without one.
+    """
+
+    number: int
+    key: str
+    words: tuple[str, ...]
+    status: Status
+    host: str = field(default_factory=socket.gethostname)
+    machine: str = field(default_factory=this_machine)
+    pid: int = field(default_factory=os.getpid)
+    process_start: int | None = field(default_factory=lambda: process_start(os.getpid()))
+    started: str = field(default_factory=utc_now)
+    seconds: float = 0.0
+    run: str | None = None
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    error: str | None = None
+    exit_status: Annotated[int, Field(ge=0, le=255)] = 0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether its process has ended without a word. False where that cannot be known: on another machine."""
+        here = self.status == "running" and self.machine == this_machine()
+        return here and not is_running(self.pid, self.process_start)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it is done, and its run is still there."""
+        return self.status == "done" and self.run is not None and (Path(self.run) / "results.json").is_file()
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep as its folder tells it.
+
+    Attributes:
+        folder: Folder of the sweep.
+        words: Words of the command.
+        planned: Number of jobs; None where the sweeper chooses them as it goes.
+        jobs: Records, by number.
+    """
+
+    folder: Path
+    words: tuple[str, ...]
+    planned: int | None
+    jobs: tuple[JobRecord, ...]
+
+    @property
+    def runs(self) -> list[Path]:
+        """Directories of the finished runs."""
+        return list(dict.fromkeys(Path(job.run) for job in self.jobs if job.is_finished and job.run))
+
+    @property
+    def missing(self) -> int:
+        """Number of jobs that have not begun."""
+        return max(0, (self.planned or 0) - len(self.jobs))
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the sweep: the worst of its jobs; 1 where one has not ended."""
+        unfinished = self.missing or any(job.status in ("running", "interrupted") for job in self.jobs)
+        return max([*(job.exit_status for job in self.jobs), int(bool(unfinished))], default=0)
+
+
+def sweep_name(words: Sequence[str], swept: Sequence[str]) -> str:
+    """Return the name of a sweep's folder: the same command goes on in the same folder.
+
+    Args:
+        words: Words of the command.
+        swept: Keys of which several values are tried.
+    """
+    digest = hashlib.sha256("\0".join(words).encode()).hexdigest()[:8]
+    keys = "_".join(key.rpartition(".")[2].rpartition("/")[2] for key in swept)[:60]
+    return f"{keys}-{digest}" if keys else digest
+
+
+def begin_sweep(folder: Path, words: Sequence[str], planned: int | None) -> None:
+    """Write what is asked.
+
+    Raises:
+        ResultsError: The folder cannot be written.
+    """
+    content = {"words": list(words), "planned": planned, "started": utc_now()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(folder / SWEEP_FILE, json.dumps(content, indent=1) + "\n")
+    except OSError as error:
+        raise ResultsError(f"{folder}: the sweep cannot be kept there ({error})") from error
+
+
+def read_sweep(folder: Path) -> Sweep:
+    """Read a sweep.
+
+    Raises:
+        ResultsError: It is no folder of a sweep, or a file is broken.
+    """
+    file = folder / SWEEP_FILE
+    if not file.is_file():
+        raise ResultsError(f"{folder} is no folder of a sweep: it has no {SWEEP_FILE}")
+    content = _read_json(file)
+    words, planned = content.get("words", []), content.get("planned")
+    jobs = [job for path in (folder / "jobs").glob(f"*/{JOB_FILE}") if (job := read_job(path))]
+    if planned is not None:  # others are of an earlier command in the same folder
+        jobs = [job for job in jobs if job.number < planned]
+    return Sweep(folder, tuple(words), planned, tuple(sorted(jobs, key=lambda job: job.number)))
+
+
+def find_sweeps(folder: Path) -> list[Path]:
+    """Return the folder if it is one of a sweep, or those of the sweeps in a folder of runs."""
+    if (folder / SWEEP_FILE).is_file():
+        return [folder]
+    found = [*folder.glob(f"*/{SWEEP_FILE}"), *folder.glob(f"{FOLDER}/*/{SWEEP_FILE}")]
+    return sorted(file.parent for file in found)
+
+
+def read_job(file: Path) -> JobRecord | None:
+    """Return the record of a job; None if there is none.
+
+    Raises:
+        ResultsError: The file is broken.
+    """
+    if not file.is_file():
+        return None
+    known = {f.name for f in fields(JobRecord)}
+    content = {key: value for key, value in _read_json(file).items() if key in known}
+    return validate(JobRecord, content, prefix=(str(file),), error=ResultsError)
+
+
+def config_key(config: Mapping[str, Any]) -> str:
+    """Return the digest of what the results of a configuration depend on, 12 hex digits."""
+    text = json.dumps(result_relevant(config), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def run_job(
+    file: Path,
+    job: JobRecord,
+    learn: Callable[[], Path],
+    report: Callable[[BaseException], tuple[int, str]],
+) -> JobRecord:
+    """Run a job and keep its record; one that is done already is not run again.
+
+    Where another process writes the same run, such as a job of an earlier start of the sweep that goes on elsewhere, it
+    is waited for.
+
+    Args:
+        file: File of the record.
+        job: The job, running.
+        learn: Function that learns and returns the directory of the run.
+        report: Function that prints an error and returns the exit status and the line.
+
+    Returns:
+        The record at the end. Errors of the job are kept in it.
+
+    Raises:
+        KeyboardInterrupt: The job was interrupted, which is kept, too.
+    """
+    earlier = read_job(file)
+    if earlier is not None and earlier.key == job.key and earlier.is_finished:
+        print(f"job {job.number} is done: {earlier.run}", flush=True)
+        return earlier
+    began = time.monotonic()
+    _write(file, job)
+
+    def ended(status: Status, **more: Any) -> JobRecord:
+        record = replace(job, status=status, seconds=round(time.monotonic() - began, 1), **more)
+        _write(file, record)
+        return record
+
+    try:
+        path = _when_free(learn)
+    except (KeyboardInterrupt, SystemExit) as error:
+        ended("interrupted", error=type(error).__name__)
+        raise
+    except Exception as error:  # noqa: BLE001 - told by kind; the other jobs of a sweep go on
+        status, line = report(error)
+        return ended("failed", error=line, exit_status=status)
+    return ended("done", run=str(path.resolve()), metrics=_metrics(path))
+
+
+def status_lines(sweep: Sweep) -> Iterator[str]:
+    """Yield the lines that say how far a sweep is: what runs, what failed, and what is left."""
+    counts = {name: sum(_state(job) == name for job in sweep.jobs) for name in _STATES}
+    told = [f"{count} {name}" for name, count in counts.items() if count]
+    told += [f"{sweep.missing} not begun"] if sweep.missing else []
+    of = "" if sweep.planned is None else f" of {sweep.planned} jobs"
+    yield f"{sweep.folder}: {', '.join(told) or 'nothing begun'}{of}"
+    common = set.intersection(*(set(job.words) for job in sweep.jobs)) if len(sweep.jobs) > 1 else set()
+    for job in sweep.jobs:
+        state = _state(job)
+        own = " ".join(word for word in job.words if word not in common)
+        line = f"{job.number:>4}  {state:<11}  {_time(job):>9}  {own}"
+        if state == "done" and (auc := job.metrics.get("auc")) is not None:
+            line += f"  AUC {auc:.3f}"
+        if state in ("running", "lost"):
+            line += f"  ({job.host}:{job.pid})"
+        yield line + (f"\n      {job.error}" if job.error else "")
+
+
+_STATES = ("done", "running", "failed", "interrupted", "lost")
+
+
+def _state(job: JobRecord) -> str:
+    return "lost" if job.is_lost else job.status
+
+
+def _time(job: JobRecord) -> str:
+    if job.status == "running":
+        return ""
+    minutes, seconds = divmod(round(job.seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def _when_free(learn: Callable[[], Path]) -> Path:
+    """Learn; while another process writes the run, wait."""
+    told = False
+    while True:
+        try:
+            return learn()
+        except RunLockedError as error:
+            if not told:
+                print(f"{error}; waiting for it", flush=True)
+                told = True
+            time.sleep(_POLL)
+
+
+def _metrics(run: Path) -> dict[str, float | None]:
+    """Return the metrics in a run's results.json, by name."""
+    found = (_read_json(run / "results.json").get("metrics") or {}).items()
+    values = {name: entry["value"] for name, entry in found if isinstance(entry, dict) and "value" in entry}
+    return {name: value for name, value in values.items() if value is None or math.isfinite(value)}
+
+
+def _write(file: Path, job: JobRecord) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(file, json.dumps(json_safe(asdict(job)), indent=1, ensure_ascii=False) + "\n")
+    except OSError as error:
+        raise ResultsError(f"{file}: the record of the job cannot be written ({error})") from error
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ResultsError(f"{file} cannot be read ({error}); remove it to run its job again") from error
+    if not isinstance(content, dict):
+        raise ResultsError(f"{file} is no record of a sweep; remove it to run its job again")
+    return content

@@ -1,0 +1,91 @@
+"""A sweep under other launchers than Hydra's basic one: the same numbers, errors that are told, and going on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+TINY = "preset=smoke benchmark=libero_object benchmark.tasks=1 threads=1 data.demos=2 train.epochs=1 "
+TINY += "train.steps_per_epoch=2 train.batch_size=4 eval.curve=none eval.select=last eval.horizon=8 eval.episodes=2"
+JOBLIB = ("hydra/launcher=workstation", "hydra.launcher.n_jobs=2")
+SUBMITIT = ("hydra/launcher=submitit_local",)
+
+
+def start(home: Path, runs: Path, *words: str) -> subprocess.Popen:
+    env = os.environ | {"LIBERO_DEMOS": str(home / "demos"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(ROOT / "train.py"), "-m", *TINY.split(), *words, f"runs_dir={runs}"]
+    return subprocess.Popen(
+        command, env=env, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def jobs(runs: Path) -> dict[int, dict]:
+    found = [json.loads(file.read_text()) for file in runs.glob("sweep/*/jobs/*/job.json")]
+    return {record["number"]: record for record in found}
+
+
+def outcomes(runs: Path) -> dict[str, list]:
+    found = {}
+    for file in sorted(runs.rglob("results.jsonl")):
+        records = [json.loads(line) for line in file.read_text().splitlines()]
+        kept = [r for r in records if r["kind"] in ("loss", "eval")]
+        times = ("seconds", "crc32")
+        found[file.parent.parent.name] = [{k: v for k, v in r.items() if k not in times} for r in kept]
+    return found
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> tuple[Path, Path]:
+    """A sweep of Hydra's basic launcher: one job cannot be run. Return the home and its runs."""
+    home = tmp_path_factory.mktemp("home")
+    runs = home / "plain"
+    process = start(home, runs, "algo=sequential,er", "train.lr=1e-3,-1")
+    output, _ = process.communicate(timeout=600)
+    assert process.returncode == 2 and "2 runs compared" in output, output
+    return home, runs
+
+
+@pytest.mark.parametrize("launcher", [JOBLIB, SUBMITIT], ids=["joblib", "submitit_local"])
+def test_every_launcher_gives_the_same_numbers_and_tells_what_failed(plain, launcher, tmp_path) -> None:
+    pytest.importorskip("joblib" if launcher is JOBLIB else "submitit")
+    home, runs = plain
+    process = start(home, tmp_path, *launcher, "algo=sequential,er", "train.lr=1e-3,-1")
+    output, _ = process.communicate(timeout=600)
+    assert process.returncode == 2, output
+    assert "2 runs compared" in output and "2 done, 2 failed of 4 jobs" in output
+    assert outcomes(tmp_path) == outcomes(runs)
+    found = jobs(tmp_path)
+    assert {n: r["status"] for n, r in found.items()} == dict(enumerate(["done", "failed"] * 2))
+    assert found[1]["error"] == "train.lr is -1; expected at least 0" and found[0]["metrics"].keys() >= {
+        "auc"
+    }
+    pages = list(tmp_path.glob("sweep/algo_lr-*/report.html"))
+    assert len(pages) == 1 and len(list(runs.glob("sweep/algo_lr-*/report.html"))) == 1
+
+
+def test_a_sweep_whose_parent_is_killed_goes_on_with_what_is_missing(plain, tmp_path) -> None:
+    pytest.importorskip("joblib")
+    home, runs = plain
+    words = (*JOBLIB, "algo=sequential,er", "train.lr=1e-3")
+    process = start(home, tmp_path, *words)
+    deadline = time.monotonic() + 300
+    while not any(r["status"] == "done" for r in jobs(tmp_path).values()) and time.monotonic() < deadline:
+        assert process.poll() is None or jobs(tmp_path)
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    done = {n: r["started"] for n, r in jobs(tmp_path).items() if r["status"] == "done"}
+    again = start(home, tmp_path, *words)
+    output, _ = again.communicate(timeout=600)
+    assert again.returncode == 0, output
+    assert outcomes(tmp_path) == {k: v for k, v in outcomes(runs).items() if v}
+    for number, started in done.items():
+        assert jobs(tmp_path)[number]["started"] == started, "what was done is not run again"

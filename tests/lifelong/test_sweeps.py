@@ -1,0 +1,166 @@
+"""What is kept of the jobs of a sweep, and how it goes on."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lifelong import sweeps
+from lifelong.cli.main import main
+from lifelong.errors import ConfigError, MissingPackageError, ResultsError, RunLockedError
+from lifelong.launch import check_choices, config_folder
+from lifelong.sweeps import (
+    JobRecord,
+    begin_sweep,
+    find_sweeps,
+    read_job,
+    read_sweep,
+    run_job,
+    status_lines,
+    sweep_name,
+)
+
+pytestmark = pytest.mark.unit
+
+
+def job(number: int = 0, key: str = "k", **changes) -> JobRecord:
+    return replace(JobRecord(number, key, ("algo=er", f"seed={number}"), "running"), **changes)
+
+
+def learned(folder: Path, auc: float = 0.5) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    metrics = {"auc": {"value": auc, "low": 0.4, "high": 0.6}, "fwt": {"value": None}, "by_task": {"fwt": []}}
+    (folder / "results.json").write_text(json.dumps({"metrics": metrics}))
+    return folder
+
+
+def told(error: BaseException) -> tuple[int, str]:
+    return 2, str(error)
+
+
+def file_of(folder: Path, number: int = 0) -> Path:
+    return folder / "jobs" / str(number) / "job.json"
+
+
+def test_a_job_that_is_done_is_not_run_again(tmp_path) -> None:
+    ran = []
+
+    def learn() -> Path:
+        ran.append(1)
+        return learned(tmp_path / "run")
+
+    file = file_of(tmp_path)
+    record = run_job(file, job(), learn, told)
+    assert record == read_job(file) and record.is_finished
+    assert record.metrics == {"auc": 0.5, "fwt": None} and record.run == str(tmp_path / "run")
+    assert run_job(file, job(), learn, told) == record and len(ran) == 1
+    run_job(file, job(key="other configuration"), learn, told)
+    assert len(ran) == 2, "another configuration is another job"
+    (tmp_path / "run" / "results.json").unlink()
+    run_job(file, job(key="other configuration"), learn, told)
+    assert len(ran) == 3, "a run that is gone is made again"
+
+
+def test_an_error_is_kept_with_its_status_and_the_job_is_tried_again(tmp_path) -> None:
+    def fail() -> Path:
+        raise ConfigError("train.lr is -1")
+
+    failed = run_job(file_of(tmp_path), job(), fail, told)
+    assert (failed.status, failed.exit_status, failed.error) == ("failed", 2, "train.lr is -1")
+    begin_sweep(tmp_path, ["algo=er"], 1)
+    assert read_sweep(tmp_path).exit_status == 2
+    run_job(file_of(tmp_path), job(), lambda: learned(tmp_path / "run"), told)
+    assert read_sweep(tmp_path).exit_status == 0
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit])
+def test_an_interruption_is_kept_and_goes_on_up(tmp_path, kind) -> None:
+    def interrupted() -> Path:
+        assert read_job(file_of(tmp_path)).status == "running", "it is known while it runs"
+        raise kind
+
+    with pytest.raises(kind):
+        run_job(file_of(tmp_path), job(), interrupted, told)
+    assert read_job(file_of(tmp_path)).status == "interrupted"
+
+
+def test_a_run_that_another_process_writes_is_waited_for(tmp_path, monkeypatch, capsys) -> None:
+    tries = []
+    monkeypatch.setattr(sweeps, "_POLL", 0.0)
+
+    def learn() -> Path:
+        tries.append(1)
+        if len(tries) < 3:
+            raise RunLockedError("another process is writing to runs/x")
+        return learned(tmp_path / "run")
+
+    assert run_job(file_of(tmp_path), job(), learn, told).status == "done"
+    assert capsys.readouterr().out.count("waiting for it") == 1
+
+
+def test_a_sweep_is_done_when_all_that_was_asked_for_is(tmp_path) -> None:
+    begin_sweep(tmp_path, ["algo=er", "seed=0,1,2"], 3)
+    for number in (0, 1):
+        run_job(
+            file_of(tmp_path, number),
+            job(number),
+            lambda number=number: learned(tmp_path / f"r{number}"),
+            told,
+        )
+    sweep = read_sweep(tmp_path)
+    assert (sweep.missing, sweep.exit_status, len(sweep.runs)) == (1, 1, 2)
+    run_job(file_of(tmp_path, 2), job(2), lambda: learned(tmp_path / "r2"), told)
+    run_job(file_of(tmp_path, 7), job(7), lambda: learned(tmp_path / "r7"), told)  # of an earlier, larger one
+    sweep = read_sweep(tmp_path)
+    assert (sweep.missing, sweep.exit_status, [j.number for j in sweep.jobs]) == (0, 0, [0, 1, 2])
+    begin_sweep(tmp_path, ["hydra/sweeper=optuna"], None)
+    assert len(read_sweep(tmp_path).jobs) == 4, "a sweeper that chooses as it goes has no plan"
+
+
+def test_the_status_names_what_runs_failed_was_lost_and_is_left(tmp_path, capsys) -> None:
+    begin_sweep(tmp_path / "sweep" / "algo-1", ["algo=er"], 6)
+    folder = tmp_path / "sweep" / "algo-1"
+    run_job(file_of(folder, 0), job(0), lambda: learned(tmp_path / "r0", 0.61), told)
+    sweeps._write(file_of(folder, 1), job(1))  # this process
+    sweeps._write(file_of(folder, 2), job(2, pid=2**22 + 1, process_start=1))
+    sweeps._write(file_of(folder, 3), job(3, status="failed", error="no memory", exit_status=2))
+    sweeps._write(file_of(folder, 4), job(4, machine="another", host="node7", pid=3))
+    lines = list(status_lines(read_sweep(folder)))
+    assert lines[0].endswith("1 done, 2 running, 1 failed, 1 lost, 1 not begun of 6 jobs")
+    text = "\n".join(lines)
+    assert "AUC 0.610" in text and "no memory" in text and f":{os.getpid()})" in text and "(node7:3)" in text
+    assert main(["sweep", "status", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.strip() == text
+    assert find_sweeps(folder) == find_sweeps(tmp_path / "sweep") == find_sweeps(tmp_path) == [folder]
+    assert main(["sweep", "status", str(tmp_path / "r0")]) == 2
+    assert "holds no sweep" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"number": 0}', '{"number": "x", "status": "odd"}'])
+def test_a_broken_record_is_named(tmp_path, text) -> None:
+    begin_sweep(tmp_path, [], 1)
+    file = file_of(tmp_path)
+    file.parent.mkdir(parents=True)
+    file.write_text(text)
+    with pytest.raises(ResultsError, match="job.json"):
+        read_sweep(tmp_path)
+
+
+def test_the_same_command_has_the_same_folder() -> None:
+    words = ["algo=er,ewc", "seed=1,2"]
+    assert sweep_name(words, ["algo", "seed"]) == sweep_name(list(words), ["algo", "seed"])
+    assert sweep_name(words, ["algo", "seed"]).startswith("algo_seed-")
+    assert sweep_name([*words, "train.lr=1"], ["algo", "seed"]) != sweep_name(words, ["algo", "seed"])
+    assert "/" not in sweep_name(["policy/head=gmm,mse"], ["policy/head"])
+
+
+def test_a_launcher_whose_plug_in_is_missing_is_named(monkeypatch) -> None:
+    launchers = {file.stem for file in (config_folder() / "hydra" / "launcher").glob("*.yaml")}
+    assert launchers == {"workstation", "cluster", "ray_cluster"}
+    monkeypatch.setattr("lifelong.errors.find_spec", lambda name: None)
+    for launcher, extra in (("joblib", "joblib"), ("workstation", "joblib"), ("cluster", "submitit")):
+        with pytest.raises(MissingPackageError, match=rf"libero-lifelong\[{extra}\]"):
+            check_choices([f"hydra/launcher={launcher}"], [config_folder()])
+    check_choices(["hydra/launcher=basic", "hydra/launcher=one_of_the_users"], [config_folder()])
