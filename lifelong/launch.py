@@ -185,7 +185,8 @@ def _check_launcher(name: str) -> None:
 def _launcher_defaults(name: str) -> list[str]:
     """Return the launchers that a file of the package's configuration builds on."""
     file = config_folder() / "hydra" / "launcher" / f"{name}.yaml"
-    return list(OmegaConf.load(file).get("defaults", [])) if file.is_file() else []
+    plain: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
+    return plain.get("defaults", [])
 
 
 def _user_folders(words: Sequence[str]) -> list[Path]:
