@@ -52,7 +52,7 @@ def register(subparsers: Subparsers) -> None:
         action="append",
         metavar="TASKS",
         help="tasks of a stream in learning order, numbers or names, such as 61,62; give it once for each stream "
-        "(default: two pairs of libero_90)",
+        "(default: five of libero_90, in one scene)",
     )
     add("--seeds", type=_numbers, default=(1,), help="seeds with which each stream is learned (default: 1)")
     add(

@@ -12,6 +12,7 @@ from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, save
 from lifelong.tuning.frontier import Frontier, Outcome
 
 _TICKS = (1.0, 1.05, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 8.0, 9.0)  # of factors
+_FEW_TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)  # where an axis is longer than a factor of two
 
 
 def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
@@ -41,7 +42,8 @@ def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
             _point(axes, outcome, "s", LINE_COLOURS[-1], filled=True, large=False)
         _equal_scores(axes, frontier.chosen)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(LogLocator(base=10, subs=_TICKS))
+            low, high = axis.get_view_interval()
+            axis.set_major_locator(LogLocator(base=10, subs=_FEW_TICKS if high > 2 * low else _TICKS))
             axis.set_minor_locator(NullLocator())
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
             axis.set_minor_formatter(NullFormatter())

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from libero_env.assets.pack import select_pack
-from libero_env.init_states import store as init_states
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import start_faults
 from libero_env.init_states.store import load_init_states, split_row
@@ -14,7 +13,7 @@ from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import build_scene
 from libero_env.sim.state import StateView
-from libero_env.tasks import get_suite, get_task, read_task, suite_names
+from libero_env.tasks import Task, get_suite, get_task, read_task, suite_names
 from libero_env.tasks.problem import Atom
 
 pytestmark = pytest.mark.sim
@@ -146,8 +145,7 @@ def test_free_motion_agrees_with_recordings(shared, recording):
 def test_starts_of_a_file_follow_its_regions(tmp_path, monkeypatch):
     """States that are generated on demand are cached for the text of the task."""
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
-    monkeypatch.setattr(init_states, "NUM_INIT_STATES", 2)
-    monkeypatch.setattr(init_states.generate_init_states, "__defaults__", (2,))
+    monkeypatch.setattr(Task, "num_starts", 2)
     text = get_task("libero_goal/8").bddl_text
     region = "(0.04 -0.03 0.060000000000000005 -0.01)"
     assert region in text
