@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import threading
 from dataclasses import asdict
 from pathlib import Path
 
@@ -188,6 +189,31 @@ def test_rendered_demonstrations_are_made_once_and_again_when_they_are_outdated(
     (_, new), (_, same) = read_episodes(path)
     assert (new.obs["agentview_rgb"][0] != whole["demo_0"][0]).any()
     np.testing.assert_array_equal(same.obs["agentview_rgb"], whole["demo_1"])
+
+
+@pytest.mark.sim
+def test_who_needs_a_file_that_is_being_rendered_waits_for_it(folder, monkeypatch):
+    task, calls, render = TASKS[0], [], rendering.rerender
+    job = RenderJob(
+        folder / task.suite / f"{task.name}_demo.hdf5",
+        task,
+        1,
+        RenderConfig(size=(32, 32), perturb="blur=0.5"),
+    )
+
+    def slow(*args, **kwargs):
+        calls.append(args)
+        second.start()
+        second.join(0.5)  # it does not get in
+        assert second.is_alive()
+        return render(*args, **kwargs)
+
+    monkeypatch.setattr(rendering, "rerender", slow)
+    found: list[Path] = []
+    second = threading.Thread(target=lambda: found.extend(ensure_rendered([job], workers=1, progress=False)))
+    assert ensure_rendered([job], workers=1, progress=False) == [job.target]
+    second.join(60)
+    assert len(calls) == 1 and found == [job.target]
 
 
 @pytest.mark.sim
