@@ -290,9 +290,9 @@ def test_starts_of_a_file_are_kept_by_what_it_says(tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
     made = []
 
-    def generate(task, scene):
+    def generate(task, scene, num):
         made.append(task.name)
-        return np.zeros((50, 1 + scene.model.nq + scene.model.nv + 7 * len(scene.fixtures)))
+        return np.zeros((num, 1 + scene.model.nq + scene.model.nv + 7 * len(scene.fixtures)))
 
     monkeypatch.setattr(init_states, "generate_init_states", generate)
     facts = said(furniture=[], place={"plate": [0, 0.2], "akita_black_bowl": [0, 0]}, goal="Up plate_1")

@@ -72,16 +72,16 @@ def test_a_kind_that_takes_everything_is_shown_to() -> None:
 
 def test_two_that_act_independently_have_no_excess() -> None:
     rng = np.random.default_rng(0)
-    base, camera, light = (rng.random((2, 2000)) < p for p in (0.9, 0.6, 0.5))
+    base, camera, light = (rng.random((2, 400)) < p for p in (0.9, 0.6, 0.5))
     found = Outcomes(
         TASKS,
-        tuple(range(2000)),
+        tuple(range(400)),
         ((), B, C, BOTH),
         np.array([base, base & camera, base & light, base & camera & light]),
     )
     (pair,) = found.interactions()
-    assert pair.expected == pytest.approx(0.27, abs=0.03)
-    assert pair.excess.low < 0 < pair.excess.high and abs(pair.excess.value) < 0.03
+    assert pair.expected == pytest.approx(0.27, abs=0.05)
+    assert pair.excess.low < 0 < pair.excess.high and abs(pair.excess.value) < 0.04
     worse = Outcomes(
         found.tasks, found.starts, found.conditions, np.array([base, base & camera, base & light, base & 0])
     )
