@@ -243,7 +243,7 @@ def _job(config: DictConfig) -> Path | None:
     file = Path(hydra_config.runtime.output_dir) / JOB_FILE
     key = config_key(plain_data(config))
     job = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
-    done = run_job(file, job, learn, _report_line)
+    done = run_job(file, job, learn, _report_line, again=ranks.size > 1)
     if done.exit_status and ranks.size > 1:
         raise SystemExit(done.exit_status)
     return Path(done.run) if done.run else None

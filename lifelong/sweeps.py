@@ -191,6 +191,8 @@ def run_job(
     job: JobRecord,
     learn: Callable[[], Path],
     report: Callable[[BaseException], tuple[int, str]],
+    *,
+    again: bool = False,
 ) -> JobRecord:
     """Run a job and keep its record; one that is done already is not run again.
 
@@ -202,6 +204,7 @@ def run_job(
         job: The job, running.
         learn: Function that learns and returns the directory of the run.
         report: Function that prints an error and returns the exit status and the line.
+        again: Whether to call `learn` also for a job that is done, as where other processes learn along.
 
     Returns:
         The record at the end. Errors of the job are kept in it.
@@ -210,7 +213,7 @@ def run_job(
         KeyboardInterrupt: The job was interrupted, which is kept, too.
     """
     earlier = read_job(file)
-    if earlier is not None and earlier.key == job.key and earlier.is_finished:
+    if not again and earlier is not None and earlier.key == job.key and earlier.is_finished:
         print(f"job {job.number} is done: {earlier.run}", flush=True)
         return earlier
     began = time.monotonic()

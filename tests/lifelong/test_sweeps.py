@@ -58,6 +58,10 @@ def test_a_job_that_is_done_is_not_run_again(tmp_path) -> None:
     assert run_job(file, job(), learn, told) == record and len(ran) == 1
     run_job(file, job(key="other configuration"), learn, told)
     assert len(ran) == 2, "another configuration is another job"
+    run_job(file_of(tmp_path, 1), job(1), learn, told)
+    run_job(file_of(tmp_path, 1), job(1), learn, told, again=True)
+    assert len(ran) == 4, "other processes are not left alone"
+    del ran[2:]
     (tmp_path / "run" / "results.json").unlink()
     run_job(file, job(key="other configuration"), learn, told)
     assert len(ran) == 3, "a run that is gone is made again"
