@@ -195,7 +195,7 @@ def _conditions(args: argparse.Namespace) -> list[str]:
             args.severities
         ):
             found.append(format_perturbations(pair))
-        elif args.pairs is not PAIRS:
+        elif tuple(args.pairs) != PAIRS:  # those that were named
             raise ConfigError(
                 f"--pairs {text}: each must also be run alone; name its kind in --kinds and its severity in "
                 "--severities"

@@ -1,6 +1,8 @@
 """`libero robustness` and the scripted expert as a policy."""
 
+import argparse
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -99,6 +101,13 @@ def test_default_kinds_and_pairs_exist() -> None:
         pair = parse_perturbations(text)
         assert {one.kind for one in pair} <= set(robustness.KINDS)
         assert {one.severity for one in pair} <= set(robustness.SEVERITIES)
+
+
+def test_worker_processes_find_the_same_conditions() -> None:
+    """Arguments are pickled on their way to them; the default pairs of kinds that are not run are left out."""
+    args = argparse.Namespace(kinds=["noise"], severities=[0.4], pairs=robustness.PAIRS, perturb_seed=0)
+    found = robustness._conditions(args)
+    assert found == ["", "noise=0.4"] == robustness._conditions(pickle.loads(pickle.dumps(args)))
 
 
 def test_the_expert_is_a_policy_that_can_be_evaluated(tmp_path, monkeypatch, capsys) -> None:
