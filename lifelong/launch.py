@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from copy import copy
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -36,6 +37,7 @@ from lifelong.sweeps import (
     JobRecord,
     begin_sweep,
     config_key,
+    job_suffix,
     read_sweep,
     run_job,
     status_lines,
@@ -64,7 +66,7 @@ class SweepStart(Callback):
         own = "BasicSweeper" in str(config.hydra.sweeper._target_)  # another one chooses its jobs as it goes
         if ranks.first:
             begin_sweep(folder, words, planned if own else None)
-        _process["sweep"] = folder
+        _process.update(sweep=folder, words=words)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -123,6 +125,8 @@ def compose_run(words: Sequence[str], config_dir: Path | None = None) -> tuple[D
 def swept(words: Sequence[str]) -> dict[str, list[str]]:
     """Return the overrides that list several values, as key -> values, such as algo.strength=0.1,1.
 
+    An interval, from which another sweeper than Hydra's own chooses, has no values.
+
     Raises:
         ConfigError: A word is no override.
     """
@@ -132,6 +136,8 @@ def swept(words: Sequence[str]) -> dict[str, list[str]]:
         raise ConfigError(f"{' '.join(str(error).split())}") from error
     return {
         override.get_key_element(): list(override.sweep_string_iterator())
+        if override.is_discrete_sweep()
+        else []
         for override in overrides
         if override.is_sweep_override()
     }
@@ -231,6 +237,8 @@ def _job(config: DictConfig) -> Path | None:
             _process.update(ranks=own, status=0)
             return _job(config)
     _process["began"] = True
+    if hydra_config.mode == RunMode.MULTIRUN:
+        config = _named_in_sweep(config, hydra_config)
     learn = partial(experiment.run, config, hydra_config.runtime.choices, ranks)
     if hydra_config.mode != RunMode.MULTIRUN or not ranks.first:
         try:
@@ -257,6 +265,19 @@ def _sweep_folder(words: Sequence[str]) -> list[str]:
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
     name = sweep_name(sorted(overrides), list(swept(overrides)))
     return [f"hydra.sweep.dir='${{runs_dir}}/{FOLDER}/{name}'"]
+
+
+def _named_in_sweep(config: DictConfig, hydra_config: DictConfig) -> DictConfig:
+    """Return a job's configuration with a `run_id` that tells its run from those of the sweep's other jobs."""
+    words = _process.get("words") or read_sweep(Path(hydra_config.sweep.dir)).words
+    several, named = swept(words), {word.partition("=")[0] for word in words}
+    own = dict(word.split("=", 1) for word in hydra_config.overrides.task)
+    name = job_suffix({key: value for key, value in own.items() if key in several or key not in named})
+    if not name:
+        return config
+    config = copy(config)
+    config.run_id = name if config.run_id is None else f"{config.run_id}_{name}"
+    return config
 
 
 def _end_sweep(ranks: Ranks) -> int:

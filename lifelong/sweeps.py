@@ -13,6 +13,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +33,8 @@ from lifelong.results.summary import json_safe
 
 SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
 Status = Literal["running", "done", "failed", "interrupted"]
+IN_NAME = ("seed", "algo", "policy", "benchmark", "run_id")  # values that the name of every run has
+_LONGEST = 60  # characters of what a sweep adds to a run's name
 _POLL = 5.0  # s between two looks at a run that another process writes
 
 
@@ -124,8 +127,28 @@ def sweep_name(words: Sequence[str], swept: Sequence[str]) -> str:
         swept: Keys of which several values are tried.
     """
     digest = hashlib.sha256("\0".join(words).encode()).hexdigest()[:8]
-    keys = "_".join(key.rpartition(".")[2].rpartition("/")[2] for key in swept)[:60]
+    keys = "_".join(map(_last, swept))[:60]
     return f"{keys}-{digest}" if keys else digest
+
+
+def job_suffix(own: Mapping[str, str]) -> str:
+    """Return what tells the run of a job from those of the other jobs, as in `lr1e-3_epochs20`.
+
+    Args:
+        own: Overrides of the job that others of the sweep have with other values, key -> value.
+    """
+    told = {key: value for key, value in own.items() if key not in IN_NAME and not key.startswith("hydra.")}
+    lasts, words = [_last(key) for key in told], []
+    for key, value in sorted(told.items()):
+        name = _last(key) if lasts.count(_last(key)) == 1 else key
+        words.append(f"{name}{'-' if value[:1].isalpha() else ''}{value}")
+    text = re.sub(r"[^\w.+-]+", "-", "_".join(words)).strip("-._+")
+    digest = hashlib.sha256(repr(sorted(told.items())).encode()).hexdigest()[:8]
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 9]}-{digest}"
+
+
+def _last(key: str) -> str:
+    return key.lstrip("+").rpartition(".")[2].rpartition("/")[2]
 
 
 def begin_sweep(folder: Path, words: Sequence[str], planned: int | None) -> None:
