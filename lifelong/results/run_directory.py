@@ -127,6 +127,11 @@ def _locked(path: Path) -> Iterator[None]:
                 f"another process is writing to {path.parent / path.name[1:-5]}; wait for it, or give this "
                 "run another name with run_id=NAME"
             ) from error
+        except OSError as error:  # such as ENOLCK of a network file system
+            raise ConfigError(
+                f"runs_dir: {path.parent} is on a file system that cannot lock files ({error.strerror}); mount it "
+                "with locks, or set runs_dir to another folder"
+            ) from error
         yield
 
 

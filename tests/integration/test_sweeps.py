@@ -17,6 +17,12 @@ TINY = "preset=smoke benchmark=libero_object benchmark.tasks=1 threads=1 data.de
 TINY += "train.steps_per_epoch=2 train.batch_size=4 eval.curve=none eval.select=last eval.horizon=8 eval.episodes=2"
 JOBLIB = ("hydra/launcher=workstation", "hydra.launcher.n_jobs=2")
 SUBMITIT = ("hydra/launcher=submitit_local",)
+RAY = (
+    "hydra/launcher=ray",
+    "+hydra.launcher.ray.init.num_cpus=2",
+    "+hydra.launcher.ray.init.include_dashboard=false",
+)
+PLUG_INS = {JOBLIB: "hydra_joblib_launcher", SUBMITIT: "hydra_submitit_launcher", RAY: "hydra_ray_launcher"}
 
 
 def start(home: Path, runs: Path, *words: str) -> subprocess.Popen:
@@ -53,9 +59,9 @@ def plain(tmp_path_factory) -> tuple[Path, Path]:
     return home, runs
 
 
-@pytest.mark.parametrize("launcher", [JOBLIB, SUBMITIT], ids=["joblib", "submitit_local"])
+@pytest.mark.parametrize("launcher", PLUG_INS, ids=["joblib", "submitit_local", "ray"])
 def test_every_launcher_gives_the_same_numbers_and_tells_what_failed(plain, launcher, tmp_path) -> None:
-    pytest.importorskip("joblib" if launcher is JOBLIB else "submitit")
+    pytest.importorskip(f"hydra_plugins.{PLUG_INS[launcher]}")
     home, runs = plain
     process = start(home, tmp_path, *launcher, "algo=sequential,er", "train.lr=1e-3,-1")
     output, _ = process.communicate(timeout=600)

@@ -1,5 +1,9 @@
 """A run's directory: one configuration, one writer at a time, no results lost."""
 
+import errno
+import fcntl
+import os
+
 import pytest
 
 from lifelong.errors import ConfigError, LifelongError
@@ -63,6 +67,19 @@ def test_a_second_writer_is_refused(tmp_path):
     with directory.opened(CONFIG, resume=True):  # noqa: SIM117
         with pytest.raises(LifelongError, match="another process is"), second.opened(CONFIG, resume=True):
             pass
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch) -> None:
+    def no_locks(*_) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    directory = RunDirectory(tmp_path / "run")
+    with (
+        pytest.raises(ConfigError, match="cannot lock files .No locks available"),
+        directory.opened(CONFIG, resume=True),
+    ):
+        pass
 
 
 def test_the_tracker_is_silent_by_default_and_names_its_modes():

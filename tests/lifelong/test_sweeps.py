@@ -15,6 +15,7 @@ from lifelong.sweeps import (
     JobRecord,
     begin_sweep,
     find_sweeps,
+    job_suffix,
     read_job,
     read_sweep,
     run_job,
@@ -158,6 +159,26 @@ def test_the_same_command_has_the_same_folder() -> None:
     assert sweep_name(words, ["algo", "seed"]).startswith("algo_seed-")
     assert sweep_name([*words, "train.lr=1"], ["algo", "seed"]) != sweep_name(words, ["algo", "seed"])
     assert "/" not in sweep_name(["policy/head=gmm,mse"], ["policy/head"])
+
+
+@pytest.mark.parametrize(
+    ("own", "suffix"),
+    [
+        ({"seed": "1", "algo": "er", "policy": "bc_mlp", "benchmark": "libero_goal"}, ""),
+        ({"train.lr": "0.001", "seed": "1"}, "lr0.001"),
+        ({"train.epochs": "20", "algo/estimator": "batch"}, "estimator-batch_epochs20"),
+        ({"a.x": "1", "b.x": "2"}, "a.x1_b.x2"),
+        ({"benchmark.tasks": "[0,4,7]", "hydra.launcher.n_jobs": "2"}, "tasks-0-4-7"),
+        ({"+algo.note": "a/b\\c d"}, "note-a-b-c-d"),
+    ],
+)
+def test_runs_of_a_sweep_are_named_by_what_tells_them_apart(own, suffix) -> None:
+    assert job_suffix(own) == suffix
+
+
+def test_the_names_of_long_values_differ() -> None:
+    names = [job_suffix({"init_from": "runs/" + "x" * 80 + end}) for end in ("1", "2")]
+    assert len(set(names)) == 2 and max(map(len, names)) <= 60
 
 
 def test_a_launcher_whose_plug_in_is_missing_is_named(monkeypatch) -> None:
