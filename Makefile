@@ -39,7 +39,7 @@ $(GL_STAMP): $(STAMP)
 	@if $(BIN)/libero doctor --gl >/dev/null 2>&1; then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	  apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
-	    apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri libosmesa6; \
+	    apt-get install -y -qq --no-install-recommends libegl1 libopengl0 libgl1-mesa-dri libosmesa6; \
 	fi
 	@$(BIN)/libero doctor --gl
 	@touch $@
@@ -62,6 +62,7 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check --quiet .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+	@if [ -x $(BIN)/hadolint ]; then $(BIN)/hadolint Dockerfile; fi
 
 fuzz: setup
 	$(BIN)/python experiments/fuzz/run.py --workers $(WORKERS) $(ARGS)

@@ -2,8 +2,10 @@
 
 import argparse
 import importlib.util
+import json
 import subprocess
 import sys
+from ctypes.util import find_library
 from importlib.machinery import PathFinder
 from pathlib import Path
 
@@ -130,6 +132,16 @@ def test_doctor_reports_what_is_broken_and_how_to_fix_it(monkeypatch, capsys):
     assert cli.main(["doctor", "--gl"]) == 1
     out = capsys.readouterr().out
     assert "FAIL  GL:" in out and "-> install one" in out
+    assert cli.main(["doctor", "--gl", "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["ok"] is False and [entry["essential"] for entry in found["findings"]] == [False, True]
+    assert found["findings"][1] == {
+        "title": "GL",
+        "detail": "no picture",
+        "ok": False,
+        "remedy": "install one",
+        "essential": True,
+    }
 
 
 @pytest.mark.sim
@@ -149,6 +161,27 @@ def test_doctor_survives_a_machine_without_gl(monkeypatch):
         monkeypatch.setattr(doctor, "_PROBE", probe)
         finding = doctor.check_gl()
         assert not finding.ok and finding.detail and "libegl1" in finding.remedy
+
+
+@pytest.mark.sim
+@pytest.mark.skipif(find_library("OSMesa") is None, reason="libosmesa6 is not installed")
+def test_where_egl_does_not_work_osmesa_draws(monkeypatch):
+    """PyOpenGL and MuJoCo keep what the first backend has chosen."""
+    no_egl = """
+import importlib
+real = importlib.import_module
+def without_egl(name, *args, **more):
+    module = real(name, *args, **more)
+    if name == "mujoco.egl":
+        raise ImportError("no EGL")
+    return module
+importlib.import_module = without_egl
+"""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    monkeypatch.setattr(doctor, "_PROBE", no_egl + doctor._PROBE)
+    finding = doctor.check_gl()
+    assert finding.ok and finding.detail.startswith("osmesa on"), finding.detail
 
 
 def test_doctor_finds_what_is_not_installed():

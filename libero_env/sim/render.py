@@ -6,6 +6,7 @@ processes.
 
 import importlib
 import os
+import sys
 import threading
 import weakref
 from collections.abc import Iterable, Sequence
@@ -22,8 +23,8 @@ from libero_env.sim.look import SceneLook
 
 BACKENDS = ("egl", "osmesa", "glfw")
 REMEDY = (
-    "install a GL library (Debian and Ubuntu: apt-get install -y libegl1 libgl1-mesa-dri libosmesa6), or set "
-    "MUJOCO_GL to one of egl, osmesa, glfw; `libero doctor` checks it"
+    "install a GL library (Debian and Ubuntu: apt-get install -y libegl1 libopengl0 libgl1-mesa-dri libosmesa6), or "
+    "set MUJOCO_GL to one of egl, osmesa, glfw; `libero doctor` checks it"
 )
 FORKED = (
     "this process was forked from one that has rendered, and OpenGL does not survive that. Render first in the new "
@@ -68,16 +69,19 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
     os.environ.setdefault(
         "LP_NUM_THREADS", "0"
     )  # small images gain nothing from threads, which wait for each other
-    failures = []
+    failures, platform = [], os.environ.get("PYOPENGL_PLATFORM")
     for name in (chosen,) if chosen else ("egl", "osmesa"):
         try:
             context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
             _opened_in.add(os.getpid())
+            if name == "osmesa":
+                os.environ["MUJOCO_GL"] = name  # where MuJoCo's library looks for OpenGL's functions
             return name, context
         except Exception as error:  # noqa: BLE001 - each backend fails in its own way (ImportError, AttributeError, GL)
             failures.append(
                 f"{name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
             )
+            _forget_platform(platform)
     raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
 
 
@@ -91,6 +95,15 @@ def choose_backend() -> str:
     name, context = open_context(64, 64)
     context.free()
     return name
+
+
+def _forget_platform(platform: str | None) -> None:
+    """Undo what a backend that failed has left behind: PyOpenGL keeps the platform with which it was first imported."""
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    if platform is not None:
+        os.environ["PYOPENGL_PLATFORM"] = platform
+    for module in [m for m in sys.modules if m.partition(".")[0] == "OpenGL" or m.startswith("mujoco.egl")]:
+        del sys.modules[module]
 
 
 @lru_cache(maxsize=1)

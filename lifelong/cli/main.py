@@ -134,6 +134,7 @@ def register_doctor(subparsers: Subparsers) -> None:
     """Add `libero doctor`."""
     parser = subparsers.add_parser("doctor", help="what this machine has and lacks, and how to fix it")
     parser.add_argument("--gl", action="store_true", help="only draw a frame")
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.set_defaults(run=run_doctor)
 
 
@@ -145,7 +146,7 @@ def run_doctor(args: argparse.Namespace) -> int:
     findings = environment.examine(gl_only=args.gl)
     if not args.gl:
         findings += learning.examine()
-    print(environment.render_findings(findings))
+    print(environment.findings_json(findings) if args.json else environment.render_findings(findings))
     return int(environment.is_broken(findings))
 
 
