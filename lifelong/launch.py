@@ -267,7 +267,7 @@ def _sweep_folder(words: Sequence[str]) -> list[str]:
     return [f"hydra.sweep.dir='${{runs_dir}}/{FOLDER}/{name}'"]
 
 
-def _named_in_sweep(config: DictConfig, hydra_config: DictConfig) -> DictConfig:
+def _named_in_sweep(config: DictConfig, hydra_config: Any) -> DictConfig:
     """Return a job's configuration with a `run_id` that tells its run from those of the sweep's other jobs."""
     words = _process.get("words") or read_sweep(Path(hydra_config.sweep.dir)).words
     several, named = swept(words), {word.partition("=")[0] for word in words}
