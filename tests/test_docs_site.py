@@ -124,7 +124,8 @@ def check_line(line: str) -> None:
     elif words[0] == "python":
         assert (ROOT / words[1]).is_file() or words[1] == "-m", line
     else:
-        assert words[0] in ("docker", "export", "git", "pip", "python3.11", ".venv/bin/pip", "source", "make"), line
+        known = ("docker", "export", "git", "pip", "python3.11", ".venv/bin/pip", "source", "make")
+        assert words[0] in known, line
 
 
 @pytest.mark.unit
