@@ -257,6 +257,7 @@ def _make_env(
         horizon=settings.horizon + settings.settle_steps,
         drawing=data.drawing,
         robot=data.robot,
+        backend=settings.backend,
         perturb=perturb[task] if perturb else (),
     )
 
@@ -278,6 +279,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             tasks=[t.name for t in context.tasks],
             instructions=context.instructions,
             perturbed=[format_perturbations(found) for found in context.perturb],
+            backend=context.eval.back_end.name,
             config=OmegaConf.to_yaml(OmegaConf.create(plain)),
             group_sizes=context.group_sizes,
             cells=context.eval.cells,

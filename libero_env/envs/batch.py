@@ -207,14 +207,13 @@ class BatchEnv(LiberoVectorEnv):
 
     def _check_goals(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in each of the simulations, and its reward; note the truth of atoms."""
-        reached, rewards = np.zeros(len(ids), bool), np.zeros(len(ids))
-        for k, i in enumerate(ids):
-            reached[k], progress = self.world.check_goal(i)
-            self._progress[i] = list(progress.values())
-            rewards[k] = self.reward(
-                self.world.views[i], bool(reached[k]), self.world.atoms, list(self._progress[i])
-            )
-        return reached, rewards
+        reached, truths = self.world.goals.check(ids)
+        self._progress[ids] = truths
+        rewards = [
+            self.reward(self.world.views[i], bool(won), self.world.atoms, list(row))
+            for i, won, row in zip(ids, reached, truths, strict=True)
+        ]
+        return reached, np.array(rewards, np.float64)
 
     def _observe(self, ids: np.ndarray) -> dict[str, np.ndarray]:
         """Return the observations of all simulations, with images rendered of the given ones."""

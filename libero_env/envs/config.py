@@ -13,6 +13,7 @@ from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations.episodes import checked_perturbations
+from libero_env.sim.engine import MUJOCO, BackEnd
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
@@ -44,12 +45,14 @@ class EnvConfig:
         robot: Model of the arm: `libero`, or `robosuite-1.4.1`, see `libero_env.assets.robot`.
         observed: When a step is observed: `after` it, or in its last `substep` but one, as by the original: joints
             2 ms, poses and images 4 ms before the end.
+        backend: Back end of the physics: `mujoco`, or `warp` for many simulations on a GPU, with settings as in
+            `warp,device=cuda:1,contacts=256`, see `libero_env.sim.engine`.
         perturb: Perturbations, as text such as `camera=0.3,light=0.5` or as values, see `libero_env.perturbations`; the
             default is none.
 
     Raises:
         InvalidInputError: A value is of another kind or outside of its range.
-        UnknownNameError: The semantics, the drawing, the robot or the time of observation do not exist.
+        UnknownNameError: The semantics, the drawing, the robot, the back end or the time of observation do not exist.
     """
 
     cameras: Sequence[str] = DEFAULT_CAMERAS
@@ -65,6 +68,7 @@ class EnvConfig:
     drawing: str | None = None
     robot: str = DEFAULT_ROBOT
     observed: str = AFTER
+    backend: BackEnd | str = MUJOCO
     perturb: str | Sequence[Any] = ()
 
     def __post_init__(self) -> None:
@@ -76,6 +80,7 @@ class EnvConfig:
             values["camera_size"] = tuple(map(_whole, values["camera_size"]))
         values["horizon"] = _whole(self.horizon)
         values["perturb"] = checked_perturbations(self.perturb)
+        values["backend"] = BackEnd.read(self.backend)
         validate_arguments(EnvConfig, values)
         assets = values["assets"]
         if not (assets is None or isinstance(assets, str | Path) or hasattr(assets, "add_arena")):
@@ -92,6 +97,11 @@ class EnvConfig:
             raise UnknownNameError("robot", self.robot, ROBOTS)
         if self.observed not in OBSERVED:
             raise UnknownNameError("time of observation", self.observed, OBSERVED)
+
+    @property
+    def back_end(self) -> BackEnd:
+        """Back end of the physics."""
+        return BackEnd.read(self.backend)
 
     @classmethod
     def from_options(cls, config: "EnvConfig | None", options: Mapping[str, Any]) -> "EnvConfig":
@@ -137,6 +147,7 @@ class EnvOptions(TypedDict, total=False):
     drawing: str | None
     robot: str
     observed: str
+    backend: BackEnd | str
     perturb: str | Sequence[Any]
 
 

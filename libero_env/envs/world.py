@@ -25,12 +25,12 @@ from libero_env.perturbations.drawing import start_name
 from libero_env.perturbations.published import rest_of
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.controller import ControllerState, get_controller
-from libero_env.sim.observations import Observer, is_of_joints
-from libero_env.sim.predicates import evaluate
+from libero_env.sim.goals import make_goals
+from libero_env.sim.observations import is_of_joints, make_observer
 from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
-from libero_env.tasks.problem import And, atoms_of
+from libero_env.tasks.problem import atoms_of
 from libero_env.tasks.published.task import require_available
 from libero_env.validation import validate
 from libero_env.validation.messages import shown
@@ -61,6 +61,7 @@ class World:
         observer: Observer of the simulations.
         atoms: Atoms of the goal, except those with variables of quantifiers.
         atom_names: Each of `atoms` as text, such as `(On plate_1 stove_1)`.
+        goals: Truth of the goal and its atoms in many simulations.
     """
 
     @show_options
@@ -92,11 +93,19 @@ class World:
         self.task, self.scene, self.base_scene = opened.task, opened.scene, opened.base_scene
         self.perturbed = opened.perturbed
         self._check_memory()
-        self.simulations = make_simulations(self.scene.model, num, threads, self.scene.fixture_bodies)
+        back_end = config.back_end
+        self.simulations = make_simulations(
+            self.scene.model, num, threads, self.scene.fixture_bodies, back_end
+        )
+        if not self.simulations.has_controller(self.controller):
+            raise InvalidInputError(
+                f"backend={back_end.name} has no controller {self.controller.name}, only osc_pose and osc_position; "
+                "backend=mujoco has"
+            )
         self.simulations.controller_state = ControllerState(num, self.controller)
         self.simulations.rest = rest_of(self.base_task)
         self.views = [StateView(self.scene, self.simulations, i) for i in range(num)]
-        self.observer = Observer(
+        self.observer = make_observer(
             self.scene,
             self.simulations,
             self.views,
@@ -106,6 +115,8 @@ class World:
         )
         self.atoms = tuple(a for a in atoms_of(self.task.problem.goal) if all(map(self._exists, a.args)))
         self.atom_names = tuple(f"({a.predicate} {' '.join(a.args)})" for a in self.atoms)
+        goal = self.task.problem.goal
+        self.goals = make_goals(goal, self.atoms, self.views, config.semantics, self.simulations)
 
     @property
     def init_states(self) -> np.ndarray:
@@ -242,7 +253,7 @@ class World:
         Raises:
             PlacementError: The objects do not fit, or do not come to rest.
         """
-        if self.perturbed is not None:
+        if self.perturbed is not None or self.config.back_end.is_warp:
             self.reset_to(ids, sample_rows(self.base_scene, generators))
             return
         simulations, controller_state = self.simulations, self.simulations.controller_state
@@ -303,19 +314,12 @@ class World:
 
     def progress(self, i: int) -> dict[str, bool]:
         """Return the truth of each atom of the goal in simulation i, by its text."""
-        truth = (evaluate(atom, self.views[i], self.config.semantics) for atom in self.atoms)
-        return dict(zip(self.atom_names, truth, strict=True))
+        return self.check_goal(i)[1]
 
     def check_goal(self, i: int) -> tuple[bool, dict[str, bool]]:
-        """Return the truth of the goal in simulation i and that of each of its atoms.
-
-        No atom of a conjunction is evaluated twice.
-        """
-        goal, progress = self.task.problem.goal, self.progress(i)
-        parts = goal.parts if isinstance(goal, And) else (goal,)
-        if all(part in self.atoms for part in parts):
-            return all(progress.values()), progress
-        return evaluate(goal, self.views[i], self.config.semantics), progress
+        """Return the truth of the goal in simulation i and that of each of its atoms."""
+        reached, truths = self.goals.check([i])
+        return bool(reached[0]), dict(zip(self.atom_names, map(bool, truths[0]), strict=True))
 
     def physics_state(self, i: int) -> np.ndarray:
         """Return [time, qpos, qvel] of simulation i, the original's layout."""

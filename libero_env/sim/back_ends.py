@@ -1,11 +1,12 @@
-"""Ways to step simulations, with the same interface and the same bits.
+"""Ways to step simulations, with the same interface.
 
 `LoopSimulations` steps one MjData after another (one simulation, or MuJoCo without `mujoco.batch`), `BatchSimulations`
-steps on a thread pool.
+steps on a thread pool, to the same bits. `libero_env.sim.mjwarp` steps on a GPU in single precision.
 """
 
 import os
 import weakref
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from libero_env.errors import ClosedEnvironmentError, LiberoError
 from libero_env.mujoco_compat import FORWARD_WARM_STARTS
+from libero_env.sim.engine import BackEnd
 from libero_env.sim.simulation import FIELDS, WATCHED, Closed, Indices, KinematicsHook, Simulations, Watch
 from libero_env.timing import SUBSTEPS
 
@@ -71,7 +73,7 @@ class LoopSimulations(Simulations):
         ids: np.ndarray,
         actions: np.ndarray,
         before_last_kinematics: KinematicsHook | None,
-        believed: dict[str, np.ndarray],
+        believed: Mapping[str, np.ndarray],
         watch: Watch | None,
     ) -> None:
         model, constants, first = self.model, self._constants(), np.zeros(1, np.int64)
@@ -126,8 +128,8 @@ class BatchSimulations(Simulations):
         self._batch: Any = Batch(model, num, nthread=threads, persistent=True)
         _watch_forks()
         _batches.add(self)
-        self.fields = {name: self._batch.bind(name) for name in FIELDS}
-        self.fields["site_xmat"] = self.fields["site_xmat"].reshape(num, model.nsite, 9)
+        fields = {name: self._batch.bind(name) for name in FIELDS}
+        self.fields = {**fields, "site_xmat": fields["site_xmat"].reshape(num, model.nsite, 9)}
         self._time, self._qacc_warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
         if self.fixture_bodies.size:  # per-simulation values of the model
             self._body_pos, self._body_quat = self._batch.expand("body_pos"), self._batch.expand("body_quat")
@@ -147,7 +149,7 @@ class BatchSimulations(Simulations):
         ids: np.ndarray,
         actions: np.ndarray,
         before_last_kinematics: KinematicsHook | None,
-        believed: dict[str, np.ndarray],
+        believed: Mapping[str, np.ndarray],
         watch: Watch | None,
     ) -> None:
         if before_last_kinematics is not None:
@@ -207,16 +209,29 @@ def _leave_batches() -> None:
 
 
 def make_simulations(
-    model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Indices = ()
+    model: mujoco.MjModel,
+    num: int,
+    threads: int = 0,
+    fixture_bodies: Indices = (),
+    back_end: BackEnd | None = None,
 ) -> Simulations:
-    """Return `num` simulations of a model: batched where MuJoCo offers it and there are several.
+    """Return `num` simulations of a model; MuJoCo's are batched where it offers that and there are several.
 
     Args:
         model: Model to simulate; it is copied.
         num: Number of simulations.
         threads: Number of threads of the batch; 0 is one for each core.
         fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
+        back_end: Back end of the physics; by default `mujoco`.
+
+    Raises:
+        LiberoError: The back end is not installed, has no such device, or cannot simulate the model.
     """
+    if back_end is not None and back_end.is_warp:
+        back_end.require_installed()
+        from libero_env.sim.mjwarp.simulations import WarpSimulations  # with the extra `warp` only
+
+        return WarpSimulations(model, num, fixture_bodies, back_end)
     if num > 1 and Batch is not None:
         return BatchSimulations(model, num, threads, fixture_bodies)
     return LoopSimulations(model, num, fixture_bodies)

@@ -313,6 +313,29 @@ class _EntityObserver:
         return entries
 
 
+def make_observer(
+    scene: Scene,
+    simulations: Simulations,
+    views: Sequence[StateView],
+    *,
+    observations: Sequence[str],
+    cameras: Sequence[str],
+    camera_size: tuple[int, int],
+) -> Observer:
+    """Return an observer that draws by the means of the simulations' back end; arguments as of `Observer`.
+
+    Raises:
+        UnknownNameError: An observation or a camera does not exist.
+        LiberoError: The back end does not offer an observation.
+    """
+    kind = Observer
+    if simulations.back_end.is_warp:
+        from libero_env.sim.mjwarp.pictures import WarpObserver as kind  # with the extra `warp` only
+    return kind(
+        scene, simulations, views, observations=observations, cameras=cameras, camera_size=camera_size
+    )
+
+
 def image_name(camera: str, kind: str) -> str:
     """Return the name of a camera's images in observations: `robot0_eye_in_hand`, `rgb` -> `eye_in_hand_rgb`."""
     return f"{camera.removeprefix('robot0_')}_{kind}"

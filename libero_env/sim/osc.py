@@ -22,10 +22,10 @@ ACTION_DIM = 7
 POSITION_SCALE = 0.05  # [m] at full action
 ROTATION_SCALE = 0.5  # [rad] at full action
 GRIPPER_SPEED = 0.01  # change of the command, in [-1, 1], in each substep
-_KP = 150.0
-_KD = 2.0 * np.sqrt(150.0)
-_NULL_KP = 10.0
-_NULL_KD = 2.0 * np.sqrt(10.0)
+KP = 150.0
+KD = 2.0 * np.sqrt(150.0)
+NULL_KP = 10.0
+NULL_KD = 2.0 * np.sqrt(10.0)
 REST = np.array(REST_QPOS)  # [rad]
 
 
@@ -192,7 +192,7 @@ def osc_torques(
             dz = site_pos[i, 2] - xanchor[i, j, 2]
             jac[0, j], jac[1, j], jac[2, j] = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
             jac[3, j], jac[4, j], jac[5, j] = ax, ay, az
-            pull[j] = _NULL_KP * (rest[j] - qpos[i, j]) - _NULL_KD * qvel[i, j]
+            pull[j] = NULL_KP * (rest[j] - qpos[i, j]) - NULL_KD * qvel[i, j]
             for l in range(7):
                 m[j, l] = mass[i, mass_address[j, l]]
         # Inverse operational inertias from M^-1 J^T, and the task-space part of the null-space pull.
@@ -220,7 +220,7 @@ def osc_torques(
             for j in range(7):
                 v += jac[r, j] * qvel[i, j]
                 w += jac[3 + r, j] * qvel[i, j]
-            force[r] = _KP * (goal_pos[i, r] - site_pos[i, r]) - _KD * v
+            force[r] = KP * (goal_pos[i, r] - site_pos[i, r]) - KD * v
             a, b = (r + 1) % 3, (r + 2) % 3
             error = 0.0
             for c in range(3):
@@ -228,7 +228,7 @@ def osc_torques(
                     site_mat[i, 3 * a + c] * goal_mat[i, 3 * b + c]
                     - site_mat[i, 3 * b + c] * goal_mat[i, 3 * a + c]
                 )
-            torque[r] = _KP * 0.5 * error - _KD * w
+            torque[r] = KP * 0.5 * error - KD * w
         _solve(linear, force, 3)
         _solve(angular, torque, 3)
         _solve(full, task_pull, 6)

@@ -11,13 +11,13 @@ import numpy as np
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import GLOW_GROUP, ObjectModel
 from libero_env.sim.regions import BOX_BELOW, Box, contains, is_over, region_boxes, region_of
-from libero_env.sim.scene import ROBOT
+from libero_env.sim.scene import ROBOT, Scene
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or
 from libero_env.tasks.signatures import declare
 
-_ON_XY_DISTANCE = 0.03  # [m] between the origins of an object and the object under it
-_UP_HEIGHT = 1.0  # [m] in the world frame
+ON_XY_DISTANCE = 0.03  # [m] between the origins of an object and the object under it
+UP_HEIGHT = 1.0  # [m] in the world frame
 _STRICT_MARGIN = 0.005  # [m] length by which an object may stick out of the box that contains it
 
 Predicate = Callable[..., bool]
@@ -27,7 +27,7 @@ def on(view: StateView, entity: str, target: str) -> bool:
     """Return whether `entity` is on an object (touching, above it, origins within 3 cm) or over the box of a region."""
     if view.is_entity(target):
         above, below = view.body_pos(entity), view.body_pos(target)
-        near = np.linalg.norm(above[:2] - below[:2]) < _ON_XY_DISTANCE
+        near = np.linalg.norm(above[:2] - below[:2]) < ON_XY_DISTANCE
         return bool(below[2] <= above[2] and near and view.in_contact(entity, target))
     over = any(is_over(box, view.body_pos(entity)) for box in region_boxes(view, target))
     region = region_of(view, target)
@@ -41,7 +41,7 @@ def in_(view: StateView, entity: str, region: str) -> bool:
 
 def up(view: StateView, entity: str) -> bool:
     """Return whether the origin of `entity` is at least a metre above the floor."""
-    return bool(view.body_pos(entity)[2] >= _UP_HEIGHT)
+    return bool(view.body_pos(entity)[2] >= UP_HEIGHT)
 
 
 def touching(view: StateView, first: str, second: str) -> bool:
@@ -187,7 +187,8 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
             return not evaluate(part, view, semantics)
         case ForAll(variables, body):
             return all(
-                evaluate(_bind(body, binding), view, semantics) for binding in _bindings(variables, view)
+                evaluate(_bind(body, binding), view, semantics)
+                for binding in _bindings(variables, view.scene)
             )
     raise TypeError(f"not a goal: {expression!r}")
 
@@ -226,6 +227,23 @@ def reaches_state(model: ObjectModel, qpos: float, state: str, opposite: str) ->
     Raises:
         LiberoError: The model has no range for the state.
     """
+    bound, upwards = state_bound(model, state, opposite)
+    if state == "turnon":
+        return qpos >= bound if upwards else qpos <= bound
+    return qpos > bound if upwards else qpos < bound
+
+
+def state_bound(model: ObjectModel, state: str, opposite: str) -> tuple[float, bool]:
+    """Return the position at which the range of a state begins, and whether it lies upwards of it.
+
+    Args:
+        model: Object or fixture with the joint.
+        state: `open`, `close`, `turnon` or `turnoff`.
+        opposite: The state at the other end.
+
+    Raises:
+        LiberoError: The model has no range for the state.
+    """
     ranges = model.articulation
     if state not in ranges:
         raise LiberoError(
@@ -234,16 +252,28 @@ def reaches_state(model: ObjectModel, qpos: float, state: str, opposite: str) ->
         )
     low, high = sorted(ranges[state])
     upwards = opposite not in ranges or low + high > sum(ranges[opposite])
-    if state == "turnon":
-        return qpos >= low if upwards else qpos <= high
-    return qpos > low if upwards else qpos < high
+    return (low if upwards else high), upwards
 
 
-def _bindings(variables: tuple[tuple[str, str], ...], view: StateView) -> list[dict[str, str]]:
+def ground(expression: Expression, scene: Scene) -> Expression:
+    """Return a goal with quantifiers replaced by conjunctions over the objects of a scene."""
+    match expression:
+        case And(parts):
+            return And(tuple(ground(part, scene) for part in parts))
+        case Or(parts):
+            return Or(tuple(ground(part, scene) for part in parts))
+        case Not(part):
+            return Not(ground(part, scene))
+        case ForAll(variables, body):
+            return And(tuple(ground(_bind(body, one), scene) for one in _bindings(variables, scene)))
+    return expression
+
+
+def _bindings(variables: tuple[tuple[str, str], ...], scene: Scene) -> list[dict[str, str]]:
     """Return all assignments of objects of the right category to the variables of a quantifier."""
     bindings: list[dict[str, str]] = [{}]
     for variable, category in variables:
-        names = [name for name, item in view.scene.objects.items() if item.category == category]
+        names = [name for name, item in scene.objects.items() if item.category == category]
         bindings = [{**binding, variable: name} for binding in bindings for name in names]
     return bindings
 

@@ -11,7 +11,7 @@ from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Region
 
 BOX_BELOW = 0.01  # [m] depth below its box in which a region still contains a point
-_ON_BELOW, _ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
+ON_BELOW, ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
 
 
 class Box(NamedTuple):
@@ -69,7 +69,7 @@ def contains(box: Box, point: np.ndarray) -> bool:
     return bool((point > low).all() and (point < high).all())
 
 
-def is_over(box: Box, point: np.ndarray, above: float = _ON_ABOVE) -> bool:
+def is_over(box: Box, point: np.ndarray, above: float = ON_ABOVE) -> bool:
     """Return whether a point (3,) is on top of a box; as in the original, rotated by R instead of its inverse.
 
     Args:
@@ -79,4 +79,4 @@ def is_over(box: Box, point: np.ndarray, above: float = _ON_ABOVE) -> bool:
     """
     centre, mat, size = box
     delta = mat @ (point - centre)
-    return bool(size[2] - _ON_BELOW < delta[2] < size[2] + above and (np.abs(delta[:2]) < size[:2]).all())
+    return bool(size[2] - ON_BELOW < delta[2] < size[2] + above and (np.abs(delta[:2]) < size[:2]).all())

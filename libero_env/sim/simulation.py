@@ -5,7 +5,7 @@ then the kinematics. How the physics is stepped is a matter of `libero_env.sim.b
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,8 @@ import numpy as np
 
 from libero_env.errors import ClosedEnvironmentError
 from libero_env.mujoco_compat import MASS_FIELD, log_warnings
-from libero_env.sim.controller import ControllerState
+from libero_env.sim.controller import Controller, ControllerState
+from libero_env.sim.engine import BackEnd
 from libero_env.sim.osc import REST, ArmIndex
 from libero_env.timing import SUBSTEPS
 
@@ -63,8 +64,11 @@ class Simulations(ABC):
         fixtures: Pose of each fixed body of `fixture_bodies`, (num, nfixtures, 7): position, quaternion wxyz.
         arm: Indices of the arm in the model.
         fields: Field of MjData by name, (num, ...), for reading. Kinematics are those of the current state.
+        back_end: Back end that steps them.
         controller_state: Controller that runs, its goals and gripper commands; may be replaced by another.
     """
+
+    back_end = BackEnd()
 
     def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = ()):
         log_warnings()
@@ -74,7 +78,7 @@ class Simulations(ABC):
         self.fixtures = np.tile(poses, (num, 1, 1))
         self.arm = ArmIndex.from_model(model)
         self.controller_state = ControllerState(num)
-        self.fields: dict[str, np.ndarray] = {}
+        self.fields: Mapping[str, np.ndarray] = {}
         self.rest = REST
         self._outdated = np.zeros(num, bool)
 
@@ -88,14 +92,19 @@ class Simulations(ABC):
         ids: np.ndarray,
         actions: np.ndarray,
         before_last_kinematics: KinematicsHook | None,
-        believed: dict[str, np.ndarray],
+        believed: Mapping[str, np.ndarray],
         watch: Watch | None,
     ) -> None:
         """Run one control period with the goals that are set; in its first substep the controller sees `believed`."""
 
     @abstractmethod
     def _warm_start(self, i: int) -> list[np.ndarray]:
-        """Return views of what the next step depends on beside the state: [qacc_warmstart (nv,), ctrl (nu,)]."""
+        """Return what the next step depends on beside the state: [qacc_warmstart (nv,), ctrl (nu,)]."""
+
+    def _set_warm_start(self, i: int, values: list[np.ndarray]) -> None:
+        """Write what `_warm_start` returns; where that are views of the simulation, they are written to."""
+        for view, value in zip(self._warm_start(i), values, strict=True):
+            view[:] = value
 
     @abstractmethod
     def time(self, i: int) -> float:
@@ -103,7 +112,20 @@ class Simulations(ABC):
 
     @abstractmethod
     def data(self, i: int) -> mujoco.MjData:
-        """Return MjData of simulation i, for reading what `fields` does not have, such as contacts."""
+        """Return MjData of simulation i, for reading what `fields` does not have."""
+
+    def contact_geoms(self, i: int) -> np.ndarray:
+        """Return the indices of the two geoms of each contact of simulation i, (ncontacts, 2)."""
+        data = self.data(i)
+        return data.contact.geom[: data.ncon]
+
+    def record(self) -> dict[str, str]:
+        """Return the back end and what of it the numbers depend on, as plain data."""
+        return {"backend": self.back_end.name}
+
+    def has_controller(self, controller: Controller) -> bool:
+        """Return whether a controller can run here."""
+        return True
 
     def close(self) -> None:
         """Free the simulations. Idempotent."""
@@ -163,7 +185,7 @@ class Simulations(ABC):
         found = {name: np.array(getattr(data, name))[None] for name in FIELDS}
         return {**found, "site_xmat": found["site_xmat"].reshape(1, self.model.nsite, 9)}
 
-    def _believed(self, ids: np.ndarray) -> dict[str, np.ndarray]:
+    def _believed(self, ids: np.ndarray) -> Mapping[str, np.ndarray]:
         """Return the fields that the controller believes, (num, ...): those of the rest pose where it is outdated."""
         if not self._outdated[ids].any():
             return self.fields
@@ -216,8 +238,7 @@ class Simulations(ABC):
         sizes = np.cumsum([1, nq, nv, 7 * nfixtures, nv, nu])
         time, qpos, qvel, fixtures, *warm_start, controller = np.split(state, sizes)
         self.reset([i], qpos[None], qvel[None], float(time[0]), fixtures.reshape(1, nfixtures, 7))
-        for view, value in zip(self._warm_start(i), warm_start, strict=True):
-            view[:] = value
+        self._set_warm_start(i, warm_start)
         self.controller_state.unpack(i, controller)
 
     @property
@@ -232,7 +253,7 @@ class Simulations(ABC):
         site = self.arm.site
         return self.fields["site_xpos"][:, site], self.fields["site_xmat"][:, site]
 
-    def _inputs(self, fields: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    def _inputs(self, fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         """Return the fields that the kernel of a controller takes."""
         site = self.arm.site
         names = ("qpos", "qvel", "xanchor", "xaxis")

@@ -90,8 +90,7 @@ class StateView:
         Raises:
             UnknownNameError: A name does not exist.
         """
-        data, model = self.simulations.data(self.index), self.scene.model
-        pairs = model.geom_bodyid[data.contact.geom[: data.ncon]]
+        pairs = self.scene.model.geom_bodyid[self.simulations.contact_geoms(self.index)]
         bodies = [self._bodies(first), self._bodies(second)]
         for a, b in ((0, 1), (1, 0)):
             if (np.isin(pairs[:, 0], bodies[a]) & np.isin(pairs[:, 1], bodies[b])).any():

@@ -99,6 +99,12 @@ def add_episode_options(parser: argparse._ArgumentGroup) -> None:
         "--robot", help="arm: libero, or robosuite-1.4.1 (default: the protocol's, or that of the run)"
     )
     parser.add_argument(
+        "--backend",
+        metavar="NAME",
+        help="physics and pictures: mujoco, or warp on a GPU, with settings as in warp,device=cuda:1,contacts=256 "
+        "(default: the protocol's, mujoco)",
+    )
+    parser.add_argument(
         "--unit-starts",
         type=arguments.positive,
         metavar="N",

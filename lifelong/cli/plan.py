@@ -116,6 +116,7 @@ def _episodes(args: argparse.Namespace, tasks: "Sequence[Task]") -> int | None:
 def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -> "Card":
     """Return the protocol on this machine, with what the arguments change; what was chosen is printed."""
     from libero_env.perturbations import format_perturbations, parse_perturbations
+    from libero_env.sim.engine import BackEnd
     from lifelong.evaluation.protocol_env import resolve_world
 
     protocol, notes = resolve_world(card, tasks, args.assets)
@@ -126,6 +127,9 @@ def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -
         protocol = protocol.changed({"world.perturb": format_perturbations(perturbations)})
     if args.robot:
         protocol = protocol.changed({"world.robot": args.robot})
+    if args.backend is not None:
+        protocol = protocol.changed({"world.backend": BackEnd.read(args.backend).name})
+    BackEnd.read(args.backend or protocol.world.backend).require_installed()
     protocol.require()
     for note in notes:
         print(f"note: {note}", file=sys.stderr, flush=True)

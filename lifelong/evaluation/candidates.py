@@ -49,6 +49,12 @@ class PolicyUnderTest(ABC):
     tasks: Sequence[Task] = ()
     selection: Sequence[int]
     on_cpu: bool = False
+    args: argparse.Namespace
+
+    @property
+    def simulated(self) -> dict[str, Any]:
+        """How the arguments of the command want simulations made, see `make_env`: threads, assets, back end."""
+        return {name: getattr(self.args, name) for name in ("threads", "assets", "backend")}
 
     @abstractmethod
     def protocol(self, base: Card) -> Card:
@@ -92,8 +98,7 @@ class RunPolicy(PolicyUnderTest):
             count,
             protocol,
             cameras=cameras,
-            threads=self.args.threads,
-            assets=self.args.assets,
+            **self.simulated,
         )
 
     @contextmanager
@@ -138,8 +143,7 @@ class UserPolicy(PolicyUnderTest):
             protocol,
             cameras=self.cameras,
             observations=self._own("observations", tuple[str, ...], OBSERVATIONS),
-            threads=self.args.threads,
-            assets=self.args.assets,
+            **self.simulated,
         )
 
     def _own(self, name: str, kind: Any, default: Any) -> Any:

@@ -44,6 +44,7 @@ class World:
         predicates: Semantics of the goals, see `libero_env.sim.predicates`.
         perturb: Perturbations, such as `camera=0.3,light=0.5`, see `libero_env.perturbations`; empty for none. A card
             without it has none.
+        backend: Back end of the physics and the pictures, see `libero_env.sim.engine`. A card without it has `mujoco`.
     """
 
     models: Literal["original", "builtin", "any"]
@@ -64,6 +65,7 @@ class World:
     delta: bool
     predicates: Literal["original", "strict"]
     perturb: str = ""
+    backend: Literal["mujoco", "warp"] = "mujoco"
 
 
 @dataclass(frozen=True)
@@ -269,17 +271,26 @@ class Card:
     def resolved(self) -> dict[str, Any]:
         """Return the card as plain data, with a digest of everything that decides a result."""
         plain = asdict(self)
-        if not self.world.perturb:  # as cards were before there were perturbations
-            del plain["world"]["perturb"]
+        for name in self._later_defaults:
+            del plain["world"][name]
         return {**plain, "digest": self.digest}
 
     @property
     def digest(self) -> str:
         """Digest of all values, 16 hex digits; names and sources are not part of it."""
         values = {k: v for k, v in self.flat().items() if "." in k and not k.startswith("sources")}
-        if not self.world.perturb:
-            del values["world.perturb"]
+        for name in self._later_defaults:
+            del values[f"world.{name}"]
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def _later_defaults(self) -> list[str]:
+        """Fields of the world with the only value that there was before they were fields; digests are without them."""
+        return [
+            name
+            for name, only in (("perturb", ""), ("backend", "mujoco"))
+            if getattr(self.world, name) == only
+        ]
 
     def steps(self, task: Task) -> int:
         """Return the maximum number of the policy's steps on a task.

@@ -11,7 +11,7 @@ from lifelong.evaluation.environments import VectorEnv
 
 
 def describe_environment(env: VectorEnv) -> dict[str, Any]:
-    """Return the models, robot and drawing of an environment, and the machine that runs it, as plain data.
+    """Return the models, robot, drawing and back end of an environment, and the machine that runs it, as plain data.
 
     Args:
         env: Environment; one that is not a `libero_env.envs.batch.BatchEnv` contributes nothing.
@@ -24,8 +24,13 @@ def describe_environment(env: VectorEnv) -> dict[str, Any]:
             "models_digest": getattr(scene.pack, "digest", None),
             "robot": scene.robot,
             "drawing": scene.drawing,
+            **world.simulations.record(),
         }
-    if (config := getattr(env, "config", None)) is not None and config.cameras:
+    if (
+        (config := getattr(env, "config", None)) is not None
+        and config.cameras
+        and not config.back_end.is_warp
+    ):
         backend, renderer = renderer_name()
         found |= {"gl": backend, "renderer": renderer}
     return found | {

@@ -75,8 +75,7 @@ class ExpertPolicy(PolicyUnderTest):
 
     def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
 
-        own = {"threads": self.args.threads, "assets": self.args.assets}
-        return make_env(task, count, protocol, cameras=self.cameras, observations=(), **own)
+        return make_env(task, count, protocol, cameras=self.cameras, observations=(), **self.simulated)
 
     @contextmanager
     def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:

@@ -114,6 +114,7 @@ def make_env(
     threads: int = 0,
     assets: str | None = None,
     drawing: str | None = "protocol",
+    backend: str | None = None,
 ) -> ProtocolEnv:
     """Build the environment of a task under a protocol.
 
@@ -126,6 +127,7 @@ def make_env(
         threads: Number of threads of the simulations; 0 is one for each core.
         assets: Models, see `libero_env.envs.config.EnvConfig`.
         drawing: How images are drawn; by default as the protocol says, None for the models' default.
+        backend: The protocol's back end with its settings, such as `warp,device=cuda:1`; by default without any.
     """
     world = protocol.world
     size = protocol.pixels.render_size
@@ -145,6 +147,7 @@ def make_env(
         drawing=world.drawing if drawing == "protocol" else drawing,
         robot=world.robot or DEFAULT_ROBOT,
         observed=protocol.episode.observed,
+        backend=world.backend if backend is None else backend,
         perturb=world.perturb,
     )
     return ProtocolEnv(env, protocol)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
+from libero_env.sim.engine import MUJOCO, BackEnd
 from libero_env.validation import validate
 from lifelong.errors import ConfigError, ResultsError
 from lifelong.evaluation.card import Card
@@ -66,11 +67,24 @@ def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Nam
         "policy_threads": args.policy_threads or _threads(result),
         "horizon": None,
         "robot": None,
+        "backend": _same_back_end(args, result),
         "perturb": None,
         "size": None,
         "out": args.out or folder / "again",
     }
     return argparse.Namespace(**(vars(args) | changes))
+
+
+def _same_back_end(args: argparse.Namespace, result: EvaluationResult) -> str | None:
+    """Return the back end that a result is repeated with: its own, with the settings that the arguments have.
+
+    Raises:
+        ConfigError: The arguments name another one.
+    """
+    own = str(result.protocol.get("world", {}).get("backend", MUJOCO))
+    if args.backend is not None and (given := BackEnd.read(args.backend).name) != own:
+        raise ConfigError(f"--backend {given}: the result is of backend={own}, which it is repeated with")
+    return args.backend
 
 
 def _check_code(policy: str, args: argparse.Namespace) -> None:

@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from libero_env.errors import LiberoError
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.perturbations import Perturbation
+from libero_env.sim.engine import MUJOCO, BackEnd
 from libero_env.validation import validate_arguments
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
@@ -42,6 +44,7 @@ class EvalSettings:
         record_every: Number of control steps between two frames of the recorded rollouts; 0 records none.
         open_environments: Number of environments kept open, of different tasks.
         sim_threads: Number of threads that step simulations; 0 uses all cores.
+        backend: Back end of the rollouts, `mujoco` or `warp` with its settings, such as `warp,device=cuda:1`.
         shift: Perturbations under which each task just learned, and all tasks at the end, are evaluated besides, from
             the same starts; as for `stream.perturb`, of any kinds. It may be chosen when a run is resumed or finished.
             None: no such evaluation.
@@ -62,10 +65,15 @@ class EvalSettings:
     record_every: Natural = 4
     open_environments: Count = 4
     sim_threads: Natural = 0
+    backend: str = MUJOCO
     shift: PerturbSetting | None = None
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("eval",), error=ConfigError)
+        try:
+            self.back_end.require_installed()
+        except LiberoError as error:
+            raise ConfigError(f"eval.backend: {error}") from error
         self.shift_perturbations()
         needed = self.episodes + (self.curve_episodes if self.selection == "apart" else 0)
         if max(needed, self.curve_episodes) > NUM_INIT_STATES:
@@ -78,6 +86,11 @@ class EvalSettings:
             raise ConfigError(
                 "eval.select=best needs a learning curve, and eval.curve=none has none: set eval.select=last"
             )
+
+    @property
+    def back_end(self) -> BackEnd:
+        """Back end of the rollouts."""
+        return BackEnd.read(self.backend)
 
     @property
     def transfer_estimate(self) -> Transfer:

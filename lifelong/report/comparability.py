@@ -15,6 +15,7 @@ from lifelong.results.evaluation_file import EvaluationResult
 WORLD = ("models", "robot", "drawing")
 PASSING = ("instruction_set", "policy_threads")  # what every machine differs in
 UNKNOWN = "not recorded"
+MUJOCO = "mujoco"  # back end of results that name none
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,12 @@ def check_comparable(sides: Sequence[Side], allow: Iterable[str] = ()) -> list[s
         Remarks on what differs and was allowed, or does not matter much.
 
     Raises:
-        ComparisonError: A setting differs; the message names both values.
+        ComparisonError: A setting differs; the message names both values. Back ends are never mixed.
     """
     rows = [(s.label, r) for s in sides for r in s.results]
     base_label, base = rows[0]
+    found_on = {back_end_of(result): label for label, result in rows}
+    check_same_back_end({label: name for name, label in found_on.items()})
     expected, refused, notes = settings(base), {}, {}
     for label, result in rows[1:]:
         found = settings(result)
@@ -98,6 +101,29 @@ def settings(result: EvaluationResult) -> dict[str, Any]:
         world["models"] = result.versions["models"]
     tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
     return _flat({"protocol": result.protocol, "environment": world, "tasks": tasks})
+
+
+def back_end_of(result: EvaluationResult) -> str:
+    """Return the back end of a result; those that name none are of `mujoco`."""
+    world = result.protocol.get("world")
+    return str(world.get("backend", MUJOCO)) if isinstance(world, Mapping) else MUJOCO
+
+
+def check_same_back_end(of: Mapping[str, str]) -> None:
+    """Check that results are of one back end: the physics and the pictures of others differ.
+
+    Args:
+        of: Back end of each result by its label.
+
+    Raises:
+        ComparisonError: There are several; the message names a result of each.
+    """
+    found = {name: label for label, name in of.items()}
+    if len(found) > 1:
+        names = ", ".join(f"{label} on backend={name}" for name, label in found.items())
+        raise ComparisonError(
+            f"results of different back ends are not compared: {names}; evaluate all on one, see --backend"
+        )
 
 
 def match(first: Side, second: Side) -> Matched:

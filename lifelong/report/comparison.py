@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.storage import atomic_write_text
+from lifelong.report.comparability import MUJOCO, check_same_back_end
 from lifelong.report.runs import Group, Run
 from lifelong.report.statistics import statistics
 from lifelong.results.metrics import METRIC_NAMES, mean_and_standard_error
@@ -30,11 +31,18 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
         written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`. `differences`: of each pair, the
         first minus the second, with its interval, its p-value, that adjusted for all pairs (`told_apart` if below
         0.05), the number of `seeds` that would tell and the difference that is `shown` by the present ones.
-        `statistics`: how they were computed.
+        `statistics`: how they were computed. `backend`: what simulated all rollouts.
+
+    Raises:
+        ComparisonError: The runs are of different back ends.
     """
     measured = {g.label: [r for r in g.runs if r.metrics is not None] for g in groups}
+    check_same_back_end(
+        {f"{g.label} ({r.path})": r.record.backend for g in groups for r in measured[g.label]}
+    )
     found = statistics({label: members_of(runs) for label, runs in measured.items() if runs})
     return {
+        "backend": next((r.record.backend for runs in measured.values() for r in runs), MUJOCO),
         "groups": {g.label: _group(g, measured[g.label], found["metrics"].get(g.label)) for g in groups},
         "differences": found["differences"],
         "statistics": found["statistics"],

@@ -12,7 +12,16 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.errors import ConfigError, ResultsError
-from lifelong.report.comparability import Matched, Side, check_comparable, match, same_policy, settings
+from lifelong.report.comparability import (
+    MUJOCO,
+    Matched,
+    Side,
+    back_end_of,
+    check_comparable,
+    match,
+    same_policy,
+    settings,
+)
 from lifelong.results.differences import (
     Difference,
     count,
@@ -95,6 +104,7 @@ class Judgement:
         controls: The same policy twice, if there is such a pair: what arises by chance alone.
         groups: Aggregates over runs; None unless each policy has at least two.
         notes: Remarks for the reader.
+        backend: Back end that simulated all of it.
         alpha: Probability of a false difference in a family.
     """
 
@@ -104,6 +114,7 @@ class Judgement:
     groups: GroupScores | None
     notes: tuple[str, ...]
     alpha: float = ALPHA
+    backend: str = MUJOCO
 
     def to_plain(self) -> dict[str, Any]:
         """Return everything as plain data for JSON."""
@@ -153,6 +164,9 @@ def judge(
             "no control arm: evaluate one of the policies again with another --seed and name both results "
             "with --control, to see which differences arise by chance alone"
         )
+    backend = back_end_of((sides or control)[0].results[0])  # type: ignore[index]  # there is one of them
+    if backend != MUJOCO:
+        notes.append(f"simulated by backend={backend}; not to be compared with results of others")
     return Judgement(
         rates=tuple(_rate(s) for s in sides),
         comparisons=tuple(comparisons),
@@ -160,6 +174,7 @@ def judge(
         groups=_groups(sides),
         notes=tuple(notes),
         alpha=alpha,
+        backend=backend,
     )
 
 

@@ -152,6 +152,8 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
         k.removesuffix("._target_"): str(v).rpartition(".")[2] if k.endswith("._target_") else v
         for k, v in flat.items()  # a component goes by the name of its class
     }
+    if "eval.backend" in flat:  # device and memory aside
+        flat["eval.backend"] = record.backend
     ignored = (
         "seed",
         "_partial_",

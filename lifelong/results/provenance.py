@@ -43,6 +43,7 @@ def start_record(
     cells: MatrixCells = "all",
     transfer: Transfer | Literal[""] = "",
     perturbed: Sequence[str] = (),
+    backend: str = "mujoco",
 ) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
@@ -60,6 +61,7 @@ def start_record(
         cells: Cells of the success matrix that are measured.
         transfer: Estimate of forward transfer, see `lifelong.results.curves`.
         perturbed: Perturbations under which each task is learned and evaluated, as text; () for none at all.
+        backend: Name of the back end of rollouts.
     """
     equal = len(set(group_sizes)) < 2  # written as earlier versions did
     return RunRecord(
@@ -78,6 +80,7 @@ def start_record(
         group_size=group_sizes[0] if group_sizes and equal else 1,
         conditions=conditions or {},
         cells=cells,
+        backend=backend,
         group_sizes=() if equal else tuple(group_sizes),
         transfer=transfer,
         perturbed=tuple(perturbed),

@@ -48,6 +48,7 @@ class RunRecord:
     perturbed: tuple[
         str, ...
     ] = ()  # perturbations of each task, in learning and evaluation; () for none at all
+    backend: str = "mujoco"  # of the rollouts: mujoco or warp; older records have none and are of mujoco
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:

@@ -155,7 +155,7 @@ def upgrade_evaluation(node: Mapping[str, Any]) -> Node:
     Args:
         node: The `eval` node; one of today comes back unchanged.
     """
-    return {"curve": "all", "cells": "all", "reuse": True, "shift": None, **node}
+    return {"curve": "all", "cells": "all", "reuse": True, "backend": "mujoco", "shift": None, **node}
 
 
 def upgrade_stream(node: Mapping[str, Any]) -> Node:

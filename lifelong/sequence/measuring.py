@@ -82,6 +82,7 @@ class Evaluator:
         return {
             **({"perturb": perturb} if perturb else {}),
             **({"shift": self._shift(phase)} if phase == "shift" else {}),
+            **({"backend": settings.backend} if settings.back_end.is_warp else {}),
             "task": task,
             "language": self._language(phase, task),
             "init_states": str(list(settings.init_states(phase))),

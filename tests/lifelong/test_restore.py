@@ -95,7 +95,13 @@ def test_a_run_is_evaluated_with_the_drawing_that_it_was_trained_with(tmp_path, 
     config["data"] |= saved
     file.write_text(yaml.safe_dump(config))
     args = Namespace(
-        policy=str(tmp_path / "run"), after=None, device="cpu", threads=1, assets="builtin", allow=[]
+        policy=str(tmp_path / "run"),
+        after=None,
+        device="cpu",
+        threads=1,
+        assets="builtin",
+        backend=None,
+        allow=[],
     )
     policy = RunPolicy(args)
     env = policy.env(policy.run.tasks[0], 1, policy.protocol(load_card("libero")))

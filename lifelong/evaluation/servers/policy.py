@@ -118,10 +118,9 @@ class ServerPolicy(PolicyUnderTest):
 
     def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
         """Build the environment of a task; see `PolicyUnderTest`."""
-        threads, assets = self.args.threads, self.args.assets
         if self.own:
             cameras = tuple(CAMERAS[view] for view in self._views())
-            return make_env(task, count, protocol, cameras=cameras, threads=threads, assets=assets)
+            return make_env(task, count, protocol, cameras=cameras, **self.simulated)
         adapter = CardAdapter(protocol, task)
         return make_env(
             task,
@@ -129,8 +128,7 @@ class ServerPolicy(PolicyUnderTest):
             protocol,
             cameras=adapter.cameras,
             observations=adapter.observations,
-            threads=threads,
-            assets=assets,
+            **self.simulated,
         )
 
     @contextmanager

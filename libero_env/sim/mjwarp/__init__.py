@@ -1,0 +1,4 @@
+"""The back end `warp`: many simulations of one model on a GPU, or on the processor for tests, by MuJoCo Warp.
+
+Numbers are of single precision. The modules import `warp` and `mujoco_warp`, which the extra `warp` installs.
+"""

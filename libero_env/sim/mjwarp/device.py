@@ -1,0 +1,114 @@
+"""What MuJoCo Warp's simulations have on the device, and how the host reads it."""
+
+from collections.abc import Callable, Iterator, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from libero_env.errors import LiberoError
+from libero_env.mujoco_compat import MASS_FIELD
+from libero_env.sim.osc import ArmIndex
+from libero_env.sim.simulation import FIELDS, Closed
+
+
+def choose_device(name: str | None) -> Any:
+    """Return a device of Warp.
+
+    Args:
+        name: Name such as `cpu` or `cuda:1`; None for the first GPU, or the processor where there is none.
+
+    Raises:
+        LiberoError: There is no such device here.
+    """
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING  # a line for each kernel otherwise
+    wp.init()
+    if name is None:
+        name = "cuda:0" if wp.is_cuda_available() else "cpu"
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError) as error:
+        here = ", ".join(str(device) for device in wp.get_devices())
+        raise LiberoError(f"backend=warp: there is no device {name!r}; here are: {here}") from error
+
+
+def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray) -> SimpleNamespace:
+    """Return what the kernels take beside MuJoCo Warp's model and data, on the present device.
+
+    Args:
+        model: Model that is simulated.
+        arm: Indices of the arm.
+        num: Number of simulations.
+        bodies: Indices of the fixed bodies whose pose differs between simulations.
+    """
+    fixed = (model.body_weldid == 0) & np.isin(model.body_rootid, bodies)
+    constants = {
+        "mass_address": arm.mass_address.astype(np.int32),
+        "torque_limit": arm.torque_limit.astype(np.float64),
+        "finger_range": arm.finger_range.astype(np.float64),
+        "fixture_bodies": bodies.astype(np.int32),
+        "static_geoms": np.flatnonzero(fixed[model.geom_bodyid]).astype(np.int32),
+    }
+    states = {
+        "active": (num, wp.bool),
+        "chosen": (num, wp.bool),
+        "grip": (num, wp.float64),
+        "goal_pos": ((num, 3), wp.float64),
+        "goal_mat": ((num, 9), wp.float64),
+        "gripper": ((num, 2), wp.float64),
+        "rest": (7, wp.float64),
+        "new_qpos": ((num, model.nq), float),
+        "new_qvel": ((num, model.nv), float),
+        "kept_qpos": ((num, model.nq), float),
+        "kept_qvel": ((num, model.nv), float),
+        "kept_warm_start": ((num, model.nv), float),
+        "kept_time": (num, float),
+        "fixture_pos": ((num, bodies.size), wp.vec3),
+        "fixture_quat": ((num, bodies.size), wp.quat),
+    }
+    return SimpleNamespace(
+        **{name: wp.array(value) for name, value in constants.items()},
+        **{name: wp.zeros(shape, dtype=dtype) for name, (shape, dtype) in states.items()},
+    )
+
+
+class Freed(Closed):
+    """What closed simulations have instead of their arrays on the device."""
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+
+class DeviceFields(Mapping[str, np.ndarray]):
+    """Fields of all simulations on the host, in double precision; each is copied when it is first read after a step."""
+
+    def __init__(self, data: Any):
+        self._data, self._found = data, dict[str, Any]()
+
+    def forget(self) -> None:
+        """Drop what was copied: the simulations have moved."""
+        self._found = {}
+
+    def derived(self, name: str, compute: Callable[[], Any]) -> Any:
+        """Return a value that is computed once after each step."""
+        if name not in self._found:
+            self._found[name] = compute()
+        return self._found[name]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in FIELDS:
+            raise KeyError(name)
+        return self.derived(name, lambda: self._download(name))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(FIELDS)
+
+    def __len__(self) -> int:
+        return len(FIELDS)
+
+    def _download(self, name: str) -> np.ndarray:
+        values = getattr(self._data, "M" if name == MASS_FIELD else name).numpy().astype(np.float64)
+        return values.reshape(*values.shape[:2], 9) if name == "site_xmat" else values

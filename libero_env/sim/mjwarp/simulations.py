@@ -1,0 +1,313 @@
+"""Simulations of one model that MuJoCo Warp steps together, on a GPU or on the processor."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from importlib import metadata
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from libero_env.errors import LiberoError
+from libero_env.sim.controller import Controller
+from libero_env.sim.engine import BackEnd
+from libero_env.sim.mjwarp import kernels
+from libero_env.sim.mjwarp.device import DeviceFields, Freed, allocate, choose_device
+from libero_env.sim.osc import osc_torques
+from libero_env.sim.simulation import WATCHED, Indices, KinematicsHook, Simulations, Watch
+from libero_env.timing import SUBSTEPS
+
+_ROWS_PER_CONTACT = 4  # of constraints; contacts with rolling friction, which have 6, are few
+_FULL = (
+    mjw.OverflowType.NEFC
+    | mjw.OverflowType.NJMAX_NNZ
+    | mjw.OverflowType.BROADPHASE
+    | mjw.OverflowType.NARROWPHASE
+    | mjw.OverflowType.CCD
+)
+
+
+class WarpSimulations(Simulations):
+    """Simulations that are stepped together by MuJoCo Warp, all of them at the cost of all.
+
+    A control step on a GPU is one CUDA graph. Simulations that are not to be stepped are stepped and held, so that
+    they do not move. Numbers are of single precision.
+
+    Args:
+        model: Model to simulate; it is copied.
+        num: Number of simulations.
+        fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
+        back_end: Device, and the largest number of contacts of a simulation.
+
+    Attributes:
+        device: Device of Warp.
+        device_model: The model on the device, with the poses of fixtures of each simulation.
+        device_data: The state of all simulations on the device.
+
+    Raises:
+        LiberoError: There is no such device, or MuJoCo Warp has not a feature that the model uses.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = (), back_end: BackEnd | None = None
+    ):
+        super().__init__(model, num, fixture_bodies)
+        self.back_end = back_end or BackEnd("warp")
+        self.device = choose_device(self.back_end.device)
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # nothing reads them
+        contacts = self.back_end.contacts
+        with wp.ScopedDevice(self.device):
+            try:
+                self.device_model = mjw.put_model(self.model, {"body_pos": num, "body_quat": num})
+            except (NotImplementedError, ValueError) as error:
+                raise LiberoError(
+                    f"backend=warp cannot simulate this model: {error}; backend=mujoco can"
+                ) from error
+            self.device_model.opt.warn_overflow = 0  # raised instead, see _check_room
+            self.device_data = mjw.make_data(
+                self.model,
+                nworld=num,
+                nconmax=contacts,
+                njmax=_ROWS_PER_CONTACT * contacts + self._other_rows,
+            )
+            self._arrays: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
+        self._copies: Any = DeviceFields(self.device_data)
+        self.fields = self._copies
+        self._graphs: dict[int, Any] = {}
+        self._actions_seen = np.zeros(num)
+
+    @property
+    def _other_rows(self) -> int:
+        """Number of constraints that are not contacts, at most: friction and limits of joints."""
+        return int((self.model.dof_frictionloss > 0).sum() + self.model.jnt_limited.sum())
+
+    def record(self) -> dict[str, str]:
+        versions = {name: metadata.version(name) for name in ("mujoco-warp", "warp-lang")}
+        return {"backend": self.back_end.name, "backend_device": self.device.name, **versions}
+
+    def has_controller(self, controller: Controller) -> bool:
+        return controller.kernel is osc_torques
+
+    def contact_geoms(self, i: int) -> np.ndarray:
+        geoms, starts = self._contacts
+        return geoms[starts[i] : starts[i + 1]]
+
+    @property
+    def _contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pairs of geoms of all contacts, by simulation, and where those of each simulation begin."""
+        return self._copies.derived("contacts", self._download_contacts)
+
+    def _download_contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        data = self.device_data
+        count = int(data.nacon.numpy()[0])
+        worlds = data.contact.worldid.numpy()[:count]
+        order = np.argsort(worlds, kind="stable")
+        starts = np.searchsorted(worlds[order], np.arange(self.num + 1))
+        return data.contact.geom.numpy()[:count][order], starts
+
+    def time(self, i: int) -> float:
+        return float(self.device_data.time.numpy()[i])
+
+    def data(self, i: int) -> mujoco.MjData:
+        found = mujoco.MjData(self.model)
+        self.pose_fixtures(i)
+        mjw.get_data_into(found, self.model, self.device_data, world_id=i)
+        return found
+
+    def close(self) -> None:
+        super().close()
+        self._graphs = {}
+        self.device_data = self.device_model = self._arrays = self._copies = Freed()
+
+    def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
+        model, data, arrays = self.device_model, self.device_data, self._arrays
+        with wp.ScopedDevice(self.device):
+            arrays.chosen.assign(_mask(self.num, ids))
+            arrays.new_qpos.assign(_rows(self.num, ids, qpos))
+            arrays.new_qvel.assign(_rows(self.num, ids, qvel))
+            if self.fixture_bodies.size:
+                arrays.fixture_pos.assign(self.fixtures[:, :, :3].astype(np.float32))
+                arrays.fixture_quat.assign(self.fixtures[:, :, 3:].astype(np.float32))
+            wp.launch(
+                kernels.start,
+                self.num,
+                inputs=[arrays.chosen, float(time), arrays.new_qpos, arrays.new_qvel, arrays.fixture_bodies],
+                outputs=[
+                    arrays.fixture_pos,
+                    arrays.fixture_quat,
+                    data.qpos,
+                    data.qvel,
+                    data.qacc_warmstart,
+                    data.ctrl,
+                    data.time,
+                    model.body_pos,
+                    model.body_quat,
+                ],
+            )
+            if arrays.static_geoms.size:
+                mjw.kinematics(model, data)
+                wp.launch(
+                    kernels.pose_static_geoms,
+                    (self.num, arrays.static_geoms.size),
+                    inputs=[arrays.static_geoms, model.geom_bodyid, model.geom_pos, model.geom_quat],
+                    outputs=[data.xpos, data.xquat, data.geom_xpos, data.geom_xmat],
+                )
+            mjw.step1(model, data)
+        self._copies.forget()
+
+    def _substeps(
+        self,
+        ids: np.ndarray,
+        actions: np.ndarray,
+        before_last_kinematics: KinematicsHook | None,
+        believed: Mapping[str, np.ndarray],
+        watch: Watch | None,
+    ) -> None:
+        if before_last_kinematics is not None:
+            raise LiberoError("backend=warp takes no before_last_kinematics hook; backend=mujoco does")
+        self._upload(ids, actions)
+        done = 0
+        with wp.ScopedDevice(self.device):
+            if believed is not self.fields:
+                self._control_on_host(ids, actions, believed)
+                self._physics()
+                done = 1
+            for until in (*WATCHED, SUBSTEPS) if watch is not None else (SUBSTEPS,):
+                if until > done:
+                    self._run(until - done)
+                    done = until
+                    self._copies.forget()
+                    if watch is not None and done in WATCHED:
+                        watch(done, ids)
+        self.controller_state.gripper[:] = self._arrays.gripper.numpy()
+        self._check_room()
+
+    def _upload(self, ids: np.ndarray, actions: np.ndarray) -> None:
+        """Send the goals, and which simulations are to be stepped, to the device."""
+        arrays, state, data = self._arrays, self.controller_state, self.device_data
+        self._actions_seen[ids] = actions[ids, -1]
+        with wp.ScopedDevice(self.device):
+            arrays.active.assign(_mask(self.num, ids))
+            for array, values in (
+                (arrays.grip, self._actions_seen),
+                (arrays.goal_pos, state.goal),
+                (arrays.goal_mat, state.memory),
+                (arrays.gripper, state.gripper),
+                (arrays.rest, self.rest),
+            ):
+                array.assign(np.ascontiguousarray(values, np.float64))
+            wp.copy(arrays.kept_qpos, data.qpos)
+            wp.copy(arrays.kept_qvel, data.qvel)
+            wp.copy(arrays.kept_warm_start, data.qacc_warmstart)
+            wp.copy(arrays.kept_time, data.time)
+            data.overflow.zero_()
+
+    def _control_on_host(
+        self, ids: np.ndarray, actions: np.ndarray, believed: Mapping[str, np.ndarray]
+    ) -> None:
+        """Compute the controls of a substep in which the controller believes the arm elsewhere than it is."""
+        state, ctrl = self.controller_state, self.fields["ctrl"].copy()
+        state.controller.kernel(
+            ids, actions, *self._inputs(believed), *state.arrays, ctrl, *self._constants()
+        )
+        self.device_data.ctrl.assign(ctrl.astype(np.float32))
+        self._arrays.gripper.assign(state.gripper)
+
+    def _run(self, substeps: int) -> None:
+        """Run substeps: on a GPU as a graph, which is captured the first time."""
+        if not self.device.is_cuda:
+            for _ in range(substeps):
+                self._substep()
+            return
+        if substeps not in self._graphs:
+            self._substep_kernels_loaded  # noqa: B018 - no module may be loaded while a graph is captured
+            with wp.ScopedCapture() as capture:
+                for _ in range(substeps):
+                    self._substep()
+            self._graphs[substeps] = capture.graph
+        wp.capture_launch(self._graphs[substeps])
+
+    @cached_property
+    def _substep_kernels_loaded(self) -> bool:
+        """Run a substep in which every simulation is held, so that all kernels are compiled."""
+        active = self._arrays.active.numpy()
+        gripper = self._arrays.gripper.numpy()
+        self._arrays.active.zero_()
+        self._substep()
+        self._arrays.active.assign(active)
+        self._arrays.gripper.assign(gripper)
+        return True
+
+    def _substep(self) -> None:
+        data, arrays, arm = self.device_data, self._arrays, self.arm
+        wp.launch(
+            kernels.osc_substep,
+            self.num,
+            inputs=[
+                arrays.active,
+                arrays.grip,
+                arrays.goal_pos,
+                arrays.goal_mat,
+                *(getattr(data, n) for n in ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat")),
+                data.M,
+                data.qfrc_bias,
+                arrays.mass_address,
+                arrays.torque_limit,
+                arrays.finger_range,
+                arrays.rest,
+                arm.site,
+            ],
+            outputs=[arrays.gripper, data.ctrl],
+        )
+        self._physics()
+
+    def _physics(self) -> None:
+        """Step the physics with the present controls, and hold the simulations that are not active."""
+        model, data, arrays = self.device_model, self.device_data, self._arrays
+        mjw.step2(model, data)
+        kept = [arrays.kept_qpos, arrays.kept_qvel, arrays.kept_warm_start, arrays.kept_time]
+        moved = [data.qpos, data.qvel, data.qacc_warmstart, data.time]
+        wp.launch(kernels.hold, self.num, inputs=[arrays.active, *kept], outputs=moved)
+        mjw.step1(model, data)
+
+    def _check_room(self) -> None:
+        """Raise where there were more contacts or constraints than memory for them.
+
+        Raises:
+            LiberoError: There were; the message says what to set.
+        """
+        overflow = self.device_data.overflow.numpy() & int(_FULL)
+        if overflow.any():
+            kinds = mjw.OverflowType(int(np.bitwise_or.reduce(overflow))).name
+            contacts = self.back_end.contacts
+            raise LiberoError(
+                f"backend=warp: {np.count_nonzero(overflow)} simulations have more contacts or constraints than there "
+                f"is room for ({kinds}); set backend='warp,contacts={2 * contacts}' (now {contacts})"
+            )
+
+    def _warm_start(self, i: int) -> list[np.ndarray]:
+        return [self.device_data.qacc_warmstart.numpy()[i], self.device_data.ctrl.numpy()[i]]
+
+    def _set_warm_start(self, i: int, values: list[np.ndarray]) -> None:
+        for array, value in zip(
+            (self.device_data.qacc_warmstart, self.device_data.ctrl), values, strict=True
+        ):
+            rows = array.numpy()
+            rows[i] = value
+            array.assign(rows)
+        self._copies.forget()
+
+
+def _mask(num: int, ids: np.ndarray) -> np.ndarray:
+    chosen = np.zeros(num, bool)
+    chosen[ids] = True
+    return chosen
+
+
+def _rows(num: int, ids: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the rows of chosen simulations among those of all, in single precision."""
+    rows = np.zeros((num, values.shape[1]), np.float32)
+    rows[ids] = values
+    return rows

@@ -1,0 +1,341 @@
+"""The back end `warp` is the same environment as `mujoco`: states, truths, episodes, and what it does not offer."""
+
+import numpy as np
+import pytest
+
+from libero_env.envs.batch import BatchEnv
+from libero_env.envs.world import World
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.sim import engine
+from libero_env.sim.back_ends import make_simulations
+from libero_env.sim.engine import BackEnd
+from libero_env.sim.goals import ViewedGoals, make_goals
+from libero_env.sim.look import Look
+from libero_env.sim.predicates import register_predicate
+from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
+
+wp = pytest.importorskip("warp")
+pytest.importorskip("mujoco_warp")
+wp.config.optimization_level = 0  # kernels compile in a third of the time
+
+TASK = "libero_10/3"  # a bowl into a drawer that is then closed: fixtures, joints, contacts
+WARP = "warp,device=cpu"
+NUM = 3
+TEN_TASKS = ["libero_spatial/0", "libero_object/3", "libero_object/7", "libero_goal/0", "libero_goal/5"]
+TEN_TASKS += ["libero_10/3", "libero_10/9", "libero_90/1", "libero_90/20", "libero_90/60"]
+
+pytestmark = pytest.mark.sim
+
+
+def make_pair(**options):
+    """The same environment on both back ends, `mujoco` first."""
+    options = {"cameras": (), "observations": ("proprioception", "objects"), **options}
+    return [BatchEnv(TASK, NUM, num_threads=1, backend=backend, **options) for backend in ("mujoco", WARP)]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    envs = make_pair(horizon=5)
+    yield envs
+    for env in envs:
+        env.close()
+
+
+def reset(envs, **options):
+    return [env.reset(options={"init_state": [0, 1, 2], **options}) for env in envs]
+
+
+def smooth_actions(steps, seed=0):
+    """Actions that lift the hand from its rest pose."""
+    rng, found = np.random.default_rng(seed), []
+    for step in range(steps):
+        if step % 10 == 0:
+            action = rng.uniform(-0.5, 0.5, (NUM, 7))
+            action[:, 2], action[:, 6] = 0.3 * np.abs(action[:, 2]), np.sign(action[:, 6])
+        found.append(action)
+    return found
+
+
+def assert_close(ours, theirs, atol=1e-5):
+    assert ours.keys() == theirs.keys()
+    for name, values in theirs.items():
+        assert ours[name].shape == values.shape and ours[name].dtype == values.dtype
+        np.testing.assert_allclose(ours[name], values, atol=atol, rtol=0, err_msg=name)
+
+
+def test_a_reset_gives_the_same_observations_and_contacts(pair):
+    (theirs, their_info), (ours, our_info) = reset(pair)
+    assert pair[1].observation_space == pair[0].observation_space
+    assert pair[1].action_space == pair[0].action_space
+    assert_close(ours, theirs, 1e-6)
+    assert {k: v.tolist() for k, v in our_info.items()} == {k: v.tolist() for k, v in their_info.items()}
+    mujoco_sims, warp_sims = (env.world.simulations for env in pair)
+    for i in range(NUM):  # fixtures are elsewhere in each, and their geoms with them
+        assert sorted(map(tuple, warp_sims.contact_geoms(i))) == sorted(
+            map(tuple, mujoco_sims.contact_geoms(i))
+        )
+        geoms = warp_sims.device_data.geom_xpos.numpy()[i]
+        np.testing.assert_allclose(geoms, mujoco_sims.data(i).geom_xpos, atol=1e-6)
+    assert np.ptp(warp_sims.fixtures[:, :, :3], axis=0).max() > 1e-4
+
+
+def test_episodes_are_the_same(pair):
+    reset(pair)
+    for action in smooth_actions(5):
+        (theirs, *rest), (ours, *own) = (env.step(action) for env in pair)
+        assert_close(ours, theirs)
+        for a, b in zip(own[:3], rest[:3], strict=True):
+            assert a.dtype == b.dtype and (a == b).all()
+        assert (own[3]["success"] == rest[3]["success"]).all() and (
+            own[3]["progress"] == rest[3]["progress"]
+        ).all()
+    assert own[2].all() and not pair[1].running.any()  # the horizon
+
+
+def test_a_simulation_does_not_move_while_another_does(pair):
+    env = pair[1]
+    before, _ = reset(pair)[1]
+    actions = smooth_actions(1)[0]
+    env.world.step([1], actions)
+    after = env.world.proprioception()
+    for name, values in before.items():
+        assert (after[name][[0, 2]] == values[[0, 2]]).all()
+    assert (after["ee_pos"][1] != before["ee_pos"][1]).any()
+    assert env.world.simulations.time(1) > env.world.simulations.time(0) == 0.0
+
+
+def test_what_a_simulation_does_depends_on_itself_alone(pair):
+    env, actions, found = pair[1], smooth_actions(1), []
+    for others in (1.0, -1.0):
+        reset([env])
+        for action in actions:
+            own = action * others
+            own[0] = action[0]
+            found.append(env.step(own)[0]["joint_states"][0])
+    assert (found[0] == found[1]).all()
+
+
+def test_a_masked_reset_leaves_the_others_alone(pair):
+    env = pair[1]
+    reset(pair)
+    moved = env.step(smooth_actions(1)[0])[0]
+    again, _ = env.reset(options={"init_state": 4, "reset_mask": [False, True, False]})
+    theirs, _ = pair[0].reset(options={"init_state": 4})
+    for name, values in again.items():
+        assert (values[[0, 2]] == moved[name][[0, 2]]).all()
+        np.testing.assert_allclose(values[1], theirs[name][1], atol=1e-6)
+
+
+def test_a_new_placement_is_that_of_mujoco(pair):
+    (theirs, _), (ours, _) = (env.reset(seed=[5, 6, 7]) for env in pair)
+    assert_close(ours, theirs, 1e-5)
+
+
+def test_a_state_is_restored_to_the_same_bits(pair):
+    env, (first, second) = pair[1], smooth_actions(11)[::10]
+    reset(pair)
+    env.step(first)
+    state = env.get_state(0)
+    expected = env.step(second)[0]
+    env.set_state(0, state)
+    found = env.step(second)[0]
+    assert all((found[name][0] == expected[name][0]).all() for name in found)
+
+
+def test_the_outdated_controller_is_that_of_mujoco(pair):
+    reset(pair, outdated_controller=True)
+    for action in smooth_actions(2):
+        (theirs, *_), (ours, *_) = (env.step(action) for env in pair)
+        assert_close(ours, theirs)
+
+
+def test_it_is_observed_within_a_step_as_mujoco():
+    envs = make_pair(observed="substep")
+    reset(envs)
+    (theirs, *_), (ours, *_) = (env.step(smooth_actions(1)[0]) for env in envs)
+    assert_close(ours, theirs)
+    for env in envs:
+        env.close()
+
+
+def test_truths_are_those_of_the_predicates(pair):
+    worlds = [env.world for env in pair]
+    scene, rng = worlds[0].scene, np.random.default_rng(0)
+    names, regions = list(scene.entities), [r.address for r in scene.problem.regions]
+    sites = [name for name in scene.joints if name not in names and name in regions and scene.joints[name]]
+    atoms = [Atom(p, (a, b)) for p in ("On", "In", "Stack") for a in scene.objects for b in regions]
+    atoms += [
+        Atom(p, (a, b)) for p in ("On", "Stack", "Incontact") for a in scene.objects for b in names if a != b
+    ]
+    atoms += [Atom("Up", (name,)) for name in scene.objects] + [Atom("True", ())]
+    atoms += [Atom(p, (site,)) for p in ("Open", "Close") for site in sites]
+    goal = Or(
+        (And(tuple(atoms[:3])), Not(ForAll((("b", scene.objects[names[0]].category),), Atom("Up", ("b",)))))
+    )
+    checkers = [make_goals(goal, atoms, world.views, "original", world.simulations) for world in worlds]
+    assert isinstance(checkers[0], ViewedGoals)
+    assert checkers[1].on_host == (Atom("True", ()),)
+    seen = []
+    for _ in range(20):  # objects anywhere around the fixtures, joints anywhere
+        qpos = np.tile(scene.model.qpos0, (NUM, 1))
+        for joint in range(scene.model.njnt):
+            address, low, high = scene.model.jnt_qposadr[joint], *scene.model.jnt_range[joint]
+            if scene.model.jnt_type[joint] == 0:
+                near = worlds[0].simulations.fixtures[0, rng.integers(len(scene.fixtures)), :3]
+                qpos[:, address : address + 3] = near + rng.uniform(-0.15, 0.25, (NUM, 3))
+            else:
+                qpos[:, address] = rng.uniform(low, high, NUM)
+        for world in worlds:
+            world.simulations.reset(range(NUM), qpos, np.zeros((NUM, scene.model.nv)))
+        (reached, truths), (our_reached, our_truths) = (one.check(range(NUM)) for one in checkers)
+        assert (our_reached == reached).all()
+        wrong = [atoms[k] for k in np.flatnonzero((our_truths != truths).any(axis=0))]
+        assert not wrong
+        seen.append(truths)
+    assert 0.01 < np.mean(seen) < 0.9
+
+
+def test_predicates_of_users_and_of_strict_semantics_are_evaluated_on_the_host(pair):
+    world = pair[1].world
+    register_predicate("Leftof", lambda view, a, b: bool(view.body_pos(a)[1] < view.body_pos(b)[1]))
+    a, b = list(world.scene.entities)[:2]
+    atom, reset_ = Atom("Leftof", (a, b)), reset(pair)
+    assert reset_
+    checker = make_goals(atom, [atom], world.views, "original", world.simulations)
+    assert checker.on_host == (atom,)
+    theirs = ViewedGoals(atom, [atom], pair[0].world.views, "original").check(range(NUM))[0]
+    assert (checker.check(range(NUM))[0] == theirs).all()
+    strict = make_goals(world.task.problem.goal, world.atoms, world.views, "strict", world.simulations)
+    assert {one.predicate for one in strict.on_host} == {"In"}
+
+
+def test_too_many_contacts_are_an_error_that_says_what_to_set(pair):
+    full = World(TASK, 1, cameras=(), backend="warp,device=cpu,contacts=4")
+    with pytest.raises(LiberoError, match=r"set backend='warp,contacts=8' \(now 4\)"):
+        full.reset_to_init([0], [0])
+        full.step([0], np.zeros((1, 7)))
+    full.close()
+
+
+def test_closed_simulations_say_so():
+    world = World(TASK, 1, cameras=(), backend=WARP)
+    world.close()
+    with pytest.raises(LiberoError, match="closed"):
+        world.step([0], np.zeros((1, 7)))
+    with pytest.raises(LiberoError, match="closed"):
+        world.proprioception()
+
+
+def test_results_name_it(pair):
+    theirs, ours = (env.world.simulations.record() for env in pair)
+    assert theirs == {"backend": "mujoco"}
+    assert ours["backend"] == "warp" and ours["backend_device"] and ours["mujoco-warp"] and ours["warp-lang"]
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        ({"backend": "warp,device=cuda:7"}, "there is no device 'cuda:7'; here are: cpu"),
+        ({"backend": WARP, "controller": "joint_position"}, "backend=mujoco has"),
+        ({"backend": WARP, "observations": ("segmentation_class",)}, "segmentation needs backend=mujoco"),
+    ],
+)
+def test_what_it_does_not_offer_is_said_in_one_line(options, told):
+    with pytest.raises(LiberoError, match=told) as caught:
+        World(TASK, 1, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_looks_need_the_other_back_end(pair):
+    observer = pair[1].world.observer
+    observer.set_look(0, Look())
+    with pytest.raises(LiberoError, match="need backend=mujoco"):
+        observer.set_look(0, Look(materials={"wall": "floor"}))
+    with pytest.raises(InvalidInputError, match="name its camera in cameras="):
+        observer.render(0, "agentview")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    "text, error, told",
+    [
+        ("wrap", UnknownNameError, "warp"),
+        ("warp,devise=cpu", UnknownNameError, "device"),
+        ("warp,contacts=0", InvalidInputError, "from 1 to"),
+        ("warp,contacts=many", InvalidInputError, "whole number"),
+        ("warp,device=", InvalidInputError, "cuda:0"),
+        ("mujoco,device=cpu", InvalidInputError, "no settings"),
+        (7, InvalidInputError, "expected a text"),
+    ],
+)
+def test_a_back_end_that_is_not_valid_is_said(text, error, told):
+    with pytest.raises(error, match=told):
+        BackEnd.read(text)
+
+
+@pytest.mark.unit
+def test_a_back_end_is_written_as_it_is_read():
+    for text in ("mujoco", "warp", "warp,device=cuda:1", "warp,device=cpu,contacts=256"):
+        assert str(BackEnd.read(text)) == text
+
+
+@pytest.mark.unit
+def test_a_missing_package_is_said_in_one_line(monkeypatch):
+    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(LiberoError, match=r"pip install 'libero-lifelong\[warp\]'"):
+        BackEnd("warp").require_installed()
+    BackEnd("mujoco").require_installed()
+
+
+@pytest.mark.slow
+def test_pictures_show_the_same():
+    envs = make_pair(
+        cameras=("agentview", "robot0_eye_in_hand"), observations=("rgb", "depth"), camera_size=(48, 64)
+    )
+    (theirs, _), (ours, _) = reset(envs)
+    for name, values in theirs.items():
+        assert ours[name].shape == values.shape and ours[name].dtype == values.dtype
+        apart = np.abs(ours[name].astype(float) - values)
+        if name.endswith("depth"):
+            assert np.mean(apart < 0.005) > 0.95, name
+        else:
+            likeness = [
+                np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in zip(ours[name], values, strict=True)
+            ]
+            assert min(likeness) > 0.8, name
+    assert (ours["agentview_rgb"][0] != ours["agentview_rgb"][1]).any()
+    assert (envs[1].world.render(2, "agentview") == ours["agentview_rgb"][2]).all()
+    for env in envs:
+        env.close()
+
+
+def free_actions(world, seed):
+    """Actions of 50 control steps; None where the robot touches something."""
+    world.reset_to_init(range(NUM), range(NUM))
+    actions, bodies, robot = (
+        smooth_actions(50, seed),
+        world.scene.model.geom_bodyid,
+        world.scene.bodies["robot"],
+    )
+    for action in actions:
+        world.step(range(NUM), action)
+        pairs = np.concatenate([world.simulations.contact_geoms(i) for i in range(NUM)])
+        if (np.isin(bodies[pairs], robot).sum(axis=1) == 1).any():
+            return None
+    return actions
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TEN_TASKS)
+def test_free_motion_is_that_of_mujoco(task):
+    """50 control steps within 1e-5 rad and m."""
+    world = World(task, NUM, cameras=(), threads=1)
+    fixtures = world.scene.fixture_bodies
+    ours = make_simulations(world.scene.model, NUM, fixture_bodies=fixtures, back_end=BackEnd.read(WARP))
+    theirs, actions = world.simulations, next(filter(None, (free_actions(world, seed) for seed in range(20))))
+    world.reset_to_init(range(NUM), range(NUM))
+    ours.reset(range(NUM), theirs.fields["qpos"], theirs.fields["qvel"], fixtures=theirs.fixtures)
+    for action in actions:
+        for simulations in (ours, theirs):
+            simulations.step(range(NUM), action)
+        np.testing.assert_allclose(ours.fields["qpos"], theirs.fields["qpos"], atol=1e-5, rtol=0)

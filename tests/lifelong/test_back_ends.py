@@ -1,0 +1,86 @@
+"""Results name the back end that simulated them, and those of different ones are never mixed."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from lifelong.cli.main import main
+from lifelong.errors import ComparisonError, ConfigError, ProtocolError
+from lifelong.evaluation.card_files import load_card
+from lifelong.evaluation.settings import EvalSettings
+from lifelong.report.comparability import Side, back_end_of, check_comparable, check_same_back_end
+from lifelong.report.comparison import compare
+from lifelong.report.judgement import judge
+from lifelong.results.provenance import start_record
+from tests.harness.results import PROTOCOL, drawn_result
+
+pytestmark = pytest.mark.unit
+
+
+def result(seed, backend=None):
+    found = drawn_result(0.8, seed, suites=("libero_goal",), policy=f"p{seed}:make")
+    world = {} if backend is None else {"backend": backend}
+    return replace(found, protocol={**PROTOCOL, "world": {**PROTOCOL.get("world", {}), **world}})
+
+
+def test_a_card_names_it_and_keeps_its_digest_without():
+    card = load_card("libero")
+    assert card.world.backend == "mujoco" and "backend" not in card.resolved()["world"]
+    warp = card.changed({"world.backend": "warp"})
+    assert warp.resolved()["world"]["backend"] == "warp" and warp.digest != card.digest
+    assert warp.changed({"world.backend": "mujoco"}).digest == card.digest
+    with pytest.raises(ProtocolError, match="backend"):
+        card.changed({"world.backend": "physx"})
+
+
+def test_results_of_different_ones_are_not_compared():
+    sides = [Side("old", (result(1),)), Side("new", (result(2, "warp"),))]
+    with pytest.raises(ComparisonError) as caught:
+        check_comparable(sides, allow=["protocol", "environment"])
+    assert str(caught.value) == (
+        "results of different back ends are not compared: old on backend=mujoco, new on backend=warp; evaluate all on "
+        "one, see --backend"
+    )
+    assert [back_end_of(one.results[0]) for one in sides] == ["mujoco", "warp"]
+
+
+@pytest.mark.parametrize("backend", [None, "warp"])
+def test_a_comparison_names_it(backend):
+    pytest.importorskip("statsmodels")
+    found = judge([Side("a", (result(1, backend),)), Side("b", (result(2, backend),))])
+    assert found.to_plain()["backend"] == (backend or "mujoco")
+    assert any("backend=warp" in note for note in found.notes) == (backend == "warp")
+
+
+def test_runs_of_different_ones_are_not_compared():
+    def run(backend):
+        return SimpleNamespace(path=f"runs/{backend}", metrics={}, record=SimpleNamespace(backend=backend))
+
+    groups = [SimpleNamespace(label=name, runs=[run(name)]) for name in ("mujoco", "warp")]
+    with pytest.raises(
+        ComparisonError, match=r"mujoco \(runs/mujoco\) on backend=mujoco, warp \(runs/warp\)"
+    ):
+        compare(groups)
+    check_same_back_end({"a": "warp", "b": "warp"})
+
+
+def test_the_record_of_a_run_names_it():
+    facts = {"algo": "er", "benchmark": "b", "policy": "p", "seed": 0, "preset": "", "tasks": ["t"]}
+    facts |= {"instructions": ["do"], "config": ""}
+    assert start_record(**facts).backend == "mujoco"
+    assert start_record(**facts, backend="warp").backend == "warp"
+
+
+@pytest.mark.parametrize("backend", ["physx", "warp,contacts=none", "mujoco,device=cpu"])
+def test_settings_with_one_that_is_not_valid_are_refused(backend):
+    with pytest.raises(ConfigError, match=r"eval\.backend"):
+        EvalSettings(backend=backend)
+
+
+def test_the_command_names_what_is_not_valid(capsys, tmp_path):
+    assert (
+        main(["eval", "expert", "--suite", "libero_goal/3", "--backend", "wrap", "--out", str(tmp_path)]) == 2
+    )
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "mujoco" in error and "warp" in error
