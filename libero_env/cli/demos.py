@@ -63,6 +63,12 @@ def _register_generate(commands: Subparsers) -> None:
     add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
     add("--robot", default="libero", help="model of the arm: libero, or robosuite-1.4.1 (default: libero)")
     add(
+        "--backend",
+        metavar="NAME",
+        default="mujoco",
+        help="physics: mujoco, or warp on a GPU, as in warp,device=cuda:1 (default: mujoco)",
+    )
+    add(
         "--seed",
         type=arguments.seed,
         default=0,
@@ -163,6 +169,7 @@ def demo_configs(args: argparse.Namespace) -> "list[DemoConfig]":
             modalities=modalities(args),
             drawing=args.drawing,
             robot=args.robot,
+            backend=args.backend,
         )
         for task in tasks
     ]

@@ -18,6 +18,7 @@ from libero_env.demos.contents import Pairing
 from libero_env.demos.observe import RenderConfig
 from libero_env.demos.write import DemoWriter, make_header
 from libero_env.errors import UnknownNameError
+from libero_env.sim.engine import MUJOCO, BackEnd
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.scene import FAST, build_scene, default_drawing
@@ -69,6 +70,8 @@ class DemoConfig:
         modalities: Kinds of image, see `RenderConfig`.
         drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
         robot: Model of the arm, see `libero_env.assets.robot`.
+        backend: Back end of the physics, such as `warp,device=cuda:1`, see `libero_env.sim.engine`. Images are drawn
+            from the states by OpenGL with all of them.
     """
 
     source: Task | str
@@ -81,9 +84,11 @@ class DemoConfig:
     modalities: tuple[str, ...] = ("rgb",)
     drawing: str | None = None
     robot: str = DEFAULT_ROBOT
+    backend: str = MUJOCO
 
     def __post_init__(self) -> None:
         validate(Annotated[int, Field(ge=0)], self.seed, prefix=("seed",))
+        self.back_end.require_installed()
         validate(Pairing, self.pairing, prefix=("pairing",))
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, ROBOTS)
@@ -92,6 +97,16 @@ class DemoConfig:
     def drawn(self) -> str:
         """How images are drawn, one of `DRAWINGS`."""
         return self.drawing or default_drawing(select_pack())
+
+    @property
+    def back_end(self) -> BackEnd:
+        """Back end of the physics."""
+        return BackEnd.read(self.backend)
+
+    @property
+    def batch(self) -> int:
+        """Number of demonstrations that are simulated together, and written before the next ones."""
+        return 50 if self.back_end.is_warp else 5
 
     @cached_property
     def task(self) -> Task:
@@ -124,6 +139,9 @@ class DemoConfig:
             generator=GENERATOR,
             disturbed=self.disturb,
             robot=self.robot,
+            **(
+                {"backend": self.back_end.name} if self.back_end.is_warp else {}
+            ),  # files without it are of mujoco
             model_digest=model_digest(task, self.drawn, self.robot),
             models=json.dumps({"pack": (pack := select_pack()).name, "digest": pack.digest}),
             versions=json.dumps(versions),
@@ -143,6 +161,7 @@ class DemoConfig:
             f"reserved={v.reserved!r})"
         )
         robot = "" if self.robot == DEFAULT_ROBOT else f", robot={self.robot!r}"
+        robot += f", backend={self.back_end.name!r}" if self.back_end.is_warp else ""
         return (
             f"Recipe(source='', camera_size={self.camera_size!r}, seed={self.seed!r}, pairing={self.pairing!r}, "
             f"disturb={self.disturb!r}, variation={variation}, cameras={self.cameras!r}, "

@@ -20,7 +20,6 @@ from libero_env.demos.config import GENERATOR, DemoConfig, RecordingJob
 from libero_env.demos.contents import Pairing
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import (
-    BATCH,
     RecorderCache,
     RecordingReport,
     initialize_worker,
@@ -191,9 +190,9 @@ def _record(
     missing = [sorted(set(range(n)) - writer.recorded()) for writer in writers]
     reports = [RecordingReport(n - len(numbers)) for numbers in missing]
     chunks = [
-        (j, numbers[i : i + BATCH])
+        (j, numbers[i : i + jobs[j].config.batch])
         for j, numbers in enumerate(missing)
-        for i in range(0, len(numbers), BATCH)
+        for i in range(0, len(numbers), jobs[j].config.batch)
     ]
     if progress is not False:
         count = n * len(jobs) - sum(report.recorded for report in reports)

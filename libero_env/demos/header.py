@@ -26,6 +26,7 @@ class _Header(TypedDict, total=False):
     pairing: Pairing
     robot: Literal["libero", "robosuite-1.4.1"]
     drawing: Literal["fast", "faithful"]
+    backend: Literal["mujoco", "warp"]
     bddl_file_name: _Text
     bddl_file_content: _Text
     problem_info: _Text

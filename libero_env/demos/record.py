@@ -16,7 +16,6 @@ from libero_env.expert.rollout import MAX_STEPS, Attempt, run_experts
 from libero_env.init_states.store import NUM_INIT_STATES
 
 MAX_ATTEMPTS = 10  # attempts at one demonstration
-BATCH = 5  # demonstrations that are simulated together, and written before the next ones
 
 
 @dataclass
@@ -50,18 +49,19 @@ class DemoRecorder:
         self.config, self.task = config, config.task
         self.env = BatchEnv(
             self.task,
-            BATCH,
+            config.batch,
             num_threads=1,
             cameras=(),
             horizon=MAX_STEPS,
             drawing=config.drawn,
             robot=config.robot,
+            backend=config.backend,
         )
         self.renderer = StateRenderer(self.task, config.render_config, robot=config.robot)
         self.shapes = Shapes(self.env.world.scene)
 
     def attempt(self, numbers: list[tuple[int, int]]) -> list[tuple[int, Attempt]]:
-        """Attempt the first `BATCH` of the given demonstrations.
+        """Attempt the first of the given demonstrations, as many as are simulated together.
 
         Args:
             numbers: Demonstration numbers, each with the number of attempts at it that failed before.
@@ -74,7 +74,7 @@ class DemoRecorder:
         """
         placed: list[int] = []
         unplaced, experts, noises = [], [], []
-        for k, failures in numbers[:BATCH]:
+        for k, failures in numbers[: self.config.batch]:
             start_seed, style_seed, noise_seed = self._seeds(k, failures)
             try:
                 self._place(len(placed), k, start_seed)
@@ -129,7 +129,7 @@ class DemoRecorder:
 
     def _place(self, slot: int, k: int, seed: np.random.SeedSequence) -> None:
         """Put one simulation at the start of demonstration k; the others stay as they are."""
-        mask = np.arange(BATCH) == slot
+        mask = np.arange(self.config.batch) == slot
         if self.config.variation.reserved:
             self.env.reset(options={"reset_mask": mask, "init_state": k % NUM_INIT_STATES})
         else:

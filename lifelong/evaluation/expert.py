@@ -75,7 +75,8 @@ class ExpertPolicy(PolicyUnderTest):
 
     def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
 
-        return make_env(task, count, protocol, cameras=self.cameras, observations=(), **self.simulated)
+        seen = ("rgb",) if self.cameras else ()  # in videos
+        return make_env(task, count, protocol, cameras=self.cameras, observations=seen, **self.simulated)
 
     @contextmanager
     def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from libero_env.demos.config import DemoConfig, RecordingJob
+from libero_env.demos.generate import demo_path, make_demos
+from libero_env.demos.header import read_header
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.world import World
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
@@ -285,6 +288,24 @@ def test_a_missing_package_is_said_in_one_line(monkeypatch):
     with pytest.raises(LiberoError, match=r"pip install 'libero-lifelong\[warp\]'"):
         BackEnd("warp").require_installed()
     BackEnd("mujoco").require_installed()
+
+
+@pytest.mark.unit
+def test_demonstrations_name_it(tmp_path):
+    plain, warp, other = (DemoConfig(TASK, backend=name) for name in ("mujoco", WARP, "warp,device=cuda:3"))
+    assert warp.header() == {**plain.header(), "backend": "warp"}
+    assert demo_path(tmp_path, warp) == demo_path(tmp_path, other) != demo_path(tmp_path, plain)
+    assert demo_path(tmp_path, plain) == demo_path(tmp_path, DemoConfig(TASK))
+    assert warp.batch > plain.batch
+
+
+@pytest.mark.slow
+def test_demonstrations_are_recorded(tmp_path, monkeypatch):
+    monkeypatch.setattr(DemoConfig, "batch", 2)
+    config = DemoConfig("libero_object/3", (32, 32), backend=WARP)
+    job = RecordingJob(config, tmp_path / "demo.hdf5")
+    report = make_demos([job], 2, workers=1, progress=False)[job.path]
+    assert report.recorded == 2 and read_header(job.path)["backend"] == "warp"
 
 
 @pytest.mark.slow
