@@ -240,7 +240,9 @@ class World:
             return
         height, width = self.config.camera_size
         images = 16 * height * width * len(self.config.cameras)
-        needed = self.num * (self.scene.model.narena + self.scene.model.nbuffer // 8 + images)
+        model = self.scene.model
+        state = 0 if self.config.back_end.is_warp else model.narena + model.nbuffer // 8  # on the device
+        needed = self.num * (state + images)
         require_memory(needed, f"num_envs={self.num}", "take fewer simulations or smaller images")
 
     def reset_random(self, ids: Indices, generators: Sequence[np.random.Generator]) -> None:

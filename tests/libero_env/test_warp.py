@@ -19,6 +19,7 @@ from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
 
 wp = pytest.importorskip("warp")
 pytest.importorskip("mujoco_warp")
+warp_simulations = pytest.importorskip("libero_env.sim.mjwarp.simulations")
 wp.config.optimization_level = 0  # kernels compile in a third of the time
 
 TASK = "libero_10/3"  # a bowl into a drawer that is then closed: fixtures, joints, contacts
@@ -116,6 +117,20 @@ def test_what_a_simulation_does_depends_on_itself_alone(pair):
             own[0] = action[0]
             found.append(env.step(own)[0]["joint_states"][0])
     assert (found[0] == found[1]).all()
+
+
+@pytest.mark.parametrize("outdated", [False, True])
+def test_a_graph_does_what_its_kernels_do(pair, outdated):
+    """Warp captures and replays graphs on the processor too, which is how what GPUs run is tested."""
+    env, action, found = pair[1], smooth_actions(1)[0], []
+    for uses_graphs in (False, True):
+        env.world.simulations.uses_graphs = uses_graphs
+        env.reset(options={"init_state": [0, 1, 2], "outdated_controller": outdated})
+        env.world.step([0, 2], action)
+        found.append(env.world.simulations.fields["qpos"].copy())
+        found.append(env.world.simulations.fields["qvel"].copy())
+    env.world.simulations.uses_graphs = False
+    assert (found[0] == found[2]).all() and (found[1] == found[3]).all()
 
 
 def test_a_masked_reset_leaves_the_others_alone(pair):
@@ -218,6 +233,15 @@ def test_too_many_contacts_are_an_error_that_says_what_to_set(pair):
         full.reset_to_init([0], [0])
         full.step([0], np.zeros((1, 7)))
     full.close()
+
+
+def test_memory_that_does_not_suffice_is_said_in_one_line(monkeypatch):
+    def fail(*args, **kwargs):
+        raise RuntimeError("Failed to allocate 99 bytes on device 'cpu'")
+
+    monkeypatch.setattr(warp_simulations.mjw, "make_data", fail)
+    with pytest.raises(LiberoError, match=r"no room for 2 simulations .* fewer contacts than 192"):
+        World(TASK, 2, cameras=(), backend=WARP)
 
 
 def test_closed_simulations_say_so():

@@ -1,6 +1,7 @@
 """What MuJoCo Warp's simulations have on the device, and how the host reads it."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ import warp as wp
 
 from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import MASS_FIELD
+from libero_env.sim.engine import BackEnd
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.simulation import FIELDS, Closed
 
@@ -73,6 +75,24 @@ def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray)
         **{name: wp.array(value) for name, value in constants.items()},
         **{name: wp.zeros(shape, dtype=dtype) for name, (shape, dtype) in states.items()},
     )
+
+
+@contextmanager
+def room_for(num: int, back_end: BackEnd) -> Iterator[None]:
+    """Say in one line where the device's memory does not suffice for so many simulations.
+
+    Raises:
+        LiberoError: It does not.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if "allocate" not in str(error) and not isinstance(error, MemoryError):
+            raise
+        raise LiberoError(
+            f"backend={back_end}: no room for {num} simulations ({error}); take fewer, smaller images, or "
+            f"fewer contacts than {back_end.contacts}"
+        ) from error
 
 
 class Freed(Closed):

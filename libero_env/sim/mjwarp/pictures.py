@@ -14,6 +14,7 @@ import warp as wp
 
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.sim.look import Look
+from libero_env.sim.mjwarp.device import room_for
 from libero_env.sim.mjwarp.simulations import WarpSimulations
 from libero_env.sim.observations import Observer, image_name
 from libero_env.sim.simulation import Indices
@@ -121,7 +122,7 @@ class _RayTracer:
         )  # the ray-tracer numbers them in the order of the model
         self._places = {name: drawn.index(name) for name in cameras}
         (height, width), num = size, simulations.num
-        with wp.ScopedDevice(simulations.device):
+        with wp.ScopedDevice(simulations.device), room_for(num, simulations.back_end):
             self._context = mjw.create_render_context(
                 model,
                 nworld=num,

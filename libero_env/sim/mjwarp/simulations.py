@@ -14,7 +14,7 @@ from libero_env.errors import LiberoError
 from libero_env.sim.controller import Controller
 from libero_env.sim.engine import BackEnd
 from libero_env.sim.mjwarp import kernels
-from libero_env.sim.mjwarp.device import DeviceFields, Freed, allocate, choose_device
+from libero_env.sim.mjwarp.device import DeviceFields, Freed, allocate, choose_device, room_for
 from libero_env.sim.osc import osc_torques
 from libero_env.sim.simulation import WATCHED, Indices, KinematicsHook, Simulations, Watch
 from libero_env.timing import SUBSTEPS
@@ -45,6 +45,8 @@ class WarpSimulations(Simulations):
         device: Device of Warp.
         device_model: The model on the device, with the poses of fixtures of each simulation.
         device_data: The state of all simulations on the device.
+        uses_graphs: Whether the kernels of a control step are launched as one graph: on GPUs. On the processor that is
+            possible, and slower.
 
     Raises:
         LiberoError: There is no such device, or MuJoCo Warp has not a feature that the model uses.
@@ -66,16 +68,17 @@ class WarpSimulations(Simulations):
                     f"backend=warp cannot simulate this model: {error}; backend=mujoco can"
                 ) from error
             self.device_model.opt.warn_overflow = 0  # raised instead, see _check_room
-            self.device_data = mjw.make_data(
-                self.model,
-                nworld=num,
-                nconmax=contacts,
-                njmax=_ROWS_PER_CONTACT * contacts + self._other_rows,
-            )
-            self._arrays: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
+            with room_for(num, self.back_end):
+                self.device_data = mjw.make_data(
+                    self.model,
+                    nworld=num,
+                    nconmax=contacts,
+                    njmax=_ROWS_PER_CONTACT * contacts + self._other_rows,
+                )
+                self._arrays: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
         self._copies: Any = DeviceFields(self.device_data)
         self.fields = self._copies
-        self._graphs: dict[int, Any] = {}
+        self.uses_graphs, self._graphs = self.device.is_cuda, dict[int, Any]()
         self._actions_seen = np.zeros(num)
 
     @property
@@ -189,7 +192,6 @@ class WarpSimulations(Simulations):
         arrays, state, data = self._arrays, self.controller_state, self.device_data
         self._actions_seen[ids] = actions[ids, -1]
         with wp.ScopedDevice(self.device):
-            arrays.active.assign(_mask(self.num, ids))
             for array, values in (
                 (arrays.grip, self._actions_seen),
                 (arrays.goal_pos, state.goal),
@@ -202,6 +204,9 @@ class WarpSimulations(Simulations):
             wp.copy(arrays.kept_qvel, data.qvel)
             wp.copy(arrays.kept_warm_start, data.qacc_warmstart)
             wp.copy(arrays.kept_time, data.time)
+            if self.uses_graphs:
+                self._load_kernels  # noqa: B018 - the first time
+            arrays.active.assign(_mask(self.num, ids))
             data.overflow.zero_()
 
     def _control_on_host(
@@ -216,29 +221,25 @@ class WarpSimulations(Simulations):
         self._arrays.gripper.assign(state.gripper)
 
     def _run(self, substeps: int) -> None:
-        """Run substeps: on a GPU as a graph, which is captured the first time."""
-        if not self.device.is_cuda:
+        """Run substeps: as a graph, which is captured the first time, or one kernel after the other."""
+        if not self.uses_graphs:
             for _ in range(substeps):
                 self._substep()
             return
         if substeps not in self._graphs:
-            self._substep_kernels_loaded  # noqa: B018 - no module may be loaded while a graph is captured
-            with wp.ScopedCapture() as capture:
+            with wp.ScopedCapture(self.device) as capture:
                 for _ in range(substeps):
                     self._substep()
             self._graphs[substeps] = capture.graph
         wp.capture_launch(self._graphs[substeps])
 
     @cached_property
-    def _substep_kernels_loaded(self) -> bool:
-        """Run a substep in which every simulation is held, so that all kernels are compiled."""
-        active = self._arrays.active.numpy()
-        gripper = self._arrays.gripper.numpy()
+    def _load_kernels(self) -> None:
+        """Run a substep in which every simulation is held: nothing is compiled while a graph is captured."""
+        gripper = self._arrays.gripper.numpy().copy()
         self._arrays.active.zero_()
         self._substep()
-        self._arrays.active.assign(active)
         self._arrays.gripper.assign(gripper)
-        return True
 
     def _substep(self) -> None:
         data, arrays, arm = self.device_data, self._arrays, self.arm
