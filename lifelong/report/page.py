@@ -11,6 +11,7 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.errors import LifelongError
+from lifelong.report.comparability import MUJOCO
 from lifelong.report.comparison import compare, write_comparison
 from lifelong.report.figures import (
     Line,
@@ -214,6 +215,7 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
 def _facts(record: RunRecord) -> list[tuple[str, Any]]:
     facts = [("policy", record.policy), ("preset", record.preset), ("seed", record.seed)]
     facts += [("last task under", record.perturbed[-1])] if any(record.perturbed) else []
+    facts += [("simulated by", record.backend)] if record.backend != MUJOCO else []
     facts += [
         ("tasks", len(record.tasks)),
         ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),

@@ -166,3 +166,13 @@ def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, messa
     assert message in output and "Traceback" not in output
     assert len(output.strip().splitlines()) == 1, output
     assert not list(tmp_path.rglob("config.yaml")), "nothing stands in the way of the mended command"
+
+
+def test_rollouts_of_another_back_end_are_named(home, tmp_path):
+    pytest.importorskip("mujoco_warp")
+    short = ("benchmark.tasks=1", "algo=sequential", "eval.curve=none", "eval.select=last", "eval.horizon=4")
+    output = finish(start(home, tmp_path, *TINY, *short, "train.epochs=1", 'eval.backend="warp,device=cpu"'))
+    path = run_dir(tmp_path)
+    assert "1 tasks learned" in output
+    assert records(path)[0]["backend"] == "warp"
+    assert "simulated by" in (path / "report.html").read_text()
