@@ -62,6 +62,7 @@ def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray)
         "goal_mat": ((num, 9), wp.float64),
         "gripper": ((num, 2), wp.float64),
         "rest": (7, wp.float64),
+        "arm": ((num, 7), wp.float64),
         "new_qpos": ((num, model.nq), float),
         "new_qvel": ((num, model.nv), float),
         "kept_qpos": ((num, model.nq), float),
@@ -105,8 +106,8 @@ class Freed(Closed):
 class DeviceFields(Mapping[str, np.ndarray]):
     """Fields of all simulations on the host, in double precision; each is copied when it is first read after a step."""
 
-    def __init__(self, data: Any):
-        self._data, self._found = data, dict[str, Any]()
+    def __init__(self, data: Any, arm: Any):
+        self._data, self._arm, self._found = data, arm, dict[str, Any]()
 
     def forget(self) -> None:
         """Drop what was copied: the simulations have moved."""
@@ -131,4 +132,6 @@ class DeviceFields(Mapping[str, np.ndarray]):
 
     def _download(self, name: str) -> np.ndarray:
         values = getattr(self._data, "M" if name == MASS_FIELD else name).numpy().astype(np.float64)
+        if name == "qpos":
+            values[:, :7] = self._arm.numpy()
         return values.reshape(*values.shape[:2], 9) if name == "site_xmat" else values

@@ -181,6 +181,22 @@ def hold(
 
 
 @wp.kernel
+def sum_arm(
+    active: wp.array[wp.bool],
+    timestep: wp.float64,
+    qvel: wp.array2d[float],
+    arm: wp.array2d[wp.float64],
+    qpos: wp.array2d[float],
+):
+    """Add a step to the arm's joint positions in double precision: in single they drift by the rounding of each sum."""
+    i = wp.tid()
+    for j in range(7):
+        if active[i]:
+            arm[i, j] = arm[i, j] + timestep * wp.float64(qvel[i, j])
+        qpos[i, j] = float(arm[i, j])
+
+
+@wp.kernel
 def start(
     chosen: wp.array[wp.bool],
     started: float,

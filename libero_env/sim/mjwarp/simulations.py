@@ -76,7 +76,7 @@ class WarpSimulations(Simulations):
                     njmax=_ROWS_PER_CONTACT * contacts + self._other_rows,
                 )
                 self._arrays: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
-        self._copies: Any = DeviceFields(self.device_data)
+        self._copies: Any = DeviceFields(self.device_data, self._arrays.arm)
         self.fields = self._copies
         self.uses_graphs, self._graphs = self.device.is_cuda, dict[int, Any]()
         self._actions_seen = np.zeros(num)
@@ -130,6 +130,9 @@ class WarpSimulations(Simulations):
             arrays.chosen.assign(_mask(self.num, ids))
             arrays.new_qpos.assign(_rows(self.num, ids, qpos))
             arrays.new_qvel.assign(_rows(self.num, ids, qvel))
+            arm = arrays.arm.numpy().copy()
+            arm[ids] = qpos[:, :7]
+            arrays.arm.assign(arm)
             if self.fixture_bodies.size:
                 arrays.fixture_pos.assign(self.fixtures[:, :, :3].astype(np.float32))
                 arrays.fixture_quat.assign(self.fixtures[:, :, 3:].astype(np.float32))
@@ -271,6 +274,13 @@ class WarpSimulations(Simulations):
         kept = [arrays.kept_qpos, arrays.kept_qvel, arrays.kept_warm_start, arrays.kept_time]
         moved = [data.qpos, data.qvel, data.qacc_warmstart, data.time]
         wp.launch(kernels.hold, self.num, inputs=[arrays.active, *kept], outputs=moved)
+        step = wp.float64(self.model.opt.timestep)
+        wp.launch(
+            kernels.sum_arm,
+            self.num,
+            inputs=[arrays.active, step, data.qvel],
+            outputs=[arrays.arm, data.qpos],
+        )
         mjw.step1(model, data)
 
     def _check_room(self) -> None:
