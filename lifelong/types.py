@@ -4,7 +4,7 @@ Shape legend: B batch, T time, V views, H W C image, A action, D size of a readi
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
 
@@ -89,12 +89,15 @@ class Batch:
         actions: What it should do, (B, T, A) float32.
         task_ids: Position of each window's task in the task sequence, (B,) int64.
         window_ids: Index of each window in its task's dataset, (B,) int64.
+        is_pad: Whether a step is past the end of its demonstration, whose last frame and action it repeats, (B, T) bool.
+            None where that is not known; it then counts as False.
     """
 
     observation: Observation
     actions: Tensor
     task_ids: Tensor
     window_ids: Tensor
+    is_pad: Tensor | None = None
 
     def __len__(self) -> int:
         return self.actions.shape[0]
@@ -103,13 +106,21 @@ class Batch:
         """Return the batch on another device."""
         move = partial(Tensor.to, device=device, non_blocking=True)
         moved = self.observation.to(device)
-        return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids))
+        is_pad = None if self.is_pad is None else move(self.is_pad)
+        return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids), is_pad)
 
     def rows(self, rows: slice | Tensor) -> "Batch":
         """Return some of the windows: those of a slice as views, those of indices as copies in the given order."""
         obs = self.observation
         part = Observation(obs.images[rows], {k: v[rows] for k, v in obs.proprio.items()}, obs.language[rows])
-        return Batch(part, self.actions[rows], self.task_ids[rows], self.window_ids[rows])
+        is_pad = None if self.is_pad is None else self.is_pad[rows]
+        return Batch(part, self.actions[rows], self.task_ids[rows], self.window_ids[rows], is_pad)
+
+    def padding(self) -> Tensor:
+        """Return `is_pad`, False where it is not known, (B, T) bool."""
+        if self.is_pad is None:
+            return torch.zeros(self.actions.shape[:2], dtype=torch.bool, device=self.actions.device)
+        return self.is_pad
 
     def join(self, other: "Batch") -> "Batch":
         """Return this batch followed by another one."""
@@ -119,5 +130,8 @@ class Batch:
             {k: torch.cat([a.proprio[k], b.proprio[k]]) for k in a.proprio},
             torch.cat([a.language, b.language]),
         )
-        rest = {f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)[1:]}
-        return replace(self, observation=joined, **rest)
+        names = ("actions", "task_ids", "window_ids")
+        rest = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names}
+        known = self.is_pad is not None or other.is_pad is not None
+        is_pad = torch.cat([self.padding(), other.padding()]) if known else None
+        return replace(self, observation=joined, is_pad=is_pad, **rest)

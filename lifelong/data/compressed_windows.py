@@ -125,7 +125,9 @@ class CompressedWindows:
             self.languages[self.language_ids[indices].long()],
         )
         tasks = torch.full((len(indices),), self.task_id, dtype=torch.int64)
-        return Batch(observation, self.actions[frames], tasks, self.window_ids[indices].long())
+        is_pad = torch.zeros_like(frames, dtype=torch.bool)
+        is_pad[:, 1:] = frames[:, 1:] == frames[:, :-1]  # frames are stored once
+        return Batch(observation, self.actions[frames], tasks, self.window_ids[indices].long(), is_pad)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all attributes, as tensors and numbers."""

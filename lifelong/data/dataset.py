@@ -177,7 +177,9 @@ class SequenceVLDataset:
         observation = Observation(
             gather(self.images), {k: gather(v) for k, v in self.proprio.items()}, language
         )
-        batch = Batch(observation, gather(self.actions), torch.full_like(indices, self.task_id), indices)
+        is_pad = frames - indices[:, None] < torch.arange(self.seq_len, device=frames.device)
+        task_ids = torch.full_like(indices, self.task_id)
+        batch = Batch(observation, gather(self.actions), task_ids, indices, is_pad)
         return batch if self.batch_device is None else batch.to(self.batch_device)
 
     def _gather(self, array: Tensor | FrameFile, frames: Tensor) -> Tensor:

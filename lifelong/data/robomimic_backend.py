@@ -125,7 +125,8 @@ class RobomimicWindows:
         observation = Observation(images, proprio, self.language.expand(len(indices), -1))
         actions = floats([w["actions"] for w in windows])
         task_ids = torch.full_like(indices, self.task_id)
-        return Batch(observation, actions, task_ids, indices).to(self.device)
+        is_pad = self._left[indices][:, None] < torch.arange(self.seq_len)
+        return Batch(observation, actions, task_ids, indices, is_pad).to(self.device)
 
     def _window(self, index: int) -> dict[str, Any]:
         """Return the arrays (T, ...) of a window: observations at its steps, actions `_shift` steps later."""

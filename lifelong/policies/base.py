@@ -6,10 +6,12 @@ Shape legend: B batch, T time, V views, H W C image, A action, L language embedd
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from lifelong.data.windows import WindowDataset
 from lifelong.errors import PolicyError
 from lifelong.types import Batch, Observation, PolicySpec
 
@@ -89,6 +91,23 @@ class Policy(nn.Module, ABC):
             teacher: The teacher's `answers` on them.
         """
         return (self.predict(batch) - teacher["mean"]).square().sum(-1)
+
+    def meet_task(self, dataset: WindowDataset, instruction: str) -> None:
+        """Take note of a task before it is learned: statistics of its data, or its text. By default nothing.
+
+        What is noted must be in the policy's `state_dict`.
+
+        Args:
+            dataset: Windows of the task.
+            instruction: The instruction as text.
+        """
+
+    def rate_factors(self) -> Mapping[str, float]:
+        """Return factors of the learning rate: beginning of parameters' names -> factor. By default none."""
+        return {}
+
+    def save_beside(self, folder: Path) -> None:
+        """Write the policy in the format of another package into a folder, where it has one. By default nothing."""
 
     @abstractmethod
     def reset(self, num_envs: int) -> None:

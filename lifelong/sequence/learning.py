@@ -150,6 +150,7 @@ class TaskSequence:
         context.ranks.barrier()  # all have read the saved progress
         costs.reset_peak(context.device)
         if saved is None:
+            context.policy.meet_task(dataset, context.instructions[task])
             context.algorithm.begin_task(task, dataset, context.policy)
         first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
         for phase in phases[first:]:
@@ -293,6 +294,7 @@ class TaskSequence:
             spent |= costs.action_costs(acting) | costs.peak_costs(self.context.device)
         self.log.append(CostRecord(task=task, costs=spent))
         self.checkpoints.save_task(task, policy.state_dict(), algorithm.state_dict())
+        policy.save_beside(self.context.directory.path)
 
     def _evaluate_seen_tasks(self, stage: Sequence[int]) -> None:
         """Fill the stage's row of the success matrix, as far as it is to be measured and not recorded yet."""

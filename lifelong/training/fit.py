@@ -107,7 +107,7 @@ def fit(
     if not len(dataset):
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
     device, size = torch.device(device), settings.batch_size
-    optimizer = _make_optimizer(algorithm.trained(policy), settings)
+    optimizer = _make_optimizer(algorithm.trained(policy), settings, policy)
     default_step = Step(policy, algorithm, optimizer, settings, device, augment, ranks)
     step, load = step or default_step, load or partial(batches_in_order, dataset)
     steps, windows = _epoch_size(len(dataset), settings)
@@ -210,9 +210,23 @@ def _shuffled_indices(windows: int, count: int, draws: torch.Generator) -> Tenso
     return order[:count]
 
 
-def _make_optimizer(trained: list[nn.Parameter], settings: FitSettings) -> torch.optim.AdamW:
+def _make_optimizer(trained: list[nn.Parameter], settings: FitSettings, policy: Policy) -> torch.optim.AdamW:
+    """Return the optimiser; parameters with the same factor of the learning rate are a group."""
+    factors = policy.rate_factors()
+    of_parameter = {
+        id(parameter): factor
+        for beginning, factor in factors.items()
+        for name, parameter in policy.named_parameters()
+        if name.startswith(beginning)
+    }
+    groups: dict[float, list[nn.Parameter]] = {}
+    for parameter in trained:
+        groups.setdefault(of_parameter.get(id(parameter), 1.0), []).append(parameter)
     return torch.optim.AdamW(
-        trained, lr=settings.lr, betas=tuple(settings.betas), weight_decay=settings.weight_decay
+        [{"params": members, "factor": factor} for factor, members in groups.items()] if factors else trained,
+        lr=settings.lr,
+        betas=tuple(settings.betas),
+        weight_decay=settings.weight_decay,
     )
 
 

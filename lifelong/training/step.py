@@ -90,7 +90,7 @@ class Step:
             nn.utils.clip_grad_norm_(self._optimized, self.settings.grad_clip)
         self.algorithm.after_clipping(self.policy)
         for group in self.optimizer.param_groups if lr is not None else ():
-            group["lr"] = lr
+            group["lr"] = lr * group.get("factor", 1.0)
         self.optimizer.step()
         self.algorithm.after_step(self.policy)
         return total, penalty

@@ -1,0 +1,402 @@
+"""Policies of LeRobot (huggingface/lerobot): ACT, diffusion policies, SmolVLA, pi0 and others, as policies of this package.
+
+LeRobot's own classes compute losses and actions; here windows become its batches. `make lerobot` makes an environment with
+it, because it asks for other versions of some packages.
+
+Shape legend: B batch, T steps of a window, A action, D sizes of all readings, L language embedding.
+"""
+
+import importlib
+import inspect
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from lifelong.data.windows import JoinedWindows, WindowDataset
+from lifelong.errors import ConfigError, MissingPackageError, PolicyError
+from lifelong.policies.base import Policy
+from lifelong.types import Batch, Count, Observation, PolicySpec
+
+# type -> its setting for the number of actions in a chunk, which is the length of a window
+CHUNKS = {
+    "act": "chunk_size",
+    "diffusion": "horizon",
+    "vqbet": "action_chunk_size",
+    "smolvla": "chunk_size",
+    "pi0": "chunk_size",
+    "pi0_fast": "chunk_size",
+    "pi05": "chunk_size",
+    "xvla": "chunk_size",
+}
+WITH_EMBEDDING = (
+    "act",
+    "diffusion",
+)  # they read the instruction's embedding as observation.environment_state
+WITH_TEXT = ("smolvla", "pi0", "pi0_fast", "pi05", "xvla")  # they read the instruction as text
+DEFAULTS: Mapping[str, Mapping[str, Any]] = {
+    "act": {"pretrained_backbone_weights": None},
+    # a chunk's actions follow from its first noise alone, so they do not depend on what else is simulated
+    "diffusion": {"noise_scheduler_type": "DDIM", "num_inference_steps": 10, "crop_shape": None},
+}
+# of LeRobot's data sets of LIBERO
+IMAGES = {"agentview_rgb": "observation.images.image", "eye_in_hand_rgb": "observation.images.image2"}
+STATE, EMBEDDING, ACTION = "observation.state", "observation.environment_state", "action"
+FOLDER = "lerobot"  # in a run's directory, in LeRobot's format
+_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
+_TASKS, _LETTERS = 256, 256  # instructions that a policy can remember, and bytes of each
+_KINDS = ("mean", "std", "min", "max")
+_MOST = 20_000  # frames that statistics are computed from, where a data set has no arrays of all
+
+Statistics = Literal["first", "latest", "none"]
+
+
+class LeRobotPolicy(Policy):
+    """A policy of LeRobot.
+
+    Its window begins with the frames that it observes, and its chunk is as long as the window, `data.seq_len`; what is past a
+    demonstration's end does not count. Losses are LeRobot's, to the bit; so are the files in `lerobot/` of the run's
+    directory, which LeRobot loads and evaluates.
+
+    Args:
+        spec: What the policy observes and does.
+        type: LeRobot's name of the policy, such as `act` or `diffusion`.
+        settings: Fields of LeRobot's configuration of that type.
+        act_steps: Number of actions of a chunk that are executed before the next is planned; None for all.
+        statistics: What readings and actions are normalised with: `first`, the statistics of the first task, for all;
+            `latest`, those of the task that was learned last, which changes what earlier tasks' actions mean; `none`.
+        language: Whether policies without text read the instruction's embedding, as `observation.environment_state`.
+        pretrained: Folder, or name on the Hugging Face Hub, of a policy to begin with; its own settings hold.
+
+    Raises:
+        MissingPackageError: LeRobot is not installed.
+        ConfigError: There is no such type, or a setting is not valid.
+    """
+
+    def __init__(
+        self,
+        *,
+        spec: PolicySpec,
+        type: str,
+        settings: Mapping[str, Any],
+        act_steps: Count | None,
+        statistics: Statistics,
+        language: bool,
+        pretrained: str | None,
+    ) -> None:
+        super().__init__(spec)
+        self.type, self.when = type, statistics
+        self.language = language and type in WITH_EMBEDDING
+        with _errors(type):
+            self.inner = self._build(settings, act_steps, pretrained)
+        self._frames = list(self.inner.config.observation_delta_indices or [0])
+        self._first = min(*self._frames, *self.inner.config.action_delta_indices)
+        longest = max(*self._frames, *self.inner.config.action_delta_indices) - self._first + 1
+        if longest != spec.seq_len:
+            raise ConfigError(
+                f"policy.type={type} learns from windows of {longest} steps, and data.seq_len is {spec.seq_len}; "
+                f"set data.seq_len={longest}"
+            )
+        sizes = sum(spec.proprio.values()) + spec.action_dim
+        self.register_buffer("moments", torch.zeros(len(_KINDS), sizes))
+        self.register_buffer("met", torch.zeros((), dtype=torch.int64))  # number of tasks
+        self.register_buffer("keys", torch.zeros(_TASKS, spec.language_dim))
+        self.register_buffer("texts", torch.zeros(_TASKS, _LETTERS, dtype=torch.uint8))
+        self._processors: tuple[Any, tuple[Any, Any]] | None = None
+
+    def _build(self, settings: Mapping[str, Any], act_steps: int | None, pretrained: str | None) -> Any:
+        factory = _lerobot("policies.factory")
+        policy_class = factory.get_policy_class(self.type)
+        if pretrained is not None:
+            return policy_class.from_pretrained(pretrained)
+        chunk = {CHUNKS[self.type]: self.spec.seq_len} if self.type in CHUNKS else {}
+        known = policy_class.config_class.__dataclass_fields__
+        if unknown := sorted(set(settings) - set(known)):
+            raise ConfigError(
+                f"policy.settings.{unknown[0]} is no setting of LeRobot's {self.type}; valid: {', '.join(known)}"
+            )
+        chosen = {**DEFAULTS.get(self.type, {}), **chunk, **settings}
+        if "n_action_steps" in known:
+            frames = chosen.get("n_obs_steps", known["n_obs_steps"].default)
+            chosen.setdefault("n_action_steps", act_steps or self.spec.seq_len - frames + 1)
+        config = factory.make_policy_config(
+            self.type, **chosen, **self._features(), device="cpu", push_to_hub=False
+        )
+        return policy_class(config)
+
+    def _features(self) -> dict[str, dict[str, Any]]:
+        types = _lerobot("configs.types")
+        feature, kind = types.PolicyFeature, types.FeatureType
+        found = {
+            IMAGES.get(view, f"observation.images.{view}"): feature(kind.VISUAL, (3, *self.spec.image_size))
+            for view in self.spec.views
+        }
+        found[STATE] = feature(kind.STATE, (sum(self.spec.proprio.values()),))
+        if self.language:
+            found[EMBEDDING] = feature(kind.ENV, (self.spec.language_dim,))
+        return {
+            "input_features": found,
+            "output_features": {ACTION: feature(kind.ACTION, (self.spec.action_dim,))},
+        }
+
+    def meet_task(self, dataset: WindowDataset, instruction: str) -> None:
+        """Take note of the text of the instruction, and of the statistics of readings and actions; see `Policy`."""
+        self._remember(dataset.batch(torch.zeros(1, dtype=torch.int64)).observation.language[0], instruction)
+        if self.when == "latest" or (self.when == "first" and int(self.met) == 1):
+            readings, actions = _frames_of(dataset, tuple(self.spec.proprio))
+            frames = torch.cat([readings, actions], dim=1).double()
+            found = (frames.mean(0), frames.std(0, unbiased=False), frames.amin(0), frames.amax(0))
+            self.moments.copy_(torch.stack(found).to(self.moments))
+
+    def _remember(self, embedding: Tensor, instruction: str) -> None:
+        number, text = int(self.met), instruction.encode()
+        if number == _TASKS or len(text) > _LETTERS:
+            raise PolicyError(
+                f"LeRobotPolicy remembers {_TASKS} instructions of {_LETTERS} bytes; this is number {number + 1}, "
+                f"of {len(text)} bytes"
+            )
+        self.keys[number] = embedding.to(self.keys)
+        self.texts[number, : len(text)] = torch.tensor(list(text), dtype=torch.uint8).to(self.texts.device)
+        self.met.add_(1)
+
+    def instructions(self, language: Tensor) -> list[str]:
+        """Return the texts of embeddings (B, L).
+
+        Raises:
+            PolicyError: One is of no task that the policy has met.
+        """
+        texts = []
+        for embedding in language:
+            same = (self.keys[: int(self.met)] == embedding.to(self.keys)).all(1).nonzero()
+            if not len(same):
+                raise PolicyError(
+                    f"policy.type={self.type} reads instructions as text, and this one is of no task that it has learned"
+                )
+            letters = bytes(self.texts[int(same[-1])].tolist())
+            texts.append(letters.rstrip(b"\0").decode())
+        return texts
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Return LeRobot's loss of a batch, a scalar."""
+        with self._learning():
+            loss: Tensor = self.inner(self.to_lerobot(batch))[0]
+        return loss
+
+    def window_losses(self, batch: Batch) -> Tensor:
+        """Return the loss of each window, one by one: LeRobot computes that of a batch; see `Policy`."""
+        return torch.stack([self.loss(batch.rows(slice(k, k + 1))) for k in range(len(batch))])
+
+    def predict(self, batch: Batch) -> Tensor:
+        """Return the chunk that is planned at each window's first frame; see `Policy`.
+
+        Raises:
+            PolicyError: The policy's chunks are random.
+        """
+        if self._takes_noise:
+            raise PolicyError(
+                f"policy.type={self.type} draws its actions, so there is no mean action to distil: choose another "
+                "algorithm, or policy.type=act"
+            )
+        plan = inspect.unwrap(type_of(self.inner).predict_action_chunk)  # with gradients
+        modes = [(module, module.training) for module in self.inner.modules()]
+        chunk = plan(self.inner, self.to_lerobot(batch, actions=False))
+        for module, mode in modes:  # which LeRobot has set to evaluation
+            module.training = mode
+        return self._unnormalised(chunk)
+
+    def reset(self, num_envs: int) -> None:
+        """Forget the past; see `Policy`."""
+        self.inner.reset()
+
+    def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
+        batch = self._processed(self._observed(observation, [0], squeeze=True))
+        if not self._takes_noise:
+            return self._unnormalised(self.inner.select_action(batch))
+        if generators is None:
+            raise PolicyError(f"policy.type={self.type} draws its actions: act(..., generators=[...])")
+        size = (self.inner.config.max_action_dim if self.type in WITH_TEXT else self.spec.action_dim,)
+        steps = getattr(self.inner.config, CHUNKS[self.type])
+        noise = torch.stack([torch.randn(steps, *size, generator=g) for g in generators])
+        return self._unnormalised(self.inner.select_action(batch, noise=noise.to(observation.language)))
+
+    @property
+    def _takes_noise(self) -> bool:
+        plan = inspect.signature(type_of(self.inner).predict_action_chunk).parameters
+        return "noise" in plan or self.type in ("smolvla", "pi0", "pi05")
+
+    def to_lerobot(self, batch: Batch, *, actions: bool = True) -> dict[str, Any]:
+        """Return a batch as LeRobot's policy takes it, normalised.
+
+        Args:
+            batch: Windows.
+            actions: Whether the actions to be learned are among it.
+        """
+        given = self._observed(batch.observation, [k - self._first for k in self._frames])
+        if actions:
+            steps = [k - self._first for k in self.inner.config.action_delta_indices]
+            given[ACTION], given["action_is_pad"] = batch.actions[:, steps], batch.padding()[:, steps]
+        return self._processed(given)
+
+    def _observed(
+        self, observation: Observation, frames: Sequence[int], *, squeeze: bool = False
+    ) -> dict[str, Any]:
+        """Return frames of an observation with LeRobot's names, images (B, frames, C, H, W) in [0, 1].
+
+        There is no axis of frames for policies that see one, or where `squeeze` is set.
+        """
+        single = squeeze or self.inner.config.observation_delta_indices is None
+        pick = lambda x: x[:, frames[0]] if single else x[:, list(frames)]  # noqa: E731
+        images = pick(observation.images)
+        given: dict[str, Any] = {
+            IMAGES.get(view, f"observation.images.{view}"): images[..., k, :, :, :].movedim(-1, -3).float()
+            / 255
+            for k, view in enumerate(self.spec.views)
+        }
+        given[STATE] = pick(torch.cat([observation.proprio[name] for name in self.spec.proprio], dim=-1))
+        if self.language:
+            embedding = observation.language.float()
+            given[EMBEDDING] = embedding if single else embedding[:, None].expand(-1, len(frames), -1)
+        if self.type in WITH_TEXT:
+            given["task"] = self.instructions(observation.language)
+        return given
+
+    def _processed(self, given: dict[str, Any]) -> dict[str, Any]:
+        done: dict[str, Any] = self.processors()[0](given)
+        return done
+
+    def _unnormalised(self, actions: Tensor) -> Tensor:
+        done: Tensor = self.processors()[1](actions)
+        return done.to(actions.device)
+
+    def processors(self) -> tuple[Any, Any]:
+        """Return LeRobot's processors of what goes in and of the actions that come out."""
+        key = (self.moments._version, self.moments.data_ptr(), str(self.moments.device))
+        if self._processors is None or self._processors[0] != key:
+            make = _lerobot("policies.factory").make_pre_post_processors
+            self.inner.config.device = self.moments.device.type
+            self._processors = (key, make(self.inner.config, dataset_stats=self.statistics()))
+        return self._processors[1]
+
+    def statistics(self) -> dict[str, dict[str, Tensor]]:
+        """Return the statistics as LeRobot has them; of images those of ImageNet, its default."""
+        colours = {name: torch.tensor(values).view(3, 1, 1) for name, values in _IMAGENET.items()}
+        found = {IMAGES.get(view, f"observation.images.{view}"): colours for view in self.spec.views}
+        if self.when == "none" or not int(self.met):
+            return found
+        state, action = (
+            self.moments.detach()
+            .cpu()
+            .split([self.moments.shape[1] - self.spec.action_dim, self.spec.action_dim], dim=1)
+        )
+        return found | {
+            STATE: dict(zip(_KINDS, state, strict=True)),
+            ACTION: dict(zip(_KINDS, action, strict=True)),
+        }
+
+    def rate_factors(self) -> Mapping[str, float]:
+        """Return the factors of the learning rate that LeRobot's optimiser groups have; see `Policy`."""
+        base = getattr(self.inner.config, "optimizer_lr", None)
+        names = {id(p): f"inner.{name}" for name, p in self.inner.named_parameters()}
+        factors = {}
+        for group in self.inner.get_optim_params():
+            if isinstance(group, dict) and base and group.get("lr") not in (None, base):
+                factors |= {names[id(p)]: group["lr"] / base for p in group["params"]}
+        return factors
+
+    def save_beside(self, folder: Path) -> None:
+        """Write the policy as LeRobot saves it, with its processors, into `lerobot/` of a folder; see `Policy`."""
+        new, place = folder / f".{FOLDER}.part", folder / FOLDER
+        shutil.rmtree(new, ignore_errors=True)
+        for part in (self.inner, *self.processors()):
+            part.save_pretrained(new)
+        shutil.rmtree(place, ignore_errors=True)
+        new.rename(place)
+
+    @contextmanager
+    def _learning(self) -> Iterator[None]:
+        """Let ACT compute its loss in evaluation mode, too, where it would leave its variational encoder out."""
+        model = getattr(self.inner, "model", None) if self.type == "act" else None
+        if model is None:
+            yield
+            return
+        before, model.training = model.training, True
+        try:
+            yield
+        finally:
+            model.training = before
+
+
+def type_of(policy: Any) -> Any:
+    """Return the class of a policy; `type` is a name of LeRobot's here."""
+    return policy.__class__
+
+
+def _frames_of(dataset: WindowDataset, readings: Iterable[str]) -> tuple[Tensor, Tensor]:
+    """Return the readings (F, D) and the actions (F, A) of all frames, or of many of them, of a data set."""
+    names = tuple(readings)
+    if isinstance(dataset, JoinedWindows):
+        parts = [_frames_of(part, names) for part in dataset.datasets]
+        return torch.cat([r for r, _ in parts]), torch.cat([a for _, a in parts])
+    proprio, actions = getattr(dataset, "proprio", None), getattr(dataset, "actions", None)
+    if proprio is None or actions is None:
+        chosen = torch.linspace(0, len(dataset) - 1, min(len(dataset), _MOST)).long().unique()
+        batches = [dataset.batch(part) for part in chosen.split(256)]
+        proprio = {n: torch.cat([b.observation.proprio[n][:, 0] for b in batches]) for n in names}
+        actions = torch.cat([b.actions[:, 0] for b in batches])
+    return torch.cat([proprio[name] for name in names], dim=1).cpu(), actions.cpu()
+
+
+def _lerobot(module: str) -> Any:
+    """Import a module of LeRobot.
+
+    Raises:
+        MissingPackageError: It is not installed, or does not fit the versions beside it.
+    """
+    try:
+        _declare_operators()
+        return importlib.import_module(f"lerobot.{module}")
+    except (ImportError, RuntimeError, TypeError) as error:
+        reason = f"LeRobot cannot be imported ({error})"
+        raise MissingPackageError(reason, "`make lerobot`, which makes an environment with it") from error
+
+
+def _declare_operators() -> None:
+    """Declare torchvision's operators where its build does not fit torch's, as of a CPU build; LeRobot calls none."""
+    try:
+        importlib.import_module("torchvision")
+    except RuntimeError as error:
+        if "torchvision::" not in str(error):
+            raise
+        library = torch.library.Library("torchvision", "FRAGMENT")
+        _KEPT.append(library)
+        for name in _OPERATORS:
+            library.define(f"{name}(Tensor x) -> Tensor")
+        importlib.import_module("torchvision")
+
+
+_KEPT: list[Any] = []  # operators are forgotten with their library
+_OPERATORS = (
+    "nms",
+    "qnms",
+    "roi_align",
+    "_roi_align_backward",
+    "roi_pool",
+    "_roi_pool_backward",
+    "ps_roi_align",
+)
+_OPERATORS += ("_ps_roi_align_backward", "ps_roi_pool", "_ps_roi_pool_backward", "deform_conv2d")
+_OPERATORS += ("_deform_conv2d_backward",)
+
+
+@contextmanager
+def _errors(type: str) -> Iterator[None]:
+    """Turn what LeRobot raises for settings that are not valid into one line."""
+    try:
+        yield
+    except (ValueError, NotImplementedError, TypeError) as error:
+        text = " ".join(str(error).split())
+        raise ConfigError(f"policy.type={type}: LeRobot refuses its settings: {text}") from error
