@@ -89,8 +89,8 @@ class Batch:
         actions: What it should do, (B, T, A) float32.
         task_ids: Position of each window's task in the task sequence, (B,) int64.
         window_ids: Index of each window in its task's dataset, (B,) int64.
-        is_pad: Whether a step is past the end of its demonstration, whose last frame and action it repeats, (B, T) bool.
-            None where that is not known; it then counts as False.
+        is_pad: Whether a step is past the end of its demonstration, whose last frame and action it repeats, (B, T)
+            bool. None where that is not known; it then counts as False.
     """
 
     observation: Observation

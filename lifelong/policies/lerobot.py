@@ -1,7 +1,7 @@
-"""Policies of LeRobot (huggingface/lerobot): ACT, diffusion policies, SmolVLA, pi0 and others, as policies of this package.
+"""Policies of LeRobot (huggingface/lerobot), such as ACT and diffusion policies, as policies of this package.
 
-LeRobot's own classes compute losses and actions; here windows become its batches. `make lerobot` makes an environment with
-it, because it asks for other versions of some packages.
+LeRobot's own classes compute losses and actions; here windows become its batches. `make lerobot` makes an environment
+with it, because it asks for other versions of some packages.
 
 Shape legend: B batch, T steps of a window, A action, D sizes of all readings, L language embedding.
 """
@@ -58,9 +58,9 @@ Statistics = Literal["first", "latest", "none"]
 class LeRobotPolicy(Policy):
     """A policy of LeRobot.
 
-    Its window begins with the frames that it observes, and its chunk is as long as the window, `data.seq_len`; what is past a
-    demonstration's end does not count. Losses are LeRobot's, to the bit; so are the files in `lerobot/` of the run's
-    directory, which LeRobot loads and evaluates.
+    Its window begins with the frames that it observes, and its chunk is as long as the window, `data.seq_len`; what
+    is past a demonstration's end does not count. Losses are LeRobot's, to the bit. After each task the policy is
+    saved in LeRobot's format, too, in `lerobot/` of the run's directory, which LeRobot loads and evaluates.
 
     Args:
         spec: What the policy observes and does.
@@ -109,7 +109,7 @@ class LeRobotPolicy(Policy):
         self._processors: tuple[Any, tuple[Any, Any]] | None = None
 
     def _build(self, settings: Mapping[str, Any], act_steps: int | None, pretrained: str | None) -> Any:
-        factory = _lerobot("policies.factory")
+        factory = lerobot_module("policies.factory")
         policy_class = factory.get_policy_class(self.type)
         if pretrained is not None:
             return policy_class.from_pretrained(pretrained)
@@ -129,7 +129,7 @@ class LeRobotPolicy(Policy):
         return policy_class(config)
 
     def _features(self) -> dict[str, dict[str, Any]]:
-        types = _lerobot("configs.types")
+        types = lerobot_module("configs.types")
         feature, kind = types.PolicyFeature, types.FeatureType
         found = {
             IMAGES.get(view, f"observation.images.{view}"): feature(kind.VISUAL, (3, *self.spec.image_size))
@@ -174,7 +174,8 @@ class LeRobotPolicy(Policy):
             same = (self.keys[: int(self.met)] == embedding.to(self.keys)).all(1).nonzero()
             if not len(same):
                 raise PolicyError(
-                    f"policy.type={self.type} reads instructions as text, and this one is of no task that it has learned"
+                    f"policy.type={self.type} reads instructions as text, and this one is of no task that it has "
+                    "learned"
                 )
             letters = bytes(self.texts[int(same[-1])].tolist())
             texts.append(letters.rstrip(b"\0").decode())
@@ -183,7 +184,7 @@ class LeRobotPolicy(Policy):
     def loss(self, batch: Batch) -> Tensor:
         """Return LeRobot's loss of a batch, a scalar."""
         with self._learning():
-            loss: Tensor = self.inner(self.to_lerobot(batch))[0]
+            loss: Tensor = self.inner(self.tolerobot_module(batch))[0]
         return loss
 
     def window_losses(self, batch: Batch) -> Tensor:
@@ -203,7 +204,7 @@ class LeRobotPolicy(Policy):
             )
         plan = inspect.unwrap(type_of(self.inner).predict_action_chunk)  # with gradients
         modes = [(module, module.training) for module in self.inner.modules()]
-        chunk = plan(self.inner, self.to_lerobot(batch, actions=False))
+        chunk = plan(self.inner, self.tolerobot_module(batch, actions=False))
         for module, mode in modes:  # which LeRobot has set to evaluation
             module.training = mode
         return self._unnormalised(chunk)
@@ -228,7 +229,7 @@ class LeRobotPolicy(Policy):
         plan = inspect.signature(type_of(self.inner).predict_action_chunk).parameters
         return "noise" in plan or self.type in ("smolvla", "pi0", "pi05")
 
-    def to_lerobot(self, batch: Batch, *, actions: bool = True) -> dict[str, Any]:
+    def tolerobot_module(self, batch: Batch, *, actions: bool = True) -> dict[str, Any]:
         """Return a batch as LeRobot's policy takes it, normalised.
 
         Args:
@@ -276,7 +277,7 @@ class LeRobotPolicy(Policy):
         """Return LeRobot's processors of what goes in and of the actions that come out."""
         key = (self.moments._version, self.moments.data_ptr(), str(self.moments.device))
         if self._processors is None or self._processors[0] != key:
-            make = _lerobot("policies.factory").make_pre_post_processors
+            make = lerobot_module("policies.factory").make_pre_post_processors
             self.inner.config.device = self.moments.device.type
             self._processors = (key, make(self.inner.config, dataset_stats=self.statistics()))
         return self._processors[1]
@@ -350,8 +351,8 @@ def _frames_of(dataset: WindowDataset, readings: Iterable[str]) -> tuple[Tensor,
     return torch.cat([proprio[name] for name in names], dim=1).cpu(), actions.cpu()
 
 
-def _lerobot(module: str) -> Any:
-    """Import a module of LeRobot.
+def lerobot_module(module: str) -> Any:
+    """Import a module of LeRobot, such as `policies.factory`.
 
     Raises:
         MissingPackageError: It is not installed, or does not fit the versions beside it.

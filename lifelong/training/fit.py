@@ -212,7 +212,7 @@ def _shuffled_indices(windows: int, count: int, draws: torch.Generator) -> Tenso
 
 def _make_optimizer(trained: list[nn.Parameter], settings: FitSettings, policy: Policy) -> torch.optim.AdamW:
     """Return the optimiser; parameters with the same factor of the learning rate are a group."""
-    factors = policy.rate_factors()
+    factors = policy.rate_factors() if isinstance(policy, Policy) else {}
     of_parameter = {
         id(parameter): factor
         for beginning, factor in factors.items()

@@ -1,0 +1,223 @@
+"""Policies of LeRobot: their losses and actions are LeRobot's own, and what is saved is read by LeRobot.
+
+`make lerobot` makes an environment with LeRobot and runs these tests in it.
+"""
+
+import pytest
+import torch
+
+pytest.importorskip("lerobot")
+
+from lifelong.data.dataset import SequenceVLDataset, last_frames
+from lifelong.data.fake import fake_observation
+from lifelong.errors import ConfigError, PolicyError
+from lifelong.policies.lerobot import FOLDER, LeRobotPolicy, lerobot_module
+from lifelong.settings import build
+from lifelong.training.fit import _make_optimizer
+from lifelong.training.settings import FitSettings
+from lifelong.types import PolicySpec
+from tests.harness.configs import composed
+
+pytestmark = pytest.mark.unit
+
+factory, configs = lerobot_module("policies.factory"), lerobot_module("configs.policies")
+LENGTHS = (9, 14)
+SMALL = {
+    "act": {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "latent_dim": 8},
+    "diffusion": {
+        "down_dims": [32, 64],
+        "diffusion_step_embed_dim": 32,
+        "n_groups": 4,
+        "num_inference_steps": 3,
+    },
+}
+
+
+def spec(steps: int = 8) -> PolicySpec:
+    return PolicySpec(
+        image_size=(32, 32), proprio={"ee_pos": 3, "gripper_states": 2}, language_dim=6, seq_len=steps
+    )
+
+
+def policy(type: str = "act", steps: int = 8, **changes) -> LeRobotPolicy:
+    given = {
+        "settings": SMALL[type],
+        "act_steps": None,
+        "statistics": "first",
+        "language": True,
+        "pretrained": None,
+    }
+    torch.manual_seed(0)
+    return LeRobotPolicy(spec=spec(steps), type=type, **(given | changes))
+
+
+def dataset(steps: int = 8, seed: int = 0) -> SequenceVLDataset:
+    draws, frames = torch.Generator().manual_seed(seed), sum(LENGTHS)
+    return SequenceVLDataset(
+        images=torch.randint(0, 256, (frames, 2, 32, 32, 3), generator=draws, dtype=torch.uint8),
+        proprio={
+            "ee_pos": torch.randn(frames, 3, generator=draws) * 3 + 1,
+            "gripper_states": torch.rand(frames, 2, generator=draws),
+        },
+        actions=2 * torch.rand(frames, 7, generator=draws) - 1,
+        last=last_frames(LENGTHS),
+        language=torch.randn(6, generator=draws),
+        task_id=seed,
+        seq_len=steps,
+    )
+
+
+def by_hand(data: SequenceVLDataset, starts, type: str, steps: int) -> dict:
+    """A batch as LeRobot's loader makes it, from the arrays alone."""
+    observed = [-1, 0] if type == "diffusion" else [0]
+    planned = range(-1, steps - 1) if type == "diffusion" else range(steps)
+    first = observed[0]
+    batch: dict = {"action": [], "action_is_pad": []}
+    for start in starts:
+        now = start - first
+        end = int(data.last[start])
+        frames = [min(now + k, end) for k in observed]
+        row = {
+            "observation.images.image": data.images[frames, 0].permute(0, 3, 1, 2) / 255,
+            "observation.images.image2": data.images[frames, 1].permute(0, 3, 1, 2) / 255,
+            "observation.state": torch.cat([data.proprio["ee_pos"], data.proprio["gripper_states"]], 1)[
+                frames
+            ],
+            "observation.environment_state": data.language.expand(len(frames), -1),
+        }
+        for key, value in row.items():
+            batch.setdefault(key, []).append(value if type == "diffusion" else value[0])
+        batch["action"].append(data.actions[[min(now + k, end) for k in planned]])
+        batch["action_is_pad"].append(torch.tensor([now + k > end for k in planned]))
+    return {key: torch.stack(values) for key, values in batch.items()}
+
+
+@pytest.mark.parametrize("type", SMALL)
+@pytest.mark.parametrize("statistics", ["first", "none"])
+def test_the_loss_of_a_batch_and_the_actions_are_stock_lerobots(tmp_path, type, statistics) -> None:
+    ours, data = policy(type, statistics=statistics), dataset()
+    ours.meet_task(data, "pick up the soup")
+    ours.save_beside(tmp_path)
+    config = configs.PreTrainedConfig.from_pretrained(tmp_path / FOLDER)
+    stock = factory.get_policy_class(type).from_pretrained(tmp_path / FOLDER, config=config)
+    before, after = factory.make_pre_post_processors(config, pretrained_path=str(tmp_path / FOLDER))
+    starts = torch.tensor([0, 3, 7, 12, 20])  # some windows end behind their demonstration
+    for mode in (True, False) if type == "diffusion" else (True,):  # ACT's loss needs its training mode
+        ours.train(mode), stock.train(mode)
+        torch.manual_seed(3)
+        loss = ours.loss(data.batch(starts))
+        torch.manual_seed(3)
+        expected, _ = stock.forward(before(by_hand(data, starts.tolist(), type, 8)))
+        assert torch.equal(loss, expected) and loss > 0
+    batch = data.batch(starts)
+    assert batch.is_pad is not None and batch.is_pad.any() and not batch.is_pad.all(1).any()
+
+    ours.eval(), stock.eval()
+    ours.reset(3), stock.reset()
+    for step in range(10):
+        seen = fake_observation(ours.spec, 3, torch.Generator().manual_seed(step), steps=1)
+        draws = [torch.Generator().manual_seed(5 + k) for k in range(3)] if type == "diffusion" else None
+        acted = ours.act(seen, draws)
+        given = {
+            "observation.images.image": seen.images[:, 0, 0].permute(0, 3, 1, 2) / 255,
+            "observation.images.image2": seen.images[:, 0, 1].permute(0, 3, 1, 2) / 255,
+            "observation.state": torch.cat([seen.proprio[n][:, 0] for n in ("ee_pos", "gripper_states")], 1),
+            "observation.environment_state": seen.language,
+        }
+        own = {}
+        if type == "diffusion":
+            own["noise"] = torch.stack(
+                [torch.randn(8, 7, generator=torch.Generator().manual_seed(5 + k)) for k in range(3)]
+            )
+        expected = after(stock.select_action(before(given), **own))
+        assert torch.equal(acted, expected.clamp(-1, 1))
+
+
+def test_a_policy_is_as_it_was_when_its_weights_are_loaded() -> None:
+    learned, again = policy(), policy()
+    learned.meet_task(dataset(), "pick up the soup")
+    again.load_state_dict(learned.state_dict())
+    seen = fake_observation(spec(), 2, torch.Generator().manual_seed(0), steps=1)
+    for one in (learned, again):
+        one.eval().reset(2)
+    assert torch.equal(learned.act(seen), again.act(seen))
+    assert again.instructions(dataset().language[None]) == ["pick up the soup"]
+    with pytest.raises(PolicyError, match="no task that it has learned"):
+        again.instructions(torch.zeros(1, 6))
+
+
+def test_statistics_are_of_the_task_that_was_asked_for() -> None:
+    tasks = [dataset(seed=0), dataset(seed=1)]
+    for when, expected in (("first", tasks[0]), ("latest", tasks[1])):
+        one = policy(statistics=when)
+        for task in tasks:
+            one.meet_task(task, "text")
+        found = one.statistics()
+        assert torch.allclose(found["action"]["mean"], expected.actions.mean(0), atol=1e-6)
+        assert torch.allclose(
+            found["observation.state"]["std"][:3], expected.proprio["ee_pos"].std(0, correction=0)
+        )
+    assert set(policy(statistics="none").statistics()) == {
+        "observation.images.image",
+        "observation.images.image2",
+    }
+
+
+def test_losses_of_windows_and_distillation() -> None:
+    one, data = policy(), dataset()
+    one.meet_task(data, "text")
+    batch = data.batch(torch.arange(4))
+    losses = one.eval().window_losses(batch)
+    assert losses.shape == (4,) and losses.requires_grad
+    modes = [module.training for module in one.train().modules()]
+    chunk = one.predict(batch)
+    assert chunk.shape == (4, 8, 7) and chunk.requires_grad
+    assert [module.training for module in one.modules()] == modes
+    with pytest.raises(PolicyError, match="no mean action"):
+        policy("diffusion").predict(batch)
+
+
+def test_learning_rates_are_lerobots() -> None:
+    one = policy(settings=SMALL["act"] | {"optimizer_lr": 1e-4, "optimizer_lr_backbone": 1e-5})
+    optimizer = _make_optimizer(list(one.parameters()), FitSettings(epochs=1, lr=1e-3), one)
+    factors = {group["factor"]: len(group["params"]) for group in optimizer.param_groups}
+    backbone = sum(name.startswith("model.backbone") for name, _ in one.inner.named_parameters())
+    assert factors == {1e-5 / 1e-4: backbone, 1.0: len(list(one.parameters())) - backbone}
+
+
+def test_chunks_do_not_depend_on_what_else_is_simulated() -> None:
+    one = policy("diffusion").eval()
+    seen = fake_observation(one.spec, 3, torch.Generator().manual_seed(0), steps=1)
+    draws = lambda *numbers: [torch.Generator().manual_seed(n) for n in numbers]  # noqa: E731
+    one.reset(3)
+    together = one.act(seen, draws(1, 2, 3))
+    one.reset(1)
+    part = type(seen)(seen.images[1:2], {k: v[1:2] for k, v in seen.proprio.items()}, seen.language[1:2])
+    assert torch.allclose(one.act(part, draws(2)), together[1:2], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"settings": {"dim_modle": 3}},
+            "policy.settings.dim_modle is no setting of LeRobot's act; valid: .*dim_model",
+        ),
+        ({"settings": {"vision_backbone": "vgg"}}, "LeRobot refuses its settings: .*vgg"),
+        ({"settings": {"chunk_size": 4, "n_action_steps": 4}}, "set data.seq_len=4"),
+    ],
+)
+def test_settings_that_are_not_valid_are_named(changes, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        policy(**changes)
+
+
+def test_the_configuration_builds_it() -> None:
+    words = (
+        "policy=lerobot",
+        "data.seq_len=10",
+        "policy.settings={dim_model: 32, n_heads: 2, dim_feedforward: 64}",
+    )
+    config = composed(*words)
+    built = build(config.policy, spec=spec(10))
+    assert isinstance(built, LeRobotPolicy) and built.inner.config.chunk_size == 10
