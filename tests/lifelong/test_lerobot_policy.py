@@ -216,7 +216,7 @@ def test_the_configuration_builds_it() -> None:
     words = (
         "policy=lerobot",
         "data.seq_len=10",
-        "policy.settings={dim_model: 32, n_heads: 2, dim_feedforward: 64}",
+        "+policy.settings={dim_model: 32, n_heads: 2, dim_feedforward: 64}",
     )
     config = composed(*words)
     built = build(config.policy, spec=spec(10))
