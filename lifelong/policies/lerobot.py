@@ -302,7 +302,7 @@ class LeRobotPolicy(Policy):
         """Return the factors of the learning rate that LeRobot's optimiser groups have; see `Policy`."""
         base = getattr(self.inner.config, "optimizer_lr", None)
         names = {id(p): f"inner.{name}" for name, p in self.inner.named_parameters()}
-        factors = {}
+        factors: dict[str, float] = {}
         for group in self.inner.get_optim_params():
             if isinstance(group, dict) and base and group.get("lr") not in (None, base):
                 factors |= {names[id(p)]: group["lr"] / base for p in group["params"]}
@@ -380,17 +380,8 @@ def _declare_operators() -> None:
 
 
 _KEPT: list[Any] = []  # operators are forgotten with their library
-_OPERATORS = (
-    "nms",
-    "qnms",
-    "roi_align",
-    "_roi_align_backward",
-    "roi_pool",
-    "_roi_pool_backward",
-    "ps_roi_align",
-)
-_OPERATORS += ("_ps_roi_align_backward", "ps_roi_pool", "_ps_roi_pool_backward", "deform_conv2d")
-_OPERATORS += ("_deform_conv2d_backward",)
+_BACKWARD = ("roi_align", "roi_pool", "ps_roi_align", "ps_roi_pool", "deform_conv2d")
+_OPERATORS = ("nms", "qnms", *_BACKWARD, *(f"_{name}_backward" for name in _BACKWARD))
 
 
 @contextmanager

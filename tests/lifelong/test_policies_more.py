@@ -59,6 +59,7 @@ CHOICES = [
     f"{group}={file.stem}"
     for group in ("policy", "policy/head")
     for file in sorted((CONFIGS / group).glob("*.yaml"))
+    if file.stem != "lerobot"  # needs LeRobot, and has tests of its own
 ]
 WITHOUT_MEMORY = (BCRNN, {**SMALL["rnn-window"][1], "memory": "none"})
 every_policy = pytest.mark.parametrize("kind", SMALL)

@@ -243,7 +243,7 @@ def test_a_bad_job_of_a_sweep_leaves_the_others_running(here, monkeypatch, capsy
 
     monkeypatch.setattr(RunDirectory, "opened", opened)
     assert main(["train", "-m", "preset=smoke", "device=cpu", "train.lr=-1,0.1", "seed=1,2"]) == 2
-    assert ran == ["bc_transformer_small_seed1", "bc_transformer_small_seed2"]
+    assert ran == ["bc_transformer_small_seed1_lr0.1", "bc_transformer_small_seed2_lr0.1"]
     assert capsys.readouterr().err.count("error: train.lr is -1; expected at least 0") == 2
 
 
