@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.adapters import freeze_statistics
 from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output
 from lifelong.policies.base import Policy
@@ -86,6 +86,19 @@ class RoutedExperts(FrozenBase):
         self._attachment = Attachment()
         self._learning: int | None = None  # task whose experts all samples use; None: each has its own
         self._now: Tensor | None = None  # what `encode` chose for the rows of the present forward pass
+
+    def _begin(self, task_index: int, policy: Policy) -> torch.Generator | None:
+        """Begin a task; see `FrozenBase`.
+
+        Raises:
+            PolicyError: What the policy's layers are given is not in the order of the windows.
+        """
+        if not getattr(policy, "by_window", True):
+            raise PolicyError(
+                f"{type(self).__name__} gives each window its adapters, and the layers of {type(policy).__name__} "
+                "are not given one window beside the other; use algo=lora"
+            )
+        return super()._begin(task_index, policy)
 
     def _hooks(self, policy: Policy) -> tuple[Any, ...]:
         """Return arguments of `Attachment.attach`: layers, what is added to their outputs, and maybe an `encode`."""

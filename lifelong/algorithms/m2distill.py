@@ -77,6 +77,10 @@ class M2Distill(Rehearsal):
         self._distilled = drawn if self.augment is None else self.augment(drawn, generator)
         return batch.join(self._drawn(batch, generator))
 
+    def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
+        """Check, before anything is learned, that the policy has features to distil."""
+        super().begin_task(task_index, dataset, with_features(policy))
+
     def penalty(self, policy: Policy) -> Tensor | None:
         """Return the weighted sum of `distances` on the drawn windows, a scalar; None during the first task."""
         if self._distilled is None:
@@ -91,7 +95,6 @@ class M2Distill(Rehearsal):
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Make the present weights the teacher's, and add the task's windows to the memory."""
-        with_features(policy)
         super().end_task(task_index, dataset, policy, generator)
         self._weights = {n: t.detach().clone() for n, t in policy.state_dict().items()}
         self._teacher = None

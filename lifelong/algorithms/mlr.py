@@ -93,10 +93,10 @@ class MLR(Algorithm):
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the encoders once the base is learned, and find the earlier tasks that are similar."""
+        policy = with_features(policy)
         if self._base_left:
             self._base_left -= 1
             return
-        policy = with_features(policy)
         if not self._frozen:
             self._frozen = feature_parameters(policy, dataset.batch(torch.tensor([0])))
         if self.adjustment and len(self._instructions):

@@ -50,7 +50,12 @@ class Policy(nn.Module, ABC):
 
     Args:
         spec: What the policy observes and does.
+
+    Attributes:
+        by_window: Whether the first axis of what its layers are given is that of the windows.
     """
+
+    by_window = True
 
     def __init__(self, spec: PolicySpec) -> None:
         super().__init__()

@@ -77,6 +77,8 @@ class LeRobotPolicy(Policy):
         ConfigError: There is no such type, or a setting is not valid.
     """
 
+    by_window = False  # the axis of time comes first in ACT's layers
+
     def __init__(
         self,
         *,

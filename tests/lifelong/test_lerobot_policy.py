@@ -212,6 +212,13 @@ def test_settings_that_are_not_valid_are_named(changes, words) -> None:
         policy(**changes)
 
 
+@pytest.mark.parametrize("algo", ["clare", "iscil", "dmpel", "m2distill", "mlr"])
+def test_algorithms_that_need_other_layers_say_so(algo) -> None:
+    algorithm = build(composed(f"algo={algo}").algo)
+    with pytest.raises(PolicyError, match="LeRobotPolicy"):
+        algorithm.begin_task(0, dataset(), policy())
+
+
 def test_the_configuration_builds_it() -> None:
     words = (
         "policy=lerobot",

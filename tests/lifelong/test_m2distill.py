@@ -200,7 +200,7 @@ def test_it_stores_the_windows_and_one_copy_of_the_weights():
 
 def test_a_policy_without_features_is_refused_in_a_line():
     with pytest.raises(PolicyError, match="LinearPolicy has no encode, over_time and head"):
-        M2Distill().end_task(0, Windows(0), LinearPolicy(), generator(0))
+        M2Distill().begin_task(0, Windows(0), LinearPolicy())
 
 
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
