@@ -113,6 +113,8 @@ def check_line(line: str) -> None:
     words = shlex.split(line)
     if words[0] == "torchrun":
         words = ["python", *words[words.index("train.py") :]]
+    if words[0].endswith("/python"):
+        words[0] = "python"
     if words[:2] in (["python", "train.py"], ["libero", "train"]):
         overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
         check_choices(overrides, [CONFIGS])
