@@ -81,7 +81,8 @@ def _same_back_end(args: argparse.Namespace, result: EvaluationResult) -> str | 
     Raises:
         ConfigError: The arguments name another one.
     """
-    own = str(result.protocol.get("world", {}).get("backend", MUJOCO))
+    world = result.protocol.get("world")
+    own = str(world.get("backend", MUJOCO)) if isinstance(world, dict) else MUJOCO
     if args.backend is not None and (given := BackEnd.read(args.backend).name) != own:
         raise ConfigError(f"--backend {given}: the result is of backend={own}, which it is repeated with")
     return args.backend

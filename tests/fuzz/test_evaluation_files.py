@@ -34,7 +34,7 @@ VALID = [
         k: v for k, v in drawn_result(0.4, 2, tasks=1).to_plain().items() if k != "format"
     },  # of the first version
 ]
-ARGS = argparse.Namespace(policy="here", out=None, policy_threads=None, allow=[])
+ARGS = argparse.Namespace(policy="here", out=None, policy_threads=None, allow=[], backend=None)
 
 
 def sealed(values: object) -> object:

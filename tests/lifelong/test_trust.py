@@ -163,8 +163,10 @@ def test_a_saved_policy_that_no_memory_holds_is_refused(changed):
 
 
 def test_code_named_by_a_result_needs_permission(tmp_path, monkeypatch):
-    result = argparse.Namespace(evaluated={"policy": "evil:make"}, tasks=[], unit_starts=1, environment={})
-    args = argparse.Namespace(policy=str(tmp_path), policy_threads=None, out=None, allow=[])
+    result = argparse.Namespace(
+        evaluated={"policy": "evil:make"}, tasks=[], unit_starts=1, environment={}, protocol={}
+    )
+    args = argparse.Namespace(policy=str(tmp_path), policy_threads=None, out=None, allow=[], backend=None)
     for kind in ("policy", "run", "server"):
         result.evaluated = {kind: "evil.part:make"}
         with pytest.raises(ConfigError, match="allow it with --allow evil"):
