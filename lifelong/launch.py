@@ -271,7 +271,7 @@ def _named_in_sweep(config: DictConfig, hydra_config: Any) -> DictConfig:
     """Return a job's configuration with a `run_id` that tells its run from those of the sweep's other jobs."""
     words = _process.get("words") or read_sweep(Path(hydra_config.sweep.dir)).words
     several, named = swept(words), {word.partition("=")[0] for word in words}
-    own = dict(word.split("=", 1) for word in hydra_config.overrides.task)
+    own = {key: value for key, _, value in (word.partition("=") for word in hydra_config.overrides.task)}
     name = job_suffix({key: value for key, value in own.items() if key in several or key not in named})
     if not name:
         return config

@@ -204,7 +204,7 @@ class LeRobotPolicy(Policy):
                 f"policy.type={self.type} draws its actions, so there is no mean action to distil: choose another "
                 "algorithm, or policy.type=act"
             )
-        plan = inspect.unwrap(type_of(self.inner).predict_action_chunk)  # with gradients
+        plan = inspect.unwrap(self.inner.__class__.predict_action_chunk)  # with gradients
         modes = [(module, module.training) for module in self.inner.modules()]
         chunk = plan(self.inner, self.tolerobot_module(batch, actions=False))
         for module, mode in modes:  # which LeRobot has set to evaluation
@@ -228,7 +228,7 @@ class LeRobotPolicy(Policy):
 
     @property
     def _takes_noise(self) -> bool:
-        plan = inspect.signature(type_of(self.inner).predict_action_chunk).parameters
+        plan = inspect.signature(self.inner.__class__.predict_action_chunk).parameters
         return "noise" in plan or self.type in ("smolvla", "pi0", "pi05")
 
     def tolerobot_module(self, batch: Batch, *, actions: bool = True) -> dict[str, Any]:
@@ -331,11 +331,6 @@ class LeRobotPolicy(Policy):
             yield
         finally:
             model.training = before
-
-
-def type_of(policy: Any) -> Any:
-    """Return the class of a policy; `type` is a name of LeRobot's here."""
-    return policy.__class__
 
 
 def _frames_of(dataset: WindowDataset, readings: Iterable[str]) -> tuple[Tensor, Tensor]:

@@ -100,6 +100,7 @@ def test_windows_are_those_of_the_demonstrations_but_for_the_pictures(steps, kee
     batch = memory.sample(40, generator(1))
     kept = original(batch, steps)
     assert torch.equal(batch.actions, kept.actions)
+    assert torch.equal(batch.padding(), kept.padding())
     assert torch.equal(batch.observation.proprio["x"], kept.observation.proprio["x"])
     assert torch.equal(batch.observation.language, kept.observation.language)
     assert torch.equal(batch.window_ids, kept.window_ids)

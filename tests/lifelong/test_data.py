@@ -53,6 +53,7 @@ def test_every_window_equals_a_naive_reference() -> None:
         for start in range(len(demo.actions)):
             for step in range(SPEC.seq_len):
                 t = min(start + step, len(demo.actions) - 1)  # past the end the last frame repeats
+                assert batch.padding()[window, step] == (start + step >= len(demo.actions))
                 np.testing.assert_array_equal(batch.actions[window, step], demo.actions[t].astype(np.float32))
                 for v, view in enumerate(SPEC.views):
                     np.testing.assert_array_equal(
@@ -65,6 +66,18 @@ def test_every_window_equals_a_naive_reference() -> None:
     assert (batch.task_ids == 2).all()
     assert torch.equal(batch.window_ids, torch.arange(len(dataset)))
     assert torch.equal(batch.observation.language, torch.arange(4.0).expand(len(dataset), 4))
+
+
+def test_padding_goes_with_its_windows() -> None:
+    dataset = make_dataset()
+    batch = dataset.batch(torch.arange(len(dataset)))
+    last = batch.rows(torch.tensor([len(dataset) - 1, 0])).to("cpu")
+    assert last.padding()[0].tolist() == [False] + [True] * (SPEC.seq_len - 1) and not last.padding()[1].any()
+    unknown = fake_batch(SPEC, 1, torch.Generator().manual_seed(0))
+    assert unknown.is_pad is None and unknown.join(unknown).is_pad is None
+    unknown = type(last)(last.observation, last.actions, last.task_ids, last.window_ids)
+    assert last.join(unknown).padding()[2:].any().item() is False
+    assert torch.equal(unknown.join(last).padding()[2:], last.padding())
 
 
 def test_a_batch_keeps_the_requested_order_and_is_a_copy() -> None:

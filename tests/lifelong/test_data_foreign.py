@@ -47,7 +47,8 @@ def write_file(path: Path, lengths=(4, 3), pairing: object = "libero", labels: b
 def everything(source: DemoSource, **how: str) -> list[torch.Tensor]:
     windows = open_windows(source, language=LANGUAGE, **how)
     batch = windows.batch(torch.arange(len(windows)))
-    return [batch.observation.images, batch.observation.proprio["ee_pos"], batch.actions, batch.window_ids]
+    readings = batch.observation.proprio["ee_pos"]
+    return [batch.observation.images, readings, batch.actions, batch.window_ids, batch.padding()]
 
 
 @given(

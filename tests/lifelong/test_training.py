@@ -409,3 +409,22 @@ def test_on_a_cpu_deterministic_changes_no_bits(tmp_path):
     (losses, weights), (losses_again, weights_again) = results
     assert losses == losses_again
     assert all(torch.equal(value, weights_again[name]) for name, value in weights.items())
+
+
+def test_parts_of_a_policy_learn_at_a_factor_of_the_rate():
+    policy = small_transformer(spec := PolicySpec(image_size=(32, 32), seq_len=2))
+    policy.rate_factors = lambda: {"encoders": 0.0}
+    before = copy.deepcopy(policy.state_dict())
+    settings = FitSettings(epochs=1, batch_size=2, lr=1e-2, weight_decay=0.0)
+
+    class Fixed:
+        def __len__(self):
+            return 2
+
+        def batch(self, indices):
+            return fake_batch(spec, len(indices), generator(0))
+
+    fit(policy, Fixed(), Sequential(), settings=settings, seed=(0,))
+    moved = {name for name, value in policy.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved and not any(name.startswith("encoders") for name in moved)
+    assert any(name.startswith("encoders") for name in before)
