@@ -186,7 +186,7 @@ class LeRobotPolicy(Policy):
     def loss(self, batch: Batch) -> Tensor:
         """Return LeRobot's loss of a batch, a scalar."""
         with self._learning():
-            loss: Tensor = self.inner(self.tolerobot_module(batch))[0]
+            loss: Tensor = self.inner(self.to_lerobot(batch))[0]
         return loss
 
     def window_losses(self, batch: Batch) -> Tensor:
@@ -206,7 +206,7 @@ class LeRobotPolicy(Policy):
             )
         plan = inspect.unwrap(self.inner.__class__.predict_action_chunk)  # with gradients
         modes = [(module, module.training) for module in self.inner.modules()]
-        chunk = plan(self.inner, self.tolerobot_module(batch, actions=False))
+        chunk = plan(self.inner, self.to_lerobot(batch, actions=False))
         for module, mode in modes:  # which LeRobot has set to evaluation
             module.training = mode
         return self._unnormalised(chunk)
@@ -231,7 +231,7 @@ class LeRobotPolicy(Policy):
         plan = inspect.signature(self.inner.__class__.predict_action_chunk).parameters
         return "noise" in plan or self.type in ("smolvla", "pi0", "pi05")
 
-    def tolerobot_module(self, batch: Batch, *, actions: bool = True) -> dict[str, Any]:
+    def to_lerobot(self, batch: Batch, *, actions: bool = True) -> dict[str, Any]:
         """Return a batch as LeRobot's policy takes it, normalised.
 
         Args:

@@ -27,12 +27,14 @@ def curves_figure(policies: Mapping[str, Sequence[Axis]], units: Mapping[str, st
         grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
         for axes in grid.flat[len(first) :]:
             axes.set_axis_off()
+        named = set[str]()  # policies that are in the legend
         for place, kind in enumerate(axis.kind for axis in first):
             axes = grid.flat[place]
             for number, (label, found) in enumerate(policies.items()):
                 axis = next((a for a in found if a.kind == kind), None)
                 if axis is not None:
-                    _draw_axis(axes, axis, number, shorten(label, 60) if place == 0 else "")
+                    _draw_axis(axes, axis, number, "" if label in named else shorten(label, 60))
+                    named.add(label)
             axes.set_title(f"{kind}\n{shorten(units.get(kind, ''), 34)}".strip(), loc="left", fontsize=8)
             axes.set_xlim(-0.03, 1.03)
             axes.set_ylim(0, 102)
@@ -72,7 +74,10 @@ def radar_figure(policies: Mapping[str, Sequence[Axis]]) -> Figure:
         axes.set_ylim(0, 100)
         axes.set_yticks((25, 50, 75, 100), ("25", "50", "75", "100 %"), fontsize=6.5)
         axes.set_xticks(angles, kinds)
-        axes.tick_params(axis="x", pad=5)
+        axes.tick_params(axis="x", pad=2)
+        for text, angle in zip(axes.get_xticklabels(), angles, strict=True):
+            side = round(np.sin(angle), 3)  # labels grow away from the circle
+            text.set_horizontalalignment("left" if side > 0 else "right" if side < 0 else "center")
         axes.set_rlabel_position(180 / len(kinds))  # type: ignore[attr-defined]  # between two kinds
         axes.grid(lw=0.4, alpha=0.4, color=INK)
         axes.spines["polar"].set_linewidth(0.5)

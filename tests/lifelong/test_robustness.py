@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lifelong.errors import ResultsError
+from lifelong.report.robustness_figures import curves_figure
 from lifelong.report.robustness_page import Robustness, render, verdict, write_robustness
 from lifelong.results.evaluation_file import EvaluationResult, TaskResult
 from lifelong.results.robustness import Condition, Outcomes, half_severity, name_of
@@ -123,6 +124,14 @@ def test_the_page_and_the_text_say_the_same_numbers(tmp_path) -> None:
     camera = next(a for a in record["policies"][0]["axes"] if a["kind"] == "camera")
     assert camera["area"]["value"] == pytest.approx(0.4) and camera["half"]["value"] is not None
     assert np.array(record["policies"][0]["outcomes"]["camera=1"]).sum() == 0
+
+
+def test_the_legend_names_a_policy_that_was_not_measured_along_the_first_kind() -> None:
+    both = outcomes({(): 10, A: 3, B: 0, C: 9})
+    policies = {"a": Robustness("a", both).axes, "b": Robustness("b", outcomes({(): 10, C: 9})).axes}
+    assert policies["a"][0].kind == "camera"
+    legend = curves_figure(policies, {}).legends[0]
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
 
 
 def test_a_policy_that_never_succeeds_has_nothing_to_lose(tmp_path) -> None:

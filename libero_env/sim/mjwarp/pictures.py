@@ -117,9 +117,7 @@ class _RayTracer:
         size: tuple[int, int],
     ):
         self._simulations, self._kinds, model = simulations, kinds, simulations.model
-        drawn = sorted(
-            cameras, key=cameras.__getitem__
-        )  # the ray-tracer numbers them in the order of the model
+        drawn = sorted(cameras, key=cameras.__getitem__)  # numbered in the order of the model
         self._places = {name: drawn.index(name) for name in cameras}
         (height, width), num = size, simulations.num
         with wp.ScopedDevice(simulations.device), room_for(num, simulations.back_end):
@@ -152,9 +150,8 @@ class _RayTracer:
                     )
                     found[image_name(camera, "rgb")] = self._bytes.numpy().copy()
                 if "depth" in self._kinds:
-                    mjw.get_depth(
-                        self._context, place, self._far, self._depths
-                    )  # as a share of it, 0 for nothing
+                    # as a share of the farthest distance, 0 for nothing
+                    mjw.get_depth(self._context, place, self._far, self._depths)
                     depths = self._far * self._depths.numpy()
                     found[image_name(camera, "depth")] = np.where(depths > 0.0, depths, self._far)
         return found

@@ -1,7 +1,6 @@
 """Simulations of one model that MuJoCo Warp steps together, on a GPU or on the processor."""
 
 from collections.abc import Mapping
-from functools import cached_property
 from importlib import metadata
 from typing import Any
 
@@ -207,8 +206,8 @@ class WarpSimulations(Simulations):
             wp.copy(arrays.kept_qvel, data.qvel)
             wp.copy(arrays.kept_warm_start, data.qacc_warmstart)
             wp.copy(arrays.kept_time, data.time)
-            if self.uses_graphs:
-                self._load_kernels  # noqa: B018 - the first time
+            if self.uses_graphs and not self._graphs:
+                self._load_kernels()
             arrays.active.assign(_mask(self.num, ids))
             data.overflow.zero_()
 
@@ -236,7 +235,6 @@ class WarpSimulations(Simulations):
             self._graphs[substeps] = capture.graph
         wp.capture_launch(self._graphs[substeps])
 
-    @cached_property
     def _load_kernels(self) -> None:
         """Run a substep in which every simulation is held: nothing is compiled while a graph is captured."""
         gripper = self._arrays.gripper.numpy().copy()
