@@ -1,20 +1,32 @@
 """Which geoms a picture cannot show, so that they need not be drawn. Leaving them out changes no bit of it.
 
-A geom is left out if its bounding box is outside the camera's view, and outside what a mirror shows of the scene.
-MuJoCo draws at most one mirror (`mjr_render`): the first opaque plane or box of the scene that is reflective, and of a
-box only the face z+.
+A geom is left out if its bounding box is outside the camera's view, and outside what a mirror shows of the scene; or
+if it is behind the upper face of an opaque box, as the legs of a table are, and no mirror is drawn. MuJoCo draws at
+most one mirror (`mjr_render`): the first opaque plane or box of the scene that is reflective, and of a box only the
+face z+.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from libero_env.parallel import compiled
+
 _MARGIN = 1e-3  # [m] far more than the rounding of positions in single precision
-_BOX, _PLANE, _MESH = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("BOX", "PLANE", "MESH"))
-_ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{n}")) for n in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER")]
+_BOX, _PLANE, _MESH, _SPHERE, _CAPSULE, _CYLINDER, _ELLIPSOID = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+    for name in ("BOX", "PLANE", "MESH", "SPHERE", "CAPSULE", "CYLINDER", "ELLIPSOID")
+)
+_ROUND = (_SPHERE, _CAPSULE, _CYLINDER, _ELLIPSOID)
 _GEOM, _NONE = int(mujoco.mjtObj.mjOBJ_GEOM), mujoco.mjtGeom.mjGEOM_NONE
-_OPAQUE = 0.995  # alpha below which MuJoCo draws a geom as a transparent one, which mirrors nothing
+_OPAQUE = 0.995  # alpha below which MuJoCo draws a geom as a transparent one, which mirrors and hides nothing
+_LARGE = 0.1  # [m^2] area of a face that may hide something
+_COSTLY = 100  # triangles of a mesh that is worth a look
+_SIDES = (-1.0, 1.0)
+_SIGNS = np.array([[x, y, z] for x in _SIDES for y in _SIDES for z in _SIDES])  # of the corners of a box
+_EDGES = np.array([(a, b) for a in range(8) for b in (a | 1, a | 2, a | 4) if b > a])
 
 
 class Culling:
@@ -26,8 +38,14 @@ class Culling:
 
     def __init__(self, model: mujoco.MjModel):
         self._model = model
-        self._is_mesh = model.geom_type == _MESH
-        self._can_cull = self._is_mesh | np.isin(model.geom_type, [_BOX, *_ROUND])
+        kinds = model.geom_type
+        is_mesh, is_round = kinds == _MESH, np.isin(kinds, _ROUND)
+        self._can_cull = is_mesh | is_round | (kinds == _BOX)
+        faces = model.mesh_facenum[model.geom_dataid] if model.nmesh else np.zeros(model.ngeom)
+        self._is_costly = is_round | (is_mesh & (faces >= _COSTLY))
+        self._is_flat = ((kinds == _BOX) | (kinds == _PLANE)).tolist()
+        self._is_large = ((kinds == _BOX) & (4 * model.geom_size[:, :2].prod(axis=1) > _LARGE)).tolist()
+        self._near = float(model.vis.map.znear * model.stat.extent)
 
     def apply(
         self,
@@ -51,31 +69,31 @@ class Culling:
         Returns:
             Geoms that were left out, with the types that they had.
         """
-        normals = self._frustum(data, camera, aspect, fovy)
-        if normals is None:
+        view = self._view(data, camera, aspect, fovy)
+        if view is None:
             return []
         elements = [(i, g.objid) for i, g in enumerate(geoms) if g.objtype == _GEOM]
         places, ids = (np.array(column, np.int64) for column in zip(*elements, strict=True))
-        boxes = _Boxes(self._model, data, ids, self._is_mesh[ids])
-        eye = data.cam_xpos[camera]
-        kept = ~self._can_cull[ids] | boxes.inside(eye, normals)
-        mirror = next((k for k, i in enumerate(places) if _is_mirror(geoms[i], eye)), None)
+        boxes = _Boxes(self._model, data, ids)
+        kept = ~self._can_cull[ids] | boxes.inside(view.eye, view.normals)
+        flat = [(k, i) for k, (i, geom) in enumerate(elements) if self._is_flat[geom]]
+        mirror = next((k for k, i in flat if _is_mirror(geoms[i], view.eye)), None)
         if mirror is not None:
-            for i in places[
-                mirror + 1 :
-            ]:  # otherwise the next one becomes the mirror where this one is left out
+            for i in places[mirror + 1 :]:  # or the next one becomes the mirror where this one is left out
                 geoms[i].reflectance = 0.0
             if mirrors and kept[mirror]:
-                kept |= self._in_mirror(data, eye, normals, boxes, int(ids[mirror]))
+                kept |= self._in_mirror(data, view, boxes, int(ids[mirror]))
+        if mirror is None or not mirrors:
+            for k, i in flat:
+                if kept[k] and self._is_large[ids[k]] and geoms[i].rgba[3] >= _OPAQUE:
+                    self._leave_out_behind(int(ids[k]), data, view, boxes, kept)
         left_out = [(geoms[i], int(geoms[i].type)) for i in places[~kept]]
         for geom, _ in left_out:
             geom.type = _NONE
         return left_out
 
-    def _frustum(
-        self, data: mujoco.MjData, camera: int, aspect: float, fovy: float | None
-    ) -> np.ndarray | None:
-        """Return the inward normals (5, 3) of the planes through the camera that bound its view, None for others."""
+    def _view(self, data: mujoco.MjData, camera: int, aspect: float, fovy: float | None) -> "_View | None":
+        """Return what a camera shows, None for cameras of other kinds."""
         model = self._model
         projection = getattr(model, "cam_projection", getattr(model, "cam_orthographic", None))
         if (projection is not None and projection[camera]) or model.cam_sensorsize[camera].any():
@@ -84,12 +102,36 @@ class Culling:
         x = y * aspect
         local = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, -1]])
         normals = local / np.linalg.norm(local, axis=1, keepdims=True)
-        return normals @ data.cam_xmat[camera].reshape(3, 3).T
+        rays = np.array([[x, y, -1], [x, -y, -1], [-x, y, -1], [-x, -y, -1]])
+        to_world = data.cam_xmat[camera].reshape(3, 3).T
+        return _View(data.cam_xpos[camera], normals @ to_world, rays @ to_world)
 
-    def _in_mirror(
-        self, data: mujoco.MjData, eye: np.ndarray, normals: np.ndarray, boxes: "_Boxes", mirror: int
-    ) -> np.ndarray:
+    def _leave_out_behind(
+        self, box: int, data: mujoco.MjData, view: "_View", boxes: "_Boxes", kept: np.ndarray
+    ) -> None:
+        """Drop from the kept geoms (n,) those that the upper face of a box hides."""
+        rotation = data.geom_xmat[box]
+        if rotation[8] < 0.5:  # a wall hides nothing in a room
+            return
+        size = self._model.geom_size[box]
+        _drop_hidden(
+            size,
+            data.geom_xpos[box] + size[2] * rotation[2::3] - view.eye,
+            rotation.reshape(3, 3),
+            *view,
+            self._near + _MARGIN,
+            boxes.ids,
+            boxes.centres,
+            boxes.axes,
+            self._is_costly,
+            self._model.geom_type,
+            data.geom_xmat,
+            kept,
+        )
+
+    def _in_mirror(self, data: mujoco.MjData, view: "_View", boxes: "_Boxes", mirror: int) -> np.ndarray:
         """Return which geoms (n,) the reflection in a plane, or in the upper face of a box, can show."""
+        eye, normals = view.eye, view.normals
         size, rotation = self._model.geom_size[mirror], data.geom_xmat[mirror].reshape(3, 3)
         is_box = self._model.geom_type[mirror] == _BOX
         up, centre = rotation[:, 2], data.geom_xpos[mirror] + (size[2] if is_box else 0.0) * rotation[:, 2]
@@ -109,24 +151,211 @@ class Culling:
         return seen
 
 
+class _View(NamedTuple):
+    """What a camera shows: all that is inside of planes through its eye.
+
+    Attributes:
+        eye: Where they meet, (3,), m.
+        normals: Inward normals of the four planes at the sides, and the direction of the view, (5, 3).
+        rays: Directions of the edges in which the first four meet, (4, 3).
+    """
+
+    eye: np.ndarray
+    normals: np.ndarray
+    rays: np.ndarray
+
+
 class _Boxes:
     """Bounding boxes of geoms: centres (n, 3) and half axes (n, 3, 3), one in each column, world frame, m."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, ids: np.ndarray, is_mesh: np.ndarray):
-        rotations, size = data.geom_xmat[ids].reshape(-1, 3, 3), model.geom_size[ids]
-        # A sphere as large as the sum of its sizes holds each round geom.
-        whole = np.where(model.geom_type[ids, None] == _BOX, size, size.sum(axis=1, keepdims=True))
-        bounds = model.geom_aabb[ids].reshape(-1, 6)
-        local = np.where(is_mesh[:, None], bounds[:, :3], 0.0)
-        half = np.where(is_mesh[:, None], bounds[:, 3:], whole)
-        self.centres = data.geom_xpos[ids] + (rotations @ local[:, :, None])[:, :, 0]
-        self.axes = rotations * half[:, None, :]
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, ids: np.ndarray):
+        self.ids, self.centres, self.axes = ids, np.empty((len(ids), 3)), np.empty((len(ids), 3, 3))
+        bounds = model.geom_aabb.reshape(-1, 6)  # of meshes: sizes of others may have changed
+        shapes = (model.geom_type, model.geom_size, bounds, data.geom_xpos, data.geom_xmat)
+        _bound(ids, *shapes, self.centres, self.axes)
 
     def inside(self, apex: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return which boxes (n,) reach inside all planes through `apex` (3,) with inward `normals` (k, 3)."""
-        distance = (self.centres - apex) @ normals.T  # (n, k)
-        reach = np.abs(np.einsum("kj,nji->nki", normals, self.axes)).sum(axis=2)
-        return (distance + reach >= -_MARGIN).all(axis=1)
+        found: np.ndarray = _reach_inside(self.centres, self.axes, apex, normals)
+        return found
+
+
+@compiled
+def _bound(
+    ids: np.ndarray,
+    kinds: np.ndarray,
+    sizes: np.ndarray,
+    bounds: np.ndarray,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    centres: np.ndarray,
+    axes: np.ndarray,
+) -> None:
+    """Write the bounding boxes of geoms."""
+    half = np.empty(3)
+    for n in range(len(ids)):
+        g = ids[n]
+        kind = kinds[g]
+        half[:] = sizes[g]
+        centres[n] = positions[g]
+        if kind == _SPHERE:
+            half[:] = sizes[g, 0]
+        elif kind in (_CYLINDER, _CAPSULE):
+            half[1] = sizes[g, 0]
+            half[2] = sizes[g, 1] + (sizes[g, 0] if kind == _CAPSULE else 0.0)
+        elif kind == _MESH:
+            half[:] = bounds[g, 3:]
+            for r in range(3):
+                for c in range(3):
+                    centres[n, r] += rotations[g, 3 * r + c] * bounds[g, c]
+        for r in range(3):
+            for c in range(3):
+                axes[n, r, c] = rotations[g, 3 * r + c] * half[c]
+
+
+@compiled
+def _reach_inside(centres: np.ndarray, axes: np.ndarray, apex: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return which boxes (n,) reach inside all planes through a point (3,) with inward normals (k, 3)."""
+    inside = np.ones(len(centres), np.bool_)
+    for n in range(len(centres)):
+        for k in range(len(normals)):
+            reach = 0.0
+            for r in range(3):
+                reach += (centres[n, r] - apex[r]) * normals[k, r]
+            for c in range(3):
+                reach += abs(
+                    axes[n, 0, c] * normals[k, 0]
+                    + axes[n, 1, c] * normals[k, 1]
+                    + axes[n, 2, c] * normals[k, 2]
+                )
+            if reach < -_MARGIN:
+                inside[n] = False
+                break
+    return inside
+
+
+@compiled
+def _is_hidden(
+    point: np.ndarray,
+    size: np.ndarray,
+    face: np.ndarray,
+    rotation: np.ndarray,
+    forward: np.ndarray,
+    near: float,
+) -> bool:
+    """Return whether the face of a box is on the way from the eye to a point, which is relative to the eye."""
+    down = point[0] * rotation[0, 2] + point[1] * rotation[1, 2] + point[2] * rotation[2, 2]
+    if down >= 0.0:
+        return False
+    share = (face[0] * rotation[0, 2] + face[1] * rotation[1, 2] + face[2] * rotation[2, 2]) / down
+    ahead = 0.0
+    for r in range(3):
+        ahead += share * point[r] * forward[r]
+    if ahead < near:
+        return False
+    for c in range(2):
+        beside = 0.0
+        for r in range(3):
+            beside += (share * point[r] - face[r]) * rotation[r, c]
+        if abs(beside) > size[c] - _MARGIN:
+            return False
+    return True
+
+
+@compiled
+def _drop_hidden(
+    size: np.ndarray,
+    face: np.ndarray,
+    rotation: np.ndarray,
+    eye: np.ndarray,
+    normals: np.ndarray,
+    rays: np.ndarray,
+    near: float,
+    ids: np.ndarray,
+    centres: np.ndarray,
+    axes: np.ndarray,
+    costly: np.ndarray,
+    kinds: np.ndarray,
+    rotations: np.ndarray,
+    kept: np.ndarray,
+) -> None:
+    """Drop from the kept geoms (n,) those that the upper face of a box hides, as far as they are worth a look.
+
+    What is behind the face is convex. So a geom is behind it if the corners of its bounding box are, or those of the
+    part of it on the inner side of one of the four planes that bound the view.
+
+    Args:
+        size: Half edges of the box, (3,).
+        face: Centre of its upper face from the eye, (3,).
+        rotation: Its axes, in columns, (3, 3).
+        eye: Position of the camera, (3,).
+        normals: See `_View`.
+        rays: See `_View`.
+        near: Least distance along the view at which something is drawn.
+        ids: Indices of the geoms, (n,).
+        centres: Centres of their bounding boxes, (n, 3).
+        axes: Half axes of these, (n, 3, 3).
+        costly: Which geoms of the model are worth a look.
+        kinds: Types of the geoms of the model.
+        rotations: Their orientations, (ngeom, 9).
+        kept: Whether each geom is drawn, (n,); changed.
+    """
+    up = rotation[:, 2].copy()
+    height = -(face[0] * up[0] + face[1] * up[1] + face[2] * up[2])
+    if height < _MARGIN:
+        return
+    forward, corners, point = normals[4], np.empty((8, 3)), np.empty(3)
+    depths, hidden = np.empty((8, 4)), np.empty(8, np.bool_)
+    fills_view = True
+    for k in range(4):
+        fills_view = fills_view and _is_hidden(rays[k], size, face, rotation, forward, near)
+    for n in range(len(ids)):
+        g = ids[n]
+        if not kept[n] or not (fills_view or costly[g]):
+            continue
+        top = 0.0  # of the geom over the eye, along the normal of the face
+        for r in range(3):
+            top += (centres[n, r] - eye[r]) * up[r]
+        if kinds[g] == _PLANE:
+            turned = abs(rotations[g, 2] * up[0] + rotations[g, 5] * up[1] + rotations[g, 8] * up[2])
+            top += 0.0 if turned > 1.0 - 1e-9 else np.inf
+        else:
+            for c in range(3):
+                top += abs(axes[n, 0, c] * up[0] + axes[n, 1, c] * up[1] + axes[n, 2, c] * up[2])
+        if top > -height - _MARGIN:
+            continue
+        if fills_view:
+            kept[n] = False
+            continue
+        whole = True
+        for k in range(8):
+            for r in range(3):
+                corners[k, r] = centres[n, r] - eye[r]
+                for c in range(3):
+                    corners[k, r] += _SIGNS[k, c] * axes[n, r, c]
+            hidden[k] = _is_hidden(corners[k], size, face, rotation, forward, near)
+            whole = whole and hidden[k]
+            for j in range(4):
+                depths[k, j] = _MARGIN
+                for r in range(3):
+                    depths[k, j] += corners[k, r] * normals[j, r]
+        if whole:
+            kept[n] = False
+            continue
+        for j in range(4):
+            behind = True
+            for k in range(8):
+                behind = behind and (hidden[k] or depths[k, j] < 0.0)
+            for e in range(len(_EDGES)):
+                a, b = _EDGES[e, 0], _EDGES[e, 1]
+                if behind and (depths[a, j] < 0.0) != (depths[b, j] < 0.0):
+                    share = depths[a, j] / (depths[a, j] - depths[b, j])
+                    for r in range(3):
+                        point[r] = corners[a, r] + share * (corners[b, r] - corners[a, r])
+                    behind = _is_hidden(point, size, face, rotation, forward, near)
+            if behind:
+                kept[n] = False
+                break
 
 
 def _is_mirror(geom: mujoco.MjvGeom, eye: np.ndarray) -> bool:

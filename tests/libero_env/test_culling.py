@@ -1,5 +1,7 @@
 """Leaving out what a camera cannot show changes no bit of an image."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -86,12 +88,56 @@ def test_mirrors_show_what_the_camera_does_not(faithful):
     )
 
 
-@pytest.mark.parametrize(("key", "drawing"), [("libero_goal/0", FAITHFUL), ("libero_10/3", FAST)])
+@pytest.mark.parametrize(
+    ("key", "drawing"),
+    [("libero_goal/0", FAITHFUL), ("libero_goal/0", FAST), ("libero_10/3", FAST), ("libero_90/70", FAST)],
+)
 def test_random_states_of_tasks(key, drawing):
-    model = build_scene(get_task(key).problem, drawing=drawing).model
+    model = copy.copy(build_scene(get_task(key).problem, drawing=drawing).model)
     rng = np.random.default_rng(0)
     states = [random_qpos(model, rng) for _ in range(4)]
-    assert_equal(render_both(model, ["agentview", "robot0_eye_in_hand"], states, drawing == FAITHFUL))
+    cameras = ["agentview", "robot0_eye_in_hand"]
+    assert_equal(render_both(model, cameras, states, drawing == FAITHFUL))
+    for _ in range(6):  # the agent's camera anywhere above and below the table, and close to it
+        model.cam_pos[model.camera("agentview").id] = rng.uniform([-0.8, -0.8, 0.3], [0.8, 0.8, 1.6])
+        model.cam_quat[model.camera("agentview").id] = rng.normal(size=4)
+        assert_equal(render_both(model, ["agentview"], states[:1], drawing == FAITHFUL))
+
+
+def left_out_of(model, camera, change=lambda data: None):
+    """Names of the geoms that a camera does not show in the state in which all joints are zero."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    change(data)
+    with Renderer(model, SIZE, SIZE) as renderer:
+        images(renderer, data, [camera])
+        return {model.geom(g.objid).name for g, _ in renderer._leave_out(data, renderer.camera_id(camera))}
+
+
+def test_a_table_hides_its_legs_unless_it_is_transparent():
+    model = copy.copy(build_scene(get_task("libero_goal/0").problem, drawing=FAST).model)
+    legs = {f"table_leg{k}_visual" for k in (1, 2, 3, 4)}
+    assert legs <= left_out_of(model, "agentview")
+
+    def look_down(data):
+        at = model.camera("agentview").id
+        data.cam_xpos[at], data.cam_xmat[at] = (0, 0, 1.2), np.eye(3).ravel()
+
+    assert {"floor", *legs} <= left_out_of(model, "agentview", look_down), "the table is all that is seen"
+
+    def look_from_below(data):
+        at = model.camera("agentview").id
+        data.cam_xpos[at], data.cam_xmat[at] = (
+            (1.5, 0, 0.4),
+            np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).ravel(),
+        )
+
+    far = {"table_leg2_visual", "table_leg3_visual"}  # the near ones are beside the view
+    assert not far & left_out_of(model, "agentview", look_from_below)
+    table = model.geom("table_visual")
+    model.geom_rgba[table.id, 3] = model.mat_rgba[table.matid, 3] = 0.5
+    assert not far & left_out_of(model, "agentview")
+    assert "floor" not in left_out_of(model, "agentview", look_down)
 
 
 def random_qpos(model, rng):
