@@ -68,7 +68,17 @@ def radar_figure(policies: Mapping[str, Sequence[Axis]]) -> Figure:
             colour = LINE_COLOURS[number % len(LINE_COLOURS)]
             closed = [*values, values[0]], [*angles, angles[0]]
             style = "-" if number == 0 else "--"
-            axes.plot(closed[1], closed[0], color=colour, lw=1.5, ls=style, label=shorten(label, 60))
+            marker = LINE_MARKERS[number % len(LINE_MARKERS)]  # shows a kind without neighbours
+            axes.plot(
+                closed[1],
+                closed[0],
+                color=colour,
+                lw=1.5,
+                ls=style,
+                marker=marker,
+                ms=2.5,
+                label=shorten(label, 60),
+            )
             if number == 0:
                 axes.fill(closed[1], closed[0], color=colour, alpha=0.15, lw=0)
         axes.set_ylim(0, 100)
