@@ -263,6 +263,51 @@ def _is_hidden(
 
 
 @compiled
+def _is_behind(
+    centre: np.ndarray,
+    axes: np.ndarray,
+    normals: np.ndarray,
+    size: np.ndarray,
+    face: np.ndarray,
+    rotation: np.ndarray,
+    near: float,
+) -> bool:
+    """Return whether the face of a box hides all that is seen of a bounding box, whose centre is relative to the eye.
+
+    What is behind the face is convex. So a box is behind it if its corners are, or those of its part on the inner side
+    of one of the four planes that bound the view.
+    """
+    corners, depths, hidden = np.empty((8, 3)), np.empty((8, 4)), np.empty(8, np.bool_)
+    for k in range(8):
+        corners[k] = centre
+        for c in range(3):
+            for r in range(3):
+                corners[k, r] += _SIGNS[k, c] * axes[r, c]
+        hidden[k] = _is_hidden(corners[k], size, face, rotation, normals[4], near)
+        for j in range(4):
+            depths[k, j] = _MARGIN
+            for r in range(3):
+                depths[k, j] += corners[k, r] * normals[j, r]
+    if hidden.all():
+        return True
+    point = np.empty(3)
+    for j in range(4):
+        behind = True
+        for k in range(8):
+            behind = behind and (hidden[k] or depths[k, j] < 0.0)
+        for e in range(len(_EDGES)):
+            a, b = _EDGES[e, 0], _EDGES[e, 1]
+            if behind and (depths[a, j] < 0.0) != (depths[b, j] < 0.0):
+                share = depths[a, j] / (depths[a, j] - depths[b, j])
+                for r in range(3):
+                    point[r] = corners[a, r] + share * (corners[b, r] - corners[a, r])
+                behind = _is_hidden(point, size, face, rotation, normals[4], near)
+        if behind:
+            return True
+    return False
+
+
+@compiled
 def _drop_hidden(
     size: np.ndarray,
     face: np.ndarray,
@@ -281,9 +326,6 @@ def _drop_hidden(
 ) -> None:
     """Drop from the kept geoms (n,) those that the upper face of a box hides, as far as they are worth a look.
 
-    What is behind the face is convex. So a geom is behind it if the corners of its bounding box are, or those of the
-    part of it on the inner side of one of the four planes that bound the view.
-
     Args:
         size: Half edges of the box, (3,).
         face: Centre of its upper face from the eye, (3,).
@@ -301,61 +343,26 @@ def _drop_hidden(
         kept: Whether each geom is drawn, (n,); changed.
     """
     up = rotation[:, 2].copy()
-    height = -(face[0] * up[0] + face[1] * up[1] + face[2] * up[2])
-    if height < _MARGIN:
+    level = (face * up).sum()  # of the face over the eye
+    if level > -_MARGIN:
         return
-    forward, corners, point = normals[4], np.empty((8, 3)), np.empty(3)
-    depths, hidden = np.empty((8, 4)), np.empty(8, np.bool_)
     fills_view = True
     for k in range(4):
-        fills_view = fills_view and _is_hidden(rays[k], size, face, rotation, forward, near)
+        fills_view = fills_view and _is_hidden(rays[k], size, face, rotation, normals[4], near)
     for n in range(len(ids)):
         g = ids[n]
         if not kept[n] or not (fills_view or costly[g]):
             continue
-        top = 0.0  # of the geom over the eye, along the normal of the face
-        for r in range(3):
-            top += (centres[n, r] - eye[r]) * up[r]
-        if kinds[g] == _PLANE:
+        centre = centres[n] - eye
+        top = (centre * up).sum()
+        if kinds[g] == _PLANE:  # infinite
             turned = abs(rotations[g, 2] * up[0] + rotations[g, 5] * up[1] + rotations[g, 8] * up[2])
             top += 0.0 if turned > 1.0 - 1e-9 else np.inf
         else:
             for c in range(3):
                 top += abs(axes[n, 0, c] * up[0] + axes[n, 1, c] * up[1] + axes[n, 2, c] * up[2])
-        if top > -height - _MARGIN:
-            continue
-        if fills_view:
-            kept[n] = False
-            continue
-        whole = True
-        for k in range(8):
-            for r in range(3):
-                corners[k, r] = centres[n, r] - eye[r]
-                for c in range(3):
-                    corners[k, r] += _SIGNS[k, c] * axes[n, r, c]
-            hidden[k] = _is_hidden(corners[k], size, face, rotation, forward, near)
-            whole = whole and hidden[k]
-            for j in range(4):
-                depths[k, j] = _MARGIN
-                for r in range(3):
-                    depths[k, j] += corners[k, r] * normals[j, r]
-        if whole:
-            kept[n] = False
-            continue
-        for j in range(4):
-            behind = True
-            for k in range(8):
-                behind = behind and (hidden[k] or depths[k, j] < 0.0)
-            for e in range(len(_EDGES)):
-                a, b = _EDGES[e, 0], _EDGES[e, 1]
-                if behind and (depths[a, j] < 0.0) != (depths[b, j] < 0.0):
-                    share = depths[a, j] / (depths[a, j] - depths[b, j])
-                    for r in range(3):
-                        point[r] = corners[a, r] + share * (corners[b, r] - corners[a, r])
-                    behind = _is_hidden(point, size, face, rotation, forward, near)
-            if behind:
-                kept[n] = False
-                break
+        if top < level - _MARGIN:
+            kept[n] = not (fills_view or _is_behind(centre, axes[n], normals, size, face, rotation, near))
 
 
 def _is_mirror(geom: mujoco.MjvGeom, eye: np.ndarray) -> bool:
