@@ -28,13 +28,20 @@ def register(subparsers: Subparsers) -> None:
         "--tolerance",
         type=arguments.number(0, 10),
         default=0.05,
-        help="share by which the error may exceed that just after learning (default: 0.05)",
+        help="share by which the error may exceed that just after learning, or the difference by which success may "
+        "fall short of it (default: 0.05)",
     )
     parser.add_argument(
         "--held-out",
         type=arguments.whole(1, 1000),
         default=5,
         help="demonstrations to measure the error on, after those that were learned from (default: 5)",
+    )
+    parser.add_argument(
+        "--episodes",
+        type=arguments.whole(0),
+        default=0,
+        help="rollouts to measure success by, instead of the error (default: 0, the error)",
     )
     parser.add_argument(
         "--initial",
@@ -53,15 +60,15 @@ def run_relearn(args: argparse.Namespace) -> None:
     from lifelong.evaluation.relearning import RelearnSettings, relearn
     from lifelong.pretraining import initial_policy
     from lifelong.report.page import write_report
-    from lifelong.results.relearning import read_relearning, savings_table
+    from lifelong.results.relearning import read_relearning, savings_tables
 
     relearn(
         args.run_dir,
         initial_policy(args.run_dir, weights=args.initial, allow=args.allow),
         tasks=args.tasks,
-        settings=RelearnSettings(args.steps, args.every, args.tolerance, args.held_out),
+        settings=RelearnSettings(args.steps, args.every, args.tolerance, args.held_out, args.episodes),
         device=args.device,
         allow=args.allow,
     )
-    print(savings_table(read_relearning(args.run_dir)))
+    print(savings_tables(read_relearning(args.run_dir)))
     print(write_report([args.run_dir]))

@@ -5,13 +5,14 @@ What is forgotten in behaviour may be kept in the weights: relearning is then sh
 did so for networks. Here a copy of the policy at the end of a run is fine-tuned on a task's demonstrations, until its
 error on held-out demonstrations is what it was when the task had just been learned, and so is a policy with the run's
 initial weights: same batches, same rate, all weights trained, whatever the run's algorithm was. The rate is constant
-after its warm-up, so that the number of steps does not depend on where a schedule would end.
+after its warm-up, so that the number of steps does not depend on where a schedule would end. Success of rollouts can
+be what has to come back instead of the error, which costs next to nothing.
 """
 
 import copy
 import time
-from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,16 +20,19 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field
 
+from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.demonstrations import DemoDatasets, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows, WindowDataset
 from lifelong.errors import ConfigError, LifelongError
+from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.restore import LoadedRun, read_config, restore
+from lifelong.evaluation.rollout import rollout
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.results.log import ResultLog
-from lifelong.results.records import RelearnRecord
+from lifelong.results.records import RelearnRecord, back_limit
 from lifelong.results.relearning import FILE_NAME
 from lifelong.seeding import RELEARN
 from lifelong.settings import Configuration
@@ -39,6 +43,7 @@ from lifelong.training.step import BatchAugmentation
 from lifelong.types import Batch, Count, NonNegative
 
 Start = Literal["final", "initial"]
+Measure = Callable[[Policy], float]  # 0 is perfect
 STARTS: tuple[Start, ...] = ("final", "initial")
 MEASURED = 512  # largest number of held-out windows of a task
 _CHUNK = 128  # windows of a forward pass
@@ -50,18 +55,27 @@ class RelearnSettings:
 
     Attributes:
         steps: Number of optimiser steps after which a task is given up.
-        every: Number of optimiser steps between two measurements of the error.
-        tolerance: Share by which the error may be larger than when the task had just been learned.
-        held_out: Number of demonstrations to measure on, those after the ones that the run learned from.
+        every: Number of optimiser steps between two measurements.
+        tolerance: By how much less than just after learning suffices: the share by which the error may be larger, or
+            the difference by which the success rate may be lower.
+        held_out: Number of demonstrations to measure the error on, those after the ones that the run learned from.
+        episodes: Number of rollouts from which the success rate is measured instead of the error, from the first
+            initial states. 0: the error is measured.
     """
 
     steps: Count = 400
     every: Count = 20
     tolerance: NonNegative = 0.05
     held_out: Annotated[int, Field(ge=1, le=1000)] = 5
+    episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("relearn",), error=ConfigError)
+
+    @property
+    def demos_held_out(self) -> int:
+        """Number of demonstrations to measure on; none where rollouts are measured."""
+        return 0 if self.episodes else self.held_out
 
 
 @dataclass(frozen=True)
@@ -71,14 +85,56 @@ class Lesson:
     Attributes:
         task: Position of the task.
         training: Windows of the demonstrations that the run learned from.
-        held_out: Windows of other demonstrations.
-        learned_error: Error on these when the run had just learned the task.
+        measure: Function that returns the error of a policy on the task, or its share of failed rollouts.
+        limit: Largest value of it with which the task counts as back.
     """
 
     task: int
     training: WindowDataset
-    held_out: Batch
-    learned_error: float
+    measure: Measure
+    limit: float
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """The error of a policy on windows of held-out demonstrations, see `error_on`."""
+
+    batch: Batch
+
+    def __call__(self, policy: Policy) -> float:
+        return error_on(policy, self.batch)
+
+
+@dataclass(frozen=True)
+class FailureShare:
+    """The share of a policy's rollouts on a task of a run that fail, under the run's own protocol.
+
+    Attributes:
+        run: The run.
+        task: Position of the task.
+        env: Environment of the task, with a simulation for each rollout.
+        episodes: Number of rollouts, which start in the first initial states.
+    """
+
+    run: LoadedRun
+    task: int
+    env: VectorEnv
+    episodes: int
+
+    def __call__(self, policy: Policy) -> float:
+        run = self.run
+        done = rollout(
+            policy,
+            self.env,
+            range(self.episodes),
+            language=run.embed(run.learned_task(self.task)),
+            horizon=run.eval.horizon,
+            settle_steps=run.eval.settle_steps,
+            seed=(run.seed, RELEARN, self.task),
+            device=run.device,
+            precision=run.eval.precision,
+        )
+        return 1 - done.rate
 
 
 def relearn(
@@ -121,20 +177,26 @@ def relearn(
         if not starts:
             continue
         before = restore(run.path, after=_stage(run, task)[-1], device=device, allow=allow)
-        with before.acting(run.tasks[task]) as then:
-            lesson = _lesson(run, then, task, settings, config)
-        for start in starts:
-            acting = run.acting(run.tasks[task]) if start == "final" else nullcontext(initial)
-            with acting as policy:
-                log.append(_measure(run, policy, start, lesson, settings, config))
+        training, held_out = _windows(run, task, settings, config)
+        with _opened(run, task, held_out, settings.episodes) as measure:
+            with before.acting(run.tasks[task]) as then:
+                learned = measure(then)
+            lesson = Lesson(
+                task, training, measure, back_limit(learned, settings.tolerance, settings.episodes)
+            )
+            for start in starts:
+                acting = run.acting(run.tasks[task]) if start == "final" else nullcontext(initial)
+                with acting as policy:
+                    log.append(_relearned(run, policy, start, lesson, learned, settings, config))
     return log.path
 
 
-def _measure(
+def _relearned(
     run: LoadedRun,
     policy: Policy,
     start: Start,
     lesson: Lesson,
+    learned: float,
     settings: RelearnSettings,
     config: Configuration,
 ) -> RelearnRecord:
@@ -152,9 +214,10 @@ def _measure(
     return RelearnRecord(
         task=lesson.task,
         start=start,
-        learned_error=lesson.learned_error,
+        learned_error=learned,
         tolerance=settings.tolerance,
-        held_out=settings.held_out,
+        held_out=settings.demos_held_out,
+        episodes=settings.episodes,
         rate=fit_settings.lr,
         steps=tuple(steps),
         errors=tuple(errors),
@@ -182,16 +245,15 @@ def steps_until(
         augment: Augmentation of training batches.
 
     Returns:
-        Numbers of steps after which the error was measured, from 0, and the errors.
+        Numbers of steps after which it was measured, from 0, and what was measured.
     """
-    limit = (1 + settings.tolerance) * lesson.learned_error
     steps: list[int] = []
     errors: list[float] = []
 
     def look(end: EpochEnd) -> None:
         steps.append(end.epoch * settings.every)
-        errors.append(error_on(policy, lesson.held_out))
-        if errors[-1] <= limit:
+        errors.append(lesson.measure(policy))
+        if errors[-1] <= lesson.limit:
             raise _Back
 
     epochs = -(-settings.steps // settings.every)
@@ -244,9 +306,9 @@ def _chosen(run: LoadedRun, tasks: Sequence[int] | None) -> list[int]:
 
 def _recorded(log: ResultLog, task: int, start: str, settings: RelearnSettings, rate: float) -> bool:
     """Return whether a measurement is recorded that these settings would repeat."""
-    wanted = settings.tolerance, settings.held_out, rate
+    wanted = task, start, settings.tolerance, settings.demos_held_out, settings.episodes, rate
     for r in log.read().of(RelearnRecord):
-        same = (r.task, r.start) == (task, start) and (r.tolerance, r.held_out, r.rate) == wanted
+        same = (r.task, r.start, r.tolerance, r.held_out, r.episodes, r.rate) == wanted
         grid = r.steps == tuple(range(0, r.steps[-1] + 1, settings.every))
         if same and grid and (r.needed is not None or r.steps[-1] >= settings.steps):
             return True
@@ -257,22 +319,34 @@ def _stage(run: LoadedRun, task: int) -> tuple[int, ...]:
     return next(stage for stage in run.stages if task in stage)
 
 
-def _lesson(
-    run: LoadedRun, then: Policy, task: int, settings: RelearnSettings, config: Configuration
-) -> Lesson:
-    """Read the demonstrations of a task, and measure the error of the policy that had just learned it."""
+def _windows(
+    run: LoadedRun, task: int, settings: RelearnSettings, config: Configuration
+) -> tuple[TaskWindows, Batch | None]:
+    """Read the windows that the run learned from, and those to measure the error on, unless rollouts are measured."""
     data: DataSettings = config.build("data")
     stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
     learned_from = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])[task]
-    tasks, counts = [run.tasks[task]], [learned_from + settings.held_out]
+    tasks, counts = [run.tasks[task]], [learned_from + settings.demos_held_out]
     recorded = find_demos(tasks, counts, data, None)
     (path,) = perturb_demos(recorded, tasks, counts, [run.perturbations(task)], data, None)
     languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host", backend="native")
 
     def windows(count: int) -> TaskWindows:
-        return DemoDatasets([path], [count], then.spec, languages, read, run.device)[0]
+        return DemoDatasets([path], [count], run.policy.spec, languages, read, run.device)[0]
 
-    everything, training = windows(learned_from + settings.held_out), windows(learned_from)
+    training = windows(learned_from)
+    if not settings.demos_held_out:
+        return training, None
+    everything = windows(sum(counts))
     rest = torch.arange(len(training), len(everything))  # windows are in the order of the demonstrations
-    held_out = everything.batch(rest[torch.linspace(0, len(rest) - 1, min(MEASURED, len(rest))).long()])
-    return Lesson(task, training, held_out, error_on(then, held_out))
+    return training, everything.batch(rest[torch.linspace(0, len(rest) - 1, min(MEASURED, len(rest))).long()])
+
+
+@contextmanager
+def _opened(run: LoadedRun, task: int, held_out: Batch | None, episodes: int) -> Iterator[Measure]:
+    """Yield what measures a policy on a task: its error on held-out windows, or without any, its failed rollouts."""
+    if held_out is not None:
+        yield HeldOutError(held_out)
+        return
+    with closing(run.environment(task, episodes, run.eval.horizon)) as env:
+        yield FailureShare(run, task, env, episodes)

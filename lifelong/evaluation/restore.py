@@ -8,11 +8,12 @@ from typing import Any
 
 import torch
 
+from libero_env.envs.batch import BatchEnv
 from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm, load_algorithm
-from lifelong.data.settings import DataSettings
+from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, LifelongError
 from lifelong.evaluation.settings import EvalSettings
@@ -95,6 +96,28 @@ class LoadedRun:
     def stages(self) -> Stages:
         """Positions of the tasks that were learned together, stage after stage."""
         return learning_stages(self.algorithm, self.group_sizes or (1,) * len(self.tasks))
+
+    def environment(self, position: int, simulations: int, horizon: int) -> BatchEnv:
+        """Return an environment of a task of the run, as it was learned: views, perturbations, drawing and robot.
+
+        Args:
+            position: Position of the task.
+            simulations: Number of episodes that run side by side.
+            horizon: Maximum number of control steps of the policy.
+        """
+        spec = self.policy.spec
+        return BatchEnv(
+            self.tasks[position],
+            simulations,
+            num_threads=self.eval.sim_threads,
+            cameras=tuple(CAMERAS[view] for view in spec.views),
+            camera_size=spec.image_size,
+            horizon=horizon + self.eval.settle_steps,
+            drawing=self.drawing,
+            robot=self.robot,
+            backend=self.eval.backend,
+            perturb=self.perturbations(position),
+        )
 
     @contextmanager
     def acting(self, task: Task) -> Iterator[Policy]:

@@ -1,6 +1,7 @@
 """Contact sheets of a run's saliency: images of where its policy looks while it acts."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,8 +9,6 @@ import numpy as np
 import torch
 from PIL import Image
 
-from libero_env.envs.batch import BatchEnv
-from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import PolicyActor, observe
 from lifelong.evaluation.inputs import Obs
@@ -105,23 +104,10 @@ def _run_episode(
 ) -> tuple[list[dict[str, torch.Tensor]], bool]:
     """Return the policy's observations at each step, (1, 1, ...) tensors by name, and the episode's success."""
     spec, language = run.policy.spec, run.embed(run.learned_task(task))
-    env = BatchEnv(
-        run.tasks[task],
-        1,
-        cameras=tuple(CAMERAS[view] for view in spec.views),
-        camera_size=spec.image_size,
-        horizon=horizon + run.eval.settle_steps,
-        drawing=run.drawing,
-        robot=run.robot,
-        perturb=run.perturbations(task),
-    )
-    try:
-        with run.acting(run.tasks[task]) as policy:
-            draws = [generator(run.seed, start)]
-            actor = RecordingActor(PolicyActor(policy, language, run.device, run.eval.precision, draws))
-            done = run_episodes(actor, env, [start], horizon=horizon, settle_steps=run.eval.settle_steps)
-    finally:
-        env.close()
+    with closing(run.environment(task, 1, horizon)) as env, run.acting(run.tasks[task]) as policy:
+        draws = [generator(run.seed, start)]
+        actor = RecordingActor(PolicyActor(policy, language, run.device, run.eval.precision, draws))
+        done = run_episodes(actor, env, [start], horizon=horizon, settle_steps=run.eval.settle_steps)
     frames = [_tensors(observe(obs, spec, language, run.device)) for obs in actor.observations]
     return frames, done.episodes[0].success
 

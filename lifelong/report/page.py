@@ -38,7 +38,7 @@ from lifelong.report.templates import page_template, percent
 from lifelong.results.episode_table import write_episodes
 from lifelong.results.metrics import METRIC_NAMES, Metrics, average_success
 from lifelong.results.records import RunRecord
-from lifelong.results.relearning import read_relearning, savings, savings_rows
+from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
 from lifelong.results.results import after_base_stage
 from lifelong.results.samples import metric_values
 from lifelong.results.shifts import shift_scores
@@ -148,7 +148,9 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
         "total_time": duration(sum(times.values())),
         "episodes": episodes_text(*run.results.episodes()),
-        "relearning": savings_rows(savings(read_relearning(run.path))),
+        "relearning": [
+            (savings_heads(part), savings_rows(part)) for part in by_measure(read_relearning(run.path))
+        ],
         "shifts": [shift_table(score, labels) for score in shift_scores(run.results)],
         "subgoals": run.results.subgoals().predicates,
         "atoms": atom_rows(run.results.subgoals(), labels),

@@ -190,13 +190,15 @@ class RelearnRecord:
         task: Position of the task.
         start: Weights that it began with: `final`, those that acted on the task at the end of the run, or `initial`,
             those that the run began with.
-        learned_error: Error on held-out demonstrations when the run had just learned the task.
-        tolerance: Share by which the error may be larger than that for the task to count as back.
-        held_out: Number of held-out demonstrations.
+        learned_error: What was measured when the run had just learned the task: the error on held-out demonstrations,
+            or the share of failed rollouts.
+        tolerance: By how much larger it may be for the task to count as back, see `back_limit`.
+        held_out: Number of held-out demonstrations; 0 where rollouts were measured.
         rate: Learning rate.
-        steps: Numbers of optimiser steps after which the error was measured, ascending from 0; the last one is where
-            the task was back, or where it was given up.
-        errors: Errors after these steps.
+        steps: Numbers of optimiser steps after which it was measured, ascending from 0; the last one is where the task
+            was back, or where it was given up.
+        errors: What was measured after these steps.
+        episodes: Number of rollouts; 0 where the error was measured.
     """
 
     kind: Literal["relearn"] = field(default="relearn", init=False)
@@ -209,6 +211,7 @@ class RelearnRecord:
     steps: tuple[Count, ...]
     errors: tuple[Number, ...]
     seconds: Number
+    episodes: Count = 0
 
     def __post_init__(self) -> None:
         if not len(self.steps) == len(self.errors) > 0:
@@ -217,8 +220,23 @@ class RelearnRecord:
     @property
     def needed(self) -> int | None:
         """Number of steps until the task was back; None if it was given up before."""
-        limit = (1 + self.tolerance) * self.learned_error
+        limit = back_limit(self.learned_error, self.tolerance, self.episodes)
         return self.steps[-1] if self.errors[-1] <= limit else None
+
+
+def back_limit(learned: float, tolerance: float, episodes: int) -> float:
+    """Return the largest value with which a task that is relearned counts as back.
+
+    Args:
+        learned: What was measured when it had just been learned: an error, or a share of failed rollouts.
+        tolerance: The share by which an error may be larger, or the difference by which a share of rollouts may be.
+        episodes: Number of rollouts; 0 for an error.
+    """
+    if not episodes:
+        return (1 + tolerance) * learned
+    return (
+        math.floor((learned + tolerance) * episodes + 1e-9)
+    ) / episodes  # whole rollouts, free of rounding
 
 
 @dataclass(frozen=True)

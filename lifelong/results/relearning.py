@@ -16,9 +16,10 @@ class Savings:
 
     Attributes:
         task: Position of the task.
-        learned_error: Error on held-out demonstrations when the run had just learned it.
-        final_error: Error at the end of the run.
-        again: Number of steps from the end of the run until the error was back; None if it was given up.
+        learned_error: What was measured when the run had just learned it: the error on held-out demonstrations, or the
+            share of failed rollouts.
+        final_error: The same at the end of the run.
+        again: Number of steps from the end of the run until it was back; None if it was given up.
         first: Number of steps from the run's initial weights; None if it was given up, or not measured.
         tried: Number of steps after which the longer of the two was given up.
     """
@@ -51,6 +52,12 @@ def read_relearning(run: Path) -> list[RelearnRecord]:
     return ResultLog(file).read().of(RelearnRecord) if file.is_file() else []
 
 
+def by_measure(records: Sequence[RelearnRecord]) -> list[list[RelearnRecord]]:
+    """Part records of errors from those of rollouts; without what there is none of."""
+    parts = [[r for r in records if bool(r.episodes) == rollouts] for rollouts in (False, True)]
+    return [part for part in parts if part]
+
+
 def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
     """Pair the starts of each task, the latest of each under the same conditions.
 
@@ -71,28 +78,41 @@ def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
 
 
 def _like(a: RelearnRecord, b: RelearnRecord) -> bool:
-    names = ("learned_error", "tolerance", "held_out", "rate")
+    names = ("learned_error", "tolerance", "held_out", "episodes", "rate")
     return all(getattr(a, name) == getattr(b, name) for name in names)
 
 
-def savings_rows(found: Sequence[Savings]) -> list[tuple[str, ...]]:
-    """Return the savings as text: task from 1, error just learned and at the end, steps again and at first, savings."""
+def savings_heads(records: Sequence[RelearnRecord]) -> tuple[str, ...]:
+    """Return the heads of the columns of `savings_rows`, for records of one measure."""
+    what = "success" if records[0].episodes else "error"
+    return "task", f"{what} just learned", f"{what} at the end", "steps again", "steps at first", "savings"
+
+
+def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
+    """Return the savings of records of one measure as text, a row for each task, counted from 1."""
+    shown = _percent if records[0].episodes else "{:.3f}".format
     rows: list[tuple[str, ...]] = []
-    for row in found:
+    for row in savings(records):
         first, again = _steps(row.first, row.tried), _steps(row.again, row.tried)
         share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
-        rows.append(
-            (str(row.task + 1), f"{row.learned_error:.3f}", f"{row.final_error:.3f}", again, first, share)
-        )
+        measured = shown(row.learned_error), shown(row.final_error)
+        rows.append((str(row.task + 1), *measured, again, first, share))
     return rows
 
 
-def savings_table(records: Sequence[RelearnRecord]) -> str:
-    """Return what was measured as a table in plain text."""
-    head = ("task", "error just learned", "error at the end", "steps again", "steps at first", "savings")
-    rows = [head, *savings_rows(savings(records))]
+def savings_tables(records: Sequence[RelearnRecord]) -> str:
+    """Return what was measured as tables in plain text, one for each measure."""
+    return "\n\n".join(_table([savings_heads(part), *savings_rows(part)]) for part in by_measure(records))
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+
+
+def _percent(failed: float) -> str:
+    """Return the success rate of a share of failed rollouts."""
+    return f"{100 * (1 - failed):.0f} %"
 
 
 def _steps(needed: int | None, tried: int) -> str:

@@ -39,3 +39,9 @@ def test_from_the_command_line(tmp_path):
     assert [(r.task, r.start) for r in found] == [(0, "final"), (0, "initial")]
     assert found[0].needed == 0, "an adapter's task is not forgotten"
     assert call(*command) == said and read_relearning(run) == found
+
+    said = call(*command, "--episodes", "2")
+    assert "error just learned" in said and "success just learned" in said
+    *before, final, initial = read_relearning(run)
+    assert before == found and {final.episodes, initial.episodes} == {2}
+    assert (final.learned_error, final.needed) == (1.0, 0), "what never succeeded is back at once"

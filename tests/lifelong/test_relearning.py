@@ -13,14 +13,23 @@ from lifelong.algorithms import Sequential
 from lifelong.cli.main import build_parser
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.evaluation import relearning
-from lifelong.evaluation.relearning import Lesson, RelearnSettings, error_on, relearn, steps_until
+from lifelong.evaluation.relearning import (
+    FailureShare,
+    HeldOutError,
+    Lesson,
+    RelearnSettings,
+    error_on,
+    relearn,
+    steps_until,
+)
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
 from lifelong.results.records import RelearnRecord, from_line, to_line
-from lifelong.results.relearning import FILE_NAME, read_relearning, savings, savings_rows, savings_table
+from lifelong.results.relearning import FILE_NAME, read_relearning, savings, savings_rows, savings_tables
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
+from lifelong.types import Batch
 from tests.harness.fakes import LinearPolicy, Windows
 
 pytestmark = pytest.mark.unit
@@ -44,7 +53,12 @@ def learned(found: Linear, task: int, steps: int = 120) -> Linear:
 
 
 def lesson(error: float, task: int = 0) -> Lesson:
-    return Lesson(task, Windows(task), Windows(task).batch(torch.arange(20)), error)
+    """A task that counts as back at an error of at most 1.05 times the given one."""
+    return Lesson(task, Windows(task), HeldOutError(held_out(task)), 1.05 * error)
+
+
+def held_out(task: int = 0) -> Batch:
+    return Windows(task).batch(torch.arange(20))
 
 
 def again(found: Linear, goal: Lesson, settings: RelearnSettings = SETTINGS):
@@ -52,19 +66,19 @@ def again(found: Linear, goal: Lesson, settings: RelearnSettings = SETTINGS):
 
 
 def test_a_task_is_back_at_the_first_measurement_within_the_tolerance() -> None:
-    then = error_on(learned(policy(), 0), lesson(0).held_out)
+    then = error_on(learned(policy(), 0), held_out())
     forgotten = learned(learned(policy(), 0), 1)
     steps, errors = again(forgotten, lesson(then))
     assert errors[0] > 1.05 * then, "it was forgotten"
     assert errors[-1] <= 1.05 * then and all(error > 1.05 * then for error in errors[:-1])
     assert steps == list(range(0, steps[-1] + 1, 5)) and 0 < steps[-1] < 200
-    assert error_on(forgotten, lesson(0).held_out) == errors[-1], "training ended there"
+    assert error_on(forgotten, held_out()) == errors[-1], "training ended there"
 
 
 def test_what_is_not_forgotten_needs_no_step() -> None:
     kept = learned(policy(), 0)
     before = copy.deepcopy(kept.state_dict())
-    assert again(kept, lesson(error_on(kept, lesson(0).held_out)))[0] == [0]
+    assert again(kept, lesson(error_on(kept, held_out())))[0] == [0]
     assert all(torch.equal(value, before[name]) for name, value in kept.state_dict().items())
 
 
@@ -96,18 +110,21 @@ def test_the_error_is_the_mean_absolute_one_and_the_mode_stays() -> None:
 # --- records
 
 
-def record(task: int, start: str, errors: tuple[float, ...], then: float = 0.1, rate: float = 1e-3):
+def record(
+    task: int, start: str, errors: tuple[float, ...], then: float = 0.1, rate: float = 1e-3, episodes: int = 0
+) -> RelearnRecord:
     steps = tuple(range(0, 10 * len(errors), 10))
     return RelearnRecord(
         task=task,
         start=start,
         learned_error=then,
         tolerance=0.05,
-        held_out=5,
+        held_out=5 * (not episodes),
         rate=rate,
         steps=steps,
         errors=errors,
         seconds=1.0,
+        episodes=episodes,
     )
 
 
@@ -130,9 +147,9 @@ def test_savings_pair_the_starts_of_each_task() -> None:
         (2, 0, None, None),
         (3, None, 10, None),
     ]
-    assert savings_rows(found)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
-    assert savings_rows(found)[3][3:] == ("> 10", "10", "–")
-    assert savings_table(records).count("\n") == 4
+    assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
+    assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
+    assert savings_tables(records).count("\n") == 4
 
 
 def test_records_are_read_back_and_refuse_what_does_not_fit(tmp_path) -> None:
@@ -142,6 +159,22 @@ def test_records_are_read_back_and_refuse_what_does_not_fit(tmp_path) -> None:
     with pytest.raises(ValueError, match="2 steps have 1 errors"):
         replace(found, errors=(0.3,))
     assert read_relearning(tmp_path) == []
+
+
+def test_success_is_back_where_it_falls_short_by_the_tolerance_at_most() -> None:
+    def needed(then: float, *errors: float) -> int | None:
+        return record(0, "final", errors, then=then, episodes=20).needed
+
+    assert needed(0.1, 1.0, 0.15) == 10, "17 of 20 where it was 18"
+    assert needed(0.1, 1.0, 0.2) is None
+    assert needed(0.0, 1.0, 0.05) == 10, "a task without failures is back, too"
+    found = [record(0, "final", (0.9, 0.1), episodes=20), record(0, "initial", (1.0, 0.5, 0.1), episodes=20)]
+    assert savings_rows(found) == [("1", "90 %", "10 %", "10", "20", "50 %")]
+    text = savings_tables([record(0, "final", (0.3, 0.1)), *found])
+    assert text.index("error just learned") < text.index("success just learned")
+    assert [s.first for s in savings([record(0, "initial", (0.1,)), found[0]])] == [None], (
+        "measures do not mix"
+    )
 
 
 def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
@@ -155,12 +188,33 @@ def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
     log = ResultLog(tmp_path / FILE_NAME)
     log.append(record(0, "final", (0.3, 0.1)))
     log.append(record(0, "initial", (0.5, 0.4, 0.1)))
+    log.append(record(0, "final", (0.75, 0.1), episodes=20))
     page = write_report([tmp_path]).read_text(encoding="utf-8")
     assert "<h2>Relearning</h2>" in page and "50 %" in page
+    assert "Error at the end" in page and "Success at the end" in page and "25 %" in page
     assert (tmp_path / "results.jsonl").read_bytes() == before
 
 
 # --- the whole measurement
+
+
+def test_rollouts_are_those_of_the_run(monkeypatch) -> None:
+    called = {}
+
+    def rollout(found, env, states, **settings):
+        called.update(settings, policy=found, env=env, states=list(states))
+        return SimpleNamespace(rate=0.75)
+
+    protocol = SimpleNamespace(horizon=70, settle_steps=3, precision="fp32")
+    run = SimpleNamespace(
+        eval=protocol, learned_task=lambda k: f"task {k}", embed=str.upper, seed=9, device="cpu"
+    )
+    monkeypatch.setattr(relearning, "rollout", rollout)
+    measured = policy()
+    assert FailureShare(run, 2, "env", 4)(measured) == 0.25
+    assert called.pop("policy") is measured
+    assert (called["env"], called["states"], called["language"]) == ("env", [0, 1, 2, 3], "TASK 2")
+    assert (called["horizon"], called["settle_steps"], called["precision"]) == (70, 3, "fp32")
 
 
 @pytest.fixture
@@ -185,12 +239,9 @@ def finished(tmp_path, monkeypatch):
     def read_config(*_):
         return SimpleNamespace(build={"train": FIT}.get, values={"train": {}})
 
-    def measured(run, then, task, *_):
-        return lesson(error_on(then, lesson(0, task).held_out), task)
-
     monkeypatch.setattr(relearning, "restore", restore)
     monkeypatch.setattr(relearning, "read_config", read_config)
-    monkeypatch.setattr(relearning, "_lesson", measured)
+    monkeypatch.setattr(relearning, "_windows", lambda run, task, *_: (Windows(task), held_out(task)))
     return tmp_path, ends
 
 
@@ -234,7 +285,7 @@ def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(fin
     folder, _ = finished
     with pytest.raises(LifelongError, match="has tasks 0 to 2; there is no task 7"):
         relearn(folder, policy(), tasks=[7], settings=SETTINGS)
-    for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}):
+    for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}, {"episodes": 51}):
         with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
             RelearnSettings(**change)
     assert build_parser().parse_args(["relearn", str(folder), "--tasks", "0", "2"]).tasks == [0, 2]
@@ -242,7 +293,10 @@ def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(fin
 
 def test_the_options_of_the_command_default_to_the_settings() -> None:
     args = build_parser().parse_args(["relearn", "run"])
-    assert RelearnSettings(args.steps, args.every, args.tolerance, args.held_out) == RelearnSettings()
+    assert (
+        RelearnSettings(args.steps, args.every, args.tolerance, args.held_out, args.episodes)
+        == RelearnSettings()
+    )
 
 
 def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:

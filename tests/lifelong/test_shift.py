@@ -253,12 +253,12 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
     assert (path / "report.html").is_file()
 
     settings, config = RelearnSettings(held_out=1), read_config(path / "config.yaml", ())
-    lesson = relearning._lesson(loaded, loaded.policy, 1, settings, config)
+    training, held_out = relearning._windows(loaded, 1, settings, config)
     shifted = next(folder.rglob(f"under-instruction=0.6*/{TASKS[1].name}_demo.hdf5"))
     (_, first), (_, other) = read_episodes(shifted)  # learned from, and held out
-    assert len(lesson.training) == len(first) and len(lesson.held_out) == len(other)
-    np.testing.assert_array_equal(lesson.held_out.observation.images[0, 0, 0], other.obs["agentview_rgb"][0])
-    assert torch.equal(lesson.held_out.observation.language[0], embedded[1])
+    assert len(training) == len(first) and len(held_out) == len(other)
+    np.testing.assert_array_equal(held_out.observation.images[0, 0, 0], other.obs["agentview_rgb"][0])
+    assert torch.equal(held_out.observation.language[0], embedded[1])
 
     def stop(self, *args):
         raise Stop
