@@ -2,6 +2,7 @@
 
     python experiments/algorithms/study.py list                # each run: done or missing, its cost, its command
     python experiments/algorithms/study.py run --minutes 120   # go on with what is missing, until it is stopped
+    python experiments/algorithms/study.py relearn             # how fast tasks come back, where a run's weights are
     python experiments/algorithms/study.py report              # tables and pictures of what is finished
 
 A run is a process of its own on one thread. One that was stopped goes on where it was; of a finished one the records
@@ -41,6 +42,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 RECORDS = HERE / "records"
 SETTINGS = ("eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
+RELEARN = ("--steps", "800", "--every", "20", "--tolerance", "0.5")  # the rate is constant: it ends no nearer
 
 # suite -> algorithms, in the order in which they are run, and number of seeds
 OBJECT = (
@@ -101,7 +103,8 @@ class Planned:
 
     def keep(self, directory: Path) -> None:
         """Keep the records of a finished run."""
-        content = {name: (directory / file).read_text(encoding="utf-8") for name, file in FILES.items()}
+        there = {name: directory / file for name, file in FILES.items() if (directory / file).is_file()}
+        content = {name: path.read_text(encoding="utf-8") for name, path in there.items()}
         self.record.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(self.record) as part:
             part.write_bytes(lzma.compress(json.dumps(content).encode(), preset=9))
@@ -115,7 +118,7 @@ class Planned:
         return directory
 
 
-FILES = {"config": "config.yaml", "records": "results.jsonl"}
+FILES = {"config": "config.yaml", "records": "results.jsonl", "relearning": "relearning.jsonl"}
 
 
 def _read(record: Path) -> dict[str, str]:
@@ -142,7 +145,7 @@ def show(runs: Sequence[Planned]) -> None:
         if run.is_done():
             spent = _hours(run)
             hours.setdefault((run.benchmark, run.algo), []).append(spent)
-            print(f"done     {60 * spent:4.0f} min  {run.name}")
+            print(f"done     {60 * spent:4.0f} min  python train.py {shlex.join(run.overrides)}")
         else:
             missing.append(run)
     for run in missing:
@@ -217,6 +220,26 @@ def _demonstrations(run: Planned) -> None:
     find_demos(tasks, [data.demos] * len(tasks), data, progress=False)
 
 
+def relearn(runs: Sequence[Planned], folder: Path) -> int:
+    """Measure the relearning of finished runs whose weights are in a folder, and keep it with their records.
+
+    Returns:
+        Number of runs that failed.
+    """
+    failed = 0
+    for run in runs:
+        directory = _directory(run, folder)
+        if directory is None or not run.is_done():
+            continue
+        command = [sys.executable, "-m", "lifelong.cli", "relearn", str(directory), *RELEARN]
+        print(run.name, flush=True)
+        if subprocess.run(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode == 0:
+            run.keep(directory)
+        else:
+            failed += 1
+    return failed
+
+
 def _directory(run: Planned, folder: Path) -> Path | None:
     return next((folder / run.benchmark / run.algo).glob(f"*_seed{run.seed}"), None)
 
@@ -242,7 +265,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("list", "run", "report"))
+    parser.add_argument("what", choices=("list", "run", "relearn", "report"))
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then what runs is stopped")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time")
     parser.add_argument(
@@ -257,6 +280,8 @@ def main() -> int:
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # and end what runs
         args.runs.mkdir(parents=True, exist_ok=True)
         return int(make(runs, args.runs.resolve(), args.minutes, args.jobs) > 0)
+    if args.what == "relearn":
+        return int(relearn(runs, args.runs.resolve()) > 0)
     show(runs) if args.what == "list" else report(runs)
     return 0
 

@@ -4,11 +4,16 @@ python experiments/algorithms/table.py          # reads SUITE/comparison.json, w
 """
 
 import json
+import statistics
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from study import planned
+
 from lifelong.report.statistics import findings
 from lifelong.report.tables import duration, quantity
+from lifelong.results.relearning import Savings, read_relearning, savings
 
 HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
@@ -50,6 +55,32 @@ def costs(values: dict) -> list[str]:
     ]
 
 
+def relearning(benchmark: str) -> list[str]:
+    """Lines of the table of relearning; none where nothing was measured."""
+    found: dict[str, list[Savings]] = {}
+    for run in planned():
+        if run.benchmark == benchmark and run.is_done():
+            with tempfile.TemporaryDirectory() as scratch:
+                measured = savings(read_relearning(run.unpack(Path(scratch))))
+            if measured:
+                found.setdefault(run.algo, []).extend(measured)
+    rows = []
+    for algo, tasks in sorted(found.items()):
+        again, first = [t.again for t in tasks], [t.first for t in tasks]
+        grown = statistics.median(t.final_error / t.learned_error for t in tasks)
+        shares = [t.share for t in tasks if t.share is not None]
+        saved = f"{statistics.median(shares):.2f}" if shares else "–"
+        rows.append([algo, f"{grown:.1f}", _middle(again), _middle(first), saved, str(len(tasks))])
+    heads = ["algorithm", "error at the end", "steps again", "steps at first", "savings", "tasks"]
+    return table(heads, rows) if rows else []
+
+
+def _middle(steps: list[int | None]) -> str:
+    """The median number of steps, where tasks that were given up count as the largest."""
+    middle = statistics.median_high([float("inf") if s is None else s for s in steps])
+    return "given up" if middle == float("inf") else f"{middle:.0f}"
+
+
 def insert(text: str, name: str, lines: list[str]) -> str:
     """Return a text with lines in place of what stands between the marks of a name."""
     start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
@@ -63,6 +94,7 @@ def main() -> None:
     for path in sorted(HERE.glob("*/comparison.json")):
         for name, lines in tables(json.loads(path.read_text(encoding="utf-8"))):
             text = insert(text, f"{path.parent.name}: {name}", lines)
+        text = insert(text, f"{path.parent.name}: relearning", relearning(path.parent.name))
     readme.write_text(text, encoding="utf-8")
 
 
