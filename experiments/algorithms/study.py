@@ -59,7 +59,7 @@ OBJECT = (
     "omla",
 )
 OBJECT += ("compressed_er", "mlr", "m2distill", "derpp", "agem", "lwf", "mas", "si", "averaging")
-STUDIES = {"libero_object": (OBJECT, 5), "libero_goal": (("sequential", "er", "ewc", "packnet"), 3)}
+STUDIES = {"libero_object": (OBJECT, 5), "libero_goal": (("sequential", "er", "ewc", "packnet", "iscil"), 3)}
 
 
 @dataclass(frozen=True)
