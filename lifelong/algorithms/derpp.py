@@ -42,7 +42,7 @@ class DERpp(Rehearsal):
             ratio: Number of windows replayed for each window of the present task, and the same number for outputs.
             alpha: Weight of the outputs. 3 would weigh errors of 0.05 as the absolute error of a deterministic
                 head does (3 * 7 * 0.05^2 = 0.05), but larger ones, of new tasks, far more: 0.3 learned
-                better and forgot less (experiments/algorithms). The divergence of mixtures has the unit of their
+                better and forgot less (experiments/tuning). The divergence of mixtures has the unit of their
                 loss.
         """
         super().__init__(ReplayMemory(budget), ratio)

@@ -129,8 +129,13 @@ def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12)
         text = f"{name}: {len(pairs) - len(open_)} of {len(pairs)} pairs are told apart"
         named = [f"{a} and {b} ({_outlook(m)})" for a, b, m in open_[:most]]
         rest = f", and {len(open_) - most} more" if len(open_) > most else ""
-        lines.append(text + (f". Not: {', '.join(named)}{rest}." if named else "."))
+        alone = ". A second seed would say how far seeds differ" if any(map(_of_one_seed, open_)) else ""
+        lines.append(text + (f". Not: {', '.join(named)}{rest}{alone}." if named else "."))
     return lines
+
+
+def _of_one_seed(pair: tuple[str, str, Mapping[str, Any]]) -> bool:
+    return not _known(pair[2]["shown"])
 
 
 def _known(value: float | None) -> bool:
@@ -139,9 +144,9 @@ def _known(value: float | None) -> bool:
 
 
 def _outlook(metric: Mapping[str, Any]) -> str:
-    """Return what a pair that is not told apart differs by, and how many seeds would tell."""
+    """Return what a pair that is not told apart differs by and, from several seeds, how many would tell."""
     value = f"{100 * metric['value']:+.1f}"
     if not _known(metric["shown"]):
-        return f"{value}; a second seed would say how far seeds differ"
+        return value
     seeds = metric["seeds"] or f"more than {MOST_SEEDS}"
     return f"{value}; {seeds} seeds would tell, these show {100 * metric['shown']:.0f}"
