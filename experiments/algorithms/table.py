@@ -11,7 +11,6 @@ from pathlib import Path
 
 from study import planned
 
-from lifelong.report.statistics import findings
 from lifelong.report.tables import duration, quantity
 from lifelong.results.relearning import Savings, read_relearning, savings
 
@@ -19,9 +18,9 @@ HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
 
 
-def table(heads: list[str], rows: list[list[str]]) -> list[str]:
-    """The lines of a Markdown table."""
-    lines = ["| " + " | ".join(heads) + " |", "|---|" + "---:|" * (len(heads) - 1)]
+def table(heads: list[str], rows: list[list[str]], align: str = "---:|") -> list[str]:
+    """The lines of a Markdown table, whose columns but the first are aligned as given."""
+    lines = ["| " + " | ".join(heads) + " |", "|---|" + align * (len(heads) - 1)]
     return lines + ["| " + " | ".join(row) + " |" for row in rows]
 
 
@@ -40,7 +39,31 @@ def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
     rows = [[label, *costs(group["costs"])] for label, group in groups]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
-    yield "pairs", findings(found, {"auc": "AUC"}, most=len(found["differences"]))
+    yield "pairs", pairs([label for label, _ in groups], found["differences"])
+
+
+def pairs(labels: list[str], differences: list[dict]) -> list[str]:
+    """Which algorithms have a larger AUC than which, with 95 % confidence in all pairs together, and which are left."""
+    better: dict[str, list[str]] = {label: [] for label in labels}
+    open_: dict[str, list[str]] = {label: [] for label in labels}
+    for pair in differences:
+        (a, b), auc = (pair["of"], pair["less"]), pair["metrics"]["auc"]
+        if auc["value"] is None:
+            continue
+        if auc["told_apart"]:
+            winner, loser = (a, b) if auc["value"] > 0 else (b, a)
+            better[winner].append(loser)
+        else:
+            seeds = f" ({auc['seeds']} seeds)" if auc["seeds"] else ""
+            open_[a].append(b + seeds)
+            open_[b].append(a + seeds)
+
+    def ordered(names: list[str]) -> str:
+        return ", ".join(sorted(names, key=lambda name: labels.index(name.split(" ")[0]))) or "–"
+
+    heads = ["algorithm", "larger AUC than", "not told apart from (seeds that would tell)"]
+    rows = [[label, ordered(better[label]), ordered(open_[label])] for label in labels]
+    return table(heads, [row for row in rows if row[1:] != ["–", "–"]], "---|")
 
 
 def costs(values: dict) -> list[str]:
