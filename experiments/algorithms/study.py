@@ -44,41 +44,63 @@ RECORDS = HERE / "records"
 SETTINGS = ("eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
 RELEARN = ("--steps", "800", "--every", "20", "--tolerance", "0.5")  # the rate is constant: it ends no nearer
 
-# suite -> algorithms, in the order in which they are run, and number of seeds
+
+@dataclass(frozen=True)
+class Study:
+    """Algorithms that are compared with each other.
+
+    Args:
+        name: Its folder beside this file, and the first part of its runs' names.
+        benchmark: Suite of tasks.
+        algorithms: Algorithms, in the order in which they are run.
+        seeds: Number of seeds of each.
+        overrides: What its commands have beyond those of the other studies.
+    """
+
+    name: str
+    benchmark: str
+    algorithms: tuple[str, ...]
+    seeds: int
+    overrides: tuple[str, ...] = ()
+
+
+# fmt: off
 OBJECT = (
-    "sequential",
-    "er",
-    "packnet",
-    "ewc",
-    "multitask",
-    "single_task",
-    "lora",
-    "dmpel",
-    "iscil",
-    "clare",
-    "omla",
+    "sequential", "er", "packnet", "ewc", "multitask", "single_task", "lora", "dmpel", "iscil", "clare", "omla",
+    "compressed_er", "mlr", "m2distill", "derpp", "agem", "lwf", "mas", "si", "averaging",
 )
-OBJECT += ("compressed_er", "mlr", "m2distill", "derpp", "agem", "lwf", "mas", "si", "averaging")
-STUDIES = {"libero_object": (OBJECT, 5), "libero_goal": (("sequential", "er", "ewc", "packnet", "iscil"), 3)}
+# fmt: on
+STUDIES = (
+    Study("libero_object", "libero_object", OBJECT, seeds=5),
+    Study("libero_goal", "libero_goal", ("sequential", "er", "ewc", "packnet", "iscil"), seeds=3),
+    Study(
+        "pretrained6",
+        "libero_object",
+        ("sequential", "er", "iscil", "mlr", "m2distill"),
+        seeds=3,
+        overrides=("stream=pretrained6",),
+    ),
+)
 
 
 @dataclass(frozen=True)
 class Planned:
     """A run of the study."""
 
-    benchmark: str
+    study: Study
     algo: str
     seed: int
 
     @property
     def name(self) -> str:
         """Its name in lists."""
-        return f"{self.benchmark}/{self.algo}/seed{self.seed}"
+        return f"{self.study.name}/{self.algo}/seed{self.seed}"
 
     @property
     def overrides(self) -> list[str]:
         """What its command has beyond `python train.py`."""
-        return [f"algo={self.algo}", f"benchmark={self.benchmark}", f"seed={self.seed}", *SETTINGS]
+        choices = [f"algo={self.algo}", f"benchmark={self.study.benchmark}", *self.study.overrides]
+        return [*choices, f"seed={self.seed}", *SETTINGS]
 
     @property
     def record(self) -> Path:
@@ -127,24 +149,23 @@ def _read(record: Path) -> dict[str, str]:
 
 def planned() -> list[Planned]:
     """Return all runs, in the order in which they are made: seed after seed."""
-    most = max(seeds for _, seeds in STUDIES.values())
     return [
-        Planned(benchmark, algo, seed)
-        for seed in range(1, most + 1)
-        for benchmark, (algorithms, seeds) in STUDIES.items()
-        if seed <= seeds
-        for algo in algorithms
+        Planned(study, algo, seed)
+        for seed in range(1, max(study.seeds for study in STUDIES) + 1)
+        for study in STUDIES
+        if seed <= study.seeds
+        for algo in study.algorithms
     ]
 
 
 def show(runs: Sequence[Planned]) -> None:
     """Print each run, and how long the missing ones take if they cost what those of the same algorithm did."""
-    hours: dict[tuple[str, str], list[float]] = {}
+    hours: dict[tuple[Study, str], list[float]] = {}
     missing = []
     for run in runs:
         if run.is_done():
             spent = _hours(run)
-            hours.setdefault((run.benchmark, run.algo), []).append(spent)
+            hours.setdefault((run.study, run.algo), []).append(spent)
             print(f"done     {60 * spent:4.0f} min  python train.py {shlex.join(run.overrides)}")
         else:
             missing.append(run)
@@ -153,7 +174,7 @@ def show(runs: Sequence[Planned]) -> None:
     known = [h for spent in hours.values() for h in spent]
     if missing and known:
         mean = sum(known) / len(known)
-        left = sum(_mean(hours.get((run.benchmark, run.algo))) or mean for run in missing)
+        left = sum(_mean(hours.get((run.study, run.algo))) or mean for run in missing)
         print(
             f"{len(runs) - len(missing)} of {len(runs)} runs are done; the others take about {left:.0f} core hours"
         )
@@ -204,7 +225,7 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
 
 def _start(run: Planned, folder: Path) -> "subprocess.Popen[bytes]":
     _demonstrations(run)
-    command = [sys.executable, str(ROOT / "train.py"), *run.overrides, f"runs_dir={folder}"]
+    command = [sys.executable, str(ROOT / "train.py"), *run.overrides, f"runs_dir={folder / run.study.name}"]
     log = _log(run, folder)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:
@@ -241,7 +262,7 @@ def relearn(runs: Sequence[Planned], folder: Path) -> int:
 
 
 def _directory(run: Planned, folder: Path) -> Path | None:
-    return next((folder / run.benchmark / run.algo).glob(f"*_seed{run.seed}"), None)
+    return next((folder / run.study.name / run.study.benchmark / run.algo).glob(f"*_seed{run.seed}"), None)
 
 
 def _log(run: Planned, folder: Path) -> Path:
@@ -249,14 +270,14 @@ def _log(run: Planned, folder: Path) -> Path:
 
 
 def report(runs: Sequence[Planned]) -> None:
-    """Write a comparison of the finished runs of each suite beside this file."""
-    for benchmark in STUDIES:
-        found = [run for run in runs if run.benchmark == benchmark and run.is_done()]
+    """Write a comparison of the finished runs of each study beside this file."""
+    for study in STUDIES:
+        found = [run for run in runs if run.study == study and run.is_done()]
         if not found:
             continue
         with tempfile.TemporaryDirectory() as scratch:
             page = write_report(
-                [run.unpack(Path(scratch)) for run in found], HERE / benchmark / "report.html"
+                [run.unpack(Path(scratch)) for run in found], HERE / study.name / "report.html"
             )
         print(f"{len(found)} runs: {page}")
 

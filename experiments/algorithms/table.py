@@ -1,6 +1,6 @@
 """Put the numbers of the comparisons into the README beside them.
 
-python experiments/algorithms/table.py          # reads SUITE/comparison.json, which `study.py report` writes
+python experiments/algorithms/table.py          # reads STUDY/comparison.json, which `study.py report` writes
 """
 
 import json
@@ -78,11 +78,11 @@ def costs(values: dict) -> list[str]:
     ]
 
 
-def relearning(benchmark: str) -> list[str]:
+def relearning(study: str) -> list[str]:
     """Lines of the table of relearning; none where nothing was measured."""
     found: dict[str, list[Savings]] = {}
     for run in planned():
-        if run.benchmark == benchmark and run.is_done():
+        if run.study.name == study and run.is_done():
             with tempfile.TemporaryDirectory() as scratch:
                 measured = savings(read_relearning(run.unpack(Path(scratch))))
             if measured:
