@@ -33,13 +33,26 @@ def metric(cell: dict) -> str:
 
 def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
     """Metrics, costs, and pairs that the intervals tell apart; best AUC first."""
-    groups = sorted(found["groups"].items(), key=lambda item: -(item[1]["metrics"]["auc"]["mean"] or 0))
-    rows = [[label, *(metric(group["metrics"][m]) for m in COLUMNS)] for label, group in groups]
-    yield "metrics", table(["algorithm", *COLUMNS.values()], rows)
-    rows = [[label, *costs(group["costs"])] for label, group in groups]
+    measured = {label: group["metrics"] for label, group in found["groups"].items()}
+    yield "metrics", metrics(measured)
+    yield "pairs", pairs(by_auc(measured), found["differences"])
+    if later := found["after_base_stage"]:
+        yield "later tasks", metrics(later["metrics"])
+        yield "pairs of later tasks", pairs(by_auc(later["metrics"]), later["differences"])
+    rows = [[label, *costs(found["groups"][label]["costs"])] for label in by_auc(measured)]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
-    yield "pairs", pairs([label for label, _ in groups], found["differences"])
+
+
+def metrics(measured: dict[str, dict]) -> list[str]:
+    """Lines of the table of metrics, by label."""
+    rows = [[label, *(metric(measured[label][name]) for name in COLUMNS)] for label in by_auc(measured)]
+    return table(["algorithm", *COLUMNS.values()], rows)
+
+
+def by_auc(measured: dict[str, dict]) -> list[str]:
+    """Labels, best AUC first."""
+    return sorted(measured, key=lambda label: -(measured[label]["auc"]["mean"] or 0))
 
 
 def pairs(labels: list[str], differences: list[dict]) -> list[str]:

@@ -5,6 +5,7 @@ The number after ± is the standard error over seeds; intervals and tests are th
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lifelong.report.comparability import MUJOCO, check_same_back_end
 from lifelong.report.runs import Group, Run
 from lifelong.report.statistics import statistics
 from lifelong.results.metrics import METRIC_NAMES, mean_and_standard_error
+from lifelong.results.results import has_later_tasks
 from lifelong.results.samples import Member, metric_values
 from lifelong.results.summary import json_safe
 
@@ -31,7 +33,9 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
         written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`. `differences`: of each pair, the
         first minus the second, with its interval, its p-value, that adjusted for all pairs (`told_apart` if below
         0.05), the number of `seeds` that would tell and the difference that is `shown` by the present ones.
-        `statistics`: how they were computed. `backend`: what simulated all rollouts.
+        `statistics`: how they were computed. `after_base_stage`: `metrics` by label and `differences` over the later
+        tasks alone, as if the sequence began with them, of the methods whose runs all learned a task after a base
+        stage; None if there are none. `backend`: what simulated all rollouts.
 
     Raises:
         ComparisonError: The runs are of different back ends.
@@ -46,7 +50,19 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
         "groups": {g.label: _group(g, measured[g.label], found["metrics"].get(g.label)) for g in groups},
         "differences": found["differences"],
         "statistics": found["statistics"],
+        "after_base_stage": _after_base_stage(measured),
     }
+
+
+def _after_base_stage(measured: Mapping[str, Sequence[Run]]) -> dict[str, Any] | None:
+    """Return metrics and differences over the later tasks alone, of the methods that learned some; None without any."""
+    later = {
+        label: [replace(m, scores=m.scores.without_first()) for m in members_of(runs)]
+        for label, runs in measured.items()
+        if runs and all(has_later_tasks(r.results) for r in runs)
+    }
+    found = statistics(later) if later else {}
+    return {name: found[name] for name in ("metrics", "differences")} if found else None
 
 
 def members_of(runs: Sequence[Run]) -> list[Member]:

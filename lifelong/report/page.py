@@ -3,7 +3,7 @@
 import base64
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,11 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
 def comparison_text(page: Path) -> list[str]:
     """Return what a comparison shows, in sentences, from the numbers beside its page."""
     found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
-    return findings(found, {name: text[0] for name, text in METRIC_TEXTS.items()})
+    return _findings(found) + [f"Later tasks alone: {line}" for line in _findings(found["after_base_stage"])]
+
+
+def _findings(found: dict[str, Any] | None) -> list[str]:
+    return findings(found, {name: text[0] for name, text in METRIC_TEXTS.items()}) if found else []
 
 
 def shift_text(run_dir: Path) -> list[str]:
@@ -168,6 +172,7 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
     """Return the template's variables for several runs, and write figures and numbers beside the page."""
     groups = group_runs(runs)
     found = compare(groups)
+    later = found["after_base_stage"]
     write_comparison(found, folder / "comparison.json")
     write_episodes(folder / "episodes.csv.gz", [(g.label, run.results) for g in groups for run in g.runs])
     panels, heatmaps, lines = zip(*map(_success_of, groups), strict=True)
@@ -186,9 +191,11 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
             for g in groups
             for r in g.repeats
         ],
-        "groups": _group_rows(groups, found),
+        "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
+        "later_groups": _group_rows(later["metrics"], found) if later else [],
         "differences": found["differences"],
-        "findings": findings(found, {name: text[0] for name, text in METRIC_TEXTS.items()}),
+        "findings": _findings(found),
+        "later_findings": _findings(later),
         "published": _published_of(found),
         "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in runs)),
         "forgotten_tasks": _forgotten_tasks(groups, found),
@@ -243,13 +250,12 @@ def _published_of(found: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
     return [(label, values) for label, values in rows if np.isfinite(values["fwt"])]
 
 
-def _group_rows(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
+def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row of metrics for each group, with the best of each column marked."""
-    rows: list[dict[str, Any]] = []
-    for group in groups:
-        measured = found["groups"][group.label]
-        cells = measured["metrics"]
-        rows.append({"label": group.label, "count": measured["measured"], "cells": cells, "best": set()})
+    rows: list[dict[str, Any]] = [
+        {"label": label, "count": found["groups"][label]["measured"], "cells": cells, "best": set()}
+        for label, cells in metrics.items()
+    ]
     for name in METRIC_NAMES:
         means = np.array([row["cells"][name]["mean"] for row in rows])
         if len(rows) > 1 and not np.isnan(means).all():

@@ -289,10 +289,13 @@ def after_base_stage(results: Results) -> Metrics | None:
     Returns:
         The metrics; None if the run has no base stage, or no later task is learned.
     """
+    return lifelong_metrics(results.scores().without_first()) if has_later_tasks(results) else None
+
+
+def has_later_tasks(results: Results) -> bool:
+    """Return whether a run has a base stage, and has learned a task after it."""
     run = results.run
-    if not run.has_base_stage or results.learned_tasks() <= len(run.groups[0]):
-        return None
-    return lifelong_metrics(results.scores().without_first())
+    return run.has_base_stage and results.learned_tasks() > len(run.groups[0])
 
 
 def _curve(records: list[EvalRecord], task: str) -> Curve:

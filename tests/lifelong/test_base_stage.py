@@ -1,5 +1,6 @@
 """A base stage of several tasks before the others: sequences, records, metrics, and runs that are killed in it."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from lifelong.algorithms import LoRA
 from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
 from lifelong.evaluation.restore import LoadedRun
-from lifelong.report.page import write_report
+from lifelong.report.page import comparison_text, write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Curve, Scores, lifelong_metrics
 from lifelong.results.provenance import start_record
@@ -109,19 +110,27 @@ def fill(log: ResultLog, cells: dict[tuple[str, int, int, int], float]) -> None:
         )
 
 
-def test_metrics_count_the_base_stage_as_one_task_and_the_later_tasks_are_measured_alone(tmp_path) -> None:
-    log = ResultLog(tmp_path / "results.jsonl")
-    log.append(record((3, 1, 1)))
+def fill_base(log: ResultLog) -> None:
     base = {("curve", 2, 0, task): 0.0 for task in range(3)}
     base |= {("curve", 2, 5, task): rate for task, rate in enumerate((0.9, 0.6, 0.6))}
     base |= {("matrix", 2, 5, task): rate for task, rate in enumerate((0.9, 0.6, 0.6))}
     fill(log, base)
-    assert log.read().learned_tasks() == 3
-    assert after_base_stage(log.read()) is None, "no later task is learned"
-    fill(log, {("curve", 3, 0, 3): 0.2, ("curve", 3, 5, 3): 0.8})
-    fill(log, {("matrix", 3, 5, task): rate for task, rate in enumerate((0.3, 0.3, 0.3, 0.8))})
+
+
+def fill_later(log: ResultLog, learned: float) -> None:
+    fill(log, {("curve", 3, 0, 3): 0.2, ("curve", 3, 5, 3): learned})
+    fill(log, {("matrix", 3, 5, task): rate for task, rate in enumerate((0.3, 0.3, 0.3, learned))})
     fill(log, {("curve", 4, 0, 4): 0.0, ("curve", 4, 5, 4): 1.0})
     fill(log, {("matrix", 4, 5, task): rate for task, rate in enumerate((0.1, 0.2, 0.3, 0.6, 1.0))})
+
+
+def test_metrics_count_the_base_stage_as_one_task_and_the_later_tasks_are_measured_alone(tmp_path) -> None:
+    log = ResultLog(tmp_path / "results.jsonl")
+    log.append(record((3, 1, 1)))
+    fill_base(log)
+    assert log.read().learned_tasks() == 3
+    assert after_base_stage(log.read()) is None, "no later task is learned"
+    fill_later(log, 0.8)
     results = log.read()
     assert results.learned_tasks() == 5
 
@@ -144,6 +153,42 @@ def test_metrics_count_the_base_stage_as_one_task_and_the_later_tasks_are_measur
     assert summary["metrics_after_base_stage"]["nbt"]["value"] == later.nbt.value
     page = write_report([tmp_path]).read_text(encoding="utf-8")
     assert "The 3 tasks that were learned together first count as one" in page
+
+
+def test_a_comparison_measures_the_later_tasks_alone(tmp_path) -> None:
+    runs = {}
+    for algo, learned in (("first", 0.8), ("second", 0.6), ("base_only", None)):
+        runs[algo] = tmp_path / algo
+        log = ResultLog(runs[algo] / "results.jsonl")
+        log.append(replace(record((3, 1, 1)), algo=algo))
+        fill_base(log)
+        if learned is not None:
+            fill_later(log, learned)
+    page = write_report(list(runs.values()), tmp_path / "page")
+    found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
+    later = found["after_base_stage"]
+    assert list(later["metrics"]) == ["first", "second"], "without a later task there is nothing to measure"
+    for algo in later["metrics"]:
+        alone = after_base_stage(ResultLog(runs[algo] / "results.jsonl").read())
+        for name in ("fwt", "nbt", "auc", "final_success", "just_learned"):
+            assert later["metrics"][algo][name]["mean"] == pytest.approx(getattr(alone, name).value)
+    (pair,) = later["differences"]
+    assert pair["metrics"]["just_learned"]["value"] == pytest.approx((0.8 - 0.6) / 2)
+    assert len(found["differences"]) == 3
+    assert "Of the later tasks alone, as if the sequence began with them" in page.read_text(encoding="utf-8")
+    assert any(line.startswith("Later tasks alone: ") for line in comparison_text(page))
+
+
+def test_a_comparison_without_a_base_stage_names_no_later_tasks(tmp_path) -> None:
+    for algo in ("first", "second"):
+        log = ResultLog(tmp_path / algo / "results.jsonl")
+        log.append(replace(record((1, 1)), algo=algo))
+        fill(log, {(kind, 0, 5, 0): 0.5 for kind in ("curve", "matrix")})
+    page = write_report([tmp_path / "first", tmp_path / "second"], tmp_path / "page")
+    assert (
+        json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))["after_base_stage"] is None
+    )
+    assert "Of the later tasks alone" not in page.read_text(encoding="utf-8")
 
 
 def test_without_a_base_stage_nothing_is_measured_apart(tmp_path) -> None:
