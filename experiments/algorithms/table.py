@@ -12,7 +12,7 @@ from pathlib import Path
 from study import planned
 
 from lifelong.report.tables import duration, quantity
-from lifelong.results.relearning import Savings, read_relearning, savings
+from lifelong.results.relearning import Savings, by_measure, read_relearning, savings
 
 HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
@@ -91,24 +91,38 @@ def costs(values: dict) -> list[str]:
     ]
 
 
-def relearning(study: str) -> list[str]:
-    """Lines of the table of relearning; none where nothing was measured."""
-    found: dict[str, list[Savings]] = {}
+def relearning(study: str) -> Iterator[tuple[str, list[str]]]:
+    """Tables of relearning, by error and by success; without lines where nothing was measured."""
+    found: dict[bool, dict[str, list[Savings]]] = {False: {}, True: {}}
     for run in planned():
         if run.study.name == study and run.is_done():
             with tempfile.TemporaryDirectory() as scratch:
-                measured = savings(read_relearning(run.unpack(Path(scratch))))
-            if measured:
-                found.setdefault(run.algo, []).extend(measured)
-    rows = []
-    for algo, tasks in sorted(found.items()):
-        again, first = [t.again for t in tasks], [t.first for t in tasks]
-        grown = statistics.median(t.final_error / t.learned_error for t in tasks)
-        shares = [t.share for t in tasks if t.share is not None]
-        saved = f"{statistics.median(shares):.2f}" if shares else "–"
-        rows.append([algo, f"{grown:.1f}", _middle(again), _middle(first), saved, str(len(tasks))])
-    heads = ["algorithm", "error at the end", "steps again", "steps at first", "savings", "tasks"]
-    return table(heads, rows) if rows else []
+                records = read_relearning(run.unpack(Path(scratch)))
+            for part in by_measure(records):
+                found[bool(part[0].episodes)].setdefault(run.algo, []).extend(savings(part))
+    steps = ["steps again", "steps at first", "savings", "tasks"]
+    rows = [[algo, _growth(tasks), *_steps(tasks)] for algo, tasks in sorted(found[False].items())]
+    yield "relearning", table(["algorithm", "error at the end", *steps], rows) if rows else []
+    rows = [[algo, *_success(tasks), *_steps(tasks)] for algo, tasks in sorted(found[True].items())]
+    heads = ["algorithm", "just learned", "at the end", *steps]
+    yield "relearning by success", table(heads, rows) if rows else []
+
+
+def _growth(tasks: list[Savings]) -> str:
+    return f"{statistics.median(t.final_error / t.learned_error for t in tasks):.1f}"
+
+
+def _success(tasks: list[Savings]) -> list[str]:
+    means = (
+        statistics.mean(1 - getattr(t, name) for t in tasks) for name in ("learned_error", "final_error")
+    )
+    return [f"{mean:.2f}" for mean in means]
+
+
+def _steps(tasks: list[Savings]) -> list[str]:
+    shares = [t.share for t in tasks if t.share is not None]
+    saved = f"{statistics.median(shares):.2f}" if shares else "–"
+    return [_middle([t.again for t in tasks]), _middle([t.first for t in tasks]), saved, str(len(tasks))]
 
 
 def _middle(steps: list[int | None]) -> str:
@@ -130,7 +144,8 @@ def main() -> None:
     for path in sorted(HERE.glob("*/comparison.json")):
         for name, lines in tables(json.loads(path.read_text(encoding="utf-8"))):
             text = insert(text, f"{path.parent.name}: {name}", lines)
-        text = insert(text, f"{path.parent.name}: relearning", relearning(path.parent.name))
+        for name, lines in relearning(path.parent.name):
+            text = insert(text, f"{path.parent.name}: {name}", lines)
     readme.write_text(text, encoding="utf-8")
 
 
