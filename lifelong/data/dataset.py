@@ -160,6 +160,7 @@ class SequenceVLDataset:
 
     def frames(self, indices: Tensor) -> Tensor:
         """Return the indices of the frames, (B, T), that the given windows (B,) cover."""
+        indices = indices.to(self.last.device)
         steps = torch.arange(self.seq_len, device=self.last.device)
         return torch.minimum(indices[:, None] + steps, self.last[indices][:, None])
 

@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset
+from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset, count_frames
 from lifelong.errors import DataError
 from lifelong.types import Batch, Count
 
@@ -125,6 +125,10 @@ class ReplayMemory(TaskMemory[Tensor]):
         """Return windows by their positions (B,) in the memory."""
         kept = [WindowSubset(self._datasets[task], indices) for task, indices in self._tasks.items()]
         return JoinedWindows(kept).batch(chosen)
+
+    def count_frames(self) -> int:
+        """Count the frames of the windows, one that several windows cover once."""
+        return sum(count_frames(self._datasets[task], indices) for task, indices in self._tasks.items())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and the indices by task id; frames are read again from the demonstrations."""

@@ -63,14 +63,14 @@ class JoinedWindows:
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64), those of one dataset after those of another."""
-        return reduce(Batch.join, [dataset.batch(chosen) for dataset, chosen in self._divided(indices)])
+        return reduce(Batch.join, [dataset.batch(chosen) for dataset, chosen in self.divided(indices)])
 
     def expect(self, indices: Tensor) -> None:
         """Read the windows of the given indices, (B,) int64, ahead where datasets can."""
-        for dataset, chosen in self._divided(indices):
+        for dataset, chosen in self.divided(indices):
             _expect(dataset, chosen)
 
-    def _divided(self, indices: Tensor) -> Iterator[tuple[WindowDataset, Tensor]]:
+    def divided(self, indices: Tensor) -> Iterator[tuple[WindowDataset, Tensor]]:
         """Yield each dataset of which there are windows, with their indices in it."""
         start = 0
         for dataset in self.datasets:
@@ -152,3 +152,24 @@ def of_episodes(dataset: WindowDataset, read: Callable[[Batch], Tensor]) -> tupl
     ends, of_window = getattr(dataset, "last", torch.arange(len(dataset))).unique(return_inverse=True)
     starts = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
     return torch.cat([read(dataset.batch(indices)) for indices in starts.split(_CHUNK)]), of_window
+
+
+def count_frames(dataset: WindowDataset, indices: Tensor) -> int:
+    """Count the frames that some windows cover, a frame of several windows once.
+
+    A dataset that reads a file knows which frames a window covers (`frames`). Without it every window counts with
+    frames of its own.
+
+    Args:
+        dataset: Windows, which may be parts or joins of others.
+        indices: The windows, (n,) int64.
+    """
+    if not len(indices):
+        return 0
+    if isinstance(dataset, JoinedWindows):
+        return sum(count_frames(part, chosen) for part, chosen in dataset.divided(indices))
+    if isinstance(dataset, WindowSubset):
+        return count_frames(dataset.dataset, dataset.chosen[indices])
+    if frames := getattr(dataset, "frames", None):
+        return len(frames(indices).unique())
+    return len(indices) * dataset.batch(indices[:1]).actions.shape[1]

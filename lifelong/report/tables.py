@@ -80,7 +80,7 @@ COST_COLUMNS = (
     Column("flops_per_action", "An action", "operations of one action with a full history", _flops),
     Column("parameters", "Parameters", "of the policy and of what the algorithm trains beside it", quantity),
     Column("parameters_trained", "Trained", "parameters that the optimiser moves", quantity),
-    Column("stored_bytes", "Stored", "kept from task to task: state, and windows to replay", _bytes),
+    Column("stored_bytes", "Stored", "kept from task to task: state, and frames to replay", _bytes),
     Column("peak_gpu_bytes", "GPU memory", "largest while learning a task", _bytes),
     Column("peak_memory_bytes", "Memory", "largest of the process so far", _bytes),
 )

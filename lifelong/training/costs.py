@@ -28,7 +28,7 @@ COSTS: Mapping[str, str] = {
     "parameters_trained": "parameters that the optimiser updates",
     "flops_per_step": "floating-point operations of a training step, replay and penalties included",
     "flops_per_action": "floating-point operations of one action, with a full history",
-    "stored_bytes": "storage the algorithm keeps from task to task: its state, and the windows it may replay",
+    "stored_bytes": "storage the algorithm keeps from task to task: its state, and the frames it may replay",
     "end_task_seconds": "wall time of the algorithm's work between two tasks",
     "peak_gpu_bytes": "largest memory held on the GPU while learning the task",
     "peak_memory_bytes": "largest memory of the process so far",
@@ -120,17 +120,17 @@ def _recurrent_flops(x: torch.Size, weights: Sequence[torch.Size]) -> int:
 
 
 def stored_bytes(algorithm: Algorithm) -> int:
-    """Count the bytes an algorithm keeps from task to task: tensors of its state, and windows of its memory.
+    """Count the bytes an algorithm keeps from task to task: tensors of its state, and frames of its memory.
 
-    A memory stores indices only, because the demonstrations stay available. Its windows count with the size they
-    would have without the demonstrations, uncompressed.
+    A memory stores indices only, because the demonstrations stay available. The frames of its windows count with the
+    size they would have without the demonstrations, uncompressed, and once where windows overlap.
     """
     total = _count_bytes(algorithm.state_dict())
     for memory in vars(algorithm).values():
         if isinstance(memory, ReplayMemory) and len(memory):
-            window = memory.sample(1, generator(0))
-            frames = (window.observation.images, *window.observation.proprio.values(), window.actions)
-            total += len(memory) * _count_bytes(list(frames)) // len(window)
+            windows = memory.sample(1, generator(0))
+            read = [windows.observation.images, *windows.observation.proprio.values(), windows.actions]
+            total += memory.count_frames() * _count_bytes(read) // windows.actions[..., 0].numel()
     return total
 
 

@@ -13,11 +13,12 @@ from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.er import ER
 from lifelong.data import SequenceVLDataset
 from lifelong.data.memory import ReplayMemory
+from lifelong.data.windows import StageWindows, WindowSubset, count_frames
 from lifelong.nn import TemporalLSTM
 from lifelong.policies import BCTransformer
 from lifelong.seeding import generator, seeded
 from lifelong.training.costs import COSTS, action_costs, count_flops, peak_costs, step_costs, stored_bytes
-from lifelong.types import PolicySpec
+from lifelong.types import Batch, PolicySpec
 from tests.harness.policies import small_rnn, small_transformer
 
 pytestmark = pytest.mark.unit
@@ -134,10 +135,36 @@ def test_stored_bytes():
     ewc.end_task(0, first, policy, generator(0))
     weights = 4 * sum(p.numel() for p in policy.parameters())
     assert stored_bytes(ewc) == pytest.approx(2 * weights, rel=0.01)  # Fisher and anchor
+
+
+@pytest.mark.parametrize("stage", [False, True], ids=["a task", "two tasks learned together"])
+def test_a_memory_stores_a_frame_of_several_windows_once(stage: bool):
+    parts = [dataset(0), dataset(1)] if stage else [dataset(0)]
+    learned = StageWindows(parts, 0) if stage else parts[0]
     er = ER(memory=ReplayMemory(9))
-    er.end_task(0, first, policy, generator(0))
-    window = 3 * (16 * 16 * 3 + 4 * 2 + 4 * 7)
-    assert stored_bytes(er) == 9 * (window + 8)  # and an index each
+    er.end_task(0, learned, transformer(), generator(0))
+    kept = er.state_dict()["memory"]["indices"]["0"].tolist()
+    # a window covers three frames, fewer at the end of its demonstration
+    ends = {i: 20 * (i // 20) + 20 for i in kept}
+    frames = {frame for i in kept for frame in range(i, min(i + 3, ends[i]))}
+    assert 9 < len(frames) < 27, "some windows overlap"
+    assert stored_bytes(er) == len(frames) * (16 * 16 * 3 + 4 * 2 + 4 * 7) + 9 * 8  # and an index each
+
+
+def test_windows_whose_frames_are_not_known_count_one_by_one():
+    whole = dataset(0)
+
+    class Plain:
+        def __len__(self) -> int:
+            return len(whole)
+
+        def batch(self, indices: torch.Tensor) -> Batch:
+            return whole.batch(indices)
+
+    assert count_frames(Plain(), torch.tensor([0, 1, 2])) == 9
+    assert count_frames(whole, torch.tensor([0, 1, 2])) == 5
+    assert count_frames(WindowSubset(whole, torch.tensor([7, 18, 19])), torch.tensor([1, 2])) == 2
+    assert count_frames(whole, torch.tensor([], dtype=torch.int64)) == 0
 
 
 def test_peak_memory_is_that_of_this_process():
