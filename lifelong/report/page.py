@@ -141,7 +141,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "notes": run.notes,
         "metrics": _metric_rows(run.metrics),
         "later_metrics": _metric_rows(after_base_stage(run.results)),
-        "base_tasks": len(record.groups[0]) if record.has_base_stage else 0,
+        "base_tasks": _base_tasks(record),
         "transfer": TRANSFER_TEXTS[run.results.transfer],
         "published": _published(run),
         "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run.metrics))]),
@@ -184,6 +184,11 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "facts": [
             ("runs", sum(len(g.runs) for g in groups)),
             ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs})))),
+            *[
+                ("tasks learned together first", n)
+                for n in sorted({_base_tasks(r.record) for r in runs})
+                if n
+            ],
         ],
         "notes": [f"{r.path}: {note}" for r in runs for note in r.notes]
         + [
@@ -230,6 +235,11 @@ def _facts(record: RunRecord) -> list[tuple[str, Any]]:
         ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),
     ]
     return facts + [("CPUs", record.cpu_count)] + ([("commit", record.commit[:10])] if record.commit else [])
+
+
+def _base_tasks(record: RunRecord) -> int:
+    """Return the number of tasks of the base stage, 0 without one."""
+    return len(record.groups[0]) if record.has_base_stage else 0
 
 
 def _metric_rows(metrics: Metrics | None) -> list[dict[str, Any]]:

@@ -175,7 +175,9 @@ def test_a_comparison_measures_the_later_tasks_alone(tmp_path) -> None:
     (pair,) = later["differences"]
     assert pair["metrics"]["just_learned"]["value"] == pytest.approx((0.8 - 0.6) / 2)
     assert len(found["differences"]) == 3
-    assert "Of the later tasks alone, as if the sequence began with them" in page.read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
+    assert "Of the later tasks alone, as if the sequence began with them" in text
+    assert "<dt>tasks learned together first</dt><dd>3</dd>" in text
     assert any(line.startswith("Later tasks alone: ") for line in comparison_text(page))
 
 
