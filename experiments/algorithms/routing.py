@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 
 from lifelong.algorithms import CLARE
+from lifelong.evaluation.relearning import FailureShare
 from lifelong.evaluation.restore import LoadedRun, restore
-from lifelong.evaluation.rollout import rollout
 from lifelong.policies.base import Policy
 
 EPISODES = 20
@@ -46,18 +46,7 @@ class Watched(CLARE):
 def success(run: LoadedRun, policy: Policy, task: int) -> float:
     """Return the share of rollouts of a task that succeed."""
     with closing(run.environment(task, EPISODES, run.eval.horizon)) as env:
-        done = rollout(
-            policy,
-            env,
-            range(EPISODES),
-            language=run.embed(run.learned_task(task)),
-            horizon=run.eval.horizon,
-            settle_steps=run.eval.settle_steps,
-            seed=(run.seed, task),
-            device=run.device,
-            precision=run.eval.precision,
-        )
-    return done.rate
+        return 1 - FailureShare(run, task, env, EPISODES)(policy)
 
 
 def main() -> None:

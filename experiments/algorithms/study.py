@@ -2,7 +2,7 @@
 
     python experiments/algorithms/study.py list                # each run: done or missing, its cost, its command
     python experiments/algorithms/study.py run --minutes 120   # go on with what is missing, until it is stopped
-    python experiments/algorithms/study.py relearn             # how fast tasks come back, where a run's weights are
+    python experiments/algorithms/study.py relearn             # how fast tasks come back (--by success)
     python experiments/algorithms/study.py report              # tables and pictures of what is finished
 
 A run is a process of its own on one thread. One that was stopped goes on where it was; of a finished one the records
