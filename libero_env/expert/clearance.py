@@ -200,6 +200,29 @@ def _highest_near(
     return highest
 
 
+def overhang(points: np.ndarray, middle: np.ndarray, radius: float, low: float, high: float) -> np.ndarray:
+    """Return the points near a spot that hang over it, (M, 3): what also stands below them is a wall.
+
+    Args:
+        points: Points on obstacles, (N, 3), [m].
+        middle: The spot; x and y count.
+        radius: Horizontal distance from the spot that counts as near, [m].
+        low: Height below which a column with a point is a wall, [m]; the table is not among the points.
+        high: Height up to which something counts, [m].
+    """
+    aside = points[:, :2] - middle[:2]
+    near = (np.abs(aside) < radius + _COARSE_CELL).all(axis=1)
+    points, aside = points[near], aside[near]
+    if not len(points):
+        return points
+    _, column = np.unique(np.floor(points[:, :2] / _COARSE_CELL), axis=0, return_inverse=True)
+    column = column.ravel()
+    lowest = np.full(column.max() + 1, np.inf)
+    np.minimum.at(lowest, column, points[:, 2])
+    hangs = (lowest[column] > low) & (points[:, 2] < high) & (np.linalg.norm(aside, axis=1) < radius)
+    return points[hangs]
+
+
 def _box_points(x: tuple, y: tuple, z: tuple, spacing: float = _COARSE_CELL) -> np.ndarray:
     """Return points on the surface of a box with these (low, high) coordinates, (N, 3)."""
     axes = [np.linspace(a, b, max(2, int(np.ceil((b - a) / spacing)) + 1)) for a, b in (x, y, z)]

@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 
 from libero_env.assets.robot import FINGER_JOINTS
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.record import DemoRecorder
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
 from libero_env.expert.arm.gripper import GRIPPER
 from libero_env.expert.arm.kinematics import limit_elbow_extension
 from libero_env.expert.arm.servo import action_toward, downward
+from libero_env.expert.clearance import overhang
 from libero_env.expert.grasping.costs import finger_offset, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, find_grasps
 from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
@@ -308,6 +311,31 @@ def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     assert isinstance(move, Move)
     assert move.pos[2] - view.eef_pos[2] + low > plan.place.pos[2] + 0.04  # not yet where it will stand
     assert rim > plan.place.pos[2] + 0.04
+
+
+def test_what_hangs_over_an_object_is_told_from_a_wall_beside_it():
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(0.0, 0.2, 41)))
+    wall = np.stack([np.full_like(y, 0.047), y, z], axis=1)
+    floor = np.stack([y - 0.07, z - 0.1, np.full_like(y, 0.15)], axis=1)  # of a drawer, above x < 0.03
+    middle = np.zeros(2)
+    above = overhang(np.concatenate([wall, floor]), middle, 0.05, 0.06, 0.3)
+    assert len(above) > 100
+    np.testing.assert_allclose(above[:, 2], 0.15)
+    assert above[:, 0].min() < -0.04 and above[:, 0].max() < 0.035
+    assert np.linalg.norm(above[:, :2], axis=1).max() < 0.05
+    assert not len(overhang(floor, middle, 0.05, 0.06, 0.1))  # as far above as does not matter
+    assert not len(overhang(floor, middle, 0.05, 0.2, 0.3))  # below
+    assert not len(overhang(NOTHING, middle, 0.05, 0.06, 0.3))
+
+
+@pytest.mark.sim
+def test_a_bowl_below_an_open_drawer_is_drawn_out_before_it_is_lifted():
+    """Lifted straight up, the bowl meets the drawer; a hand that pulls harder slips off the handle."""
+    recorder = DemoRecorder(DemoConfig("libero_goal/3", (64, 64)))
+    attempts = [attempt for _, attempt in recorder.attempt([(k, 0) for k in range(5)])]
+    recorder.close()
+    assert [attempt.retries for attempt in attempts] == [0] * 5
+    assert max(map(len, attempts)) < 240
 
 
 @pytest.mark.sim

@@ -23,7 +23,8 @@ MAX_RETRIES = 5
 ARRIVED, ARRIVED_TURN = 0.008, 0.15  # [m], [rad] from where the fingers close
 APPROACH = 0.08  # [m] from which the hand comes along its approach
 OBSTACLE_RADIUS = 0.07  # [m] around the hand
-LEAD = 0.06  # [m] of the target ahead of the hand while it moves the part
+# [m] of the target ahead of the hand that pushes a part, or pulls it: harder, it slips off slanting handles of drawers
+PUSH_LEAD, PULL_LEAD = 0.06, 0.035
 MAX_SLIP = 0.035  # [m] between hand and grasp
 WITHDRAWN = 0.06  # [m] from the part, where the hand counts as withdrawn
 AJAR, PULLED = 0.5, 0.85  # [rad] from which on a door is pushed open, and up to which it is pulled
@@ -226,7 +227,7 @@ class MoveJoint(Skill):
             return self._start("release", view)
         if grasp.gripping and np.linalg.norm(view.eef_pos - contact.pos) > MAX_SLIP:
             return self._let_go(view)
-        lead = min(LEAD / radius, 0.5)
+        lead = min((PULL_LEAD if grasp.gripping else PUSH_LEAD) / radius, 0.5)
         ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond the target, as the hand gives way
         if self.state == "turnoff":
             ahead = np.sign(left) * self._knob_lead(left, speed)

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from libero_env.expert.arm.servo import lateral_ramp
-from libero_env.expert.clearance import hand_extent_below, obstacle_height
+from libero_env.expert.clearance import hand_extent_below, obstacle_height, overhang
 from libero_env.expert.planning.pick_plan import PickPlan
 from libero_env.expert.planning.reachability import ENTRY_DISTANCE
 from libero_env.expert.shapes import Shapes, pose_of
@@ -30,6 +30,12 @@ MAX_SAG = 0.01  # [m] that a hand is commanded to be higher, as its load draws i
 # a hand that brakes before it lets go cannot be cloned: the clone comes to rest just short of where the fingers open
 SINKING = 0.02  # [m] below its place, where the hand is commanded to
 BLOCKED_DISTANCE = 0.03  # [m] before its place, at which an object that stops is blocked
+# an object that stands below something, such as a drawer just opened, is drawn out before it is lifted
+CLEAR = 0.01  # [m] around the object that is free of what hangs over it, before it is lifted
+OVERHANG_HEIGHT = 0.25  # [m] above the object, up to which something is in its way
+DRAW_OUT = 0.06  # [m] of the target ahead of the hand, and least distance to the place
+MIN_ASIDE = 0.1  # of the object's radius, from its middle to that of the overhang: else no way out is seen
+HEADROOM, DRAW_UP = 0.05, 0.03  # [m] above the object, from which on it also rises on its way, by so much
 MAX_IDLE_STEPS = 20  # steps without motion after which a place is out of reach
 MAX_EXIT_STEPS = 30  # steps to back out of where something blocks the way
 
@@ -82,6 +88,7 @@ class Transport:
         self._exit_pose, self._steps = exit_pose, 0
         self._blocked_steps = 0  # in which something resisted the way in
         self._idle_steps, self._previous_turn = 0, 0.0  # without motion; [rad] that the hand had to rotate
+        self._is_covered = True  # by something overhead, as far as is known
         self._inserting = False  # on the last part of the way: down between walls, or in from a side
 
     @property
@@ -122,6 +129,10 @@ class Transport:
         if self._idle_steps > MAX_IDLE_STEPS:
             return "blocked"
         below = max(self._extent_below(view), hand_extent_below(self._mat))
+        if self._is_covered and np.linalg.norm(goal[:2] - pos[:2]) > DRAW_OUT:
+            if (draw_out := self._draw_out(view)) is not None:
+                return draw_out
+            self._is_covered = False
         if place.from_above:
             return self._lower(view, goal, turn, below, slow)
         return self._enter_from_side(view, goal, turn, below, slow)
@@ -136,6 +147,21 @@ class Transport:
             goal = place.pos + [0, 0, RELEASE_GAP] - self._mat @ self._offset(view)
             pos = goal - ENTRY_DISTANCE * place.entry
         return Pose(pos, view.eef_mat)
+
+    def _draw_out(self, view: StateView) -> Move | None:
+        """Return the motion away from what hangs over the object, or None where it can be lifted."""
+        middle, radius, top = self._ground_plan(view)
+        obstacles = self._obstacles(view)
+        obstacles = obstacles[obstacles[:, 2] > self._surface_height(view) + 0.005]
+        above = overhang(obstacles, middle, radius + CLEAR, top - 0.002, top + OVERHANG_HEIGHT)
+        if not len(above):
+            return None
+        aside = middle - above[:, :2].mean(axis=0)
+        distance = float(np.linalg.norm(aside))
+        if distance < MIN_ASIDE * radius:
+            return None
+        rise = DRAW_UP if above[:, 2].min() - top > HEADROOM else 0.0
+        return Move(view.eef_pos + [*(DRAW_OUT / distance * aside), rise], view.eef_mat)
 
     def _lower(
         self, view: StateView, goal: np.ndarray, turn: float, below: float, slow: bool
@@ -236,13 +262,19 @@ class Transport:
 
     def _path_height(self, view: StateView, goal: np.ndarray) -> float:
         """Return the height of the highest obstacle that object and hand pass on the way to a goal (3,), [m]."""
-        points = self.shapes.points(view, self._object, 0.02)[:, :2]
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.01
+        middle, radius, _ = self._ground_plan(view)
+        radius += 0.01
         offset = np.array([*(middle - view.eef_pos[:2]), 0.0])
         obstacles, surface = self._obstacles(view), self._surface_height(view)
         for_object = obstacle_height(obstacles, view.eef_pos + offset, goal + offset, radius, surface)
         return max(for_object, obstacle_height(obstacles, view.eef_pos, goal, HAND_RADIUS, surface))
+
+    def _ground_plan(self, view: StateView) -> tuple[np.ndarray, float, float]:
+        """Return the middle of the object in the ground plan, (2,), its radius there, and its top, [m]."""
+        points = self.shapes.points(view, self._object, 0.02)
+        plan = points[:, :2]
+        middle = 0.5 * (plan.min(axis=0) + plan.max(axis=0))
+        return middle, float(np.linalg.norm(plan - middle, axis=1).max()), float(points[:, 2].max())
 
     def _obstacles(self, view: StateView) -> np.ndarray:
         return self.shapes.obstacles(view, self._object)
