@@ -9,9 +9,11 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from study import planned
+from study import Planned, planned
 
 from lifelong.report.tables import duration, quantity
+from lifelong.results.log import ResultLog
+from lifelong.results.records import LossRecord
 from lifelong.results.relearning import Savings, by_measure, read_relearning, savings
 
 HERE = Path(__file__).parent
@@ -31,7 +33,7 @@ def metric(cell: dict) -> str:
     return f"{cell['mean']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
 
 
-def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
+def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
     """Metrics, costs, and pairs that the intervals tell apart; best AUC first."""
     measured = {label: group["metrics"] for label, group in found["groups"].items()}
     yield "metrics", metrics(measured)
@@ -39,7 +41,11 @@ def tables(found: dict) -> Iterator[tuple[str, list[str]]]:
     if later := found["after_base_stage"]:
         yield "later tasks", metrics(later["metrics"])
         yield "pairs of later tasks", pairs(by_auc(later["metrics"]), later["differences"])
-    rows = [[label, *costs(found["groups"][label]["costs"])] for label in by_auc(measured)]
+    training = training_seconds(study)
+    rows = [
+        [label, duration(training[label]), *costs(found["groups"][label]["costs"])]
+        for label in by_auc(measured)
+    ]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
 
@@ -80,9 +86,8 @@ def pairs(labels: list[str], differences: list[dict]) -> list[str]:
 
 
 def costs(values: dict) -> list[str]:
-    """Cells of a row of costs."""
+    """Cells of a row of costs, behind the time of training."""
     return [
-        duration(values["training_seconds"]),
         duration(values.get("end_task_seconds", 0.0)),
         quantity(values["flops_per_step"], "FLOP"),
         quantity(values["parameters_trained"]),
@@ -91,15 +96,33 @@ def costs(values: dict) -> list[str]:
     ]
 
 
-def relearning(study: str) -> Iterator[tuple[str, list[str]]]:
-    """Tables of relearning, by error and by success; without lines where nothing was measured."""
-    found: dict[bool, dict[str, list[Savings]]] = {False: {}, True: {}}
+def training_seconds(study: str) -> dict[str, float]:
+    """Time of training a task, by algorithm: of each task the fastest epoch of all seeds, as other work ran beside."""
+    found: dict[str, dict[int, float]] = {}  # of each task, by algorithm
+    for run, folder in finished(study):
+        epochs: dict[int, list[float]] = {}
+        for record in ResultLog(folder / "results.jsonl").read().of(LossRecord):
+            epochs.setdefault(record.task, []).append(record.seconds)
+        seconds = found.setdefault(run.algo, {})
+        for task, times in epochs.items():
+            seconds[task] = min(seconds.get(task, float("inf")), len(times) * min(times))
+    return {algo: statistics.mean(tasks.values()) for algo, tasks in found.items()}
+
+
+def finished(study: str) -> Iterator[tuple[Planned, Path]]:
+    """Yield the finished runs of a study, each with a folder of its records."""
     for run in planned():
         if run.study.name == study and run.is_done():
             with tempfile.TemporaryDirectory() as scratch:
-                records = read_relearning(run.unpack(Path(scratch)))
-            for part in by_measure(records):
-                found[bool(part[0].episodes)].setdefault(run.algo, []).extend(savings(part))
+                yield run, run.unpack(Path(scratch))
+
+
+def relearning(study: str) -> Iterator[tuple[str, list[str]]]:
+    """Tables of relearning, by error and by success; without lines where nothing was measured."""
+    found: dict[bool, dict[str, list[Savings]]] = {False: {}, True: {}}
+    for run, folder in finished(study):
+        for part in by_measure(read_relearning(folder)):
+            found[bool(part[0].episodes)].setdefault(run.algo, []).extend(savings(part))
     steps = ["steps again", "steps at first", "savings", "tasks"]
     rows = [[algo, _growth(tasks), *_steps(tasks)] for algo, tasks in sorted(found[False].items())]
     yield "relearning", table(["algorithm", "error at the end", *steps], rows) if rows else []
@@ -142,7 +165,7 @@ def main() -> None:
     readme = HERE / "README.md"
     text = readme.read_text(encoding="utf-8")
     for path in sorted(HERE.glob("*/comparison.json")):
-        for name, lines in tables(json.loads(path.read_text(encoding="utf-8"))):
+        for name, lines in tables(path.parent.name, json.loads(path.read_text(encoding="utf-8"))):
             text = insert(text, f"{path.parent.name}: {name}", lines)
         for name, lines in relearning(path.parent.name):
             text = insert(text, f"{path.parent.name}: {name}", lines)

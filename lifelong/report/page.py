@@ -199,6 +199,7 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
         "later_groups": _group_rows(later["metrics"], found) if later else [],
         "differences": found["differences"],
+        "later_differences": later["differences"] if later else [],
         "findings": _findings(found),
         "later_findings": _findings(later),
         "published": _published_of(found),

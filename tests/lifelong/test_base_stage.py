@@ -178,6 +178,10 @@ def test_a_comparison_measures_the_later_tasks_alone(tmp_path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "Of the later tasks alone, as if the sequence began with them" in text
     assert "<dt>tasks learned together first</dt><dd>3</dd>" in text
+    rows = text.split("Differences between methods")[1].split("Of the later tasks alone:")
+    assert [part.split("</details>")[0].count("first − second") for part in rows] == [1, 1], (
+        "one row in each table"
+    )
     assert any(line.startswith("Later tasks alone: ") for line in comparison_text(page))
 
 
