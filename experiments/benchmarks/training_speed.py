@@ -103,7 +103,7 @@ def measure(job: Job) -> dict[str, float | str]:
     """Median seconds of a step, peak memory in bytes, operations of a step; with `profile` torch's table."""
     torch.set_num_threads(job.threads)
     keep_freed_memory()
-    policy, batch = build(job)
+    policy, batch = prepare(job)
     step, draws, cuda = make_step(job, policy), generator(0), job.device.startswith("cuda")
     wait = torch.cuda.synchronize if cuda else lambda: None
     for _ in range(5 if cuda else 1):  # kernels are chosen, graphs are recorded

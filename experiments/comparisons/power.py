@@ -7,7 +7,7 @@ import argparse
 from dataclasses import replace
 
 import numpy as np
-from coverage import table
+from interval_coverage import table
 from model import Design, Method, samples_of, simulate, truths
 
 from lifelong.results.contrasts import Contrast, contrasts

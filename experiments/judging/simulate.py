@@ -17,11 +17,11 @@ from lifelong.results.differences import (
     Counts,
     Pairs,
     bootstrap_starts,
-    holm,
     mcnemar_exact,
     score_interval,
     sign_flip_test,
 )
+from lifelong.results.intervals import holm
 from lifelong.results.sequential import sequential_test
 
 TASKS = 10

@@ -1,0 +1,75 @@
+"""Scripts of experiments are run by hand: that what they import from the project is still there is checked here."""
+
+import ast
+import importlib
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+SCRIPTS = sorted(EXPERIMENTS.rglob("*.py"))
+PACKAGES = ("libero", "libero_env", "lifelong")
+# of extras, and of environments in which some scripts are run
+FOREIGN = (
+    "easydict",
+    "gymnasium",
+    "liberoplus",
+    "robomimic",
+    "robosuite",
+    "tests",
+    "warp",
+    "websocket_policy_server",
+)
+pytestmark = pytest.mark.unit
+
+
+def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
+    """Yield (module, name) of every import, wherever it stands; name is None where a module is imported."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def top_level_names(path: Path) -> set[str]:
+    """Return what a script defines or imports."""
+    found: set[str] = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for part in ast.walk(node):
+            if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
+                found.add(part.id)
+            elif isinstance(part, ast.FunctionDef | ast.ClassDef):
+                found.add(part.name)
+            elif isinstance(part, ast.alias):
+                found.add(part.asname or part.name)
+    return found
+
+
+def exists(module: str, name: str | None) -> bool:
+    """Return whether an import from the project would work."""
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        return not (error.name or "").startswith(PACKAGES)  # an extra that is not installed tells nothing
+    if name is None or hasattr(found, name):
+        return True
+    return importlib.util.find_spec(f"{module}.{name}") is not None if hasattr(found, "__path__") else False
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(EXPERIMENTS)))
+def test_what_a_script_imports_exists(script):
+    missing = []
+    for module, name in imported(ast.parse(script.read_text(encoding="utf-8"))):
+        package, beside = module.split(".")[0], script.with_name(f"{module}.py")
+        if beside.is_file():
+            found = name is None or name in top_level_names(beside)
+        elif package in PACKAGES:
+            found = exists(module, name)
+        else:
+            found = importlib.util.find_spec(package) is not None or package in FOREIGN
+        if not found:
+            missing.append(f"{module}.{name}" if name else module)
+    assert not missing, f"{script} imports what does not exist: {', '.join(missing)}"
