@@ -9,7 +9,7 @@ from libero_env.expert.arm.servo import lateral_ramp
 from libero_env.expert.clearance import hand_extent_below, obstacle_height, overhang
 from libero_env.expert.planning.pick_plan import PickPlan
 from libero_env.expert.planning.reachability import ENTRY_DISTANCE
-from libero_env.expert.shapes import Shapes, pose_of
+from libero_env.expert.shapes import COARSE, Shapes, pose_of
 from libero_env.expert.skills.approach import funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
@@ -30,11 +30,12 @@ MAX_SAG = 0.01  # [m] that a hand is commanded to be higher, as its load draws i
 # a hand that brakes before it lets go cannot be cloned: the clone comes to rest just short of where the fingers open
 SINKING = 0.02  # [m] below its place, where the hand is commanded to
 BLOCKED_DISTANCE = 0.03  # [m] before its place, at which an object that stops is blocked
-# an object that stands below something, such as a drawer just opened, is drawn out before it is lifted
-CLEAR = 0.01  # [m] around the object that is free of what hangs over it, before it is lifted
+# an object that stands below a fixture, such as a drawer just opened, is drawn out before it is lifted
+CLEAR = 0.03  # [m] around the object over which no fixture may hang, as a clone does not rise as straight
 OVERHANG_HEIGHT = 0.25  # [m] above the object, up to which something is in its way
 DRAW_OUT = 0.06  # [m] of the target ahead of the hand, and least distance to the place
 MIN_ASIDE = 0.1  # of the object's radius, from its middle to that of the overhang: else no way out is seen
+WIDE_BERTH = 0.03  # [m] by which such an object is carried higher: it has what hung over it close beside it
 HEADROOM, DRAW_UP = 0.05, 0.03  # [m] above the object, from which on it also rises on its way, by so much
 MAX_IDLE_STEPS = 20  # steps without motion after which a place is out of reach
 MAX_EXIT_STEPS = 30  # steps to back out of where something blocks the way
@@ -88,7 +89,8 @@ class Transport:
         self._exit_pose, self._steps = exit_pose, 0
         self._blocked_steps = 0  # in which something resisted the way in
         self._idle_steps, self._previous_turn = 0, 0.0  # without motion; [rad] that the hand had to rotate
-        self._is_covered = True  # by something overhead, as far as is known
+        self._clearance = style.carry_clearance  # [m] over what the object passes
+        self._is_covered = True  # by a fixture, as far as is known
         self._inserting = False  # on the last part of the way: down between walls, or in from a side
 
     @property
@@ -131,6 +133,7 @@ class Transport:
         below = max(self._extent_below(view), hand_extent_below(self._mat))
         if self._is_covered and np.linalg.norm(goal[:2] - pos[:2]) > DRAW_OUT:
             if (draw_out := self._draw_out(view)) is not None:
+                self._clearance = self.style.carry_clearance + WIDE_BERTH
                 return draw_out
             self._is_covered = False
         if place.from_above:
@@ -142,18 +145,19 @@ class Transport:
         place, pos = self.plan.place, view.eef_pos
         if place.from_above:
             high = self._path_height(view, pos) + self._extent_below(view)
-            pos = np.array([*pos[:2], max(pos[2], high + self.style.carry_clearance)])
+            pos = np.array([*pos[:2], max(pos[2], high + self._clearance)])
         elif self._inserting:
             goal = place.pos + [0, 0, RELEASE_GAP] - self._mat @ self._offset(view)
             pos = goal - ENTRY_DISTANCE * place.entry
         return Pose(pos, view.eef_mat)
 
     def _draw_out(self, view: StateView) -> Move | None:
-        """Return the motion away from what hangs over the object, or None where it can be lifted."""
+        """Return the motion away from the fixture that hangs over the object, or None where it can be lifted."""
         middle, radius, top = self._ground_plan(view)
-        obstacles = self._obstacles(view)
-        obstacles = obstacles[obstacles[:, 2] > self._surface_height(view) + 0.005]
-        above = overhang(obstacles, middle, radius + CLEAR, top - 0.002, top + OVERHANG_HEIGHT)
+        clouds = [self.shapes.points(view, name, COARSE) for name in view.scene.fixtures]
+        fixtures = np.concatenate([*clouds, np.zeros((0, 3))])
+        fixtures = fixtures[fixtures[:, 2] > self._surface_height(view) + 0.005]
+        above = overhang(fixtures, middle, radius + CLEAR, top - 0.002, top + OVERHANG_HEIGHT)
         if not len(above):
             return None
         aside = middle - above[:, :2].mean(axis=0)
@@ -184,14 +188,14 @@ class Transport:
         if self._blocked_steps > 1:
             return "blocked" if pos[2] - goal[2] > BLOCKED_DISTANCE else "arrived"
         walls = obstacle_height(self._obstacles(view), goal, goal, 0.05, self._surface_height(view))
-        over_walls = walls + below + style.carry_clearance
+        over_walls = walls + below + self._clearance
         target = goal.copy()
         target[2] += funnel_lift(style.funnel_slope, away - (0.03 if drops else 0.012), turn - 0.12, 0.04)
         if aligned and not drops:
             target[2] -= SINKING
-        deep = over_walls - style.carry_clearance - goal[2] > MIN_WALL and not drops
+        deep = over_walls - self._clearance - goal[2] > MIN_WALL and not drops
         if self._stays_above(away, turn, deep, slow):
-            over_path = self._path_height(view, goal) + below + 0.7 * style.carry_clearance
+            over_path = self._path_height(view, goal) + below + 0.7 * self._clearance
             target[2] = max(target[2], over_walls, over_path)
         lateral_scale = lateral_ramp(pos[2], target[2], 0.0, 0.05)
         mat = view.eef_mat if lateral_scale == 0.0 and self._is_beside_obstacles(view) else self._mat
@@ -230,7 +234,7 @@ class Transport:
             self._inserting = bool(np.linalg.norm(before - pos) < 0.02 and turn < 0.2)
             target = before.copy()
             if np.linalg.norm(before[:2] - pos[:2]) > 0.04 or turn > 0.4:
-                high = self._path_height(view, before) + below + 0.7 * self.style.carry_clearance
+                high = self._path_height(view, before) + below + 0.7 * self._clearance
                 target[2] = max(target[2], high)
             return Move(target, self._mat, lateral_ramp(pos[2], target[2], 0.0, 0.05))
         left = float((goal - pos) @ entry)
