@@ -41,6 +41,19 @@ def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -
     return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=(initializer,))
 
 
+def check_main_guard() -> None:
+    """Check that this process is not a worker of `spawn_pool` that still imports the main script.
+
+    Raises:
+        LiberoError: It is: the script calls this without a guard, and its workers would wait for it, and it for them.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # as `multiprocessing.spawn` tells
+        raise LiberoError(
+            "worker processes import the script that was started, and it starts workers when it is imported: put what "
+            'it does into a function, and call that below `if __name__ == "__main__":`'
+        )
+
+
 class _Pool(ProcessPoolExecutor):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
@@ -51,8 +64,8 @@ class _Pool(ProcessPoolExecutor):
         self.shutdown(wait=True, cancel_futures=kind is not None)
         if kind is not None and issubclass(kind, BrokenExecutor):
             raise LiberoError(
-                "a worker process was killed, by the system if memory was short; what is finished is kept. The same "
-                "command goes on; fewer workers need less memory"
+                "a worker process ended, for the reason above or killed by the system if memory was short; what is "
+                "finished is kept. The same command goes on; fewer workers need less memory"
             ) from error
 
 

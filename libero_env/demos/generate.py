@@ -28,7 +28,7 @@ from libero_env.demos.record import (
 )
 from libero_env.demos.write import OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.parallel import as_finished, cpu_count, progress_bar, spawn_pool
+from libero_env.parallel import as_finished, check_main_guard, cpu_count, progress_bar, spawn_pool
 from libero_env.paths import demos_dir
 from libero_env.sim.scene import FAST
 from libero_env.tasks import Task, get_suite
@@ -276,6 +276,7 @@ def _remove_outdated(job: RecordingJob) -> None:
 @contextmanager
 def recording_lock(folder: Path) -> Iterator[None]:
     """Let one process at a time record or render in a folder; the lock of a process that was killed is free."""
+    check_main_guard()
     lock = FileLock(folder / ".recording.lock")
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -157,9 +157,9 @@ def test_a_faithful_drawing_is_recorded(whole, tmp_path):
 @pytest.mark.parametrize(
     ("config", "folder"),
     [
-        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-12"),
-        (DemoConfig("libero_object/0", (64, 64), drawing="fast"), "64x64-seed0-scripted-expert-12"),
-        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-12-d9a2a37b"),
+        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-13"),
+        (DemoConfig("libero_object/0", (64, 64), drawing="fast"), "64x64-seed0-scripted-expert-13"),
+        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-13-d9a2a37b"),
         (
             DemoConfig(
                 "libero_goal/3",
@@ -168,9 +168,9 @@ def test_a_faithful_drawing_is_recorded(whole, tmp_path):
                 cameras=("agentview",),
                 modalities=("rgb", "depth"),
             ),
-            "128x128-seed0-scripted-expert-12-800fa04f",
+            "128x128-seed0-scripted-expert-13-800fa04f",
         ),
-        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-12-bf1e44b3"),
+        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-13-bf1e44b3"),
     ],
 )
 def test_folders_of_earlier_versions_are_found(config, folder, tmp_path):
@@ -231,6 +231,18 @@ def test_no_worker_outlives_a_killed_recording(tmp_path):
     while any(_runs(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert len(workers) == 2 and not any(_runs(pid) for pid in workers)
+
+
+def test_a_script_without_a_main_guard_is_told_so_and_does_not_wait_for_itself(tmp_path):
+    file = tmp_path / "record.py"
+    file.write_text(
+        "from libero_env.demos.generate import generate\n"
+        f"generate({TASK!r}, 10, path={str(tmp_path / 'x.hdf5')!r}, workers=2, camera_size={SIZE})\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, str(file)], stderr=subprocess.PIPE, text=True, env=environment)
+    assert done.returncode == 1
+    assert 'if __name__ == "__main__":' in done.stderr and "a worker process ended" in done.stderr
 
 
 def _runs(pid: int) -> bool:

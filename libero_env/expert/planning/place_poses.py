@@ -35,12 +35,14 @@ class PlacePose:
         mat: Orientation of the object, (3, 3).
         entry: Direction in which the object comes in, unit vector (3,).
         cost: Cost of the place; lower is better.
+        room: Distance in the ground plan that the object may be off the place and the atom still holds, [m].
     """
 
     pos: np.ndarray
     mat: np.ndarray
     entry: np.ndarray
     cost: float
+    room: float
 
     @property
     def pose(self) -> Pose:
@@ -129,6 +131,7 @@ def _search_spots(
     overhang = voxels.overhang_overlap(upper_surface(body) + [0, 0, _LIFT], origins, spots.below)
     free = overhang < _MAX_OVERHANG
     costs, origins = (spots.costs[keep] + 2.0 * overhang)[free], origins[free]
+    rooms = spots.room[keep][free]
     if not len(origins):
         return []
     entries = placement.sides
@@ -139,10 +142,11 @@ def _search_spots(
         costs = costs + _UNSUPPORTED_COST * (gap > 0.01)
     ways, overlaps = _find_entries(voxels, tested, origins, entries, max_overlap)
     found = []
-    for pos, cost, entry, overlap in zip(origins, costs, ways, overlaps, strict=True):
+    for pos, cost, room, entry, overlap in zip(origins, costs, rooms, ways, overlaps, strict=True):
         if entry is not None:
             total = cost + rotation.cost + 8.0 * overlap + 0.5 * (entry[2] > -0.5)
-            found.append(PlacePose(pos, rotation.mat @ placement.object_pose.mat, entry, total))
+            mat = rotation.mat @ placement.object_pose.mat
+            found.append(PlacePose(pos, mat, entry, total, float(room)))
     return found
 
 

@@ -76,12 +76,14 @@ class Spots:
     Attributes:
         xy: Positions of the object's origin, (S, 2), [m].
         costs: Costs of the spots, (S,).
+        room: Distance that the object may be off each spot and the atom still holds, (S,), [m].
         below: Height above which nothing supports the object, [m].
         holds: Returns whether the atom holds for a position of the object's origin, (3,).
     """
 
     xy: np.ndarray
     costs: np.ndarray
+    room: np.ndarray
     below: float
     holds: Callable[[np.ndarray], bool]
 
@@ -91,10 +93,12 @@ def target_spots(placement: Placement) -> Iterator[Spots]:
     view, target = placement.view, placement.target
     if view.is_entity(target):
         xy = view.body_pos(target)[:2]
-        costs = 8.0 * np.linalg.norm(_OFFSETS, axis=1)
-        yield Spots(
-            xy + _OFFSETS, costs, np.inf, lambda pos: bool(np.linalg.norm(pos[:2] - xy) < _MAX_STACK_OFFSET)
-        )
+        distances = np.linalg.norm(_OFFSETS, axis=1)
+
+        def stacked(pos: np.ndarray) -> bool:
+            return bool(np.linalg.norm(pos[:2] - xy) < _MAX_STACK_OFFSET)
+
+        yield Spots(xy + _OFFSETS, 8.0 * distances, _MAX_STACK_OFFSET - distances, np.inf, stacked)
         return
     inside = placement.atom.predicate == "In"
     test = contains if inside else is_over
@@ -104,11 +108,12 @@ def target_spots(placement: Placement) -> Iterator[Spots]:
         u, v = (np.linspace(-0.9, 0.9, _GRID) * h for h in half[:2])
         offsets = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         costs = 4.0 * np.linalg.norm(offsets - _slot_offset(half, placement.slot), axis=1)
-        costs += _EDGE_COST * np.maximum(_EDGE_MARGIN - (half[:2] - np.abs(offsets)).min(axis=1), 0.0)
+        room = (half[:2] - np.abs(offsets)).min(axis=1)
+        costs += _EDGE_COST * np.maximum(_EDGE_MARGIN - room, 0.0)
         below = centre[2] + (0.5 * half[2] if inside else 0.06)
         if placement.target_is_flat:
             below = view.scene.workspace.surface_height + 0.02
-        yield Spots(centre[:2] + offsets, costs, below, partial(test, _shrunk(box)))
+        yield Spots(centre[:2] + offsets, costs, room, below, partial(test, _shrunk(box)))
 
 
 def _slot_offset(half: np.ndarray, slot: tuple[int, int]) -> np.ndarray:

@@ -23,6 +23,9 @@ MAX_HELD_DISTANCE = 0.012  # [m] from the grip site to the nearest point of an o
 MAX_CORRECTION = 0.35  # [rad] that the hand rotates to compensate for a rotation of the object in it
 RELEASE_GAP, SIDE_GAP = 0.005, 0.008  # [m] above the place, from above and from a side
 MIN_DROP = 0.06  # [m] of drop height from which on the position needs less accuracy
+ACCURACY = 0.014  # [m] from the place, within which an object is lowered onto it
+ROOM_SHARE = 0.6  # of the room that a narrow place leaves
+MIN_ACCURACY = 0.004  # [m]
 MIN_WALL = 0.05  # [m] of walls around a place, from which on an object goes down only from their middle
 ALIGNED, ALIGNED_TURN = 0.008, 0.1  # [m], [rad] from the middle, where it goes down
 MISALIGNED, MISALIGNED_TURN = 0.03, 0.4  # [m], [rad] from the middle, where it goes up again
@@ -90,6 +93,7 @@ class Transport:
         self._blocked_steps = 0  # in which something resisted the way in
         self._idle_steps, self._previous_turn = 0, 0.0  # without motion; [rad] that the hand had to rotate
         self._clearance = style.carry_clearance  # [m] over what the object passes
+        self._accuracy = max(min(ACCURACY, ROOM_SHARE * plan.place.room), MIN_ACCURACY)  # [m] from the place
         self._is_covered = True  # by a fixture, as far as is known
         self._inserting = False  # on the last part of the way: down between walls, or in from a side
 
@@ -182,7 +186,7 @@ class Transport:
         pos, style, drops = view.eef_pos, self.style, not self.sinks
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
         self._blocked_steps = self._blocked_steps + 1 if slow and away < 0.04 else 0
-        aligned = away < (0.025 if drops else 0.014) and turn < 0.2
+        aligned = away < (0.025 if drops else self._accuracy) and turn < 0.2
         if aligned and pos[2] < goal[2] + (0.02 if drops else 0.012):
             return "arrived"
         if self._blocked_steps > 1:
@@ -190,7 +194,8 @@ class Transport:
         walls = obstacle_height(self._obstacles(view), goal, goal, 0.05, self._surface_height(view))
         over_walls = walls + below + self._clearance
         target = goal.copy()
-        target[2] += funnel_lift(style.funnel_slope, away - (0.03 if drops else 0.012), turn - 0.12, 0.04)
+        width = 0.03 if drops else self._accuracy - 0.002
+        target[2] += funnel_lift(style.funnel_slope, away - width, turn - 0.12, 0.04)
         if aligned and not drops:
             target[2] -= SINKING
         deep = over_walls - self._clearance - goal[2] > MIN_WALL and not drops
