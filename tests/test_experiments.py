@@ -22,6 +22,9 @@ FOREIGN = (
     "warp",
     "websocket_policy_server",
 )
+# started by another script, with arguments in order, in an environment without the project
+WORKERS = ("original_training.py", "original_worker.py", "robomimic_loader.py")
+COMMANDS = [p for p in SCRIPTS if "__main__" in p.read_text(encoding="utf-8") and p.name not in WORKERS]
 pytestmark = pytest.mark.unit
 
 
@@ -73,3 +76,11 @@ def test_what_a_script_imports_exists(script):
         if not found:
             missing.append(f"{module}.{name}" if name else module)
     assert not missing, f"{script} imports what does not exist: {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("script", COMMANDS, ids=lambda path: str(path.relative_to(EXPERIMENTS)))
+def test_a_script_explains_itself_and_does_not_start_when_asked_for_help(script):
+    modules = {module for module, _ in imported(ast.parse(script.read_text(encoding="utf-8")))}
+    assert modules & {"argparse", "hydra"}, (
+        f"{script} starts its work on --help; parse its arguments, even if none"
+    )

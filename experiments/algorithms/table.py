@@ -3,6 +3,7 @@
 python experiments/algorithms/table.py          # reads STUDY/comparison.json, which `study.py report` writes
 """
 
+import argparse
 import json
 import statistics
 import tempfile
@@ -162,6 +163,9 @@ def insert(text: str, name: str, lines: list[str]) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     readme = HERE / "README.md"
     text = readme.read_text(encoding="utf-8")
     for path in sorted(HERE.glob("*/comparison.json")):

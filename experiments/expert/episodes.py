@@ -1,5 +1,9 @@
-"""Draw a contact sheet of one demonstration for each task: `episodes.png`."""
+"""Draw a contact sheet of one demonstration for each task of LIBERO-Object: `episodes.png` beside this file.
 
+python experiments/expert/episodes.py
+"""
+
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +17,9 @@ MOMENTS = (0.0, 0.2, 0.4, 0.55, 0.8, 1.0)
 
 
 def main() -> None:
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     columns = []
     for task in get_suite("libero_object").tasks:
         recorder = DemoRecorder(DemoConfig(task.id, (96, 96)))

@@ -4,6 +4,7 @@ libero tasks certify libero_spatial libero_object libero_goal libero_10 libero_9
 python experiments/expert/summary.py
 """
 
+import argparse
 import json
 from collections.abc import Iterator
 from itertools import groupby
@@ -39,6 +40,9 @@ def table(results: dict) -> Iterator[str]:
 
 
 def main() -> None:
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     readme = HERE / "README.md"
     for name in ("builtin", "builtin-disturbed", "original"):
         folder, _, kind = name.partition("-")
