@@ -33,6 +33,7 @@ class Averaging(Algorithm):
     the success matrix, its diagonal too, is of the averaged ones.
     """
 
+    tuned = {"share": (0.25, 0.5, 0.7, 0.9)}
     state_form = {"tasks": int, "before": (None, Weights(complete=True))}
 
     def __init__(self, *, share: Share | None = None, base_tasks: Natural = 1):
