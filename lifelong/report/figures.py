@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ from lifelong.results.metrics import Curve, mean_and_standard_error, wilson_inte
 # Okabe and Ito's colours, distinguishable for colour-blind readers, without yellow, which is too light on white
 LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+LARGEST_WITH_EVERY_TASK = 12  # number of tasks up to which a success matrix has every number
+NAME_WIDTH = 24  # characters of a line of a task's name beside it
 INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
 STYLE = {
     "text.parse_math": False,  # labels are texts of users: $ is a character
@@ -95,13 +98,15 @@ def heatmap_figure(panels: Sequence[Panel]) -> Figure:
     rows = math.ceil(len(panels) / columns)
     with matplotlib.rc_context(STYLE):
         single = len(panels) == 1
-        width, height = (4.4, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
+        width, height = (4.5, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
         figure = Figure(figsize=(width, height), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()
         for place, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
-            image = _draw_matrix(axes, panel, label_rows=single)
+            image = _draw_matrix(axes, panel, font=7.5 if single else 6)
+            if single and len(panel.rates) <= LARGEST_WITH_EVERY_TASK:
+                _name_rows(axes, panel.labels)
             if place % columns == 0:
                 axes.set_ylabel("after learning task")
             if place + columns >= len(panels):
@@ -250,30 +255,39 @@ def shorten(text: str, length: int = 120) -> str:
     return cut.rstrip(" ,") + "…"
 
 
-def _draw_matrix(axes: Axes, panel: Panel, label_rows: bool) -> matplotlib.image.AxesImage:
+def _draw_matrix(axes: Axes, panel: Panel, font: float) -> matplotlib.image.AxesImage:
     size = len(panel.rates)
     image = axes.imshow(100 * panel.rates, cmap=success_colours(), vmin=0, vmax=100)
     axes.set_title(shorten(panel.title))
-    every = 1 if size <= 12 else math.ceil(size / 10)
-    ticks = range(0, size, every)
-    named = label_rows and every == 1
-    names = [f"{shorten(panel.labels[t], 20)}  {t + 1}" if named else str(t + 1) for t in ticks]
-    axes.set_yticks(ticks, names)
+    ticks = range(0, size, 1 if size <= LARGEST_WITH_EVERY_TASK else math.ceil(size / 10))
+    axes.set_yticks(ticks, [str(t + 1) for t in ticks])
     axes.set_xticks(ticks, [str(t + 1) for t in ticks])
     axes.tick_params(length=0)
     for side in axes.spines.values():
         side.set_visible(False)
-    if size <= 12:
+    if size <= LARGEST_WITH_EVERY_TASK:
         axes.set_xticks(np.arange(size + 1) - 0.5, minor=True)
         axes.set_yticks(np.arange(size + 1) - 0.5, minor=True)
         axes.grid(which="minor", color="white", lw=1.2)
         axes.tick_params(which="minor", length=0)
-        font = 7.5 if label_rows else 6
         for i, j in zip(*np.nonzero(~np.isnan(panel.rates)), strict=True):
             colour = cell_colours(float(panel.rates[i, j]))[1]
             text = f"{100 * panel.rates[i, j]:.0f}"
             axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=font)
     return image
+
+
+def _name_rows(axes: Axes, labels: Sequence[str]) -> None:
+    """Put the names of tasks beside the numbers of a matrix's rows, in up to two lines each."""
+    names = [
+        "\n".join(textwrap.wrap(shorten(label), NAME_WIDTH, max_lines=2, placeholder="…")) for label in labels
+    ]
+    axes.set_yticks(range(len(names)), names, fontsize=6.5, linespacing=0.95)
+    axes.tick_params(axis="y", pad=18)
+    axes.set_anchor("W")  # a square in the middle of its room is laid out as if its names had that room, too
+    rows = axes.get_yaxis_transform()
+    for task in range(len(names)):
+        axes.annotate(str(task + 1), (0, task), (-4, 0), rows, "offset points", ha="right", va="center")
 
 
 def _draw_curve(axes: Axes, curve: Curve | None) -> None:

@@ -13,8 +13,9 @@ import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+from libero_env.tasks import get_suite
 from lifelong.errors import LifelongError
-from lifelong.report.figures import Line, forgetting_figure
+from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure
 from lifelong.report.page import write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
 from lifelong.report.statistics import statistics
@@ -222,6 +223,25 @@ def test_figures_for_papers_are_written_beside_the_page(finished: Path):
     assert (finished / "heatmap.pdf").read_bytes().startswith(b"%PDF")
     with Image.open(finished / "heatmap.png") as image:
         assert min(image.size) > 800
+
+
+@pytest.mark.parametrize(
+    "suite, tasks", [("libero_goal", 10), ("libero_object", 10), ("libero_90", 12), ("libero_goal", 2)]
+)
+def test_a_heatmap_names_its_tasks_apart_and_inside_of_the_picture(suite: str, tasks: int):
+    labels = [task.language for task in get_suite(suite).tasks[:tasks]]
+    figure = heatmap_figure([Panel(suite, np.tril(np.ones((tasks, tasks))), labels)])
+    FigureCanvasAgg(figure).draw()
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert all(name.count("\n") <= 1 and max(map(len, name.split("\n"))) <= 24 for name in names)
+    assert len(set(names)) == len(set(labels))
+    drawn, whole = figure.get_tightbbox(), figure.bbox_inches
+    assert (
+        drawn.x0 >= -0.02
+        and drawn.x1 <= whole.x1 + 0.02
+        and drawn.y0 >= -0.02
+        and drawn.y1 <= whole.y1 + 0.02
+    )
 
 
 def test_the_same_results_give_the_same_page(finished: Path, tmp_path: Path):
