@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -25,6 +24,7 @@ from lifelong.results.metrics import Curve, mean_and_standard_error, wilson_inte
 # Okabe and Ito's colours, distinguishable for colour-blind readers, without yellow, which is too light on white
 LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+LINE_DASHES = ("-", "--", ":", "-.")  # of the first lines, one for each colour, of as many after them, ...
 LARGEST_WITH_EVERY_TASK = 12  # number of tasks up to which a success matrix has every number
 NAME_WIDTH = 24  # characters of a line of a task's name beside it
 INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
@@ -170,7 +170,7 @@ def learning_figure(
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
     """Draw average success over the tasks learned so far against their number, ± one standard error.
 
-    If there are more lines than colours, the further ones are dashed with open markers.
+    Lines of the same colour differ in dashes and markers.
     """
     named = any(line.label for line in lines)
     with matplotlib.rc_context(STYLE):
@@ -181,18 +181,18 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
             columns = [mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T]
             mean, error = 100 * np.array(columns).T
             x, (turn, place) = np.arange(1, len(mean) + 1), divmod(number, len(LINE_COLOURS))
-            colour, marker = LINE_COLOURS[place], LINE_MARKERS[place % len(LINE_MARKERS)]
-            style: dict[str, Any] = {"ls": "--", "mfc": "white"} if turn else {}
+            colour, marker = LINE_COLOURS[place], LINE_MARKERS[(place + turn) % len(LINE_MARKERS)]
             axes.plot(
                 x,
                 mean,
                 color=colour,
+                ls=LINE_DASHES[turn % len(LINE_DASHES)],
                 marker=marker,
+                mfc="white" if turn % 2 else colour,
                 ms=3.8,
                 lw=1.4,
                 label=shorten(line.label),
                 clip_on=False,
-                **style,
             )
             band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
             axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)

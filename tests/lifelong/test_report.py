@@ -340,6 +340,15 @@ def test_long_names_do_not_squeeze_the_plot(tmp_path: Path):
         assert box.width > 0.85 and box.height * figure.get_size_inches()[1] > 1.9
 
 
+def test_no_two_of_twenty_lines_look_the_same():
+    figure = forgetting_figure([Line(str(n), np.full((1, 4), 0.5)) for n in range(20)])
+    looks = {
+        (line.get_color(), line.get_linestyle(), line.get_marker(), line.get_markerfacecolor())
+        for line in figure.axes[0].lines
+    }
+    assert len(looks) == 20
+
+
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     """Two methods, one with three seeds and the other with two orders of two seeds."""
