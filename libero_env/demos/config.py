@@ -26,7 +26,7 @@ from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate, validate_arguments
 
-GENERATOR = "scripted-expert-13"  # change it when the same seed yields different demonstrations
+GENERATOR = "scripted-expert-14"  # change it when the same seed yields different demonstrations
 
 
 @dataclass(frozen=True)

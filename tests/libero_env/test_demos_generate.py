@@ -157,9 +157,9 @@ def test_a_faithful_drawing_is_recorded(whole, tmp_path):
 @pytest.mark.parametrize(
     ("config", "folder"),
     [
-        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-13"),
-        (DemoConfig("libero_object/0", (64, 64), drawing="fast"), "64x64-seed0-scripted-expert-13"),
-        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-13-d9a2a37b"),
+        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-14"),
+        (DemoConfig("libero_object/0", (64, 64), drawing="fast"), "64x64-seed0-scripted-expert-14"),
+        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-14-d9a2a37b"),
         (
             DemoConfig(
                 "libero_goal/3",
@@ -168,9 +168,9 @@ def test_a_faithful_drawing_is_recorded(whole, tmp_path):
                 cameras=("agentview",),
                 modalities=("rgb", "depth"),
             ),
-            "128x128-seed0-scripted-expert-13-800fa04f",
+            "128x128-seed0-scripted-expert-14-800fa04f",
         ),
-        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-13-bf1e44b3"),
+        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-14-bf1e44b3"),
     ],
 )
 def test_folders_of_earlier_versions_are_found(config, folder, tmp_path):

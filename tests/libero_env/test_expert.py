@@ -17,7 +17,7 @@ from libero_env.expert.arm.kinematics import limit_elbow_extension
 from libero_env.expert.arm.servo import action_toward, downward
 from libero_env.expert.clearance import overhang
 from libero_env.expert.grasping.costs import finger_offset, grip_cost
-from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, find_grasps
+from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, collision_depth, find_grasps
 from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.rollout import run_experts
@@ -335,6 +335,17 @@ def test_an_object_is_released_nearer_to_the_middle_of_a_narrow_place(view_of):
     move = next_move(0.01, found.room)
     assert isinstance(move, Move) and move.pos[1] > view.eef_pos[1]
     assert next_move(0.006, found.room) == "arrived"
+
+
+@pytest.mark.sim
+def test_an_object_in_a_drawer_is_grasped_where_the_hand_has_room(view_of):
+    """Of the first few grasps of an approach all may hit the drawer or the cabinet, and a later one nothing."""
+    view = view_of("libero_spatial/4")
+    (step,) = plan_goal(get_task("libero_spatial/4").problem.goal, view)
+    shapes = Shapes(view.scene)
+    grasp = plan_pick(view, shapes, step.atom).grasp
+    fixtures = np.concatenate([shapes.points(view, name, 0.006) for name in view.scene.fixtures])
+    assert collision_depth(fixtures, grasp.pos_world, grasp.mat) == 0.0
 
 
 def test_what_hangs_over_an_object_is_told_from_a_wall_beside_it():

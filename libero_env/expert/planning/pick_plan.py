@@ -69,6 +69,7 @@ class PickSearch:
     Attributes:
         top_grasps: Number of grasps from straight above, for each attempt so far and the next one.
         tilted_grasps: Number of grasps for one tilted approach, likewise.
+        crowded_grasps: Number of them where obstacles leave no room from above: the best ones there hit something.
         grasp_spacing: Distance between grasps below which only the best is kept, [m].
         obstacle_radius: Distance from an object beyond which nothing is in the hand's way, [m].
         collision_limit: Cost of the best grasp from which on more tilted approaches are searched.
@@ -89,6 +90,7 @@ class PickSearch:
 
     top_grasps: int = 20
     tilted_grasps: int = 4
+    crowded_grasps: int = 16
     grasp_spacing: float = 0.015
     obstacle_radius: float = 0.3
     collision_limit: float = 1.0

@@ -51,7 +51,7 @@ def plan_pick(
     if grasps[0].cost < SEARCH.collision_limit and error <= SEARCH.reach_tolerance:
         return best
     try:  # tilt the hand away from obstacles, or towards the arm
-        tilted = _candidate_grasps(placement, _ALL_TILTS, failures, near)
+        tilted = _candidate_grasps(placement, _ALL_TILTS, failures, near, SEARCH.crowded_grasps)
     except GraspError:
         return best
     pairs = sorted([*pairs, *_rank_pairs(placement, tilted, places)], key=lambda plan: plan.cost)
@@ -117,6 +117,7 @@ def _candidate_grasps(
     tilts: Sequence[np.ndarray | None],
     failures: Sequence[FailedAttempt],
     near: np.ndarray,
+    tilted_grasps: int = SEARCH.tilted_grasps,
 ) -> list[Grasp]:
     """Return grasps for some approaches, best first; collisions, a poor grip and failed attempts cost.
 
@@ -126,6 +127,7 @@ def _candidate_grasps(
         failures: Attempts that failed before.
         near: Position (3,) to which the side of a symmetric object that is grasped is the near one, so that all
             demonstrations choose the same.
+        tilted_grasps: Number of grasps for one tilted approach, for each attempt so far and the next one.
 
     Raises:
         GraspError: There is no grasp.
@@ -140,7 +142,7 @@ def _candidate_grasps(
     found: list[Grasp] = []
     for tilt in tilts:
         tilt_cost = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
-        number = (SEARCH.top_grasps if tilt is None else SEARCH.tilted_grasps) * (1 + len(failures))
+        number = (SEARCH.top_grasps if tilt is None else tilted_grasps) * (1 + len(failures))
         try:
             grasps = find_grasps(
                 cloud,
