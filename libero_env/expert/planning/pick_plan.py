@@ -69,7 +69,8 @@ class PickSearch:
     Attributes:
         top_grasps: Number of grasps from straight above, for each attempt so far and the next one.
         tilted_grasps: Number of grasps for one tilted approach, likewise.
-        crowded_grasps: Number of them where obstacles leave no room from above: the best ones there hit something.
+        crowded_grasps: Number of them at the first attempt where obstacles leave no room from above: the first few
+            may all hit something. Later attempts differ more from each other with few.
         grasp_spacing: Distance between grasps below which only the best is kept, [m].
         obstacle_radius: Distance from an object beyond which nothing is in the hand's way, [m].
         collision_limit: Cost of the best grasp from which on more tilted approaches are searched.

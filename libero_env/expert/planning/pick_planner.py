@@ -51,7 +51,8 @@ def plan_pick(
     if grasps[0].cost < SEARCH.collision_limit and error <= SEARCH.reach_tolerance:
         return best
     try:  # tilt the hand away from obstacles, or towards the arm
-        tilted = _candidate_grasps(placement, _ALL_TILTS, failures, near, SEARCH.crowded_grasps)
+        number = SEARCH.tilted_grasps if failures else SEARCH.crowded_grasps
+        tilted = _candidate_grasps(placement, _ALL_TILTS, failures, near, number)
     except GraspError:
         return best
     pairs = sorted([*pairs, *_rank_pairs(placement, tilted, places)], key=lambda plan: plan.cost)
