@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 from model import Design, Method, Outcomes, samples_of, simulate, truths, with_spread
 
-from lifelong.results.components import interval
-from lifelong.results.contrasts import contrasts
+from lifelong.results import components
+from lifelong.results.components import interval, p_values
+from lifelong.results.contrasts import Contrast, contrasts
 from lifelong.results.scores import METRIC_NAMES, METRIC_RANGES, matrix_weights
 
 METHODS = {
@@ -68,12 +69,20 @@ def coverage_before(design: Design, simulations: int, rng: np.random.Generator) 
 
 
 def false_differences(
-    methods: Sequence[Method], design: Design, simulations: int, rng: np.random.Generator
+    methods: Sequence[Method],
+    design: Design,
+    simulations: int,
+    rng: np.random.Generator,
+    spreads: Sequence[float] = (),
 ) -> dict[str, tuple[float, float]]:
-    """Share of pairs of equal methods with p < 0.05, and of simulations with any pair so after Holm; by metric."""
+    """Share of pairs of equal methods with p < 0.05, and of simulations with any pair so after Holm; by metric.
+
+    The methods' spreads between runs are those given, or drawn anew in each simulation.
+    """
     single, family = dict.fromkeys(METRIC_NAMES, 0.0), dict.fromkeys(METRIC_NAMES, 0.0)
     for _ in range(simulations):
-        spread = [with_spread(m, rng) for m in methods]
+        fixed = [replace(m, spread=s) for m, s in zip(methods, spreads, strict=False)]
+        spread = fixed or [with_spread(m, rng) for m in methods]
         found = [samples_of(outcomes, design) for outcomes in simulate(spread, design, rng)]
         for metric in METRIC_NAMES:
             pairs = contrasts({str(i): row[metric] for i, row in enumerate(found)})
@@ -82,9 +91,37 @@ def false_differences(
     return {m: (single[m] / simulations, family[m] / simulations) for m in METRIC_NAMES}
 
 
+def false_by_power(
+    powers: Sequence[float], design: Design, simulations: int, rng: np.random.Generator
+) -> list[dict[str, float]]:
+    """Share of simulations in which two equal methods differ, if the runs' share is taken to each of the powers."""
+    found: dict[str, list[Contrast]] = {metric: [] for metric in METRIC_NAMES}
+    for _ in range(simulations):
+        methods = [with_spread(m, rng) for m in equal_methods(2)]
+        both = [samples_of(outcomes, design) for outcomes in simulate(methods, design, rng)]
+        for metric, pairs in found.items():
+            pairs += contrasts({str(i): row[metric] for i, row in enumerate(both)})
+    rates, chosen = [], components.TEST_POWER
+    for power in powers:
+        components.TEST_POWER = power * (
+            design.seeds - 1
+        )  # divided there by the degrees of freedom of two methods
+        p = {m: p_values([c.estimate.value for c in cs], [c.parts for c in cs]) for m, cs in found.items()}
+        rates.append({metric: float(np.mean(values < 0.05)) for metric, values in p.items()})
+    components.TEST_POWER = chosen
+    return rates
+
+
 def equal_methods(count: int) -> list[Method]:
     """Methods that keep everything and succeed alike; every second repeats its rollouts."""
     return [Method(0.7, 1.0, frozen=bool(i % 2)) for i in range(count)]
+
+
+# Spreads between runs, of which one or a few are far above the others', as clare's and mlr's are in the study.
+UNEQUAL = {
+    "one of 8 has 5 times the spread": [5.0] + [1.0] * 7,
+    "as in the study": [5, 2, 2] + [1] * 5 + [0.5] * 6,
+}
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -101,7 +138,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--simulations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=2023)
-    parser.add_argument("--part", choices=("coverage", "before", "pairs", "all"), default="all")
+    parser.add_argument(
+        "--part", choices=("coverage", "before", "pairs", "power", "unequal", "all"), default="all"
+    )
     args = parser.parse_args()
     rng, began = np.random.default_rng(args.seed), time.perf_counter()
     seeds = (2, 3, 5)
@@ -123,16 +162,36 @@ def main() -> None:
             found = coverage_before(Design(10, 20, count), args.simulations // 4, rng)
             rows.append([f"{count} seeds", *(percent(v) for v in found.values())])
         print(*table(["before", *found], rows), sep="\n")
-    if args.part in ("pairs", "all"):
+    if args.part in ("unequal", "all"):
         rows = []
-        for methods in (2, 3, 13, 21):
+        for name, unequal in UNEQUAL.items():
             for count in seeds:
-                some = args.simulations if methods < 13 else args.simulations // (1 if methods < 21 else 4)
-                found = false_differences(equal_methods(methods), Design(10, 20, count), some, rng)
+                design, methods = Design(10, 20, count), [Method(0.7, 1.0)] * len(unequal)
+                found = false_differences(methods, design, args.simulations // 10, rng, unequal)
                 cells = [f"{percent(found[m][0])} / {percent(found[m][1])}" for m in METRIC_NAMES]
-                rows.append([f"{methods} methods, {count} seeds", *cells])
+                rows.append([f"{name}, {count} seeds", *cells])
                 print("|", " | ".join(rows[-1]), "|", flush=True)
         print(*table(["equal methods: pairs / family", *METRIC_NAMES], rows), sep="\n")
+    if args.part in ("power", "all"):
+        rows = []
+        for count in seeds:
+            powers = [1, 0.75, 0.5, 0.25, components.TEST_POWER / (count - 1)]
+            for power, shares in zip(
+                powers, false_by_power(powers, Design(10, 20, count), 4 * args.simulations, rng), strict=True
+            ):
+                rows.append([f"{count} seeds", f"{power:.3g}", *(percent(shares[m]) for m in METRIC_NAMES)])
+                print("|", " | ".join(rows[-1]), "|", flush=True)
+        print(*table(["two equal methods", "power of the share", *METRIC_NAMES], rows), sep="\n")
+    if args.part in ("pairs", "all"):
+        rows = []
+        for methods, times in {2: 4, 3: 1, 13: 1 / 4, 21: 1 / 16}.items():
+            for count in seeds:
+                some = int(args.simulations * times)
+                found = false_differences(equal_methods(methods), Design(10, 20, count), some, rng)
+                cells = [f"{percent(found[m][0])} / {percent(found[m][1])}" for m in METRIC_NAMES]
+                rows.append([f"{methods} methods, {count} seeds", str(some), *cells])
+                print("|", " | ".join(rows[-1]), "|", flush=True)
+        print(*table(["equal methods: pairs / family", "simulations", *METRIC_NAMES], rows), sep="\n")
     print(f"{(time.perf_counter() - began) / 60:.0f} minutes")
 
 

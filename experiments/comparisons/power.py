@@ -1,4 +1,4 @@
-"""How often "so many seeds would tell" is right: the power at the seeds that a first comparison asks for.
+"""How often "so many seeds needed" is right: the power at the seeds that a first comparison asks for.
 
 python experiments/comparisons/power.py --simulations 400          # prints the table of the README
 """
@@ -41,14 +41,14 @@ def main() -> None:
         for other in OTHERS.values():
             difference = truths(BASE, design)[METRIC] - truths(other, design)[METRIC]
             pilots = [compare(other, design, rng) for _ in range(args.simulations)]
-            told = np.mean([p.p_value < 0.05 for p in pilots])
-            shown = np.array([outlook(p, 1).shown for p in pilots])
-            # what the first seeds ask for, given that they do not tell
+            significant = np.mean([p.p_value < 0.05 for p in pilots])
+            detectable = np.array([outlook(p, 1).detectable for p in pilots])
+            # what the first seeds ask for, given that the difference is not significant
             asked = [outlook(p, 1).seeds or MOST_SEEDS for p in pilots if p.p_value >= 0.05]
             low, middle, high = np.percentile(asked or [np.nan], [25, 50, 75])
             known = [replace(p, estimate=replace(p.estimate, value=difference)) for p in pilots]
             needed = round(float(np.median([outlook(p, 1).seeds or MOST_SEEDS for p in known])))
-            cells = [f"{difference:.3f}", f"{100 * told:.0f} %", f"{np.median(shown):.3f}"]
+            cells = [f"{difference:.3f}", f"{100 * significant:.0f} %", f"{np.median(detectable):.3f}"]
             cells += [f"{middle:.0f} ({low:.0f} to {high:.0f})", f"{needed}"]
             cells.append(f"{100 * power(other, replace(design, seeds=needed), args.simulations, rng):.0f} %")
             rows.append([f"{first} seeds", *cells])
@@ -56,8 +56,8 @@ def main() -> None:
     heads = [
         "first comparison",
         "difference",
-        "told apart",
-        "these show",
+        "significant",
+        "detectable",
         "asks for, if not",
         "of the true one",
     ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.report.comparability import MUJOCO, check_same_back_end
-from lifelong.report.runs import Group, Run
+from lifelong.report.runs import Group, Run, other_demonstrations
 from lifelong.report.statistics import statistics
 from lifelong.results.metrics import METRIC_NAMES, mean_and_standard_error
 from lifelong.results.results import has_later_tasks
@@ -31,11 +31,12 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
         `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high, the value of
         each seed or order, standard deviations between these and of the starts), `published` (FWT and AUC of eq. 3 as
         written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`. `differences`: of each pair, the
-        first minus the second, with its interval, its p-value, that adjusted for all pairs (`told_apart` if below
-        0.05), the number of `seeds` that would tell and the difference that is `shown` by the present ones.
+        first minus the second, with its interval, its p-value, that adjusted for all pairs (`significant` if below
+        0.05), the number of `seeds` needed to show it, and the difference `detectable` with the present ones.
         `statistics`: how they were computed. `after_base_stage`: `metrics` by label and `differences` over the later
         tasks alone, as if the sequence began with them, of the methods whose runs all learned a task after a base
-        stage; None if there are none. `backend`: what simulated all rollouts.
+        stage; None if there are none. `backend`: what simulated all rollouts. `other_demonstrations`: sentences about
+        runs that learned from other demonstrations than the rest.
 
     Raises:
         ComparisonError: The runs are of different back ends.
@@ -51,6 +52,7 @@ def compare(groups: Sequence[Group]) -> dict[str, Any]:
         "differences": found["differences"],
         "statistics": found["statistics"],
         "after_base_stage": _after_base_stage(measured),
+        "other_demonstrations": other_demonstrations(groups),
     }
 
 

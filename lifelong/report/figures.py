@@ -93,18 +93,23 @@ def cell_colours(rate: float) -> tuple[str, str]:
 
 
 def heatmap_figure(panels: Sequence[Panel]) -> Figure:
-    """Draw success matrices side by side, up to four in a row, in percent, with one colour bar."""
+    """Draw success matrices side by side, up to four in a row, in percent, with one colour bar.
+
+    Several matrices begin with the first row that one of them has: tasks that are learned together have one row.
+    """
     columns = min(len(panels), 4)
     rows = math.ceil(len(panels) / columns)
     with matplotlib.rc_context(STYLE):
         single = len(panels) == 1
-        width, height = (4.5, 3.4) if single else (2.45 * columns + 0.5, 2.6 * rows)
+        first = 0 if single else _first_known([panel.rates.T for panel in panels])
+        shares = [1 - first / len(panel.rates) for panel in panels]
+        width, height = (4.5, 3.4) if single else (2.45 * columns + 0.5, (0.6 + 2 * max(shares)) * rows)
         figure = Figure(figsize=(width, height), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()
         for place, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
-            image = _draw_matrix(axes, panel, font=7.5 if single else 6)
+            image = _draw_matrix(axes, panel, first, font=7.5 if single else 6)
             if single and len(panel.rates) <= LARGEST_WITH_EVERY_TASK:
                 _name_rows(axes, panel.labels)
             if place % columns == 0:
@@ -197,9 +202,10 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
             band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
             axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)
         longest = max(line.values.shape[1] for line in lines)
-        axes.set_xlim(0.8, longest + 0.2)
+        first = 1 + _first_known([line.values for line in lines])
+        axes.set_xlim(first - 0.2, longest + 0.2)
         axes.set_ylim(0, 100)
-        axes.set_xticks(range(1, longest + 1, max(1, longest // 10)))
+        axes.set_xticks(range(first, longest + 1, max(1, longest // 10)))
         axes.set_xlabel("tasks learned")
         axes.set_ylabel("average success (%)")
         axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
@@ -255,25 +261,33 @@ def shorten(text: str, length: int = 120) -> str:
     return cut.rstrip(" ,") + "…"
 
 
-def _draw_matrix(axes: Axes, panel: Panel, font: float) -> matplotlib.image.AxesImage:
+def _first_known(values: Sequence[NDArray[np.float64]]) -> int:
+    """Return the first column in which an array has a number; 0 if none has one."""
+    known = [~np.isnan(array).all(axis=0) for array in values]
+    return min((int(np.argmax(columns)) for columns in known if columns.any()), default=0)
+
+
+def _draw_matrix(axes: Axes, panel: Panel, first: int, font: float) -> matplotlib.image.AxesImage:
+    """Draw a success matrix from its row `first` on."""
     size = len(panel.rates)
     image = axes.imshow(100 * panel.rates, cmap=success_colours(), vmin=0, vmax=100)
     axes.set_title(shorten(panel.title))
     ticks = range(0, size, 1 if size <= LARGEST_WITH_EVERY_TASK else math.ceil(size / 10))
-    axes.set_yticks(ticks, [str(t + 1) for t in ticks])
+    axes.set_yticks([t for t in ticks if t >= first], [str(t + 1) for t in ticks if t >= first])
     axes.set_xticks(ticks, [str(t + 1) for t in ticks])
     axes.tick_params(length=0)
     for side in axes.spines.values():
         side.set_visible(False)
     if size <= LARGEST_WITH_EVERY_TASK:
         axes.set_xticks(np.arange(size + 1) - 0.5, minor=True)
-        axes.set_yticks(np.arange(size + 1) - 0.5, minor=True)
+        axes.set_yticks(np.arange(first, size + 1) - 0.5, minor=True)
         axes.grid(which="minor", color="white", lw=1.2)
         axes.tick_params(which="minor", length=0)
         for i, j in zip(*np.nonzero(~np.isnan(panel.rates)), strict=True):
             colour = cell_colours(float(panel.rates[i, j]))[1]
             text = f"{100 * panel.rates[i, j]:.0f}"
             axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=font)
+    axes.set_ylim(size - 0.5, first - 0.5)
     return image
 
 

@@ -98,7 +98,8 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
 def comparison_text(page: Path) -> list[str]:
     """Return what a comparison shows, in sentences, from the numbers beside its page."""
     found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
-    return _findings(found) + [f"Later tasks alone: {line}" for line in _findings(found["after_base_stage"])]
+    later = [f"Later tasks alone: {line}" for line in _findings(found["after_base_stage"])]
+    return found["other_demonstrations"] + _findings(found) + later
 
 
 def _findings(found: dict[str, Any] | None) -> list[str]:
@@ -137,7 +138,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
     times = {k: v for k, v in run.results.seconds_by_phase().items() if v > 0}
     return {
         "title": f"{record.algo} on {record.benchmark}",
-        "facts": _facts(record),
+        "facts": _facts(run),
         "notes": run.notes,
         "metrics": _metric_rows(run.metrics),
         "later_metrics": _metric_rows(after_base_stage(run.results)),
@@ -195,7 +196,8 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
             f"{r.path}: a further run of seed {r.record.seed} of {g.label}; it is not counted"
             for g in groups
             for r in g.repeats
-        ],
+        ]
+        + found["other_demonstrations"],
         "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
         "later_groups": _group_rows(later["metrics"], found) if later else [],
         "differences": found["differences"],
@@ -227,7 +229,8 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
     return Panel(group.label, mean, labels), titled, Line(group.label, values)
 
 
-def _facts(record: RunRecord) -> list[tuple[str, Any]]:
+def _facts(run: Run) -> list[tuple[str, Any]]:
+    record, found = run.record, run.results.demonstrations
     facts = [("policy", record.policy), ("preset", record.preset), ("seed", record.seed)]
     facts += [("last task under", record.perturbed[-1])] if any(record.perturbed) else []
     facts += [("simulated by", record.backend)] if record.backend != MUJOCO else []
@@ -235,6 +238,8 @@ def _facts(record: RunRecord) -> list[tuple[str, Any]]:
         ("tasks", len(record.tasks)),
         ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),
     ]
+    by = ", ".join(dict.fromkeys(filter(None, found.generators))) if found else ""
+    facts += [("demonstrations by", by)] if by else []
     return facts + [("CPUs", record.cpu_count)] + ([("commit", record.commit[:10])] if record.commit else [])
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from lifelong.errors import LifelongError, ResultsError
-from lifelong.results.conditions import resume_notes
+from lifelong.results.conditions import few_of, resume_notes
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import RunRecord
@@ -142,6 +142,36 @@ def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
     if len(words) > 3:
         words = [*words[:3], "…"]
     return f"{identity['algo']} ({', '.join(words)})" if words else str(identity["algo"])
+
+
+def other_demonstrations(groups: Sequence[Group]) -> list[str]:
+    """Return a sentence for each set of runs whose demonstrations differ although their settings of them are equal.
+
+    That happens when the expert was improved, or files of `data.folder` were replaced, between two runs.
+    """
+    sets: dict[Any, dict[tuple[tuple[str, str], ...], list[str]]] = {}
+    for group in groups:
+        for run in group.runs:
+            if (found := run.results.demonstrations) is None:
+                continue
+            counts = tuple(sorted(zip(run.record.tasks, found.counts, strict=True)))
+            digests = tuple(sorted(zip(run.record.tasks, found.digests, strict=True)))
+            data = tuple(item for item in _identity(run) if item[0].startswith("data."))
+            alike = sets.setdefault((run.record.benchmark, counts, data), {})
+            alike.setdefault(digests, []).append(f"{group.label} seed {run.record.seed}")
+    lines = []
+    for (first, names), *others in (list(alike.items()) for alike in sets.values()):
+        for digests, others_names in others:
+            differ = [task for (task, was), (_, now) in zip(first, digests, strict=True) if was != now]
+            lines.append(
+                f"{_few(others_names)} learned from other demonstrations of {few_of(differ)} than {_few(names)}: a "
+                "difference between them may be due to that."
+            )
+    return lines
+
+
+def _few(names: Sequence[str], most: int = 4) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more runs" if len(names) > most else "")
 
 
 def _identity(run: Run) -> tuple[tuple[str, Any], ...]:

@@ -74,13 +74,13 @@ def _metric(name: str, sample: Sample) -> dict[str, Any]:
 
 def _differences(found: Mapping[str, Mapping[str, Sample]], labels: Sequence[str]) -> list[dict[str, Any]]:
     tables = {name: _of_metric(name, contrasts(found[name])) for name in METRIC_NAMES}
-    unknown = dict.fromkeys(("value", "low", "high", "p_value", "adjusted", "shown"), float("nan"))
+    unknown = dict.fromkeys(("value", "low", "high", "p_value", "adjusted", "detectable"), float("nan"))
     return [
         {
             "of": a,
             "less": b,
             "metrics": {
-                name: table.get((a, b), {**unknown, "told_apart": False, "paired_seeds": 0, "seeds": None})
+                name: table.get((a, b), {**unknown, "significant": False, "paired_seeds": 0, "seeds": None})
                 for name, table in tables.items()
             },
         }
@@ -103,16 +103,16 @@ def _of_metric(name: str, pairs: Sequence[Contrast]) -> dict[tuple[str, str], di
             "high": inside.high,
             "p_value": pair.p_value,
             "adjusted": pair.adjusted,
-            "told_apart": pair.adjusted < ALPHA,
+            "significant": pair.adjusted < ALPHA,
             "paired_seeds": pair.pairs,
-            "shown": ahead.shown,
+            "detectable": ahead.detectable,
             "seeds": ahead.seeds,
         }
     return found
 
 
 def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12) -> list[str]:
-    """Return in sentences what a comparison shows and what it does not, and how many seeds would tell.
+    """Return in sentences how many pairs differ significantly, and how many seeds the others would need.
 
     Args:
         found: Result of `statistics`, or of `lifelong.report.comparison.compare`.
@@ -123,19 +123,23 @@ def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12)
     for metric, name in names.items():
         pairs = [(d["of"], d["less"], d["metrics"][metric]) for d in found["differences"]]
         pairs = [(a, b, m) for a, b, m in pairs if _known(m["value"])]
-        open_ = sorted((p for p in pairs if not p[2]["told_apart"]), key=lambda p: p[2]["p_value"])
+        tested = [p for p in pairs if _known(p[2]["adjusted"])]
+        open_ = sorted((p for p in tested if not p[2]["significant"]), key=lambda p: p[2]["p_value"])
         if not pairs:
             continue
-        text = f"{name}: {len(pairs) - len(open_)} of {len(pairs)} pairs are told apart"
+        text = f"{name}: {len(tested) - len(open_)} of {len(pairs)} pairs differ significantly."
         named = [f"{a} and {b} ({_outlook(m)})" for a, b, m in open_[:most]]
         rest = f", and {len(open_) - most} more" if len(open_) > most else ""
-        alone = ". A second seed would say how far seeds differ" if any(map(_of_one_seed, open_)) else ""
-        lines.append(text + (f". Not: {', '.join(named)}{rest}{alone}." if named else "."))
+        text += f" Not: {', '.join(named)}{rest}." if named else ""
+        alone = "" if len(tested) == len(pairs) else f" {_UNTESTED[not tested]}"
+        lines.append(text + alone)
     return lines
 
 
-def _of_one_seed(pair: tuple[str, str, Mapping[str, Any]]) -> bool:
-    return not _known(pair[2]["shown"])
+_UNTESTED = {
+    True: "None is tested: there is one seed, and only a second one says how far seeds differ.",
+    False: "Pairs of methods with one seed each are not tested: only a second one says how far seeds differ.",
+}
 
 
 def _known(value: float | None) -> bool:
@@ -144,9 +148,9 @@ def _known(value: float | None) -> bool:
 
 
 def _outlook(metric: Mapping[str, Any]) -> str:
-    """Return what a pair that is not told apart differs by and, from several seeds, how many would tell."""
+    """Return the difference of a pair and, from several seeds, how many would show it and what these would."""
     value = f"{100 * metric['value']:+.1f}"
-    if not _known(metric["shown"]):
+    if not _known(metric["detectable"]):
         return value
     seeds = metric["seeds"] or f"more than {MOST_SEEDS}"
-    return f"{value}; {seeds} seeds would tell, these show {100 * metric['shown']:.0f}"
+    return f"{value}; {seeds} seeds needed, detectable {100 * metric['detectable']:.0f}"

@@ -11,8 +11,9 @@ two or three seeds are far too narrow. So the variance of the mean is estimated 
 which is the unbiased form of clustering in two ways (Cameron, Gelbach & Miller, J. Bus. Econ. Stat. 2011). The quantile
 follows Cochran & Cox ("Experimental Designs", 1957, 4.14): t with R - 1 and t with the starts' degrees of freedom,
 weighted by w and 1 - w, where w is A / (A + B) to a power. Theirs is 1. For intervals it is 1.25, as with 1 some cover
-98.5 %; for tests 0.75, as with 1 up to 6 % are false with two runs. Both were chosen by simulation
-(experiments/comparisons). Satterthwaite's degrees of freedom cover 88 % where two runs decide.
+98.5 %; for tests 0.75 / (R - 1), as with 1 up to 6 % are false with two to five runs, and with 0.75 with three and
+more. Both were chosen by simulation (experiments/comparisons). Satterthwaite's degrees of freedom cover 88 % where two
+runs decide.
 """
 
 from collections.abc import Hashable, Sequence
@@ -25,7 +26,8 @@ from lifelong.errors import require_package
 from lifelong.results.curves import Floats
 from lifelong.results.intervals import Estimate, score_interval
 
-INTERVAL_POWER, TEST_POWER = 1.25, 0.75  # of the share of the runs' component in the quantile
+INTERVAL_POWER = 1.25  # of the share of the runs' component in the quantile
+TEST_POWER = 0.75  # of tests, divided by the runs' degrees of freedom
 SMALLEST = 1e-60  # p-value
 ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
 
@@ -75,7 +77,7 @@ class Components:
         runs_df: Degrees of freedom of A; 0 if there is a single run, so that A is unknown and taken as 0.
         starts_df: Those of B.
         least: Variance of one episode, so that nothing is certain because all succeeded.
-        power: Power of A's share in the quantile.
+        tested: Whether the quantile is that of a test, which gives A more weight than that of an interval.
     """
 
     runs: float
@@ -84,7 +86,7 @@ class Components:
     runs_df: float
     starts_df: float
     least: float = 0.0
-    power: float = INTERVAL_POWER
+    tested: bool = False
 
     @property
     def variance(self) -> float:
@@ -106,8 +108,9 @@ def quantiles(parts: Sequence[Components], levels: Floats) -> Floats:
     require_package("scipy", "train")
     from scipy.special import stdtrit
 
-    columns = np.array([(c.runs, c.starts, c.runs_df, c.starts_df, c.power) for c in parts]).T
-    runs, starts, runs_df, starts_df, power = columns
+    columns = np.array([(c.runs, c.starts, c.runs_df, c.starts_df, c.tested) for c in parts]).T
+    runs, starts, runs_df, starts_df, tested = columns
+    power = np.where(tested, TEST_POWER / np.maximum(runs_df, 1.0), INTERVAL_POWER)
     t_runs = np.where(runs_df > 0, -stdtrit(np.maximum(runs_df, 1e-3), levels / 2), 0.0)
     t_starts = -stdtrit(np.maximum(starts_df, 1.0), levels / 2)
     total = runs + starts

@@ -8,14 +8,14 @@ same.
 import hashlib
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from lifelong.results.records import RunRecord
+from lifelong.results.records import DemonstrationsRecord, RunRecord
 from lifelong.results.results import Results
 
 Conditions = Mapping[str, str]
@@ -87,7 +87,7 @@ def changed_conditions(first: RunRecord, later: RunRecord) -> list[str]:
 
 
 def resume_notes(results: Results) -> list[str]:
-    """Return a sentence for each resume of a run under conditions other than those before it."""
+    """Return a sentence for each resume of a run under other conditions, or with other demonstrations, than before."""
     starts, notes = results.of(RunRecord), []
     for before, after in zip(starts, starts[1:], strict=False):
         if changes := changed_conditions(before, after):
@@ -95,7 +95,37 @@ def resume_notes(results: Results) -> list[str]:
                 f"Resumed {after.started.replace('T', ' ').replace('+00:00', ' UTC')} under other conditions "
                 f"({', '.join(changes)}): from there on, bits differ from those of an uninterrupted run."
             )
+    found = results.of(DemonstrationsRecord)
+    for earlier, later in zip(found, found[1:], strict=False):
+        if other := changed_demonstrations(earlier, later, results.run.tasks):
+            notes.append(f"Resumed {other}.")
     return notes
+
+
+def changed_demonstrations(
+    earlier: DemonstrationsRecord, later: DemonstrationsRecord, tasks: Sequence[str]
+) -> str:
+    """Return what a resume with other demonstrations says, without a full stop; "" where they are the same ones.
+
+    Args:
+        earlier: Demonstrations before.
+        later: Demonstrations after.
+        tasks: Names of the tasks.
+    """
+    pairs = zip(tasks, earlier.counts, later.counts, earlier.digests, later.digests, strict=True)
+    names = [name for name, *values in pairs if values[0] != values[1] or values[2] != values[3]]
+    if not names:
+        return ""
+    return (
+        f"with other demonstrations than before of {few_of(names)}: what was learned before the resume was learned "
+        "from the earlier ones"
+    )
+
+
+def few_of(names: Sequence[str], most: int = 3) -> str:
+    """Return names as a list, and of more than `most` how many there are and the first ones."""
+    listed = ", ".join(names[:most])
+    return listed if len(names) <= most else f"{len(names)} tasks ({listed}, …)"
 
 
 @cache

@@ -4,8 +4,9 @@ A pair is compared on the seeds that both have (all, unpaired, if these are fewe
 a seed does to every method alike (the first task's weights, the order of demonstrations) is removed as a block. With
 two to five seeds each method's own variance is hardly known, so it is pooled with the mean of all methods', which
 counts as `PRIOR_DF` degrees of freedom (Smyth, Stat. Appl. Genet. Mol. Biol. 2004, with the weight fixed, as it cannot
-be estimated from a dozen methods). The p-values of all pairs are adjusted by Holm (Scand. J. Stat. 1979). Error rates
-by simulation: experiments/comparisons.
+be estimated from a dozen methods), and is never taken to be less than its own estimate: a method whose seeds differ far
+more than others' would otherwise be found to differ too often. The p-values of all pairs are adjusted by Holm (Scand.
+J. Stat. 1979). Error rates by simulation: experiments/comparisons.
 """
 
 from collections.abc import Hashable, Mapping
@@ -16,7 +17,6 @@ import numpy as np
 
 from lifelong.results.components import (
     ONE_EPISODE,
-    TEST_POWER,
     Components,
     Sample,
     components,
@@ -25,7 +25,7 @@ from lifelong.results.components import (
 )
 from lifelong.results.intervals import Estimate, holm
 
-PRIOR_DF = 3.0
+PRIOR_DF = 2.0
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,9 @@ class Contrast:
         first: Label of the first.
         second: Label of the second.
         estimate: Difference with its interval, for this pair alone.
-        p_value: Probability of a difference as large if there is none.
-        adjusted: The p-value adjusted for all pairs; below 0.05, the two are told apart.
+        p_value: Probability of a difference as large if there is none; NaN where no method has a second seed, so that
+            nothing says how far seeds differ. The interval is then one over starts only.
+        adjusted: The p-value adjusted for all pairs; below 0.05, the difference is significant.
         pairs: Number of seeds (or orders) that both have and that are compared; 0 if they are compared unpaired.
         least_seeds: Number of seeds that are compared of the method that has fewer.
         parts: Components of the variance.
@@ -95,7 +96,11 @@ def contrasts(
     if not names:
         return []
     halves = quantiles(parts, np.full(len(parts), 1 - confidence)) * np.sqrt([c.variance for c in parts])
-    p = p_values(values, parts).tolist()
+    certain = [known[a].constant and known[b].constant for a, b in names]
+    p = [
+        value if same or part.runs_df > 0 else float("nan")
+        for value, same, part in zip(p_values(values, parts).tolist(), certain, parts, strict=True)
+    ]
     ends = [
         Estimate(value, max(value - half, possible[0]), min(value + half, possible[1]))
         for value, half in zip(values, halves.tolist(), strict=True)
@@ -119,10 +124,11 @@ def spreads(samples: Mapping[str, Sample], *, blocks: bool) -> dict[str, Spread]
     mean = sum(own[label].variance * own[label].df for label in moving) / total if total > 0 else 0.0
     found = {}
     for label, spread in own.items():
-        prior = min(PRIOR_DF, total - spread.df) if label in moving and len(moving) > 2 else 0.0
+        pooled = label in moving and (len(moving) > 2 or spread.df == 0)
+        prior = min(PRIOR_DF, total - spread.df) if pooled else 0.0
         df = spread.df + prior
         variance = (spread.df * spread.variance + prior * mean) / df if df > 0 else 0.0
-        found[label] = Spread(variance, df, total)
+        found[label] = Spread(max(variance, spread.variance), df, total)
     return found
 
 
@@ -178,5 +184,5 @@ def _difference(
         runs_df=min(between**2 / shares, of_a.most) if shares > 0 else 0.0,
         both=min(parts.both, between),
         least=float(least),
-        power=TEST_POWER,
+        tested=True,
     )

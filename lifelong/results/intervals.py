@@ -75,10 +75,13 @@ def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return the p-values of a family of tests, adjusted by Holm: p_(i) · (m - i), never falling, at most 1."""
+    """Return the p-values of a family of tests, adjusted by Holm: p_(i) · (m - i), never falling, at most 1.
+
+    NaN stands for what was not tested: it stays, and does not count among the m.
+    """
     p = np.asarray(p_values, dtype=float)
-    order = np.argsort(p, kind="stable")
-    steps = np.minimum(1.0, np.maximum.accumulate(p[order] * (len(p) - np.arange(len(p)))))
-    found = np.empty(len(p))
+    order = np.argsort(p, kind="stable")[: np.isfinite(p).sum()]
+    steps = np.minimum(1.0, np.maximum.accumulate(p[order] * (len(order) - np.arange(len(order)))))
+    found = np.full(len(p), np.nan)
     found[order] = steps
     return [float(value) for value in found]

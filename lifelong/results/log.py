@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import IO
 
 from lifelong.errors import ResultsError
-from lifelong.results.records import Record, RunRecord, from_line, to_line
+from lifelong.results.records import DemonstrationsRecord, Record, RunRecord, from_line, to_line
 from lifelong.results.results import Results
 
 MAX_LINE = 4 << 20  # [bytes]
@@ -82,9 +82,7 @@ class ResultLog:
                         first = lines.setdefault(
                             hashlib.blake2b(line.strip(), digest_size=16).digest(), number
                         )
-                        if first != number and not isinstance(
-                            record, RunRecord
-                        ):  # of two starts in one second
+                        if first != number and not isinstance(record, RunRecord | DemonstrationsRecord):
                             raise ValueError(f"repeats line {first}")
                         records.append((number, record))
                     except ValueError as error:

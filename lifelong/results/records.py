@@ -161,6 +161,28 @@ class PhaseRecord:
 
 
 @dataclass(frozen=True)
+class DemonstrationsRecord:
+    """The demonstrations that the process which started last learns from, by task.
+
+    Attributes:
+        counts: Number of demonstrations.
+        generators: What recorded them, such as `scripted-expert-1`; "" where their file does not say.
+        digests: Digest of their states and actions, see `libero_env.demos.DemoOrigin`.
+    """
+
+    kind: Literal["demonstrations"] = field(default="demonstrations", init=False)
+    counts: tuple[Count, ...]
+    generators: tuple[str, ...]
+    digests: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.counts) == len(self.generators) == len(self.digests) > 0:
+            raise ValueError(
+                f"{len(self.counts)} counts have {len(self.generators)} generators and {len(self.digests)} digests"
+            )
+
+
+@dataclass(frozen=True)
 class CostRecord:
     """Costs of learning a task besides the time of its epochs and evaluations, named as in `lifelong.training.costs`.
 
@@ -253,6 +275,7 @@ Record = (
     | LossRecord
     | EvalRecord
     | PhaseRecord
+    | DemonstrationsRecord
     | CostRecord
     | TaskEndRecord
     | RelearnRecord
@@ -263,6 +286,7 @@ RECORD_TYPES: Mapping[str, type[Record]] = {
     "loss": LossRecord,
     "eval": EvalRecord,
     "phase": PhaseRecord,
+    "demonstrations": DemonstrationsRecord,
     "cost": CostRecord,
     "task_end": TaskEndRecord,
     "relearn": RelearnRecord,

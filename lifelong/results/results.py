@@ -16,6 +16,7 @@ from lifelong.results.curves import Curve, Transfer, mean_curve
 from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import (
     CostRecord,
+    DemonstrationsRecord,
     EvalRecord,
     LossRecord,
     PhaseRecord,
@@ -62,6 +63,12 @@ class Results:
     def finished(self) -> bool:
         """Whether the whole sequence is learned."""
         return bool(self.of(RunEndRecord))
+
+    @property
+    def demonstrations(self) -> DemonstrationsRecord | None:
+        """What the tasks are learned from, after the last resume; None where it is not recorded."""
+        found = self.of(DemonstrationsRecord)
+        return found[-1] if found else None
 
     def evaluation(
         self, phase: str, learned: int, task: int, epoch: int | None = None, *, shift: str = ""

@@ -1,4 +1,4 @@
-"""How many seeds would tell two methods apart, from the variances that a comparison estimated."""
+"""How many seeds would show a difference between two methods, from the variances that a comparison estimated."""
 
 import math
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ class Outlook:
     """What more seeds would show.
 
     Attributes:
-        shown: Difference that the present seeds show in four of five cases, at the level that all pairs leave to each;
-            NaN if the spread between seeds is not known.
-        seeds: Number of seeds of each method with which the observed difference would be shown in four of five
-            cases; None if more than 100, or unknown.
+        detectable: Smallest difference that the present seeds show with 80 % power, at the level that all pairs leave
+            to each; NaN if the spread between seeds is not known.
+        seeds: Number of seeds of each method with which the observed difference would be shown with 80 % power;
+            None if more than 100, or unknown.
     """
 
-    shown: float
+    detectable: float
     seeds: int | None
 
 
@@ -44,8 +44,8 @@ def outlook(contrast: Contrast, tests: int, alpha: float = ALPHA) -> Outlook:
     if parts.runs_df <= 0:
         return Outlook(math.nan, None)
     counts = list(range(2, MOST_SEEDS + 1))
-    found = _shown([_with_seeds(parts, seeds, count) for count in counts], alpha / tests)
-    present = float(_shown([parts], alpha / tests)[0])
+    found = _detectable([_with_seeds(parts, seeds, count) for count in counts], alpha / tests)
+    present = float(_detectable([parts], alpha / tests)[0])
     enough = np.flatnonzero(found <= abs(contrast.estimate.value))
     return Outlook(present, counts[int(enough[0])] if len(enough) else None)
 
@@ -66,8 +66,8 @@ def _with_seeds(parts: Components, seeds: int, count: int) -> Components:
     )
 
 
-def _shown(parts: Sequence[Components], level: float) -> np.ndarray:
-    """Return (P,) differences that are shown with the power."""
+def _detectable(parts: Sequence[Components], level: float) -> np.ndarray:
+    """Return (P,) smallest differences that are shown with the power."""
     count = len(parts)
     t = quantiles(parts, np.full(count, level)) + quantiles(parts, np.full(count, 2 * (1 - POWER)))
     return np.asarray(t * np.sqrt([c.variance for c in parts]))

@@ -14,7 +14,7 @@ from libero_env.storage import atomic_write_text
 from lifelong.errors import ResultsError
 from lifelong.results.conditions import resume_notes
 from lifelong.results.metrics import METRIC_NAMES, Metrics, lifelong_metrics, wilson_interval
-from lifelong.results.records import TaskEndRecord
+from lifelong.results.records import DemonstrationsRecord, RunRecord, TaskEndRecord
 from lifelong.results.results import Results, after_base_stage
 from lifelong.results.scores import Scores
 from lifelong.results.shifts import shift_summary
@@ -56,8 +56,9 @@ def summarize(results: Results) -> dict[str, Any]:
     unseen = np.isnan(rates)
     ends = {r.task: r.best_epoch for r in results.of(TaskEndRecord)}
     return {
-        "run": {k: v for k, v in asdict(run).items() if k != "kind"},
+        "run": _without_kind(run),
         "resumed_under_other_conditions": resume_notes(results),
+        "demonstrations": _without_kind(results.demonstrations),
         "finished": results.finished,
         "tasks_learned": size,
         "statistics": {
@@ -99,6 +100,10 @@ def summarize(results: Results) -> dict[str, Any]:
             for r in results.evaluations()
         ],
     }
+
+
+def _without_kind(record: RunRecord | DemonstrationsRecord | None) -> dict[str, Any] | None:
+    return None if record is None else {k: v for k, v in asdict(record).items() if k != "kind"}
 
 
 def _metrics(scores: Scores) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     CostRecord,
+    DemonstrationsRecord,
     EvalRecord,
     LossRecord,
     PhaseRecord,
@@ -57,6 +58,7 @@ def evaluation(phase, learned: int, epoch: int, task: int) -> EvalRecord:
 
 RECORDS = [
     START,
+    DemonstrationsRecord(counts=(50, 10), generators=("expert", ""), digests=("aa", "bb")),
     PhaseRecord(phase="demos", seconds=3.0),
     *(evaluation("curve", task, epoch, task) for task in (0, 1) for epoch in (0, 1)),
     *(LossRecord(task=task, epoch=1, loss=0.5 + task, seconds=2.0) for task in (0, 1)),

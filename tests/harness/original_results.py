@@ -1,5 +1,6 @@
 """What ours finds for the weights and batches that LIBERO's code gets too, in the shapes of `original_learning.py`."""
 
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -53,6 +54,25 @@ def gradients(policy: Policy) -> Found:
 def weights(policy: Policy) -> Found:
     """Return copies of weights and running statistics."""
     return {n: t.clone() for n, t in policy.state_dict().items()}
+
+
+def projections(found: Found) -> np.ndarray:
+    """Return each tensor's product with four fixed vectors of 1 and -1, (tensors by name, 4) float32.
+
+    A difference d of a tensor moves them by about its norm, whatever its direction.
+    """
+    rows = []
+    for name in sorted(found):
+        signs = np.random.default_rng(zlib.crc32(name.encode())).integers(0, 2, (4, found[name].numel()))
+        rows.append((2.0 * signs - 1) @ found[name].double().flatten().numpy())
+    return np.array(rows, dtype=np.float32)
+
+
+def kept_of(found: Found) -> dict[str, np.ndarray]:
+    """Return what is recorded of tensors: their names, norms and projections."""
+    names = sorted(found)
+    norms = np.array([found[n].double().norm() for n in names], dtype=np.float32)
+    return {"names": np.array(names), "norms": norms, "projections": projections(found)}
 
 
 def measure(policy: Policy, first: Batch, episode: Batch) -> dict:

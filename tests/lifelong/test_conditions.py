@@ -17,7 +17,7 @@ from lifelong.results.conditions import (
 )
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
-from lifelong.results.records import from_line, to_line
+from lifelong.results.records import DemonstrationsRecord, from_line, to_line
 from lifelong.settings import RunSettings
 
 pytestmark = pytest.mark.unit
@@ -92,6 +92,20 @@ def test_a_resume_under_other_conditions_is_told(tmp_path):
 
 def test_the_same_conditions_say_nothing(tmp_path):
     assert resume_notes(write(tmp_path, START, START).read()) == []
+
+
+def test_a_resume_with_other_demonstrations_is_told(tmp_path):
+    first = DemonstrationsRecord(counts=(50,), generators=("expert-1",), digests=("aa",))
+    for other in (replace(first, digests=("bb",)), replace(first, counts=(10,))):
+        folder = tmp_path / f"{other.counts}"
+        log = write(folder, START, first, START, first, START, other, START, first)
+        assert log.read().problems == ResultLog(log.path).read().problems == (), (
+            "a record may be as an earlier one"
+        )
+        assert log.read().demonstrations == first
+        notes = resume_notes(log.read())
+        assert len(notes) == 2 and notes[0].startswith("Resumed with other demonstrations than before of a: ")
+        assert notes[0] in load_run(folder).notes, "the report shows it"
 
 
 def test_a_resumed_run_takes_over_the_threads_that_it_was_started_with(tmp_path, threads, capsys):

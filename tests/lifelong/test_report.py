@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from PIL import Image
 from libero_env.tasks import get_suite
 from lifelong.errors import LifelongError
 from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure
-from lifelong.report.page import write_report
+from lifelong.report.page import comparison_text, write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
 from lifelong.report.statistics import statistics
 from lifelong.results.episode_table import read_episodes
@@ -25,6 +26,7 @@ from lifelong.results.metrics import METRIC_NAMES, METRIC_RANGES
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     CostRecord,
+    DemonstrationsRecord,
     EvalRecord,
     LossRecord,
     PhaseRecord,
@@ -340,6 +342,27 @@ def test_long_names_do_not_squeeze_the_plot(tmp_path: Path):
         assert box.width > 0.85 and box.height * figure.get_size_inches()[1] > 1.9
 
 
+def test_tasks_that_are_learned_together_leave_no_empty_rows():
+    rates = np.full((10, 10), np.nan)
+    for row in range(5, 10):
+        rates[row, : row + 1] = 1.0
+    panel = Panel("er", rates, [str(task) for task in range(10)])
+    heatmap, whole = (
+        heatmap_figure([panel] * 5),
+        heatmap_figure([replace(panel, rates=np.tril(np.ones((10, 10))))] * 5),
+    )
+    for figure in (heatmap, whole):
+        FigureCanvasAgg(figure).draw()
+    axes = heatmap.axes[0]
+    assert axes.get_ylim() == (9.5, 4.5) and [t.get_text() for t in axes.get_yticklabels()] == list(
+        "6789"
+    ) + ["10"]
+    assert whole.axes[0].get_ylim() == (9.5, -0.5)
+    assert heatmap.get_size_inches()[1] < 0.7 * whole.get_size_inches()[1]
+    line = forgetting_figure([Line("er", rates[:, :1].T)])
+    assert list(line.axes[0].get_xticks()) == [6, 7, 8, 9, 10]
+
+
 def test_no_two_of_twenty_lines_look_the_same():
     figure = forgetting_figure([Line(str(n), np.full((1, 4), 0.5)) for n in range(20)])
     looks = {
@@ -447,6 +470,31 @@ def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Pat
         ("ewc (strength 500)", 1),
         ("er", 1),
     ]
+
+
+def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
+    kinds = {"old": ("aa", "bb"), "older": ("aa", "bb"), "new": ("aa", "cc"), "fewer": ("dd", "ee")}
+    runs = []
+    for number, (name, digests) in enumerate(kinds.items()):
+        runs.append(make_run(tmp_path / name, ("ewc", "er")[number % 2], number, tasks=2))
+        counts = (10, 10) if name == "fewer" else (50, 50)
+        ResultLog(runs[-1] / "results.jsonl").append(
+            DemonstrationsRecord(counts=counts, generators=("expert",) * 2, digests=digests)
+        )
+    runs.append(make_run(tmp_path / "unknown", "er", 9, tasks=2))
+    page = write_report(runs, tmp_path / "report.html")
+    told = [line for line in comparison_text(page) if "other demonstrations" in line]
+    second = load_run(runs[0]).record.tasks[1]
+    assert told == [
+        f"ewc seed 2 learned from other demonstrations of {second} than ewc seed 0, er seed 1: a difference between "
+        "them may be due to that."
+    ]
+    assert told[0] in page.read_text(), (
+        "fewer demonstrations are another setting, and an older record says nothing"
+    )
+    assert not any(
+        "other demonstrations" in line for line in comparison_text(write_report(runs[:2], tmp_path))
+    )
 
 
 def test_runs_of_different_progress_and_length_compare(tmp_path: Path):

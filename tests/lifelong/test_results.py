@@ -13,6 +13,7 @@ from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     RECORD_TYPES,
     CostRecord,
+    DemonstrationsRecord,
     EvalRecord,
     LossRecord,
     PhaseRecord,
@@ -89,7 +90,8 @@ def test_every_kind_of_record_survives_the_round_trip():
         errors=(0.4, 0.1),
         seconds=2.0,
     )
-    records = [*RUN, relearned]
+    learned_from = DemonstrationsRecord(counts=(50, 10), generators=("expert", ""), digests=("aa", "bb"))
+    records = [*RUN, relearned, learned_from]
     assert {r.kind for r in records} == set(RECORD_TYPES)
     for record in records:
         line = to_line(record)
