@@ -43,6 +43,9 @@ class DMPEL(RoutedExperts):
     * The paper's router takes features of a frozen CLIP; this one the image in `pool` by `pool` pixels, and the whole
       context at length one (see `SigmoidRouter`).
     * The task that the base was learned with needs no expert: its contexts recall zeros.
+    * While a task is learned, its own experts are always among the best `top_k`: from the fourth task with an expert
+      on, the chance of the router's first weights would otherwise leave them out of some groups of layers, where they
+      would never learn.
     * Recall takes all coefficients and all stored contexts at every step, not the best in batches. There is no dropout
       of coefficients, and A is initialised as in LoRA, not orthogonally to earlier experts.
     * Linear layers and convolutions have experts. An LSTM stays as in the base; its inputs and outputs pass through
@@ -142,7 +145,7 @@ class DMPEL(RoutedExperts):
             groups = len(_groups(adapted_layers(policy, self.adapted)))
             coefficients = queries.new_zeros(len(queries), groups, 0)
         else:
-            coefficients = self._router(queries).detach()
+            coefficients = self._router(queries, self.experts).detach()
         self._memory[task_index] = {"queries": queries, "coefficients": coefficients}
         self._recall()
         self._episodes = {}
@@ -169,7 +172,8 @@ class DMPEL(RoutedExperts):
         """Return the coefficient of each expert in each group of layers, (B, G, N)."""
         assert self._router is not None
         given = observation.proprio.get(_QUERY)
-        return self._router(self.query(observation) if given is None else given[:, 0])
+        learning = self.experts if self._episodes else 0
+        return self._router(self.query(observation) if given is None else given[:, 0], learning)
 
     @contextmanager
     def holding(self, coefficients: Tensor) -> Iterator[None]:

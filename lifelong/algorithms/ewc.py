@@ -27,7 +27,7 @@ class EWC(Algorithm):
     """
 
     state_form = ANCHOR_FORM
-    tuned = {"strength": (1.5e3, 1.5e4, 1.5e5, 1.5e6), "gamma": (0.5, 0.9, 1.0)}
+    tuned = {"strength": (150.0, 500.0, 1.5e3, 5e3, 1.5e4), "gamma": (0.5, 0.9, 1.0)}
     plain_start = True
 
     def __init__(

@@ -24,7 +24,7 @@ class MAS(Algorithm):
     """
 
     state_form = {"anchor": ANCHOR_FORM}
-    tuned = {"strength": (0.1, 1.0, 10.0, 30.0, 100.0, 1000.0)}
+    tuned = {"strength": (0.01, 0.03, 0.1, 0.3, 1.0, 10.0)}
     plain_start = True
 
     def __init__(

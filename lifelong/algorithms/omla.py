@@ -58,7 +58,7 @@ class OMLA(LoRA):
 
         Args:
             prior_rate: Share of the way that the prior moves to each learned adapter, in [0, 1]; 0 for LoRA.
-            rank: Rank of the adapters, see `LoRA`; as the arguments below.
+            rank: Rank of the adapters, at most the smaller side of a weight.
             alpha: Numerator of the adapters' scale alpha / rank.
             adapted: Patterns of names of the parameters that get adapters.
             own: Patterns of names of parameters of which every task has its own copy.

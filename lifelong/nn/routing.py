@@ -64,11 +64,18 @@ class SigmoidRouter(nn.Module):
             h = functional.gelu(h @ self.middle.T)
             return 2 * torch.sigmoid((h @ self.leave.T).view(len(query), *self.bias.shape) + self.bias)
 
-    def forward(self, query: Tensor) -> Tensor:
-        """Map queries (B, Q) to coefficients (B, G, N), zero beyond the `top_k` largest of each group."""
+    def forward(self, query: Tensor, newest: int = 0) -> Tensor:
+        """Map queries (B, Q) to coefficients (B, G, N), zero beyond the `top_k` largest of each group.
+
+        Args:
+            query: Queries (B, Q).
+            newest: Number of experts, from the last, that count in any case and are among the `top_k`.
+        """
         c = self.coefficients(query)
         if 0 < self.top_k < c.shape[-1]:
-            c = c * (c >= c.topk(self.top_k, dim=-1).values[..., -1:])
+            rank = c.detach().clone()
+            rank[..., c.shape[-1] - newest :] = torch.inf
+            c = c * (rank >= rank.topk(max(self.top_k, newest), dim=-1).values[..., -1:])
         return c
 
 

@@ -378,16 +378,25 @@ def test_dmpel_recall_keeps_the_coefficients_of_earlier_tasks():
     assert drift[1000] < 0.1 < 0.3 < drift[0], drift
 
 
-def test_dmpel_the_newest_expert_stays_alive():
-    """At the end of the third task with an expert, it still counts, and its B still moves."""
-    policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=20)
-    for task in range(3):
-        learn_small(algorithm, policy, task, LONG)
-    algorithm.begin_task(3, sequences.dataset(3), policy)
-    fit(policy, sequences.dataset(3), algorithm, settings=LONG, seed=(3, 0))
-    assert algorithm._router(algorithm._episodes["queries"])[..., -1].min() > 0.1
-    policy.loss(algorithm.mix(everything(3), generator(0))).backward()
-    assert all(pair["b"].grad.abs().max() > 0 for pair in algorithm._library[3].values())
+@pytest.mark.parametrize(("experts", "tasks"), [(1, 8), (2, 4)])
+def test_dmpel_the_newest_experts_stay_alive(experts: int, tasks: int):
+    """At the end of each task they still count, and their B still moves, also where more than `top_k` compete."""
+    policy = make_policy(head="deterministic")
+    algorithm = DMPEL(rank=2, pool=2, recall_steps=20, top_k=3, experts=experts)
+    learn_small(algorithm, policy, 0, LONG)
+    for task in range(1, tasks):
+        dataset = sequences.dataset(task % 4)
+        algorithm.begin_task(task, dataset, policy)
+        fit(policy, dataset, algorithm, settings=LONG, seed=(task, 0))
+        now = algorithm._router(algorithm._episodes["queries"], experts)
+        assert now[..., -experts:].min() > 0.1
+        assert ((now > 0).sum(-1) == min(3, experts * task)).all(), "no more than top_k count"
+        policy.loss(algorithm.mix(everything(task % 4), generator(0))).backward()
+        assert all(pair["b"].grad.abs().max() > 0 for pair in algorithm._library[task].values()), task
+        assert all(pair["b"].abs().max() > 0 for pair in algorithm._library[task].values()), task
+        policy.zero_grad()
+        algorithm.end_phase("learn", policy)
+        algorithm.end_task(task, dataset, policy, generator(task))
 
 
 def test_dmpel_of_earlier_versions_is_refused_in_a_line(tmp_path):
