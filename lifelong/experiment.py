@@ -13,6 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from libero_env.assets.pack import select_pack
+from libero_env.demos.read import demo_origin
 from libero_env.envs.batch import BatchEnv
 from libero_env.memory import memory_limit
 from libero_env.perturbations import Perturbation, format_perturbations, reword_task
@@ -34,12 +35,18 @@ from lifelong.evaluation.environment_record import renderer_name_or_none
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.held_out import HeldOutShift, held_out_shift
 from lifelong.evaluation.settings import EvalSettings
+from lifelong.policies.base import Policy
 from lifelong.pretraining import policy_at_start, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
-from lifelong.results.conditions import changed_conditions, present_conditions, recorded_threads
+from lifelong.results.conditions import (
+    changed_conditions,
+    changed_demonstrations,
+    present_conditions,
+    recorded_threads,
+)
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record, utc_now
-from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord
+from lifelong.results.records import DemonstrationsRecord, PhaseRecord, RunEndRecord, RunRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from lifelong.sequence import TaskSequence, is_measured
@@ -89,6 +96,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                 )
             if not finished:
                 if ranks.first:
+                    _note_single_frames(context.policy, names["policy"])
                     context.tracker.start(_run_name(names, settings), str(directory.path), plain)
                     _record_start(context, names, plain)
                 _run_sequence(context, pretraining, plain)
@@ -96,6 +104,16 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                 context.tracker.finish()
                 _write_results(directory, plain)
     return directory.path
+
+
+def _note_single_frames(policy: Policy, name: str) -> None:
+    """Say where a policy that uses its history is given windows of one frame, as by the preset `laptop`."""
+    if policy.uses_history and policy.spec.seq_len == 1:
+        print(
+            f"note: policy={name} learns and acts on single frames, as data.seq_len=1; "
+            "data.seq_len=10 gives it the last ten, as in the paper",
+            file=sys.stderr,
+        )
 
 
 def _is_finished(context: RunContext) -> bool:
@@ -322,9 +340,26 @@ def _find_demos(context: RunContext) -> tuple[list[Path], list[tuple[Path, ...]]
     recorded = find_demos(context.tasks, context.demos, context.data, context.progress)
     own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
     paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
+    _record_demonstrations(context, recorded)
     seconds = time.perf_counter() - began
     context.directory.log.append(PhaseRecord(phase="demos", seconds=seconds))
     return paths, copies
+
+
+def _record_demonstrations(context: RunContext, paths: Sequence[Path]) -> None:
+    """Record what the tasks' demonstrations are; say where a resume learns from others than the run did before."""
+    origins = [demo_origin(path, count) for path, count in zip(paths, context.demos, strict=True)]
+    record = DemonstrationsRecord(
+        counts=tuple(one.count for one in origins),
+        generators=tuple(one.generator for one in origins),
+        digests=tuple(one.digest for one in origins),
+    )
+    log = context.directory.log
+    before = log.read().of(DemonstrationsRecord)
+    if not before or before[-1] != record:
+        log.append(record)
+    if before and (changes := changed_demonstrations(before[-1], record, [t.name for t in context.tasks])):
+        print(f"resumed {changes}", file=sys.stderr)
 
 
 def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mapping[str, Any]) -> None:

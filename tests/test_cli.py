@@ -15,6 +15,7 @@ import pytest
 from libero_env import paths
 from libero_env.cli import doctor
 from libero_env.cli.doctor import Finding
+from libero_env.errors import MAX_LISTED, UnknownNameError
 from libero_env.tasks import bddl, get_suite, get_task
 from lifelong.cli import main as cli
 from lifelong.cli.doctor import check_torch
@@ -58,14 +59,48 @@ def test_a_task_is_shown_as_bddl(capsys):
     ("argv", "hint"),
     [
         (["tasks", "list", "libero_objet"], "Did you mean 'libero_object'?"),
-        (["tasks", "show", "libero_object/12"], "Valid: 0, 1, "),
-        (["tasks", "list", "libero_object", "--order", "99"], "task order of libero_object 99"),
+        (["tasks", "show", "libero_object/12"], "unknown index of libero_object '12'. Valid: 0 to 9\n"),
+        (["tasks", "list", "libero_object", "--order", "30"], "libero_object 30. Valid: 0 to 20\n"),
+        (
+            ["tasks", "show", "libero_goa"],
+            "unknown suite 'libero_goa'. Did you mean 'libero_goal'? Valid: li",
+        ),
+        (["tasks", "certify", "libero-goal"], "unknown suite 'libero-goal'. Did you mean 'libero_goal'?"),
+        (["tasks", "lint", "LIBERO_GOAL"], "Did you mean 'libero_goal'?"),
+        (["perturb", "certify", "libero_gola"], "Did you mean 'libero_goal'?"),
+        (["robustness", "expert", "--suite", "libero_gaol"], "Did you mean 'libero_goal'?"),
+        (["eval", "expert", "--suite", "libero_goa"], "Did you mean 'libero_goal'?"),
+        (
+            ["eval", "nowhere", "--suite", "libero_goal"],
+            "nowhere does not exist; give the directory of a run",
+        ),
+        (["serve", "nowhere"], "nowhere does not exist; give the directory of a run"),
+        (["relearn", "nowhere"], "nowhere does not exist; give the directory of a run"),
+        (["demos", "check", "/nonexist"], "/nonexist does not exist; give demonstration files, or folders"),
+        (["demos", "info", "/nonexist", "tests"], "/nonexist does not exist; give demonstration files"),
     ],
 )
 def test_errors_are_one_line_and_a_status(argv, hint, capsys):
     assert cli.main(argv) == 2
     err = capsys.readouterr().err
     assert err.startswith("error: ") and hint in err and err.count("\n") == 1
+
+
+def test_a_list_of_many_names_is_cut(capsys):
+    assert cli.main(["tasks", "show", "nope"]) == 2
+    assert len(capsys.readouterr().err) < 300, "ranges of indices, not 130 names"
+    cut = str(UnknownNameError("object", "o7", [f"o{i}" for i in range(100, 200)]))
+    assert cut.endswith(f"o{99 + MAX_LISTED}, ... (100 in all)") and cut.count(",") == MAX_LISTED
+
+
+@pytest.mark.parametrize(("inside", "shown"), [("er/bc_seed1", "*/*"), ("one", "*"), ("a/er/one", "*/*/*")])
+def test_a_folder_of_runs_is_no_run(inside, shown, tmp_path, capsys):
+    for name in ("", "_b"):
+        (tmp_path / f"{inside}{name}").mkdir(parents=True)
+        (tmp_path / f"{inside}{name}" / "results.jsonl").write_text("")
+    assert cli.main(["report", str(tmp_path)]) == 2
+    told = f"error: {tmp_path} is no run: it holds 2, in {tmp_path}/{shown}; write libero report {tmp_path}/{shown}"
+    assert capsys.readouterr().err == f"{told}\n"
 
 
 @pytest.fixture

@@ -128,7 +128,9 @@ def test_errors_by_kind(capsys):
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        ("ending_nowhere:make", "No module named 'ending_nowhere'; write module:function"),
+        ("ending_nowhere:make", "there is no module ending_nowhere, neither in the current folder ("),
+        ("ending_nowhere:make", ") nor installed; type the command in the folder of ending_nowhere.py"),
+        ("ending_policy.py:make", "a module is named without .py: write ending_policy:make, in the folder"),
         ("ending_policy:missing", "module ending_policy has no function missing"),
         ("ending_policy:number", "module ending_policy has a int, not a function, number"),
         ("ending_policy:nothing", "returns a NoneType without predict"),

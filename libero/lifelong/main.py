@@ -17,7 +17,7 @@ def main() -> int:
     from libero._adapters.lifelong.config import CONFIGS
     from libero.lifelong.run import run
     from libero_env.cli import ending
-    from lifelong.launch import check_choices
+    from lifelong.composition import check_choices
 
     status, mistakes = 0, (HydraException, OmegaConfBaseException)
 

@@ -4,6 +4,7 @@ import argparse
 import io
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from libero_env.cli import arguments, assets, demos, ending, objects, perturb, tasks, teleop
@@ -21,7 +22,9 @@ from lifelong.cli import (
     sweep,
     tune,
 )
+from lifelong.errors import ConfigError
 
+RECORDS = "results.jsonl"  # in the directory of each run
 TRAIN_HELP = """\
 Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
 group (algo=ewc, benchmark=libero_goal, preset=paper) or set a key (train.lr=3e-4). A killed run resumes when the same
@@ -169,13 +172,31 @@ def register_report(subparsers: Subparsers) -> None:
 
 
 def run_report(args: argparse.Namespace) -> None:
-    """Write the page; print its path and, of several runs, what can be told apart."""
+    """Write the page; print its path and, of several runs, which differ significantly."""
     from lifelong.report.page import comparison_text, shift_text, write_report
 
+    for folder in args.run_dirs:
+        _check_run(folder)
     page = write_report(args.run_dirs, args.out)
     print(page)
     for line in comparison_text(page) if len(args.run_dirs) > 1 else shift_text(args.run_dirs[0]):
         print(line)
+
+
+def _check_run(folder: Path) -> None:
+    """Check that a folder is not one of runs, at some level below `runs`.
+
+    Raises:
+        ConfigError: It is; the message names its runs.
+    """
+    if (folder / RECORDS).is_file():
+        return
+    for levels in ("*", "*/*", "*/*/*"):
+        if count := len(list(folder.glob(f"{levels}/{RECORDS}"))):
+            shown = folder / levels
+            raise ConfigError(
+                f"{folder} is no run: it holds {count}, in {shown}; write libero report {shown}"
+            )
 
 
 COMMANDS: tuple[Callable[[Subparsers], None], ...] = (

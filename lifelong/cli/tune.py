@@ -98,7 +98,7 @@ def run_tune(args: argparse.Namespace) -> None:
     """Measure all values and write table, picture, JSON file and the chosen value."""
     import torch
 
-    from lifelong.launch import compose_run
+    from lifelong.composition import compose_run
     from lifelong.settings import Configuration, plain_data
     from lifelong.tuning.figure import draw_frontier
     from lifelong.tuning.frontier import render
@@ -143,7 +143,7 @@ def _candidates(
     words: Sequence[str], config_dir: Path | None
 ) -> tuple[list["Candidate"], list[str], str | None]:
     """Return a candidate for each combination of values, the words that are not swept, and the default's label."""
-    from lifelong.launch import compose_run, swept
+    from lifelong.composition import compose_run, swept
     from lifelong.settings import Configuration, plain_data
 
     lists = swept(words)
@@ -171,7 +171,7 @@ def _candidates(
 def _candidate(
     label: str, values: dict[str, str], words: Sequence[str], config_dir: Path | None
 ) -> "Candidate":
-    from lifelong.launch import compose_run
+    from lifelong.composition import compose_run
     from lifelong.settings import Configuration, plain_data
     from lifelong.tuning.sweep import Candidate
 

@@ -10,7 +10,7 @@ import yaml
 from libero_env.errors import UnknownNameError
 from lifelong import checkpoints
 from lifelong.algorithms.importance import BatchFisher
-from lifelong.launch import check_choices
+from lifelong.composition import check_choices
 from lifelong.seeding import generator
 from lifelong.settings import build
 from lifelong.training.fit import fit

@@ -12,9 +12,9 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import lifelong
+from lifelong.composition import check_choices
 from lifelong.errors import ConfigError
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.launch import check_choices
 from lifelong.settings import RunSettings
 from lifelong.settings.targets import GROUPS
 from tests.harness.configs import CONFIGS, FILES, composed

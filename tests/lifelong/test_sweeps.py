@@ -9,8 +9,8 @@ import pytest
 
 from lifelong import sweeps
 from lifelong.cli.main import main
+from lifelong.composition import check_choices, config_folder
 from lifelong.errors import ConfigError, MissingPackageError, ResultsError, RunLockedError
-from lifelong.launch import check_choices, config_folder
 from lifelong.sweeps import (
     JobRecord,
     begin_sweep,
