@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 DEBUG_VARIABLE = "LIBERO_DEBUG"  # environment variable that asks for every traceback
+MAX_LISTED = 64  # valid names in a message; all categories of objects fit
 RAISED_BY = "raised by "  # a note on an error from code of the user begins so; then follows whose code it is
 
 
@@ -16,19 +17,32 @@ class LiberoError(Exception):
 class UnknownNameError(LiberoError, LookupError):
     """A name (suite, task, category, option, ...) that does not exist.
 
-    The message lists the valid names and suggests the nearest.
+    The message lists the valid names, the first of many, and suggests the nearest; of numbers it gives the range.
 
     Args:
         kind: Kind of the name, such as `task`.
         name: Name that does not exist.
         valid: Names that exist.
+        unlisted: Names that exist too, which are suggested, but not listed.
     """
 
-    def __init__(self, kind: str, name: object, valid: Iterable[object]):
+    def __init__(self, kind: str, name: object, valid: Iterable[object], *, unlisted: Iterable[object] = ()):
+        if isinstance(valid, range) and valid:
+            ends = f"{valid[0]}" if len(valid) == 1 else f"{valid[0]} to {valid[-1]}"
+            super().__init__(f"unknown {kind} {name!r}. Valid: {ends}")
+            return
         names = sorted(map(str, valid))
-        close = difflib.get_close_matches(str(name), names, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names)}")
+        near = closest(str(name), [*names, *map(str, unlisted)])
+        hint = f" Did you mean {near!r}?" if near is not None else ""
+        more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
+        super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names[:MAX_LISTED])}{more}")
+
+
+def closest(name: str, valid: Iterable[str]) -> str | None:
+    """Return the valid name that is most like another one, upper or lower case; None where none is like it."""
+    folded = {one.casefold(): one for one in valid}
+    near = difflib.get_close_matches(name.casefold(), folded, n=1)
+    return folded[near[0]] if near else None
 
 
 class MissingPackageError(LiberoError):

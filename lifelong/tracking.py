@@ -13,7 +13,7 @@ class Tracker:
     Args:
         mode: `disabled` does nothing. `offline` writes into the run directory without a login; `wandb sync` uploads
             it later. `online` uploads at once.
-        project: W&B project.
+        project: Name of the W&B project.
         entity: W&B user or team; None for the default of the login.
 
     Raises:

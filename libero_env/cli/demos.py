@@ -217,7 +217,7 @@ def run_info(args: argparse.Namespace) -> int:
     from libero_env.errors import DemoError
 
     broken = 0
-    for path in find_demo_files(args.paths):
+    for path in demo_files(args.paths):
         try:
             print(describe(path))
         except DemoError as error:
@@ -228,7 +228,20 @@ def run_info(args: argparse.Namespace) -> int:
 
 def run_check(args: argparse.Namespace) -> int:
     """Read every file completely; return 1 if one is broken."""
-    return int(check_files(find_demo_files(args.paths)) > 0)
+    return int(check_files(demo_files(args.paths)) > 0)
+
+
+def demo_files(paths: list[Path]) -> list[Path]:
+    """Return the demonstration files among the given paths and in the given folders; see `find_demo_files`.
+
+    Raises:
+        DemoError: A folder is missing, or there are no files.
+    """
+    from libero_env.errors import DemoError
+
+    if missing := [path for path in paths if path.suffix != ".hdf5" and not path.exists()]:
+        raise DemoError(f"{missing[0]} does not exist; give demonstration files, or folders that hold some")
+    return find_demo_files(paths)
 
 
 def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:

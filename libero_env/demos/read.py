@@ -19,6 +19,7 @@ Labels: some demonstrations are recorded with noise on the actions. `actions` ar
 replayed; `expert_actions`, where present, are those that the expert chose, which are the ones to learn.
 """
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,7 +40,7 @@ from libero_env.demos.contents import (
     read_pairing,
     read_values,
 )
-from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file
+from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file, read_attribute
 from libero_env.errors import DemoError
 
 
@@ -136,6 +137,40 @@ def demo_lengths(
             shifted = pairing == "aligned" and read_pairing(handle, file) == "libero"
             lengths += [count_steps(handle["data"][name], file, name) - shifted for name in names]
     return lengths
+
+
+@dataclass(frozen=True)
+class DemoOrigin:
+    """What some demonstrations of a file are, and what made them.
+
+    Attributes:
+        count: Number of demonstrations.
+        generator: What recorded them, such as `scripted-expert-1`; "" where the file does not say.
+        digest: 16 hex digits that change with their states and actions, but not with what was drawn of them.
+    """
+
+    count: int
+    generator: str
+    digest: str
+
+
+def demo_origin(path: str | Path, limit: int | None = None) -> DemoOrigin:
+    """Return the origin of the demonstrations that `iter_demos` returns; only states and actions are read.
+
+    Raises:
+        DemoError: As for `read_demos`.
+    """
+    plan, digest, generators = _plan(path, (), limit), hashlib.sha256(), set()
+    for file, names, _ in plan.files:
+        with open_demo_file(file) as handle:
+            generators.add(str(read_attribute(handle["data"], "generator", f"{file}: data", "")))
+            for name in names:
+                for key in ("actions", "expert_actions", "states"):
+                    values = read_values(handle["data"][name], key, file, name)
+                    if values is not None:
+                        digest.update(f"{key} {values.shape}".encode())
+                        digest.update(values.astype("<f8").tobytes())
+    return DemoOrigin(len(plan.sizes), ", ".join(sorted(generators)), digest.hexdigest()[:16])
 
 
 @dataclass(frozen=True)

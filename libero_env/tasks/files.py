@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError, closest
 from libero_env.tasks import bddl
 from libero_env.tasks.authoring import FILE, check_keys, task_from_definition
 from libero_env.tasks.builder import language_from_name
@@ -112,15 +112,18 @@ def get_task(key: str) -> Task:
         )
     for mark in "/-":
         suite_name, found, index = key.rpartition(mark)
-        if found:
+        if found and (mark == "/" or index.isdecimal() or is_suite(suite_name)):
             suite = get_suite(suite_name)
             if not index.isdecimal() or len(index) > 9 or int(index) >= len(suite):
                 raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))
             return suite.tasks[int(index)]
     named = {task.name: task for name in suite_names() for task in get_suite(name).tasks}
-    if key not in named:
-        raise UnknownNameError("task", key, named)
-    return named[key]
+    if key in named:
+        return named[key]
+    if closest(key, suite_names()):
+        raise UnknownNameError("suite", key, suite_names())
+    indices = [f"{name}/0 to {name}/{len(get_suite(name)) - 1}" for name in suite_names()]
+    raise UnknownNameError("task", key, indices, unlisted=named)
 
 
 def read_task(path: str | Path) -> Task:

@@ -198,6 +198,11 @@ def load_callable(text: str) -> Any:
 def _imported(module: str, text: str) -> ModuleType:
     """Return a module; one that it imports itself and that does not exist is an error of its own."""
     parts = module.split(".")
+    if module.endswith(".py"):
+        own = text.removeprefix(module)
+        raise LifelongError(
+            f"{text}: a module is named without .py: write {Path(module).stem}{own}, in the folder of the file"
+        )
     if not all(part.isidentifier() for part in parts):
         raise LifelongError(f"{text}: {module!r} is no name of a module; {_WRITE}")
     try:
@@ -205,7 +210,10 @@ def _imported(module: str, text: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name not in {".".join(parts[: i + 1]) for i in range(len(parts))}:
             raise
-        raise LifelongError(f"{text}: {error}; {_WRITE}") from error
+        raise LifelongError(
+            f"{text}: there is no module {error.name}, neither in the current folder ({Path.cwd()}) nor installed; "
+            f"type the command in the folder of {error.name}.py"
+        ) from error
 
 
 def source_digest(text: str) -> str | None:

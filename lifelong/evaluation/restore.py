@@ -195,6 +195,11 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
     """Return the directory of the run, the checkpoint, and the position of the task it was written after."""
     if source.is_file():
         return source.parent.parent, source, -1
+    if not source.exists():
+        raise LifelongError(
+            f"{source} does not exist; give the directory of a run, such as runs/libero_object/er/NAME, or one of its "
+            "checkpoints"
+        )
     folder = RunDirectory(source).checkpoints
     there = folder.tasks()
     if not (source / "config.yaml").is_file() or not there:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.read import align, read_demos
+from libero_env.demos.read import align, demo_origin, read_demos
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from tests.harness.demos import episode, header
@@ -43,6 +44,22 @@ def test_limit_and_keys_select(path):
     (demo,) = read_demos(path, obs_keys=["ee_states"], limit=1)
     assert list(demo.obs) == ["ee_states"]
     np.testing.assert_array_equal(demo.obs["ee_states"][:, 3:], episode(0).obs["ee_ori"])
+
+
+def test_the_origin_names_what_is_learned_and_not_how_it_looks(path, tmp_path):
+    assert demo_origin(path).generator == "", "the file does not say"
+    with h5py.File(path, "r+") as handle:
+        handle["data"].attrs["generator"] = "someone"
+    origin = demo_origin(path)
+    assert (origin.count, origin.generator) == (3, "someone")
+    assert demo_origin(path, limit=2).digest not in ("", origin.digest)
+    for key, same in (("obs/agentview_rgb", True), ("states", False), ("expert_actions", False)):
+        copy = tmp_path / "copy.hdf5"
+        shutil.copy(path, copy)
+        with h5py.File(copy, "r+") as handle:
+            handle["data/demo_2"][key][0] = 0
+        assert (demo_origin(copy).digest == origin.digest) == same, key
+        assert demo_origin(copy, limit=2) == demo_origin(path, limit=2)
 
 
 def test_file_has_the_originals_layout(path):

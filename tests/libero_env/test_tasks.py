@@ -131,8 +131,12 @@ def test_orders_are_permutations(name):
         (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, "),
         (lambda: get_suite("libero_90").order(1), "task order of libero_90 1. Valid: 0"),
         (lambda: get_suite("libero_object").order(21), "task order of libero_object 21"),
-        (lambda: get_suite("libero_object").order(-1), "Valid: 0, 1, "),
+        (lambda: get_suite("libero_object").order(-1), "Valid: 0 to 20"),
         (lambda: get_task("libero_object/10"), "index of libero_object '10'"),
+        (lambda: get_task("LIBERO_OBJECT"), "unknown suite 'LIBERO_OBJECT'. Did you mean 'libero_object'?"),
+        (lambda: get_task("libero-object"), "unknown suite 'libero-object'. Did you mean 'libero_object'?"),
+        (lambda: get_task("libero_object-12"), "index of libero_object '12'. Valid: 0 to 9"),
+        (lambda: get_task("nope"), "Valid: libero_10/0 to libero_10/9, libero_100/0 to libero_100/99, "),
         (lambda: get_task("libero_object/-1"), "index of libero_object '-1'"),
         (
             lambda: get_task("pick_up_the_milk_and_put_it_in_the_basket"),

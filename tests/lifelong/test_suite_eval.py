@@ -141,7 +141,7 @@ def test_a_policy_from_a_module_of_the_working_directory(module):
     assert load_callable(f"{module}:make").calls == []
     assert sys.path == before
     for text, message in (
-        ("nowhere_at_all:make", "No module"),
+        ("nowhere_at_all:make", "no module nowhere_at_all"),
         (f"{module}:mend", "mend"),
         (f"{module}:nothing", "predict"),
     ):
@@ -297,7 +297,8 @@ def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
             [f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"],
             "Did you mean 'openvla-oft'?",
         ),
-        ([str(tmp_path / "no_run")], "no run directory"),
+        ([str(tmp_path / "no_run")], "no_run does not exist; give the directory of a run"),
+        ([str(tmp_path)], "no run directory"),
     ):
         assert cli.main(["eval", *argv]) == 2
         err = capsys.readouterr().err
