@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 from lifelong.algorithms import AGEM
+from lifelong.composition import compose_run
 from lifelong.data.memory import ReplayMemory
-from lifelong.launch import compose_run
 from lifelong.settings import BenchmarkSettings, plain_data
 from lifelong.tuning.proxy import Trial, measure, open_stream
 

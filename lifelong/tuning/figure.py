@@ -41,6 +41,7 @@ def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
         for outcome in frontier.others:
             _point(axes, outcome, "s", LINE_COLOURS[-1], filled=True, large=False)
         _equal_scores(axes, frontier.chosen)
+        _name_points(axes, frontier)
         for axis in (axes.xaxis, axes.yaxis):
             low, high = axis.get_view_interval()
             axis.set_major_locator(LogLocator(base=10, subs=_FEW_TICKS if high > 2 * low else _TICKS))
@@ -62,10 +63,31 @@ def _point(axes: Axes, outcome: Outcome, marker: str, colour: str, *, filled: bo
     )
     face = colour if filled else "white"
     axes.plot(x.value, y.value, marker, ms=8 if large else 5, mec=colour, mfc=face, mew=1.2)
-    weight = "bold" if large else "normal"
-    axes.annotate(
-        outcome.label, (x.value, y.value), (6, 5), textcoords="offset points", fontsize=8, weight=weight
-    )
+
+
+def _name_points(axes: Axes, frontier: Frontier) -> None:
+    """Write each value beside its point, at the corner that is farthest from other points and names."""
+    outcomes = [*frontier.outcomes, *frontier.others]
+    places = axes.transData.transform([(o.learned.value, o.kept.value) for o in outcomes])
+    taken = list(places)
+    for outcome, place in zip(outcomes, places, strict=True):
+        width = 4.5 * len(outcome.label)  # of its text, [points]
+        middles = {(x, y): place + (x + np.sign(x) * width / 2, y + 4) for x in (6, -6) for y in (5, -12)}
+        rest = [other for other in taken if other is not place]
+        corner = max(
+            middles,
+            key=lambda c: min((np.hypot(*((middles[c] - other) / (width, 10))) for other in rest), default=0),
+        )
+        taken.append(middles[corner])
+        axes.annotate(
+            outcome.label,
+            (outcome.learned.value, outcome.kept.value),
+            corner,
+            textcoords="offset points",
+            fontsize=8,
+            weight="bold" if outcome is frontier.chosen else "normal",
+            ha="left" if corner[0] > 0 else "right",
+        )
 
 
 def _equal_scores(axes: Axes, chosen: Outcome) -> None:

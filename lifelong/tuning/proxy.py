@@ -19,6 +19,7 @@ from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
+from lifelong.results.conditions import source_digest
 from lifelong.seeding import END_TASK, FIT, INIT, generator, seeded
 from lifelong.settings import Configuration
 from lifelong.training.fit import fit
@@ -91,7 +92,7 @@ class Trial:
     held_out: float
 
     def key(self) -> str:
-        """Return a digest of all that the trial depends on."""
+        """Return a digest of all that the trial depends on: its settings and the source, the expert's included."""
         return self._digest(self.config["algo"], self.stream)
 
     def start_key(self, algorithm: Algorithm) -> str:
@@ -101,7 +102,7 @@ class Trial:
 
     def _digest(self, algo: Mapping[str, Any], tasks: Sequence[Task]) -> str:
         groups = {group: self.config[group] for group in _GROUPS} | {"algo": algo}
-        rest = [FORMAT, [task.id for task in tasks], self.seed, self.steps, self.held_out]
+        rest = [FORMAT, [task.id for task in tasks], self.seed, self.steps, self.held_out, source_digest()]
         return hashlib.sha256(json.dumps([groups, rest], sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -9,13 +9,13 @@ import yaml
 
 from lifelong import algorithms
 from lifelong.cli.main import main
+from lifelong.composition import compose_run, swept
 from lifelong.errors import LiberoError
-from lifelong.launch import compose_run, swept
 from lifelong.settings import Configuration, plain_data
 from lifelong.training.settings import FitSettings
 from lifelong.tuning import proxy, sweep
 from lifelong.tuning.frontier import Frontier, Outcome, render
-from lifelong.tuning.proxy import StreamData, scaled
+from lifelong.tuning.proxy import StreamData, Trial, scaled
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.runs import TINY, make_windows
 
@@ -184,6 +184,14 @@ def test_the_first_task_is_learned_once_for_all_values_to_the_same_bits(
 
 
 # --- what is typed wrongly
+
+
+def test_trials_of_another_source_or_expert_are_measured_again(monkeypatch) -> None:
+    trial = Trial(plain_data(composed("algo=ewc")), (), 1, 10, 0.25)
+    algorithm = Configuration(trial.config).build("algo")
+    before = trial.key(), trial.start_key(algorithm)
+    monkeypatch.setattr(proxy, "source_digest", lambda: "0" * 12)
+    assert trial.key() != before[0] and trial.start_key(algorithm) != before[1]
 
 
 def test_lists_of_values_are_found_and_others_are_left() -> None:
