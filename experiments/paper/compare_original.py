@@ -28,6 +28,15 @@ PARTS = {  # by policy: functions of original_results and the batches they take
 }
 
 
+RECORDED = {
+    "gradient",
+    "dropout_gradient",
+    "fisher",
+    "ewc_clipped",
+    "owner",
+}  # tensors of which something is kept
+
+
 def compared(name: str, part: str, spec: original.PolicySpec, kept: dict) -> Iterator[tuple[str, float, str]]:
     """Yield what is compared, the largest relative difference, and where it is."""
     given = {label: original.smooth_batch(spec, k) for k, label in enumerate(("first", "second"))}
@@ -46,19 +55,16 @@ def compared(name: str, part: str, spec: original.PolicySpec, kept: dict) -> Ite
             apart, where = max(((value[n] != found[key][n]).float().mean().item(), n) for n in value)
             yield "share of weights with another owner", apart, where
         elif key.startswith("packnet"):
-            kept = [where_owners_agree(side, ours["owner"], found["owner"]) for side in (value, found[key])]
-            yield f"{key}, owners alike", *worst(*kept)
+            alike = [where_owners_agree(side, ours["owner"], found["owner"]) for side in (value, found[key])]
+            yield f"{key}, owners alike", *worst(*alike)
         elif key in found:
             yield key, *worst(value, found[key])
         else:
             yield key, relative(value, torch.from_numpy(np.asarray(theirs[key]))), ""
-    if part == "learn":
-        gradient = found["gradient"]
-        kept[f"{name}/names"] = np.array(sorted(gradient))
-        kept[f"{name}/gradient_norms"] = np.array(
-            [gradient[n].norm() for n in sorted(gradient)], dtype=np.float32
-        )
-        kept |= {f"{name}/{key}": theirs[key] for key, value in ours.items() if not isinstance(value, dict)}
+    kept |= {f"{name}/{key}": theirs[key] for key, value in ours.items() if not isinstance(value, dict)}
+    for key in RECORDED & ours.keys():
+        recorded = original_results.kept_of(found[key])
+        kept |= {f"{name}/{key}/{what}": values for what, values in recorded.items()}
 
 
 def main() -> None:
