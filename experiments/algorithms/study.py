@@ -30,8 +30,8 @@ import yaml
 from hydra import compose, initialize_config_dir
 
 from libero_env.storage import atomic_path
+from lifelong.composition import config_folder
 from lifelong.data.demonstrations import find_demos
-from lifelong.launch import config_folder
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import result_relevant

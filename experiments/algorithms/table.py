@@ -35,7 +35,7 @@ def metric(cell: dict) -> str:
 
 
 def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
-    """Metrics, costs, and pairs that the intervals tell apart; best AUC first."""
+    """Metrics, costs, and pairs that differ significantly; best AUC first."""
     measured = {label: group["metrics"] for label, group in found["groups"].items()}
     yield "metrics", metrics(measured)
     yield "pairs", pairs(by_auc(measured), found["differences"])
@@ -43,10 +43,7 @@ def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
         yield "later tasks", metrics(later["metrics"])
         yield "pairs of later tasks", pairs(by_auc(later["metrics"]), later["differences"])
     training = training_seconds(study)
-    rows = [
-        [label, duration(training[label]), *costs(found["groups"][label]["costs"])]
-        for label in by_auc(measured)
-    ]
+    rows = [[label, training[label], *costs(found["groups"][label]["costs"])] for label in by_auc(measured)]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
 
@@ -68,22 +65,23 @@ def pairs(labels: list[str], differences: list[dict]) -> list[str]:
     open_: dict[str, list[str]] = {label: [] for label in labels}
     for pair in differences:
         (a, b), auc = (pair["of"], pair["less"]), pair["metrics"]["auc"]
-        if auc["value"] is None:
+        if auc["adjusted"] is None:  # undefined, or of methods with one seed each
             continue
-        if auc["told_apart"]:
+        if auc["significant"]:
             winner, loser = (a, b) if auc["value"] > 0 else (b, a)
             better[winner].append(loser)
         else:
-            seeds = f" ({auc['seeds']} seeds)" if auc["seeds"] else ""
+            seeds = f" ({auc['seeds'] or '> 100'})"
             open_[a].append(b + seeds)
             open_[b].append(a + seeds)
 
     def ordered(names: list[str]) -> str:
         return ", ".join(sorted(names, key=lambda name: labels.index(name.split(" ")[0]))) or "–"
 
-    heads = ["algorithm", "larger AUC than", "not told apart from (seeds that would tell)"]
+    heads = ["algorithm", "larger AUC than", "no significant difference from (seeds needed)"]
     rows = [[label, ordered(better[label]), ordered(open_[label])] for label in labels]
-    return table(heads, [row for row in rows if row[1:] != ["–", "–"]], "---|")
+    rows = [row for row in rows if row[1:] != ["–", "–"]]
+    return table(heads, rows, "---|") if rows else ["No pair is tested: there is one seed."]
 
 
 def costs(values: dict) -> list[str]:
@@ -97,8 +95,11 @@ def costs(values: dict) -> list[str]:
     ]
 
 
-def training_seconds(study: str) -> dict[str, float]:
-    """Time of training a task, by algorithm: of each task the fastest epoch of all seeds, as other work ran beside."""
+def training_seconds(study: str) -> dict[str, str]:
+    """Time of training a task, by algorithm: of each task the fastest epoch of all seeds, as other work ran beside.
+
+    Where all tasks are learned in one stage, it is the time of that stage.
+    """
     found: dict[str, dict[int, float]] = {}  # of each task, by algorithm
     for run, folder in finished(study):
         epochs: dict[int, list[float]] = {}
@@ -107,7 +108,10 @@ def training_seconds(study: str) -> dict[str, float]:
         seconds = found.setdefault(run.algo, {})
         for task, times in epochs.items():
             seconds[task] = min(seconds.get(task, float("inf")), len(times) * min(times))
-    return {algo: statistics.mean(tasks.values()) for algo, tasks in found.items()}
+    return {
+        algo: duration(statistics.mean(tasks.values())) + (" (all tasks)" if len(tasks) == 1 else "")
+        for algo, tasks in found.items()
+    }
 
 
 def finished(study: str) -> Iterator[tuple[Planned, Path]]:
