@@ -16,7 +16,6 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs"
-SHORT = 30  # characters; an entry shorter than that may need the comment too
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\(\.\./([^)#]+)(?:#[^)]*)?\)")
 
 
@@ -99,7 +98,7 @@ def configuration_reference() -> str:
 
 
 def _group(name: str, files: list[Path], default: str | None) -> str:
-    listed = [f"- `{name}={f.stem}`{' (default)' if f.stem == default else ''}{_about(f)}" for f in files]
+    listed = [f"- `{name}={f.stem}`{_default(name, f.stem, default)}{_about(f)}" for f in files]
     whole, targets = [], {}
     for file in files:
         values = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
@@ -109,6 +108,29 @@ def _group(name: str, files: list[Path], default: str | None) -> str:
             targets.setdefault(values["_target_"], []).append(file)
     tables = [_table(name, target, own) for target, own in targets.items()]
     return "\n\n".join(["\n".join(listed), *tables, *whole])
+
+
+def _default(name: str, option: str, default: str | None) -> str:
+    """Return what to add to an option: whether it is the default, and whether the default preset changes that."""
+    chosen = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))["defaults"]
+    preset = next(d["preset"] for d in chosen if isinstance(d, dict) and "preset" in d)
+    values = yaml.safe_load((CONFIGS / "preset" / f"{preset}.yaml").read_text(encoding="utf-8"))
+    replaced = {
+        k.removeprefix("override /"): v
+        for d in values["defaults"]
+        if isinstance(d, dict)
+        for k, v in d.items()
+    }
+    if replaced.get(name, default) != default:
+        by_preset = {default: "default before the preset", replaced[name]: f"default, by `preset={preset}`"}
+        return f" ({by_preset[option]})" if option in by_preset else ""
+    if option != default:
+        return ""
+    return (
+        f" (default before the preset: `preset={preset}` sets some of its keys)"
+        if name in values
+        else " (default)"
+    )
 
 
 def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, Any]]:
@@ -149,12 +171,13 @@ def _valid(target: str, key: str) -> str:
 
 
 def meaning(target: str, key: str, files: list[Path]) -> str:
-    """What a key means: the docstring of what it builds, and the comment in the file where it has more."""
+    """What a key means: the docstring of what it builds, with the comment in the file where that lists choices."""
     comment = next((c for c in (_comments(f).get(key) for f in files) if c), "")
     text = _entry(target, key)
-    if len(text) < SHORT:
-        return ". ".join(part for part in (text, comment) if part)
-    values = [yaml.safe_load(f.read_text(encoding="utf-8")).get(key) for f in files]
+    if not text:
+        return comment
+    found = [leaf for f in files for leaf in leaves(yaml.safe_load(f.read_text(encoding="utf-8")))]
+    values = [value for *_, name, value in found if name == key]
     choices = any(isinstance(v, str) and comment.startswith(f"{v},") and f"`{v}`" not in text for v in values)
     return f"{text.rstrip('.')} ({comment})" if choices else text
 
@@ -173,7 +196,7 @@ def _entry(target: str, key: str) -> str:
             found = next((_entry(other, n) for n in names if n != "proprio" and n in _documented(other)), "")
             if len(found) > 2:  # more than a letter of the legend
                 return found
-    return re.sub(r",? ?[Ss]ee `\w+`[^.;]*", "", text).strip(" .")
+    return re.sub(r",? ?[Ss]ee `\w+`[^.;]*", "", text).strip(" .;,")
 
 
 @cache

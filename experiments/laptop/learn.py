@@ -26,10 +26,10 @@ from torch import Tensor
 from libero_env.demos.read import Demo, read_demos
 from libero_env.envs.batch import BatchEnv
 from lifelong.algorithms import Sequential
+from lifelong.composition import config_folder
 from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.demonstrations import find_demos
 from lifelong.evaluation.rollout import rollout
-from lifelong.launch import config_folder
 from lifelong.policies.base import Policy
 from lifelong.seeding import seeded
 from lifelong.settings import Configuration, plain_data

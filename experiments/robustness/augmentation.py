@@ -21,9 +21,9 @@ from scipy.stats import binomtest
 from libero_env.envs.batch import BatchEnv
 from libero_env.perturbations import parse_perturbations
 from lifelong.algorithms import Sequential
+from lifelong.composition import config_folder
 from lifelong.data.demonstrations import DemoDatasets, demo_copies, find_demos
 from lifelong.evaluation.rollout import rollout
-from lifelong.launch import config_folder
 from lifelong.policies.base import Policy
 from lifelong.seeding import seeded
 from lifelong.settings import Configuration, plain_data

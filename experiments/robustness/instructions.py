@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from libero_env.perturbations import parse_perturbations
 from libero_env.perturbations.problem import reword_task
 from libero_env.tasks import get_task
-from lifelong.launch import config_folder
+from lifelong.composition import config_folder
 from lifelong.settings import Configuration, plain_data
 
 BINS = (-1.0, 0.55, 0.65, 0.75, 0.85, 1.01)
