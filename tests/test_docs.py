@@ -81,6 +81,15 @@ def test_what_is_named_exists(file):
 
 
 @pytest.mark.unit
+def test_tests_that_are_named_exist():
+    pages = [*ROOT.glob("docs/*.md"), *ROOT.glob("experiments/*/README.md")]
+    named = {m for page in pages for m in re.findall(r"(tests/[\w/]+\.py)::(\w+)", page.read_text())}
+    assert len(named) > 10
+    for file, name in named:
+        assert f"def {name}(" in (ROOT / file).read_text(), f"{file}::{name}"
+
+
+@pytest.mark.unit
 def test_the_gallery_is_whole():
     docs = ROOT / "docs"
     text = (docs / "gallery.md").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ from libero._adapters.lifelong.config import load_config
 from libero_env.objects import catalog
 from lifelong.algorithms import Algorithm
 from lifelong.cli.main import build_parser, main
-from lifelong.launch import check_choices
+from lifelong.composition import check_choices
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -53,9 +53,11 @@ class Policy(nn.Module, ABC):
 
     Attributes:
         by_window: Whether the first axis of what its layers are given is that of the windows.
+        uses_history: Whether it acts on earlier frames too, which it learns from windows of several steps.
     """
 
     by_window = True
+    uses_history = False
 
     def __init__(self, spec: PolicySpec) -> None:
         super().__init__()

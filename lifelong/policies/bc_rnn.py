@@ -44,6 +44,8 @@ class BCRNN(JoinedFeaturesPolicy):
         PolicyError: An unknown memory, or components or sizes that do not work together.
     """
 
+    uses_history = True
+
     def __init__(
         self,
         *,

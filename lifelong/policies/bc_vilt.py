@@ -28,8 +28,8 @@ class BCViLT(TokenPolicy):
 
     Args:
         spec: What the policy observes and does; `spec.seq_len` is the longest history.
-        patch_embed: S.
-        embed_dim: E.
+        patch_embed: S, the size of a patch's token.
+        embed_dim: E, the size of a step's token.
         encoder: Patches of an image, one encoder for each camera, see `PatchEncoder`; completed with `image_size` and
             `dim`.
         spatial: Network over the patches of a frame, see `SpatialTransformer`; completed with `views`, `patches`,

@@ -24,6 +24,8 @@ class TokenPolicy(HistoryPolicy):
         standardise_language: Whether to bring embeddings to mean 0 and variance 1.
     """
 
+    uses_history = True
+
     def __init__(self, spec: PolicySpec, *, stochastic: bool, standardise_language: bool) -> None:
         super().__init__(spec, stochastic=stochastic)
         self.standardise_language = standardise_language

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from libero_env.demos.config import GENERATOR
 from lifelong import checkpoints
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -72,7 +73,11 @@ def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
     assert summary["finished"] and summary["tasks_learned"] == 2
     assert summary["metrics"].keys() >= {"fwt", "nbt", "auc"}
     assert summary["success_matrix"]["rates"][0][0] > 0, "a first report shows some success"
+    assert summary["demonstrations"]["generators"] == [GENERATOR] * 2
+    (learned_from,) = (r for r in records(path) if r["kind"] == "demonstrations")
+    assert len(set(learned_from["digests"])) == 2 and len(set(learned_from["counts"])) == 1
     page = (path / "report.html").read_text()
+    assert GENERATOR in page
     assert "<svg" in page and "data:image/webp" in page
     kept = {p.name for p in (path / "checkpoints").iterdir()}
     assert {"task_0.safetensors", "task_1.safetensors"} <= kept
