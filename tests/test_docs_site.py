@@ -21,7 +21,7 @@ from libero._adapters.lifelong.config import load_config
 from libero_env.objects import catalog
 from lifelong.algorithms import Algorithm
 from lifelong.cli.main import build_parser, main
-from lifelong.composition import check_choices
+from lifelong.composition import check_choices, swept
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -118,8 +118,10 @@ def check_line(line: str) -> None:
     if words[:2] in (["python", "train.py"], ["libero", "train"]):
         overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
         check_choices(overrides, [CONFIGS])
-        if "-m" in words:  # Hydra takes lists apart before it composes
-            overrides = [re.sub(r"=([^\[,]*),.*", r"=\1", w) for w in overrides]
+        if "-m" in words:  # Hydra takes sweeps apart before it composes: the first value of each
+            values = swept(overrides, [CONFIGS])
+            single = [w for w in overrides if w.split("=")[0] not in values]
+            overrides = [*single, *(f"{key}={several[0]}" for key, several in values.items())]
         composes(*overrides)
     elif words[0].endswith("libero"):
         build_parser().parse_args(words[1:])
