@@ -102,10 +102,9 @@ def false_by_power(
         for metric, pairs in found.items():
             pairs += contrasts({str(i): row[metric] for i, row in enumerate(both)})
     rates, chosen = [], components.TEST_POWER
+    degrees = design.seeds - 1  # by which the constant is divided
     for power in powers:
-        components.TEST_POWER = power * (
-            design.seeds - 1
-        )  # divided there by the degrees of freedom of two methods
+        components.TEST_POWER = power * degrees
         p = {m: p_values([c.estimate.value for c in cs], [c.parts for c in cs]) for m, cs in found.items()}
         rates.append({metric: float(np.mean(values < 0.05)) for metric, values in p.items()})
     components.TEST_POWER = chosen
