@@ -49,9 +49,8 @@ from lifelong.sweeps import (
 )
 from lifelong.training.distributed import Ranks, process_group, rank
 
-_process: dict[
-    str, Any
-] = {}  # of the process that was started: its ranks, folders of configuration files, and sweep
+# of the process that was started: its ranks, folders of configuration files, and sweep
+_process: dict[str, Any] = {}
 
 
 class SweepStart(Callback):

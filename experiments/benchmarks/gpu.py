@@ -76,9 +76,8 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
     device, ids = env.world.simulations.device, np.arange(worlds)
     starts = {"init_state": ids % 50}
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (worlds, 7))
-    clock = (
-        time.perf_counter if device.is_cuda else time.process_time
-    )  # on which one thread works, beside others
+    # of the processor one thread works, beside others
+    clock = time.perf_counter if device.is_cuda else time.process_time
     begin = clock()
     env.reset(options=starts)
     env.step(actions)  # compiles, and captures the graph

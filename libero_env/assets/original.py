@@ -163,9 +163,8 @@ class OriginalPack:
         self._simplify(room)
         spec.attach(room, prefix=_ROOM, frame=spec.worldbody.add_frame())
         for item in (*spec.bodies, *spec.geoms, *spec.sites):
-            item.name = item.name.removeprefix(
-                _ROOM
-            )  # MuJoCo warns about an empty prefix; assets keep theirs
+            # MuJoCo warns about an empty prefix; assets keep their names
+            item.name = item.name.removeprefix(_ROOM)
         add_cameras_and_lights(spec, workspace)
 
     def restore_drawing(

@@ -130,9 +130,8 @@ def ensure_rendered(
     with ExitStack() as locks:
         for folder in sorted({job.target.parent for job in missing}):
             locks.enter_context(recording_lock(folder))
-        missing = _incomplete(
-            missing
-        )  # another process may have rendered some before the folders were locked
+        # another process may have rendered some before the folders were locked
+        missing = _incomplete(missing)
         if missing:
             _render(missing, min(workers or cpu_count(), len(missing)), progress)
     return [job.target for job in jobs]

@@ -32,9 +32,8 @@ class Shared:
 
     def __init__(self, layout: Mapping[str, Any], name: str | None = None):
         boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in layout.items()]
-        starts = np.cumsum(
-            [0, *(-(-int(np.prod(s)) * d.itemsize // 64) * 64 for _, s, d in boxes)]
-        )  # aligned
+        sizes = [int(np.prod(shape)) * dtype.itemsize for _, shape, dtype in boxes]
+        starts = np.cumsum([0, *(-(-size // 64) * 64 for size in sizes)])  # aligned
         self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
         self.name = self._memory.name
         self._owner = name is None

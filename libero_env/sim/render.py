@@ -66,9 +66,8 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
         raise RenderError(FORKED)
     if chosen and chosen not in BACKENDS:
         raise RenderError(f"MUJOCO_GL={chosen} is not a backend; valid: {', '.join(BACKENDS)}. Or unset it")
-    os.environ.setdefault(
-        "LP_NUM_THREADS", "0"
-    )  # small images gain nothing from threads, which wait for each other
+    # small images gain nothing from threads, which wait for each other
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     failures, platform = [], os.environ.get("PYOPENGL_PLATFORM")
     for name in (chosen,) if chosen else ("egl", "osmesa"):
         try:

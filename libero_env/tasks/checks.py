@@ -77,9 +77,8 @@ def check_problem(problem: Problem) -> None:
 
 def kind_of(problem: Problem, name: str) -> str:
     """Return `object`, `fixture`, `workspace` or `region`; a variable of a quantifier is an object."""
-    from libero_env.assets.arena import (
-        WORKSPACES,
-    )  # not with the module: `libero --help` need not wait for MuJoCo
+    # not with the module: `libero --help` need not wait for MuJoCo
+    from libero_env.assets.arena import WORKSPACES
 
     if category := problem.fixtures.get(name):
         return "workspace" if category in WORKSPACES else "fixture"

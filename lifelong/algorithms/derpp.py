@@ -82,9 +82,8 @@ class DERpp(Rehearsal):
         """Add the task's windows to the memory, with the policy's outputs on them."""
         super().end_task(task_index, dataset, policy, generator)
         before, self._kept = set(self._kept), self._held()
-        only_means = any(
-            "mean" in answers for answers in self._outputs.values()
-        )  # as an earlier version kept
+        # as an earlier version kept
+        only_means = any("mean" in answers for answers in self._outputs.values())
         for task, kept in self._kept.items():
             if task in before:  # a smaller share is a prefix of the larger one
                 self._outputs[task] = {n: z[: len(kept)].clone() for n, z in self._outputs[task].items()}

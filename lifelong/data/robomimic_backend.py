@@ -58,9 +58,8 @@ class RobomimicWindows:
         self._windows = _sequence_dataset(source, self._labels, self.seq_len + self._shift)
         lengths = torch.tensor(source.lengths())
         self._steps = torch.cat([torch.arange(n) for n in lengths])  # (W,) first step of each window
-        self._left = (
-            lengths.repeat_interleave(lengths) - 1 - self._steps
-        )  # (W,) number of frames after that step
+        # (W,) number of frames after that step
+        self._left = lengths.repeat_interleave(lengths) - 1 - self._steps
         starts = (lengths + self._shift).cumsum(0) - (lengths + self._shift)
         self._indices = starts.repeat_interleave(lengths) + self._steps  # (W,) index in robomimic's dataset
 

@@ -45,9 +45,8 @@ class RunRecord:
     # of each group, where they are not all of group_size
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
     transfer: Transfer | Literal[""] = ""  # estimate of forward transfer; older records do not say
-    perturbed: tuple[
-        str, ...
-    ] = ()  # perturbations of each task, in learning and evaluation; () for none at all
+    # perturbations of each task, in learning and evaluation; () for none at all
+    perturbed: tuple[str, ...] = ()
     backend: str = "mujoco"  # of the rollouts: mujoco or warp; older records have none and are of mujoco
 
     def __post_init__(self) -> None:

@@ -185,9 +185,8 @@ def _walls(vertices, faces, low, extent, count) -> np.ndarray:
 def _inside(vertices, faces, low, extent, count) -> np.ndarray:
     """Return the cells whose centre is inside a closed mesh: those with an odd number of surfaces below."""
     step = extent / count
-    x, y, z = (
-        low[k] + step[k] * (np.arange(count[k]) + 0.5013) for k in range(3)
-    )  # off-centre, so as not to meet vertices
+    # off-centre, so as not to meet vertices
+    x, y, z = (low[k] + step[k] * (np.arange(count[k]) + 0.5013) for k in range(3))
     below = np.zeros(count, int)
     corners = vertices[faces]
     for axis, lines in enumerate((x, y)):  # most triangles of a fine mesh are between the lines

@@ -197,9 +197,8 @@ def _facet(corners: Sequence[np.ndarray], half: np.ndarray, face: str, cell: Cel
     """Return a convex polygon of a body around the origin, facing outwards, with the texture of a face of its box."""
     points = np.array(corners, float)
     (ax, ay, az), (bx, by, bz) = points[1] - points[0], points[2] - points[0]
-    normal = np.array(
-        [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
-    )  # ten times as fast as np.cross
+    # ten times as fast as np.cross
+    normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
     if normal @ points.mean(axis=0) < 0:
         points = points[::-1]
     share = 0.5 + 0.5 * points @ np.transpose(_FACES[face]) / (np.abs(_FACES[face]) @ half)
