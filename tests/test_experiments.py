@@ -3,6 +3,7 @@
 import ast
 import importlib
 import importlib.util
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,6 +26,8 @@ FOREIGN = (
 # started by another script, with arguments in order, in an environment without the project
 WORKERS = ("original_training.py", "original_worker.py", "robomimic_loader.py")
 COMMANDS = [p for p in SCRIPTS if "__main__" in p.read_text(encoding="utf-8") and p.name not in WORKERS]
+RECORDS = EXPERIMENTS / "algorithms" / "records"
+PAGES = sorted(RECORDS.parent.glob("*/comparison.json"))
 pytestmark = pytest.mark.unit
 
 
@@ -84,3 +87,12 @@ def test_a_script_explains_itself_and_does_not_start_when_asked_for_help(script)
     assert modules & {"argparse", "hydra"}, (
         f"{script} starts its work on --help; parse its arguments, even if none"
     )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.parent.name)
+def test_a_page_of_the_study_is_of_all_its_records(page):
+    groups = json.loads(page.read_text(encoding="utf-8"))["groups"].values()
+    named = {run for group in groups for run in group["runs"]}
+    files = (RECORDS / page.parent.name).rglob("*.json.xz")
+    kept = {file.relative_to(RECORDS).as_posix().removesuffix(".json.xz") for file in files}
+    assert named == kept, "the page is outdated: experiments/algorithms/study.py report writes it again"

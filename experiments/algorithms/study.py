@@ -14,6 +14,7 @@ import argparse
 import json
 import lzma
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -21,6 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import chdir
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -131,6 +133,7 @@ class Planned:
         """Keep the records of a finished run."""
         there = {name: directory / file for name, file in FILES.items() if (directory / file).is_file()}
         content = {name: path.read_text(encoding="utf-8") for name, path in there.items()}
+        content["config"] = re.sub(r"(?m)^runs_dir: .*", "runs_dir: runs", content["config"])  # anyone's
         self.record.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(self.record) as part:
             part.write_bytes(lzma.compress(json.dumps(content).encode(), preset=9))
@@ -279,10 +282,8 @@ def report(runs: Sequence[Planned]) -> None:
         found = [run for run in runs if run.study == study and run.is_done()]
         if not found:
             continue
-        with tempfile.TemporaryDirectory() as scratch:
-            page = write_report(
-                [run.unpack(Path(scratch)) for run in found], HERE / study.name / "report.html"
-            )
+        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # runs are named by relative paths
+            page = write_report([run.unpack(Path()) for run in found], HERE / study.name / "report.html")
         print(f"{len(found)} runs: {page}")
 
 
