@@ -105,6 +105,8 @@ class DMPEL(RoutedExperts):
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self._episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
         self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
+        # of each group, the tasks (counted in the library) whose experts count in some row of the present pass
+        self._counting: list[list[int]] = []
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Store the episodes' contexts; after the base, add experts and build a new router."""
@@ -204,15 +206,20 @@ class DMPEL(RoutedExperts):
         groups = {name: _groups(layers).index(name.partition(".")[0]) for name in layers}
 
         def add(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
-            if self._now is None:
+            if self._now is None or not (counting := self._counting[groups[name]]):
                 return None
             pairs = [of_task[name] for of_task in self._library.pairs.values()]
             rank = pairs[0]["a"].shape[0] // self.experts
-            weights = self.scale * self._now[:, groups[name]].repeat_interleave(rank, dim=1)
-            return expert_output(layer, x, pairs, weights)
+            of_tasks = self._now[:, groups[name]].unflatten(1, (-1, self.experts))  # (B, tasks, experts)
+            weights = self.scale * of_tasks[:, counting].flatten(1).repeat_interleave(rank, dim=1)
+            return expert_output(layer, x, [pairs[i] for i in counting], weights)
 
         def encode(policy: Any, own: Any, observation: Observation) -> Tensor:
             self._now = self.coefficients(observation) if self._held is None else self._held
+            of_tasks = self._now.detach().unflatten(2, (-1, self.experts))  # (B, G, tasks, experts)
+            self._counting = [
+                [i for i, some in enumerate(of_group) if some] for of_group in of_tasks.any(3).any(0).tolist()
+            ]
             return own(observation)
 
         return layers, add, encode

@@ -6,6 +6,7 @@ import dataclasses
 import pytest
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from lifelong import checkpoints
 from lifelong.algorithms import CLARE, DMPEL, IsCiL, LoRA
@@ -18,6 +19,7 @@ from lifelong.nn.routing import SigmoidRouter
 from lifelong.seeding import generator, seeded
 from lifelong.sequence.stages import TrainingPhase
 from lifelong.streams import StageWindows
+from lifelong.training.costs import count_flops
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Observation
@@ -494,6 +496,26 @@ def test_dmpel_routes_once_in_an_episode():
             for step in range(3):
                 acting.act(frame(observation, step), [generator(i) for i in range(3)])
     assert len(seen) == 2
+
+
+def test_dmpel_computes_the_experts_that_count_and_no_others():
+    """A step costs as much with seven experts as with the three that count, and gives what all of them would."""
+    policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=20, top_k=3)
+    batch, flops = everything(1).rows(slice(0, 1)), {}
+    for task in range(8):
+        learn_small(algorithm, policy, task)
+        with algorithm.policy_for(task, policy) as acting, torch.no_grad(), count_flops() as counter:
+            answer = acting.eval().predict(batch)
+        router = FlopCounterMode(display=False)
+        if algorithm._router is not None:
+            with router:
+                algorithm.coefficients(batch.observation)
+        flops[task] = counter.get_total_flops() - router.get_total_flops()
+    assert flops[0] < flops[1] < flops[2] < flops[3] == flops[7]
+    dense = copy.copy(algorithm)
+    dense.coefficients = lambda observation: algorithm.coefficients(observation).clamp(min=1e-30)
+    with dense.policy_for(7, policy) as acting, torch.no_grad():
+        torch.testing.assert_close(acting.eval().predict(batch), answer, rtol=1e-5, atol=1e-6)
 
 
 def test_dmpel_leaves_the_policy_as_it_was():
