@@ -152,5 +152,6 @@ def _outlook(metric: Mapping[str, Any]) -> str:
     value = f"{100 * metric['value']:+.1f}"
     if not _known(metric["detectable"]):
         return value
-    seeds = metric["seeds"] or f"more than {MOST_SEEDS}"
-    return f"{value}; {seeds} seeds needed, detectable {100 * metric['detectable']:.0f}"
+    seeds, detectable = metric["seeds"] or f"more than {MOST_SEEDS}", metric["detectable"]
+    least = f"detectable {100 * detectable:.0f}" if detectable < 1 else "nothing detectable"
+    return f"{value}; {seeds} seeds needed, {least}"
