@@ -1,13 +1,13 @@
 """How many seeds would show a difference between two methods, from the variances that a comparison estimated.
 
-A planned comparison has estimated variances, too: its statistic follows Student's noncentral t, whose distribution is
-approximated here by the normal one of Johnson and Welch (Biometrika 1940, eq. 2): T exceeds q about as often as a normal
-variable of mean d - q c and variance 1 + q² (1 - c²) exceeds 0, where d is the difference in standard errors and c the mean
-of an estimated standard error by the true one.
+A planned comparison estimates its variances, too, so its statistic follows Student's noncentral t. That is approximated
+as Johnson and Welch did (Biometrika 31, 1940): T exceeds q about as often as a normal variable of mean d - q c and
+variance 1 + q² (1 - c²) exceeds 0, where d is the difference in standard errors, and c the mean of an estimated
+standard error over the true one.
 
-The variance between seeds that two to five of them estimate is in most cases too small, by half in the median where it has
-one degree of freedom. It is divided by the median of what such an estimate is by the true variance, so that as many plans
-ask for too many seeds as for too few (cf. Browne, Statistics in Medicine 1995).
+A variance that two to five seeds estimate is too small in most cases: by half in the median with one degree of freedom.
+It is divided by the median of such an estimate over the true variance, so that as many plans ask for too many seeds as
+for too few (cf. Browne, Statistics in Medicine 14, 1995).
 """
 
 import math
@@ -24,6 +24,7 @@ from lifelong.results.curves import Floats
 MOST_SEEDS = 100
 POWER = 0.8
 ALPHA = 0.05
+_CERTAIN_DF = 1e4  # degrees of freedom from which on a variance counts as known
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ def outlook(contrast: Contrast, tests: int, alpha: float = ALPHA) -> Outlook:
     seeds, parts = contrast.least_seeds, contrast.parts
     if parts.runs_df <= 0:
         return Outlook(math.nan, None)
-    parts = _unbiased(parts)
+    require_package("scipy", "train")
+    parts = _median_unbiased(parts)
     counts = list(range(2, MOST_SEEDS + 1))
     found = _detectable([_with_seeds(parts, seeds, count) for count in counts], alpha / tests)
     present = float(_detectable([parts], alpha / tests)[0])
@@ -62,7 +64,7 @@ def outlook(contrast: Contrast, tests: int, alpha: float = ALPHA) -> Outlook:
     return Outlook(present, counts[int(enough[0])] if len(enough) else None)
 
 
-def _unbiased(parts: Components) -> Components:
+def _median_unbiased(parts: Components) -> Components:
     """Return the variance with a component of the runs that is as often too large as too small."""
     from scipy.special import chdtri
 
@@ -92,8 +94,10 @@ def _detectable(parts: Sequence[Components], level: float) -> Floats:
 
     q = quantiles(parts, np.full(len(parts), level))
     variance = np.array([c.variance for c in parts])
-    # degrees of freedom of the whole variance (Satterthwaite 1946)
-    df = variance**2 / np.array([c.runs**2 / c.runs_df + c.starts**2 / c.starts_df for c in parts])
+    shares = np.array([c.runs**2 / c.runs_df + c.starts**2 / c.starts_df for c in parts])
+    df = np.full(len(parts), _CERTAIN_DF)
+    np.divide(variance**2, shares, out=df, where=shares > 0)  # Satterthwaite 1946
+    df = np.minimum(df, _CERTAIN_DF)
     c = np.sqrt(2 / df) * np.exp(gammaln((df + 1) / 2) - gammaln(df / 2))
     errors = q * c + ndtri(POWER) * np.sqrt(1 + q**2 * (1 - c**2))
     return np.asarray(errors * np.sqrt(variance))
