@@ -71,7 +71,7 @@ def pairs(labels: list[str], differences: list[dict]) -> list[str]:
             winner, loser = (a, b) if auc["value"] > 0 else (b, a)
             better[winner].append(loser)
         else:
-            seeds = f" ({auc['seeds'] or '> 100'})"
+            seeds = f" ({auc['seeds']})" if auc["seeds"] else ""
             open_[a].append(b + seeds)
             open_[b].append(a + seeds)
 
