@@ -31,7 +31,7 @@ def metric(cell: dict) -> str:
     """Mean over seeds, and its interval over seeds and starts; a dash where nothing is defined."""
     if cell["mean"] is None:
         return "–"
-    return f"{cell['mean']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
+    return f"{cell['mean']:z.2f} [{cell['low']:z.2f}, {cell['high']:z.2f}]"
 
 
 def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
