@@ -69,7 +69,7 @@ def _median_unbiased(parts: Components) -> Components:
     from scipy.special import chdtri
 
     median = float(chdtri(parts.runs_df, 0.5)) / parts.runs_df
-    return replace(parts, runs=parts.runs / median, both=min(parts.both, parts.runs / median))
+    return replace(parts, runs=parts.runs / median)
 
 
 def _with_seeds(parts: Components, seeds: int, count: int) -> Components:
