@@ -10,7 +10,7 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "evaluation" / "kills.py"
 SMALL = ["--suite", "libero_goal/3", "libero_object/0", "--episodes", "8", "--unit-starts", "2"]
-SMALL += ["--horizon", "80", "--pause", "0.1"]  # the last units take longer than the pauses before the kills
+SMALL += ["--horizon", "50", "--pause", "0.1"]  # the last units take longer than the pauses before the kills
 
 
 def test_killed_three_times_three_processes_end_with_the_result_of_one():
