@@ -31,7 +31,7 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
 def commands(parser: argparse.ArgumentParser | None = None) -> Iterator[argparse.ArgumentParser]:
     """Every subcommand of `libero` that runs something, in the order of its help."""
     if parser is None:
-        from lifelong.cli.main import build_parser
+        from libero_eval.cli.main import build_parser
 
         parser = build_parser()
     groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
@@ -261,8 +261,8 @@ PROTOCOL_ROWS = {
 
 def protocol_table() -> str:
     """A row for each protocol, with the values in which they differ most."""
-    from lifelong.cli.protocols import shown_values
-    from lifelong.evaluation.card_files import card_names, load_card
+    from libero_eval.cli.protocols import shown_values
+    from libero_eval.protocols.files import card_names, load_card
 
     lines = [
         "| protocol |" + "".join(f" {title} |" for title in PROTOCOL_ROWS),

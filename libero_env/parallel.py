@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import socket
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import suppress
 from functools import lru_cache
 from multiprocessing import connection
+from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -209,3 +211,41 @@ def _warn_uncached(reason: str) -> None:
         "write to",
         reason,
     )
+
+
+def this_machine() -> str:
+    """Return what tells this machine, its boot and its process numbers apart from others."""
+    parts = [socket.gethostname()]
+    with suppress(OSError):
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
+    with suppress(OSError):
+        parts.append(os.readlink("/proc/self/ns/pid"))
+    return " ".join(parts)
+
+
+def process_start(pid: int) -> int | None:
+    """Return when a process started, in ticks since the boot; None if it has ended, or without /proc."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    state, *rest = text.rpartition(")")[2].split()  # proc(5): field 3 is the state, field 22 the start
+    return None if state in "ZX" else int(rest[18])
+
+
+def is_running(pid: int, start: int | None) -> bool:
+    """Return whether a process of this machine runs.
+
+    Args:
+        pid: Its number.
+        start: When it started, of `process_start`; tells processes with the same number apart.
+    """
+    if start is not None:
+        return process_start(pid) == start
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass  # it is another user's
+    return True

@@ -23,10 +23,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from libero_env.parallel import is_running, process_start, this_machine
 from libero_env.storage import atomic_write_text
 from libero_env.validation import validate
 from lifelong.errors import ResultsError, RunLockedError
-from lifelong.evaluation.claims import is_running, process_start, this_machine
 from lifelong.results.provenance import utc_now
 from lifelong.results.run_directory import result_relevant
 from lifelong.results.summary import json_safe

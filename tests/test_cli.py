@@ -17,7 +17,7 @@ from libero_env.cli import doctor
 from libero_env.cli.doctor import Finding
 from libero_env.errors import MAX_LISTED, UnknownNameError
 from libero_env.tasks import bddl, get_suite, get_task
-from lifelong.cli import main as cli
+from libero_eval.cli import main as cli
 from lifelong.cli.doctor import check_torch
 
 pytestmark = pytest.mark.unit

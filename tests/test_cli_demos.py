@@ -10,7 +10,7 @@ from libero_env.cli import arguments
 from libero_env.cli import demos as cli_demos
 from libero_env.demos.read import read_demos
 from libero_env.demos.record import RecordingReport
-from lifelong.cli import main as cli
+from libero_eval.cli import main as cli
 from tests.harness.demos import wander
 
 pytestmark = pytest.mark.sim

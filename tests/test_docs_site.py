@@ -19,8 +19,8 @@ from hydra import compose, initialize_config_dir
 
 from libero._adapters.lifelong.config import load_config
 from libero_env.objects import catalog
+from libero_eval.cli.main import build_parser, main
 from lifelong.algorithms import Algorithm
-from lifelong.cli.main import build_parser, main
 from lifelong.composition import check_choices, swept
 
 ROOT = Path(__file__).parents[1]
@@ -87,7 +87,7 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     assert main(["eval", "my_policy:make", *tiny]) == 0
     assert "eval/my_policy.make/eval.json" in capsys.readouterr().out
     (reading,) = re.findall(
-        r"^```python\n(from lifelong.results.evaluation_file.*?)^```",
+        r"^```python\n(from libero_eval.evaluation_file.*?)^```",
         text(DOCS / "evaluating.md"),
         re.M | re.S,
     )
@@ -277,7 +277,7 @@ def test_extras_and_variables_are_told():
     ]
     code = "".join(
         file.read_text(encoding="utf-8")
-        for p in ("libero_env", "lifelong")
+        for p in ("libero_env", "lifelong", "libero_eval")
         for file in (ROOT / p).rglob("*.py")
     )
     variables = set(re.findall(r"\b(?:LIBERO|MUJOCO)_[A-Z_]+\b(?!\.TXT)", code))

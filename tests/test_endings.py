@@ -19,10 +19,10 @@ from libero_env.cli import ending
 from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
 from libero_env.tasks import get_task, read_task
+from libero_eval.cli import main as cli
+from libero_eval.protocols.packaged import PROTOCOLS
+from libero_eval.work.suite import SuiteEvaluation
 from lifelong import launch
-from lifelong.cli import main as cli
-from lifelong.evaluation.protocols import PROTOCOLS
-from lifelong.evaluation.suite import SuiteEvaluation
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 60.0  # s; for a process to start or to end

@@ -11,7 +11,7 @@ import pytest
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = sorted(EXPERIMENTS.rglob("*.py"))
-PACKAGES = ("libero", "libero_env", "lifelong")
+PACKAGES = ("libero", "libero_env", "libero_eval", "lifelong")
 # of extras, and of environments in which some scripts are run
 FOREIGN = (
     "easydict",

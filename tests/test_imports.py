@@ -12,6 +12,7 @@ import pytest
 
 import libero
 import libero_env
+import libero_eval
 import lifelong
 
 pytestmark = pytest.mark.unit
@@ -25,6 +26,7 @@ ENV_SIDE = sorted(
 )
 FACADE = sorted(module.name for module in pkgutil.walk_packages(libero.__path__, "libero."))
 LEARNING_SIDE = sorted(module.name for module in pkgutil.walk_packages(lifelong.__path__, "lifelong."))
+JUDGING_SIDE = sorted(module.name for module in pkgutil.walk_packages(libero_eval.__path__, "libero_eval."))
 
 # What other packages do when they are imported: numba tries whether its cache can be written, matplotlib lists the
 # fonts once per machine, gymnasium silences pygame.
@@ -79,7 +81,11 @@ def import_in_fresh_process(names: list[str], home: Path) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("names", [ENV_SIDE, FACADE, LEARNING_SIDE], ids=["libero_env", "libero", "lifelong"])
+@pytest.mark.parametrize(
+    "names",
+    [ENV_SIDE, FACADE, LEARNING_SIDE, JUDGING_SIDE],
+    ids=["libero_env", "libero", "lifelong", "libero_eval"],
+)
 def test_importing_does_nothing(names, tmp_path):
     done = import_in_fresh_process(names, tmp_path)
     theirs = {f"set {name}" for name in THEIR_VARIABLES}
@@ -95,5 +101,5 @@ def test_the_environment_loads_nothing_of_learning(tmp_path):
 
 def test_the_command_line_starts_light(tmp_path):
     """`libero --help` must not wait for PyTorch or MuJoCo."""
-    loaded = import_in_fresh_process(["lifelong.cli.main"], tmp_path)["loaded"]
+    loaded = import_in_fresh_process(["libero_eval.cli.main"], tmp_path)["loaded"]
     assert not {"torch", "mujoco", "hydra", "transformers", "matplotlib", "numba"} & set(loaded)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import torch
 
+from libero_eval.relearning import FailureShare
 from lifelong.algorithms import CLARE
-from lifelong.evaluation.relearning import FailureShare
 from lifelong.evaluation.restore import LoadedRun, restore
 from lifelong.policies.base import Policy
 

@@ -13,8 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from lifelong.cli.evaluate import plan_eval, policy_threads
-from lifelong.cli.main import build_parser
+from libero_eval.cli.evaluate import plan_eval, policy_threads
+from libero_eval.cli.main import build_parser
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
+from libero_eval.judging.sequential import sequential_test
 from lifelong.results.differences import (
     Counts,
     Pairs,
@@ -22,7 +23,6 @@ from lifelong.results.differences import (
     sign_flip_test,
 )
 from lifelong.results.intervals import holm
-from lifelong.results.sequential import sequential_test
 
 TASKS = 10
 

@@ -1,4 +1,4 @@
-"""Coverage of the intervals of `lifelong.results.robustness`, and false positives of its test, by simulation.
+"""Coverage of the intervals of `libero_eval.robustness.results`, and false positives of its test, by simulation.
 
     python experiments/robustness/interval_coverage.py --simulations 400
 
@@ -11,7 +11,7 @@ import argparse
 
 import numpy as np
 
-from lifelong.results.robustness import Condition, Outcomes
+from libero_eval.robustness.results import Condition, Outcomes
 
 SEVERITIES = (0.2, 0.4, 0.6, 0.8, 1.0)
 TASKS = STARTS = 10

@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-PACKAGES = ("libero_env", "lifelong", "libero")
+PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero")
 LONG = 40  # lines of a function
 
 _GRAPH = """

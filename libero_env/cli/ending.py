@@ -30,7 +30,10 @@ MISTAKE, DEFECT, SIGNALLED = 2, 70, 128
 DEBUG = "--debug"
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _MAX_FRAMES = 12  # of the user's code in a message
-_ROOTS = [str(Path(__file__).parents[2] / name) + os.sep for name in ("libero_env", "lifelong", "libero")]
+_ROOTS = [
+    str(Path(__file__).parents[2] / name) + os.sep
+    for name in ("libero_env", "lifelong", "libero_eval", "libero")
+]
 _INSTALLED = [sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")]
 # what a machine refuses; other errors of the operating system are unexpected
 _REFUSALS = {

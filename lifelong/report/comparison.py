@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 
 from libero_env.storage import atomic_write_text
-from lifelong.report.comparability import MUJOCO, check_same_back_end
+from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, other_demonstrations
 from lifelong.report.statistics import statistics
 from lifelong.results.metrics import METRIC_NAMES, mean_and_standard_error
 from lifelong.results.results import has_later_tasks
 from lifelong.results.samples import Member, metric_values
 from lifelong.results.summary import json_safe
+
+MUJOCO = "mujoco"  # back end of results that name none
 
 
 def compare(groups: Sequence[Group]) -> dict[str, Any]:
@@ -162,3 +164,20 @@ def _mean(values: Sequence[float]) -> dict[str, float]:
     known = [v for v in values if not np.isnan(v)]
     mean, error = mean_and_standard_error(known)
     return {"mean": mean, "standard_error": error}
+
+
+def check_same_back_end(of: Mapping[str, str]) -> None:
+    """Check that results are of one back end: the physics and the pictures of others differ.
+
+    Args:
+        of: Back end of each result by its label.
+
+    Raises:
+        ComparisonError: There are several; the message names a result of each.
+    """
+    found = {name: label for label, name in of.items()}
+    if len(found) > 1:
+        names = ", ".join(f"{label} on backend={name}" for name, label in found.items())
+        raise ComparisonError(
+            f"results of different back ends are not compared: {names}; evaluate all on one, see --backend"
+        )

@@ -11,8 +11,7 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.errors import LifelongError
-from lifelong.report.comparability import MUJOCO
-from lifelong.report.comparison import compare, write_comparison
+from lifelong.report.comparison import MUJOCO, compare, write_comparison
 from lifelong.report.figures import (
     Line,
     Panel,

@@ -4,10 +4,15 @@ import jinja2
 import numpy as np
 
 
-def page_template(name: str) -> jinja2.Template:
-    """Return a template of this folder, with the filter `percent`; an undefined name is an error."""
+def page_template(name: str, package: str = "lifelong.report") -> jinja2.Template:
+    """Return a template of a package, with the filter `percent`; an undefined name is an error.
+
+    Args:
+        name: File of the template; it may include those of `lifelong.report`.
+        package: Package whose folder holds it.
+    """
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lifelong.report", "."),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p, ".") for p in (package, "lifelong.report")]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -20,7 +20,11 @@ from lifelong.results.results import Results
 
 Conditions = Mapping[str, str]
 
-_PACKAGES = ("libero_env", "lifelong")  # whose files decide results; the facade only calls them
+_PACKAGES = (
+    "libero_env",
+    "lifelong",
+    "libero_eval",
+)  # whose files decide results; the facade only calls them
 _ENDINGS = (".py", ".yaml", ".npz", ".json")
 _VARIABLES = (
     "MKL_CBWR",

@@ -2,7 +2,7 @@
 
 An episode is identified by its task and its initial state, so the outcomes of two policies are pairs, and only pairs
 in which they differ (discordant ones) carry evidence. The tests and intervals hold for the two sets of weights that
-were evaluated; how much training again would change needs several runs of each (`lifelong.results.group_scores`).
+were evaluated; how much training again would change needs several runs of each (`libero_eval.judging.group_scores`).
 """
 
 import math

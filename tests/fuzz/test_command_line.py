@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifelong.cli.main import build_parser, main
+from libero_eval.cli.main import build_parser, main
 from lifelong.errors import ConfigError
 from lifelong.report.figures import Line, Panel, as_svg, forgetting_figure, heatmap_figure
 from lifelong.report.templates import page_template

@@ -9,14 +9,14 @@ import pytest
 import yaml
 from hypothesis import given
 
-from lifelong.cli.compare import _single_sides
-from lifelong.evaluation.card_files import load_card
-from lifelong.evaluation.protocols import PROTOCOLS
-from lifelong.evaluation.repeat import repeated, repeated_card
-from lifelong.report.judgement import judge, write_judgement
-from lifelong.report.judgement_text import render
-from lifelong.results.evaluation_file import FILE_NAME, EvaluationResult, task_result
-from lifelong.results.exports import export_lerobot, export_vla_eval
+from libero_eval.cli.compare import _single_sides
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, task_result
+from libero_eval.exports import export_lerobot, export_vla_eval
+from libero_eval.judging.comparison import judge, write_judgement
+from libero_eval.judging.text import render
+from libero_eval.protocols.files import load_card
+from libero_eval.protocols.packaged import PROTOCOLS
+from libero_eval.repeat import repeated, repeated_card
 from lifelong.results.summary import json_safe
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, mutated

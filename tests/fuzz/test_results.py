@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifelong.results.check import examine
+from libero_eval.check import examine
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.provenance import start_record

@@ -12,7 +12,7 @@ from libero_env.objects import folder
 from libero_env.paths import objects_dir
 from libero_env.tasks import bddl, make_task, read_suite
 from libero_env.tasks.problem import differences
-from lifelong.evaluation.card_files import load_card
+from libero_eval.protocols.files import load_card
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, hostile, mutated
 

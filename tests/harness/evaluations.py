@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from libero_env.tasks import get_suite
+from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.protocols.packaged import PROTOCOLS
+from libero_eval.work.suite import SuiteEvaluation
+from libero_eval.work.worker import Worker
 from lifelong.evaluation.actors import CallableActor
-from lifelong.evaluation.protocols import PROTOCOLS
-from lifelong.evaluation.suite import SuiteEvaluation
-from lifelong.evaluation.worker import Worker
-from lifelong.results.evaluation_file import EvaluationResult
 
 TASKS = get_suite("libero_goal").tasks[:2]
 QUICK = PROTOCOLS["libero"].changed(

@@ -11,10 +11,10 @@ import zmq
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
-from lifelong.evaluation.servers.codecs import GROOT, OPENPI, VLA_EVAL
-from lifelong.evaluation.servers.groot import ACTION
-from lifelong.evaluation.servers.serving import PolicyServer
-from lifelong.evaluation.servers.sessions import ServedPolicy
+from libero_eval.servers.codecs import GROOT, OPENPI, VLA_EVAL
+from libero_eval.servers.groot import ACTION
+from libero_eval.servers.serving import PolicyServer
+from libero_eval.servers.sessions import ServedPolicy
 
 MODALITIES = {
     "video": ["image", "wrist_image"],

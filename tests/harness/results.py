@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lifelong.results.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.evaluation_file import EvaluationResult, TaskResult
 
 PROTOCOL = {"name": "openpi", "horizon": {"libero_goal": 300, "libero_object": 280}, "settle_steps": 10}
 ENVIRONMENT = {"models": "builtin", "robot": "libero", "drawing": "fast", "renderer": "egl"}

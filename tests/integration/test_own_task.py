@@ -15,7 +15,7 @@ from PIL import Image
 
 from libero_env.envs.env import LiberoEnv
 from libero_env.tasks import read_task, write_task
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from libero_env.tasks import get_suite
+from libero_eval.servers.actor import RemoteActor
+from libero_eval.servers.codecs import OPENPI, VLA_EVAL
+from libero_eval.servers.connections import Limits
+from libero_eval.servers.wires import EpisodeStart, VlaEvalDialect, WebSocketWire
 from lifelong.errors import ServerError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.inputs import PolicyInput
 from lifelong.evaluation.restore import restore
-from lifelong.evaluation.servers.actor import RemoteActor
-from lifelong.evaluation.servers.codecs import OPENPI, VLA_EVAL
-from lifelong.evaluation.servers.connections import Limits
-from lifelong.evaluation.servers.wires import EpisodeStart, VlaEvalDialect, WebSocketWire
 from lifelong.seeding import generator
 from tests.harness.counterparts import counterpart
 from tests.harness.runs import make_run

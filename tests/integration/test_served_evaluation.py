@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from lifelong.cli import main as cli
+from libero_eval.cli import main as cli
+from libero_eval.servers.actor import RemoteActor
+from libero_eval.servers.codecs import OPENPI
+from libero_eval.servers.sessions import ServedPolicy
 from lifelong.evaluation.restore import restore
-from lifelong.evaluation.servers.actor import RemoteActor
-from lifelong.evaluation.servers.codecs import OPENPI
-from lifelong.evaluation.servers.sessions import ServedPolicy
 from tests.harness import policy_servers
 from tests.harness.runs import make_run
 

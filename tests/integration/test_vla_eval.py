@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from lifelong.cli import main as cli
+from libero_eval.cli import main as cli
 from tests.harness.peers import vla_eval
 from tests.harness.recorded import write_actions
 from tests.harness.runs import make_run
@@ -13,7 +13,7 @@ from tests.harness.runs import make_run
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 THEIRS = "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark"
-OURS = "lifelong.evaluation.vla_eval:LiberoBenchmark"
+OURS = "libero_eval.vla_eval:LiberoBenchmark"
 TASK = "libero_object/0"
 
 

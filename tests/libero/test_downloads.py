@@ -16,7 +16,7 @@ from libero_env.assets.hub import DownloadError
 from libero_env.demos import download as demos_download
 from libero_env.demos.download import REPO, REVISION, download_demos, remote_files
 from libero_env.errors import UnknownNameError
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 
 pytestmark = pytest.mark.unit
 

@@ -30,7 +30,7 @@ from libero_env.tasks import (
 from libero_env.tasks.authoring import EMPTY, model_regions
 from libero_env.tasks.builder import load_data
 from libero_env.tasks.problem import Atom, Not, Or, differences
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 from lifelong.errors import ConfigError
 from lifelong.settings import BenchmarkSettings
 

@@ -11,7 +11,7 @@ from libero_env.design.certify import Certificate, Outcome, certify, markdown_ta
 from libero_env.errors import LiberoError
 from libero_env.tasks import get_suite, get_task, read_task
 from libero_env.tasks.problem import And, Atom
-from lifelong.cli import main as cli
+from libero_eval.cli import main as cli
 
 TASKS = get_suite("libero_object").tasks[:2]
 

@@ -13,7 +13,7 @@ from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shar
 from libero_env.errors import LiberoError
 from libero_env.perturbations import Perturbation, draws
 from libero_env.tasks import get_suite, get_task
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 
 TASK = get_task("libero_goal/3")
 ROBOT = Perturbation("robot", 0.4)

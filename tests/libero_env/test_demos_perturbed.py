@@ -16,7 +16,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.perturbations import parse_perturbations
 from libero_env.tasks import get_task
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 from tests.harness.demos import STEPS, wander
 
 TASK, SIZE = "libero_goal/3", (24, 32)

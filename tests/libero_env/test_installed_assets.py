@@ -17,7 +17,7 @@ from libero_env.assets.published import (
 )
 from libero_env.cli.doctor import check_models
 from libero_env.errors import MissingPackageError
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 from lifelong.results.provenance import installed_versions
 
 pytestmark = pytest.mark.unit

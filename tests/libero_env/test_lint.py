@@ -17,7 +17,7 @@ from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
 from libero_env.tasks.signatures import KINDS
-from lifelong.cli import main as cli
+from libero_eval.cli import main as cli
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
 GOAL = "(And (In akita_black_bowl_1 wooden_cabinet_1_top_region))"

@@ -26,7 +26,7 @@ from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
 from libero_env.tasks.authoring import model_regions
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 
 pytestmark = pytest.mark.sim
 

@@ -12,7 +12,7 @@ from libero_env.objects import folder
 from libero_env.tasks import make_task, read_suite, read_task
 from libero_env.tasks.task import Task
 from libero_env.validation import validate
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
 
 pytestmark = pytest.mark.unit
 

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
+from libero_eval.judging.comparability import Side, back_end_of, check_comparable, check_same_back_end
+from libero_eval.judging.comparison import judge
+from libero_eval.protocols.files import load_card
 from lifelong.errors import ComparisonError, ConfigError, ProtocolError
-from lifelong.evaluation.card_files import load_card
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.report.comparability import Side, back_end_of, check_comparable, check_same_back_end
 from lifelong.report.comparison import compare
-from lifelong.report.judgement import judge
 from lifelong.results.provenance import start_record
 from tests.harness.results import PROTOCOL, drawn_result
 

@@ -11,6 +11,17 @@ pytest.importorskip("statsmodels")
 
 from scipy import stats  # noqa: E402
 
+from libero_eval.judging.power import (  # noqa: E402
+    Question,
+    discordance_of,
+    paired_episodes,
+    paired_power,
+    sequential_stopping,
+    shown_difference,
+    unpaired_episodes,
+)
+from libero_eval.judging.power_text import shown, table  # noqa: E402
+from libero_eval.judging.sequential import log_evidence, rounds, sequential_test  # noqa: E402
 from lifelong.errors import ConfigError  # noqa: E402
 from lifelong.results.differences import (  # noqa: E402
     Counts,
@@ -23,17 +34,6 @@ from lifelong.results.differences import (  # noqa: E402
     score_interval,
     sign_flip_test,
 )
-from lifelong.results.power import (  # noqa: E402
-    Question,
-    discordance_of,
-    paired_episodes,
-    paired_power,
-    sequential_stopping,
-    shown_difference,
-    unpaired_episodes,
-)
-from lifelong.results.power_text import shown, table  # noqa: E402
-from lifelong.results.sequential import log_evidence, rounds, sequential_test  # noqa: E402
 
 pytestmark = pytest.mark.unit
 

@@ -12,8 +12,8 @@ import libero_env.parallel as parallel
 from libero_env import LiberoEnv
 from libero_env.errors import LiberoError
 from libero_env.tasks import get_task
+from libero_eval.cli.main import main
 from lifelong import experiment
-from lifelong.cli.main import main
 from lifelong.errors import ConfigError
 from lifelong.settings import build
 from lifelong.sweeps import read_sweep, sweep_name

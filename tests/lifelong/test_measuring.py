@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from libero_eval.check import examine
 from lifelong.algorithms import Algorithm, LoRA, PackNet, Sequential, SingleTask
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report import write_report
-from lifelong.results.check import examine
 from lifelong.results.log import ResultLog
 from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.provenance import start_record

@@ -10,12 +10,12 @@ import yaml
 from PIL import Image
 
 from libero_env.tasks import get_task
+from libero_eval.candidates import RunPolicy
+from libero_eval.protocols.files import load_card
+from libero_eval.saliency import SaliencySettings
+from libero_eval.saliency_sheet import draw_saliency
 from lifelong.errors import ConfigError, LifelongError
-from lifelong.evaluation.candidates import RunPolicy
-from lifelong.evaluation.card_files import load_card
 from lifelong.evaluation.restore import restore
-from lifelong.evaluation.saliency import SaliencySettings
-from lifelong.evaluation.saliency_sheet import draw_saliency
 from tests.harness.runs import make_run
 
 pytestmark = pytest.mark.unit

@@ -10,9 +10,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from libero_eval.cli.main import main
 from lifelong import experiment
 from lifelong.algorithms.base import Algorithm
-from lifelong.cli.main import main
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.results.run_directory import RunDirectory

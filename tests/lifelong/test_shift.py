@@ -18,12 +18,12 @@ from libero_env.demos.observe import RenderConfig
 from libero_env.demos.perturbed import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
 from libero_env.tasks import get_suite
+from libero_eval import relearning
+from libero_eval.cli.main import main
+from libero_eval.relearning import RelearnSettings
 from lifelong import experiment
-from lifelong.cli.main import main
 from lifelong.data import demonstrations
 from lifelong.errors import ConfigError
-from lifelong.evaluation import relearning
-from lifelong.evaluation.relearning import RelearnSettings
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.language import encoder
 from lifelong.results.log import ResultLog

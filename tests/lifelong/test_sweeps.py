@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from libero_eval.cli.main import main
 from lifelong import sweeps
-from lifelong.cli.main import main
 from lifelong.composition import check_choices, config_folder
 from lifelong.errors import ConfigError, MissingPackageError, ResultsError, RunLockedError
 from lifelong.sweeps import (

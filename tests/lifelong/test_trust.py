@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from lifelong.cli.main import main
+from libero_eval.cli.main import main
+from libero_eval.repeat import repeated
 from lifelong.errors import ConfigError
-from lifelong.evaluation.repeat import repeated
 from lifelong.evaluation.restore import restore
 from lifelong.settings.targets import GROUPS, find_target
 from tests.harness.configs import CONFIGS
@@ -36,7 +36,7 @@ HOSTILE = [
     ),
     *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.source.Path"),
     *(
-        "lifelong.cli.main.main",
+        "libero_eval.cli.main.main",
         "lifelong.cli.__main__.main",
         "lifelong.algorithms.er.ER.__init__",
         "lifelong",
@@ -49,7 +49,7 @@ HOSTILE = [
     *("lifelong.policies.base.Policy.__subclasses__", "lifelong.language.encoder.np.load", "lifelong.nn"),
     *(
         "libero_env.storage.atomic_path",
-        "lifelong.evaluation.candidates.load_callable",
+        "libero_eval.candidates.load_callable",
         "lifelong.data.loading.Path",
     ),
     *("lifelong.tracking.__builtins__", "lifelong.nn.augmentation.ABC", "lifelong.launch.SweepStart"),
@@ -101,7 +101,7 @@ def test_every_target_of_the_configuration_files_may_be_saved():
 @pytest.mark.parametrize(
     "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "wandb", "pretrain"})
 )
-@pytest.mark.parametrize("target", ["posix.mkdir", "lifelong.evaluation.candidates.importlib.import_module"])
+@pytest.mark.parametrize("target", ["posix.mkdir", "libero_eval.candidates.importlib.import_module"])
 def test_a_strangers_run_executes_nothing(group, target, changed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = changed(**{group: {"_target_": target, "path": "made", "name": "made"}})

@@ -7,8 +7,8 @@ import pytest
 import torch
 import yaml
 
+from libero_eval.cli.main import main
 from lifelong import algorithms
-from lifelong.cli.main import main
 from lifelong.composition import compose_run, swept
 from lifelong.errors import LiberoError
 from lifelong.settings import Configuration, plain_data

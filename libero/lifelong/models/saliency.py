@@ -1,4 +1,4 @@
-"""Saliency of `lifelong.evaluation.saliency` for policies whose batches are dictionaries.
+"""Saliency of `libero_eval.saliency` for policies whose batches are dictionaries.
 
 Shape legend: B batch, T time, C H W image, A action.
 """
@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from libero._adapters.lifelong.batches import map_tensors
 from libero._adapters.lifelong.observations import image_tensor, uint8_image
-from lifelong.evaluation.saliency import SaliencySettings, saliency
+from libero_eval.saliency import SaliencySettings, saliency
 from lifelong.types import Batch, Observation
 
 
 class PerturbationAttention:
-    """Change of a policy's action when a place of an image is blurred; see `lifelong.evaluation.saliency`.
+    """Change of a policy's action when a place of an image is blurred; see `libero_eval.saliency`.
 
     Args:
         model: Policy; `forward(data)` returns a distribution of actions, or actions.

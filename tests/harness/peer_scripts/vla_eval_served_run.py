@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import vla_eval
 
-from lifelong.evaluation.vla_eval import RunServer
+from libero_eval.vla_eval import RunServer
 
 
 class Recording(RunServer):

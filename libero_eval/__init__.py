@@ -1,0 +1,1 @@
+"""Judge any policy: protocols, policy servers, resumable evaluations, comparisons, robustness."""

@@ -1,0 +1,1 @@
+"""The subcommands of `libero` that evaluate and judge."""

@@ -1,0 +1,1 @@
+"""Comparisons of evaluated policies: paired tests, intervals, sample sizes."""

@@ -1,0 +1,195 @@
+"""Which results may be compared: the same protocol, tasks and environment, and starts in common."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from libero_eval.evaluation_file import EvaluationResult
+from lifelong.errors import ComparisonError
+from lifelong.report.comparison import MUJOCO, check_same_back_end
+from lifelong.results.differences import Pairs
+
+# What the outcome of an episode depends on by design. Other entries of the environment (renderer, processor) and
+# versions change little; a difference in them is told, and the comparison goes on.
+WORLD = ("models", "robot", "drawing")
+PASSING = ("instruction_set", "policy_threads")  # what every machine differs in
+UNKNOWN = "not recorded"
+
+
+@dataclass(frozen=True)
+class Side:
+    """One policy of a comparison.
+
+    Attributes:
+        label: Its name in tables.
+        results: Its results: one, or several runs.
+        paths: Where these were read.
+    """
+
+    label: str
+    results: tuple[EvaluationResult, ...]
+    paths: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Matched:
+    """The episodes that two sides have in common.
+
+    Attributes:
+        pairs: Their outcomes; `pairs.tasks` are positions in `tasks`.
+        tasks: Ids of the tasks.
+        dropped: Number of episodes of each side without a partner.
+    """
+
+    pairs: Pairs
+    tasks: tuple[str, ...]
+    dropped: tuple[int, int]
+
+
+def check_comparable(sides: Sequence[Side], allow: Iterable[str] = ()) -> list[str]:
+    """Compare protocols, tasks and environments of all results with those of the first.
+
+    Args:
+        sides: Policies to be compared.
+        allow: Names of settings that may differ, or of groups of them: `protocol`, `protocol.horizon`,
+            `environment.robot`, `tasks`.
+
+    Returns:
+        Remarks on what differs and was allowed, or does not matter much.
+
+    Raises:
+        ComparisonError: A setting differs; the message names both values. Back ends are never mixed.
+    """
+    rows = [(s.label, r) for s in sides for r in s.results]
+    base_label, base = rows[0]
+    found_on = {back_end_of(result): label for label, result in rows}
+    check_same_back_end({label: name for name, label in found_on.items()})
+    expected, refused, notes = settings(base), {}, {}
+    for label, result in rows[1:]:
+        found = settings(result)
+        for key in sorted(expected.keys() | found.keys()):
+            if key.startswith("tasks.") and not (key in expected and key in found):
+                continue  # a task of one of them only: its episodes have no partner
+            values = expected.get(key, UNKNOWN), found.get(key, UNKNOWN)
+            if values[0] == values[1]:
+                continue
+            text = f"{key}: {_short(values[0])} in {base_label}, {_short(values[1])} in {label}"
+            if UNKNOWN in values and key.startswith("environment."):
+                notes[key] = f"{text}; taken to be the same"
+            elif any(key == a or key.startswith(a + ".") for a in allow):
+                notes[key] = f"{text}; allowed"
+            else:
+                refused[key] = text
+        for key, pair in _lesser_differences(base, result).items():
+            notes[key] = f"{key}: {pair[0]} in {base_label}, {pair[1]} in {label}"
+    if refused:
+        names = " ".join(f"--allow {key}" for key in refused)
+        lines = "\n  ".join(refused.values())
+        raise ComparisonError(
+            f"these results cannot be compared, as they were made differently:\n  {lines}\n"
+            f"evaluate again with the same settings, or compare nevertheless with {names}"
+        )
+    return list(notes.values())
+
+
+def settings(result: EvaluationResult) -> dict[str, Any]:
+    """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
+    world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
+    if "models" not in world and "models" in result.versions:  # files of the first format
+        world["models"] = result.versions["models"]
+    tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
+    return _flat({"protocol": result.protocol, "environment": world, "tasks": tasks})
+
+
+def back_end_of(result: EvaluationResult) -> str:
+    """Return the back end of a result; those that name none are of `mujoco`."""
+    world = result.protocol.get("world")
+    return str(world.get("backend", MUJOCO)) if isinstance(world, Mapping) else MUJOCO
+
+
+def match(first: Side, second: Side) -> Matched:
+    """Pair the episodes of two sides by task and initial state.
+
+    Raises:
+        ComparisonError: They have no start in common.
+    """
+    tables = [[_outcomes(r) for r in side.results] for side in (first, second)]
+    shared = set.intersection(*(set(t) for side in tables for t in side))
+    if not shared:
+        raise ComparisonError(
+            f"{first.label} and {second.label} were not evaluated in the same starts: "
+            f"{_starts(first)} against {_starts(second)}"
+        )
+    order = [t.task for t in first.results[0].tasks if any(key[0] == t.task for key in shared)]
+    keys = sorted(shared, key=lambda key: (order.index(key[0]), key[1]))
+    columns = [np.array([[t[key] for t in side] for key in keys], dtype=bool) for side in tables]
+    dropped = [sum(len(t) - len(shared) for t in side) for side in tables]
+    pairs = Pairs(
+        tasks=np.array([order.index(task) for task, _ in keys]),
+        starts=np.array([start for _, start in keys]),
+        first=columns[0],
+        second=columns[1],
+    )
+    return Matched(pairs, tuple(order), (dropped[0], dropped[1]))
+
+
+def same_policy(first: EvaluationResult, second: EvaluationResult) -> bool:
+    """Return whether two results are of the same policy, apart from the seed: the same weights where they are known."""
+    weights = [r.evaluated.get("weights") for r in (first, second)]
+    if all(weights):
+        return weights[0] == weights[1]
+    a, b = ({k: v for k, v in r.evaluated.items() if k != "seed"} for r in (first, second))
+    return a == b
+
+
+def _outcomes(result: EvaluationResult) -> dict[tuple[str, int], bool]:
+    return {
+        (task.task, start): won
+        for task in result.tasks
+        for start, won in zip(task.init_states, task.successes, strict=True)
+    }
+
+
+def _lesser_differences(first: EvaluationResult, second: EvaluationResult) -> dict[str, tuple[Any, Any]]:
+    """Return versions and properties of the environment that differ but do not forbid a comparison."""
+    found = {}
+    for name, a, b in (
+        ("versions", first.versions, second.versions),
+        ("environment", first.environment, second.environment),
+    ):
+        for key in sorted(a.keys() & b.keys()):
+            strict = key.partition("_")[0] in WORLD
+            if not strict and a[key] != b[key] and key not in PASSING:
+                found[f"{name}.{key}"] = (a[key], b[key])
+    return found
+
+
+def _starts(side: Side) -> str:
+    result = side.results[0]
+    task = result.tasks[0]
+    return f"{len(result.tasks)} tasks from {task.task}, starts {_ranges(task.init_states)}"
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Format whole numbers as ranges: 0–9, 20, 40–49."""
+    parts: list[list[int]] = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in parts)
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(value, Mapping):
+        parts = (_flat(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
+        return {k: v for part in parts for k, v in part.items()}
+    return {prefix: list(value) if isinstance(value, tuple) else value}
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,337 @@
+"""Comparison of evaluated policies, start by start: differences, tests, a control arm, and what could be shown."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from libero_env.storage import atomic_write_text
+from libero_eval.judging.comparability import (
+    Matched,
+    Side,
+    back_end_of,
+    check_comparable,
+    match,
+    same_policy,
+    settings,
+)
+from libero_eval.judging.group_scores import GroupScores, group_scores
+from libero_eval.judging.power import Question, shown_difference
+from libero_eval.judging.sequential import ALPHA, SequentialTest, sequential_test
+from lifelong.errors import ConfigError, ResultsError
+from lifelong.report.comparison import MUJOCO
+from lifelong.results.differences import (
+    Difference,
+    count,
+    difference,
+    mcnemar_exact,
+    score_interval,
+)
+from lifelong.results.intervals import Estimate, holm, wilson_interval
+from lifelong.results.summary import json_safe
+
+FORMAT = "libero-comparison/1"
+
+
+@dataclass(frozen=True)
+class Part:
+    """The difference on all tasks together, on a suite, or on a task.
+
+    Attributes:
+        name: `all`, a suite, or the id of a task.
+        title: The instruction of a task; empty otherwise.
+        difference: The difference.
+        adjusted: P-value adjusted by Holm over the family: all comparisons of this kind of part; for tasks, the tasks
+            of this comparison. None for a control arm, which is not tested for being better.
+    """
+
+    name: str
+    title: str
+    difference: Difference
+    adjusted: float | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two policies in the same starts, first minus second.
+
+    Attributes:
+        first: Label of the first.
+        second: Label of the second.
+        total: The difference on all tasks.
+        suites: That on each suite, if there are several.
+        tasks: That on each task.
+        sequential: Test that may be stopped early; None if a policy has several runs.
+        shown: Difference that so many pairs would have shown in four of five cases, as often as these two differ; NaN
+            if unknown.
+        dropped: Number of episodes of each without a partner; they are not counted.
+    """
+
+    first: str
+    second: str
+    total: Part
+    suites: tuple[Part, ...]
+    tasks: tuple[Part, ...]
+    sequential: SequentialTest | None
+    shown: float
+    dropped: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A policy in a table: its runs, episodes and success with Wilson's interval over the episodes."""
+
+    label: str
+    paths: tuple[str, ...]
+    runs: int
+    episodes: int
+    errors: int
+    success: Estimate
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Everything that a comparison found.
+
+    Attributes:
+        rates: The policies.
+        comparisons: Each pair of them.
+        controls: The same policy twice, if there is such a pair: what arises by chance alone.
+        groups: Aggregates over runs; None unless each policy has at least two.
+        notes: Remarks for the reader.
+        backend: Back end that simulated all of it.
+        alpha: Probability of a false difference in a family.
+    """
+
+    rates: tuple[Rate, ...]
+    comparisons: tuple[Comparison, ...]
+    controls: tuple[Comparison, ...]
+    groups: GroupScores | None
+    notes: tuple[str, ...]
+    alpha: float = ALPHA
+    backend: str = MUJOCO
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return everything as plain data for JSON."""
+        plain = _plain({"format": FORMAT, **asdict(self)})
+        if self.groups:
+            plain["groups"]["improvement"] = [
+                {"of": a, "over": b, **asdict(e)} for (a, b), e in self.groups.improvement.items()
+            ]
+        return json_safe(plain)
+
+
+def judge(
+    sides: Sequence[Side],
+    *,
+    control: tuple[Side, Side] | None = None,
+    allow: Sequence[str] = (),
+    alpha: float = ALPHA,
+) -> Judgement:
+    """Compare every pair of policies in the starts that they have in common.
+
+    Args:
+        sides: At least two policies. Two results of one policy with different seeds are also a control arm.
+        control: Two results of one policy, for the control arm alone.
+        allow: Settings that may differ, see `check_comparable`.
+        alpha: Probability of a false difference in each family of tests.
+
+    Raises:
+        ComparisonError: The results were made differently, or have no start in common.
+        ConfigError: There are fewer than two policies, or two of one name.
+        MissingPackageError: SciPy, statsmodels or rliable is not installed.
+    """
+    if len(sides) < 2 and not (control and not sides):
+        raise ConfigError("a comparison needs two results, or --control with two results of one policy")
+    labels = [s.label for s in sides]
+    if twice := sorted({name for name in labels if labels.count(name) > 1}):
+        raise ConfigError(f"two policies are called {', '.join(twice)}; write NAME=RESULT to name them")
+    notes = check_comparable([*sides, *(control or ())], allow)
+    rivals: list[tuple[Side, Side]] = []
+    controls = [control] if control else []
+    for a, b in combinations(sides, 2):
+        (controls if _is_control(a, b) else rivals).append((a, b))
+    notes += [note for a, b in controls for note in _control_notes(a, b)]
+    comparisons = _adjusted([_compare(a, b, alpha) for a, b in rivals])
+    notes += [_dropped(c) for c in comparisons if any(c.dropped)]
+    if not controls:
+        notes.append(
+            "no control arm: evaluate one of the policies again with another --seed and name both results "
+            "with --control, to see which differences arise by chance alone"
+        )
+    backend = back_end_of((sides or control)[0].results[0])  # type: ignore[index]  # there is one of them
+    if backend != MUJOCO:
+        notes.append(f"simulated by backend={backend}; not to be compared with results of others")
+    return Judgement(
+        rates=tuple(_rate(s) for s in sides),
+        comparisons=tuple(comparisons),
+        controls=tuple(_compare(a, b, alpha) for a, b in controls),
+        groups=_groups(sides),
+        notes=tuple(notes),
+        alpha=alpha,
+        backend=backend,
+    )
+
+
+def write_judgement(found: Judgement, path: Path) -> Path:
+    """Write everything as JSON, in one step; numbers that are not finite become null.
+
+    Raises:
+        ResultsError: The file cannot be written.
+    """
+    text = json.dumps(found.to_plain(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    try:
+        atomic_write_text(path, text)
+    except OSError as error:
+        raise ResultsError(f"{path}: the comparison cannot be written ({error})") from error
+    return path
+
+
+def _compare(a: Side, b: Side, alpha: float) -> Comparison:
+    matched = match(a, b)
+    pairs, names = matched.pairs, matched.tasks
+    suites = list(dict.fromkeys(name.partition("/")[0] for name in names))
+    titles = {t.task: t.instruction for r in a.results for t in r.tasks}
+    total = difference(pairs)
+    by_suite = [
+        Part(s, "", difference(pairs.of_tasks([i for i, n in enumerate(names) if n.startswith(s + "/")])))
+        for s in suites
+    ]
+    by_task = [Part(name, titles[name], _task_difference(matched, i)) for i, name in enumerate(names)]
+    return Comparison(
+        first=a.label,
+        second=b.label,
+        total=Part("all", "", total),
+        suites=tuple(by_suite) if len(suites) > 1 else (),
+        tasks=tuple(by_task),
+        sequential=sequential_test(pairs, alpha) if pairs.single else None,
+        shown=_shown(total, alpha),
+        dropped=matched.dropped,
+    )
+
+
+def _task_difference(matched: Matched, task: int) -> Difference:
+    """Return the difference on one task; its bootstrap is that of all tasks' where there are several runs only."""
+    pairs = matched.pairs.of_tasks([task])
+    if not pairs.single:
+        return difference(pairs, draws=1999)
+    counts = count(pairs)
+    score = score_interval(counts)
+    unknown = Estimate(score.value, math.nan, math.nan)
+    return Difference(
+        pairs=len(pairs),
+        first=float(pairs.first.mean()),
+        second=float(pairs.second.mean()),
+        value=score.value,
+        counts=counts,
+        test="McNemar, exact",
+        p_value=mcnemar_exact(counts),
+        score=score,
+        bootstrap=unknown,
+        over_tasks=None,
+        by_chance=None,
+    )
+
+
+def _adjusted(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """Adjust the p-values by Holm: totals together, suites of all comparisons together, tasks of each comparison."""
+    totals = holm([c.total.difference.p_value for c in comparisons])
+    suites = iter(holm([p.difference.p_value for c in comparisons for p in c.suites]))
+    found = []
+    for comparison, adjusted in zip(comparisons, totals, strict=True):
+        tasks = holm([p.difference.p_value for p in comparison.tasks])
+        found.append(
+            replace(
+                comparison,
+                total=replace(comparison.total, adjusted=adjusted),
+                suites=tuple(replace(p, adjusted=next(suites)) for p in comparison.suites),
+                tasks=tuple(replace(p, adjusted=v) for p, v in zip(comparison.tasks, tasks, strict=True)),
+            )
+        )
+    return found
+
+
+def _shown(total: Difference, alpha: float) -> float:
+    """Return the difference that as many pairs show in four of five cases; NaN where it cannot be computed."""
+    if total.counts is None:
+        return math.nan
+    base = max(total.first, total.second)
+    if not 0 < base < 1 or not total.counts.discordant:
+        return math.nan
+    question = Question(base, -base / 1000, alpha=alpha)  # downwards: near 100 % there is no room above
+    share = min(total.counts.discordant / total.counts.pairs, question.discordance_range[1])
+    return shown_difference(replace(question, discordance=max(share, base / 1000)), total.pairs)
+
+
+def _rate(side: Side) -> Rate:
+    wins = sum(sum(t.successes) for r in side.results for t in r.tasks)
+    episodes = sum(len(t.successes) for r in side.results for t in r.tasks)
+    low, high = wilson_interval(wins, episodes)
+    return Rate(
+        label=side.label,
+        paths=side.paths,
+        runs=len(side.results),
+        episodes=episodes,
+        errors=sum(sum(e is not None for e in t.errors) for r in side.results for t in r.tasks),
+        success=Estimate(wins / episodes, float(low), float(high)),
+    )
+
+
+def _groups(sides: Sequence[Side]) -> GroupScores | None:
+    """Return aggregates over runs, on the tasks that all runs have; None unless each side has two runs."""
+    if not sides or any(len(s.results) < 2 for s in sides):
+        return None
+    rates = {
+        s.label: [{t.task: float(np.mean(t.successes)) for t in r.tasks} for r in s.results] for s in sides
+    }
+    shared = set.intersection(*(set(row) for rows in rates.values() for row in rows))
+    names = sorted(shared)
+    return group_scores(
+        {k: np.array([[row[name] for name in names] for row in rows]) for k, rows in rates.items()}
+    )
+
+
+def _is_control(a: Side, b: Side) -> bool:
+    """Return whether both are one policy under the same settings, so that they differ by chance alone."""
+    if len(a.results) != 1 or len(b.results) != 1:
+        return False
+    first, second = a.results[0], b.results[0]
+    return same_policy(first, second) and settings(first) == settings(second)
+
+
+def _control_notes(a: Side, b: Side) -> list[str]:
+    first, second = a.results[0], b.results[0]
+    if not same_policy(first, second):
+        return [
+            f"control arm: {a.label} and {b.label} are not results of one policy; it says nothing about chance"
+        ]
+    if first.outcomes == second.outcomes:
+        return [
+            f"control arm: the outcomes of {a.label} and {b.label} are equal to the bit, so the policy and the "
+            "simulation are deterministic here, or the file is the same; repeat with another --seed, other starts "
+            "or other hardware to see chance"
+        ]
+    return []
+
+
+def _dropped(c: Comparison) -> str:
+    return (
+        f"{c.first} and {c.second}: {c.total.difference.pairs} pairs; without a partner and not counted: "
+        f"{c.dropped[0]} episodes of {c.first}, {c.dropped[1]} of {c.second}"
+    )
+
+
+def _plain(value: Any) -> Any:
+    """Return nested data without arrays; keys that are no text are left to the caller."""
+    if isinstance(value, Mapping):
+        return {k if isinstance(k, str) else " over ".join(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value

@@ -1,0 +1,92 @@
+"""Answers of `libero power` as plain text."""
+
+import math
+from dataclasses import replace
+
+from libero_eval.judging.power import (
+    Question,
+    paired_episodes,
+    sequential_stopping,
+    shown_difference,
+    unpaired_episodes,
+)
+from lifelong.errors import ConfigError
+
+DIFFERENCES = (0.01, 0.02, 0.03, 0.05, 0.10)
+DISCORDANCES = (0.05, 0.10, 0.20)
+SIMULATED = 20_000  # pairs up to which the sequential test is simulated
+
+
+def answer(question: Question) -> str:
+    """Say how many episodes a difference needs: in the same starts, in others, and with a test that stops early."""
+    paired, unpaired = paired_episodes(question), unpaired_episodes(question)
+    lines = [
+        _asked(question),
+        f"same starts (McNemar, exact; {100 * question.differing:.1f} % of the pairs differ"
+        f"{'' if question.discordance is not None else ', as independent outcomes do'}): "
+        f"{paired} episodes of each policy",
+        f"different starts (two proportions): {unpaired} episodes of each policy",
+    ]
+    if 2 * paired <= SIMULATED:
+        found = sequential_stopping(question, 2 * paired)
+        half = f"half of the evaluations stop by {found.median:.0f} pairs, " if found.median > 0 else ""
+        lines.append(
+            f"same starts, stopped as soon as it is decided: {half}"
+            f"{100 * found.power:.0f} % are decided by {found.limit}"
+        )
+    return "\n".join(lines)
+
+
+def shown(question: Question, episodes: int) -> str:
+    """Say which difference a number of episodes of each policy in the same starts shows."""
+    downwards = replace(question, difference=-question.base / 1000, discordance=question.discordance)
+    found = {"worse": shown_difference(downwards, episodes)}
+    if question.base < 1:
+        found["better"] = shown_difference(replace(question, difference=(1 - question.base) / 1000), episodes)
+    lines = [
+        f"{episodes} pairs, success {100 * question.base:.1f} %, power {100 * question.power:.0f} %, alpha "
+        f"{question.alpha:g}{_tests(question)}: shown are"
+    ]
+    for name, size in found.items():
+        text = f"{100 * size:.1f} points" if math.isfinite(size) else "no difference that is possible"
+        lines.append(f"  {name} by {text}" if math.isfinite(size) else f"  {name}: {text}")
+    return "\n".join(lines)
+
+
+def table(question: Question) -> str:
+    """Return a table: episodes of each policy by difference and by the share of pairs that differ."""
+    heads = ["difference", *(f"{100 * d:.0f} % differ" for d in DISCORDANCES), "independent", "other starts"]
+    rows = [heads]
+    for size in DIFFERENCES:
+        gap = size if question.base + size <= 1 else -size
+        cells = [f"{100 * gap:+.0f} points".replace("-", "−")]
+        for share in (*DISCORDANCES, None):
+            cells.append(_episodes(question, gap, share))
+        rows.append([*cells, str(unpaired_episodes(replace(question, difference=gap, discordance=None)))])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(heads))]
+    text = "\n".join("  ".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True)) for row in rows)
+    return (
+        f"episodes of each policy, success {100 * question.base:.0f} %, power {100 * question.power:.0f} %, "
+        f"alpha {question.alpha:g}{_tests(question)}\n"
+        "in the same starts, by the share of starts in which exactly one of the two succeeds; in other starts\n\n"
+        f"{text}\n\n"
+        "a suite of ten tasks has 500 starts, four suites have 2000; --difference and --discordance ask for one case"
+    )
+
+
+def _episodes(question: Question, gap: float, share: float | None) -> str:
+    try:
+        return str(paired_episodes(replace(question, difference=gap, discordance=share)))
+    except ConfigError:  # with these rates, so many pairs cannot differ
+        return "–"
+
+
+def _asked(question: Question) -> str:
+    return (
+        f"success {100 * question.base:.1f} % and {100 * question.other:.1f} %, power {100 * question.power:.0f} %, "
+        f"alpha {question.alpha:g}{_tests(question)}"
+    )
+
+
+def _tests(question: Question) -> str:
+    return f" over {question.tests} comparisons" if question.tests > 1 else ""

@@ -1,0 +1,127 @@
+"""The adapter of a protocol card: what a policy is given, and what its answers mean."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from libero_env.tasks import Task
+from libero_eval.protocols.preprocessing import preprocess
+from libero_eval.protocols.protocol import Card
+from lifelong.errors import PolicyError
+from lifelong.evaluation.inputs import Obs, PolicyInput
+
+ACTION_DIM = 7
+
+
+@dataclass(frozen=True)
+class CardAdapter:
+    """Converts observations of simulations to a card's inputs, and predicted actions to the simulations' own.
+
+    Attributes:
+        card: The protocol.
+        task: Task whose instruction is given.
+    """
+
+    card: Card
+    task: Task
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras that the simulations render, in the protocol's order."""
+        return self.card.pixels.cameras
+
+    @property
+    def observations(self) -> tuple[str, ...]:
+        """Names of the observations that `inputs` reads."""
+        return ("rgb", "proprioception", "ee_quat")
+
+    def inputs(self, obs: Obs, rows: Sequence[int] | None = None) -> list[PolicyInput]:
+        """Return the inputs of some simulations; see `lifelong.evaluation.inputs.Adapter`."""
+        rows = range(len(next(iter(obs.values())))) if rows is None else rows
+        prompt = self.card.prompt(self.task)
+        return [PolicyInput(self._images(obs, i), self._state(obs, i), prompt) for i in rows]
+
+    def actions(self, predicted: np.ndarray) -> np.ndarray:
+        """Return the simulations' actions for predicted ones; see `lifelong.evaluation.inputs.Adapter`."""
+        actions = np.array(predicted, np.float64)
+        if actions.ndim == 0 or actions.shape[-1] != ACTION_DIM:
+            raise PolicyError(f"predicted actions have shape {actions.shape}; expected (..., {ACTION_DIM})")
+        if not np.isfinite(actions).all():
+            raise PolicyError("predicted actions are not finite")
+        gripper = self.card.action.gripper or "as_predicted"
+        actions[..., -1] = GRIPPERS[gripper](np.asarray(predicted)[..., -1])
+        return actions
+
+    def _images(self, obs: Obs, i: int) -> dict[str, np.ndarray]:
+        pixels, found = self.card.pixels, dict[str, np.ndarray]()
+        for camera in pixels.cameras:
+            image = np.asarray(obs[f"{camera.removeprefix('robot0_')}_rgb"][i])
+            if pixels.orientation == "bottom_up":
+                image = image[::-1]
+            elif pixels.orientation == "rotated":  # the original's rows, bottom first, turned by 180 degrees
+                image = image[:, ::-1]
+            crop = 1.0 if pixels.crop is None else pixels.crop
+            found[camera] = preprocess(image, pixels.resize or "none", pixels.resize_size, crop)
+        return found
+
+    def _state(self, obs: Obs, i: int) -> np.ndarray:
+        rules = self.card.proprioception
+        if rules.source != "observation":
+            return np.zeros(0)
+        quat = np.roll(np.asarray(obs["ee_quat"][i], np.float64), -1)  # wxyz -> xyzw
+        parts = {
+            "ee_pos": np.asarray(obs["ee_pos"][i], np.float64),
+            "ee_rotation": ROTATIONS[rules.rotation or "quat_xyzw"](quat),
+            "gripper_qpos": np.asarray(obs["gripper_states"][i], np.float64),
+        }
+        return np.concatenate([parts[name] for name in rules.order or ()]).astype(rules.dtype or "float64")
+
+
+def axis_angle(quat_xyzw: np.ndarray) -> np.ndarray:
+    """Return axis times angle, (3,) rad, as robosuite's `quat2axisangle`: a quaternion and its negative differ.
+
+    Args:
+        quat_xyzw: Unit quaternion, (4,).
+    """
+    w = min(max(quat_xyzw[3], -1.0), 1.0)
+    length = np.sqrt(1.0 - w * w)
+    if math.isclose(length, 0.0):
+        return np.zeros(3)
+    return (quat_xyzw[:3] * 2.0 * math.acos(w)) / length
+
+
+def axis_angle_float32(quat_xyzw: np.ndarray) -> np.ndarray:
+    """Return `axis_angle` computed in single precision, as LeRobot's `LiberoProcessorStep`, (3,) float32."""
+    quat = quat_xyzw.astype(np.float32)
+    w = np.clip(quat[3], np.float32(-1), np.float32(1))
+    length = np.sqrt(np.clip(np.float32(1) - w * w, np.float32(0), None))
+    if length <= 1e-10:
+        return np.zeros(3, np.float32)
+    return (quat[:3] / length) * (np.float32(2) * np.arccos(w))
+
+
+def axis_angle_positive(quat_xyzw: np.ndarray) -> np.ndarray:
+    """Return axis times angle of the quaternion with w >= 0, (3,) float32, as vla-eval's `quat_to_axisangle`."""
+    quat = -quat_xyzw if quat_xyzw[3] < 0 else quat_xyzw
+    w = float(np.clip(quat[3], -1.0, 1.0))
+    length = np.sqrt(1.0 - w * w)
+    if length < 1e-8:
+        return np.zeros(3, np.float32)
+    return (quat[:3] / length * (2.0 * np.arccos(w))).astype(np.float32)
+
+
+ROTATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "axis_angle": axis_angle,
+    "axis_angle_float32": axis_angle_float32,
+    "axis_angle_positive": axis_angle_positive,
+    "quat_xyzw": lambda quat: quat,
+}
+# Predicted gripper -> -1 opens, +1 closes
+GRIPPERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "as_predicted": lambda x: x,
+    "sign": lambda x: np.where(x < 0, -1.0, 1.0),  # vla-eval
+    "open_sign": lambda x: -np.sign(2 * x - 1),  # OpenVLA: 1 is open
+    "open_cut": lambda x: 1.0 - 2.0 * (x > 0.5),  # starVLA: 1 is open
+}

@@ -1,0 +1,239 @@
+"""Success against severity: how much of it a perturbation takes, where half is lost, and what two take together.
+
+All conditions are run from the same starts, so a (task, start) is one cluster of outcomes. Intervals draw starts anew
+within each task, the same for all conditions (a stratified bootstrap of clusters); tasks, kinds and severities are
+fixed, and so is the policy. Where all episodes of a cell end alike, the bootstrap has nothing to vary, so success rates
+have Wilson's intervals instead, and to other variances that of one start is added.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from libero_eval.evaluation_file import EvaluationResult
+from lifelong.errors import ResultsError
+from lifelong.results.components import ONE_EPISODE
+from lifelong.results.curves import Floats
+from lifelong.results.intervals import Estimate, combine_intervals, wilson_interval
+
+DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
+Condition = tuple[tuple[str, float], ...]  # (kind, severity) of each perturbation, by kind; () is the base
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Success along the severities of one kind of perturbation.
+
+    Attributes:
+        kind: Kind of the perturbation.
+        severities: V severities in ascending order, from 0, the base.
+        success: V success rates, means over tasks.
+        area: Area under the line through these, over the measured severities and divided by their range: the success
+            that is to be expected at a severity between 0 and the largest.
+        kept: That area as a share of the base's success; 1 if nothing is lost.
+        half: Least severity at which the line has fallen to half of the base's success; infinite where it has not.
+        p_value: Two-sided p-value of no effect at all: then the outcomes of a start are exchangeable over severities,
+            and are permuted.
+    """
+
+    kind: str
+    severities: tuple[float, ...]
+    success: tuple[Estimate, ...]
+    area: Estimate
+    kept: Estimate
+    half: Estimate
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """What two perturbations take together.
+
+    Attributes:
+        condition: Both perturbations.
+        success: Success with both.
+        expected: Success if each left the share that it leaves alone: p_a · p_b / p_base.
+        excess: Success with both minus that: below 0 they hurt each other.
+    """
+
+    condition: Condition
+    success: Estimate
+    expected: float
+    excess: Estimate
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Outcomes of all conditions from the same starts.
+
+    Attributes:
+        tasks: T tasks.
+        starts: S starts of each task.
+        conditions: C conditions; the first is the base.
+        successes: (C, T, S) outcomes.
+    """
+
+    tasks: tuple[str, ...]
+    starts: tuple[int, ...]
+    conditions: tuple[Condition, ...]
+    successes: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, results: Mapping[Condition, EvaluationResult]) -> "Outcomes":
+        """Return the outcomes of results by their condition.
+
+        Args:
+            results: Result of each condition, the base, (), among them.
+
+        Raises:
+            ResultsError: There is no base, or a condition was not run in the same episodes.
+        """
+        if () not in results:
+            raise ResultsError("there is no result without perturbations, with which the others are compared")
+        base = results[()]
+        tasks, starts = tuple(task.task for task in base.tasks), base.init_states
+        conditions = ((), *sorted(condition for condition in results if condition))
+        for condition in conditions:
+            episodes = {(t.task, t.init_states) for t in results[condition].tasks}
+            if episodes != {(task, starts) for task in tasks}:
+                raise ResultsError(
+                    f"{name_of(condition)} was not run in the same tasks and starts as the base: they cannot be paired"
+                )
+        by_task = [{t.task: t.successes for t in results[c].tasks} for c in conditions]
+        return cls(tasks, starts, conditions, np.array([[row[t] for t in tasks] for row in by_task]))
+
+    @cached_property
+    def rates(self) -> Floats:
+        """(C,) success rates, means over tasks."""
+        return self.successes.mean((1, 2))
+
+    @cached_property
+    def draws(self) -> Floats:
+        """(B, C) success rates where starts are drawn anew within each task, the same for all conditions.
+
+        Draws from S starts vary by (S - 1)/S of what starts do, which is made up for.
+        """
+        generator = np.random.default_rng(SEED)
+        tasks, starts = len(self.tasks), len(self.starts)
+        drawn = generator.integers(starts, size=(DRAWS, tasks, starts))
+        weights = np.stack([(drawn == s).sum(-1) for s in range(starts)], axis=-1)
+        drawn_rates = np.einsum("bts,cts->bc", weights, self.successes.astype(float)) / (tasks * starts)
+        return self.rates + (drawn_rates - self.rates) * np.sqrt(starts / max(starts - 1, 1))
+
+    @property
+    def _least(self) -> float:
+        """Variance that one start adds: nothing is certain because all episodes ended alike."""
+        return ONE_EPISODE / (len(self.tasks) * len(self.starts)) ** 2
+
+    def success(self, condition: Condition) -> Estimate:
+        """Return the success rate of a condition, with the interval of Wilson's of its tasks."""
+        wins = self.successes[self.conditions.index(condition)].sum(1)
+        count = np.full(len(self.tasks), len(self.starts))
+        low, high = wilson_interval(wins, count)
+        found = combine_intervals(np.full(len(wins), 1 / len(wins)), wins / count, low, high)
+        return Estimate(found.value, max(0.0, found.low), min(1.0, found.high))
+
+    def axes(self) -> tuple[Axis, ...]:
+        """Return every kind that was run by itself, the most harmful first."""
+        kinds = dict.fromkeys(c[0][0] for c in self.conditions if len(c) == 1)
+        return tuple(sorted((self._axis(kind) for kind in kinds), key=lambda axis: axis.kept.value))
+
+    def interactions(self) -> tuple[Interaction, ...]:
+        """Return every pair of perturbations of which each was run by itself at the same severity."""
+        alone = {c[0] for c in self.conditions if len(c) == 1}
+        pairs = [c for c in self.conditions if len(c) == 2 and set(c) <= alone]
+        return tuple(map(self._interaction, pairs))
+
+    def _axis(self, kind: str) -> Axis:
+        conditions = [c for c in self.conditions if not c or (len(c) == 1 and c[0][0] == kind)]
+        conditions.sort(key=lambda c: c[0][1] if c else 0.0)
+        columns = [self.conditions.index(c) for c in conditions]
+        severities = tuple(c[0][1] if c else 0.0 for c in conditions)
+        rates, draws = self.rates[columns], self.draws[:, columns]
+        weights = _trapezoid(np.array(severities))
+        area = _estimate(float(rates @ weights), draws @ weights, self._least, 0.0, 1.0)
+        kept = _estimate(
+            _share(float(rates @ weights), float(rates[0])),
+            _shares(draws @ weights, draws[:, 0]),
+            self._least,
+            0.0,
+            np.inf,
+        )
+        halves = np.array([half_severity(severities, row) for row in draws])
+        low, high = np.quantile(halves, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="nearest")
+        half = Estimate(half_severity(severities, rates), float(low), float(high))
+        p_value = _exchange_test(self.successes[columns].reshape(len(columns), -1).T, weights)
+        return Axis(kind, severities, tuple(map(self.success, conditions)), area, kept, half, p_value)
+
+    def _interaction(self, condition: Condition) -> Interaction:
+        columns = [self.conditions.index(c) for c in (condition, *((one,) for one in condition), ())]
+
+        def expected(rates: Floats) -> Floats:
+            return _shares(rates[..., 1] * rates[..., 2], rates[..., 3])
+
+        rates, draws = self.rates[columns], self.draws[:, columns]
+        excess = _estimate(
+            float(rates[0] - expected(rates)), draws[:, 0] - expected(draws), self._least, -np.inf, np.inf
+        )
+        return Interaction(condition, self.success(condition), float(expected(rates)), excess)
+
+
+def name_of(condition: Condition) -> str:
+    """Return a condition as text, such as `camera=0.4,light=0.2`."""
+    return ",".join(f"{kind}={severity:g}" for kind, severity in condition) or "without perturbations"
+
+
+def half_severity(severities: Sequence[float], rates: Floats) -> float:
+    """Return the least severity at which the line through the rates has fallen to half of the first; else infinity.
+
+    Args:
+        severities: V severities in ascending order.
+        rates: (V,) success rates.
+    """
+    limit = rates[0] / 2
+    for k in range(1, len(rates)):
+        if rates[k] <= limit < rates[k - 1]:
+            share = (rates[k - 1] - limit) / (rates[k - 1] - rates[k])
+            return float(severities[k - 1] + share * (severities[k] - severities[k - 1]))
+    return float("inf")
+
+
+def _trapezoid(places: Floats) -> Floats:
+    """Return the weights of the trapezoidal rule, divided by the range; 1 for a single place."""
+    if len(places) == 1:
+        return np.ones(1)
+    gaps = np.diff(places) / (places[-1] - places[0])
+    return np.concatenate([gaps, [0.0]]) / 2 + np.concatenate([[0.0], gaps]) / 2
+
+
+def _exchange_test(outcomes: NDArray[np.bool_], weights: Floats) -> float:
+    """Return the p-value of the area less the base's success, where the outcomes of a start are permuted.
+
+    Args:
+        outcomes: (N, V) outcomes of each start by severity, the base first.
+        weights: (V,) weights of the area.
+    """
+    contrast = weights - np.eye(len(weights))[0]
+    differing = outcomes[outcomes.any(1) & ~outcomes.all(1)].astype(float)  # others add nothing
+    order = np.random.default_rng(SEED).random((DRAWS, *differing.shape)).argsort(-1)
+    permuted = np.take_along_axis(np.broadcast_to(differing, order.shape), order, -1)
+    found, chance = differing.sum(0) @ contrast, permuted.sum(1) @ contrast
+    return float((1 + (abs(chance) >= abs(found) - 1e-9).sum()) / (1 + DRAWS))
+
+
+def _share(part: float, whole: float) -> float:
+    return float(part / whole) if whole > 0 else float("nan")
+
+
+def _shares(parts: Floats, wholes: Floats) -> Floats:
+    return np.divide(parts, wholes, out=np.zeros_like(parts, dtype=float), where=np.asarray(wholes) > 0)
+
+
+def _estimate(value: float, draws: Floats, least: float, low: float, high: float) -> Estimate:
+    """Return a value with the quantiles of its draws, to whose distances the variance `least` is added."""
+    ends = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    down, up = np.hypot(np.maximum([value - ends[0], ends[1] - value], 0), 1.96 * np.sqrt(least))
+    return Estimate(value, max(low, float(value - down)), min(high, float(value + up)))

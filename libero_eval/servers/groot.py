@@ -1,0 +1,205 @@
+"""GR00T's policy server as a client: ZeroMQ, one request at a time, each with the observations of many simulations.
+
+Sources: Isaac-GR00T `gr00t/policy/server_client.py` (messages), `gr00t/policy/gr00t_policy.py` (the flat names of
+`Gr00tSimPolicyWrapper`), `gr00t/eval/sim/LIBERO/libero_env.py` (LIBERO's keys).
+"""
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from libero_eval.servers.codecs import GROOT
+from libero_eval.servers.connections import API_KEY, Limits
+from libero_eval.servers.packages import need
+from libero_eval.servers.wires import EpisodeStart, camera_image
+from lifelong.errors import ServerError, WireError
+from lifelong.evaluation.inputs import PolicyInput
+
+VIDEO = {"image": "agentview", "wrist_image": "robot0_eye_in_hand"}  # key -> camera
+STATE = {
+    "x": slice(0, 1),
+    "y": slice(1, 2),
+    "z": slice(2, 3),
+    "roll": slice(3, 4),
+    "pitch": slice(4, 5),
+    "yaw": slice(5, 6),
+    "gripper": slice(6, 8),
+}  # key -> part of the state; roll, pitch and yaw are a rotation vector, as in their environment
+ACTION = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+PROMPT = "annotation.human.action.task_description"
+_KEYS = {"video": tuple(VIDEO), "state": tuple(STATE), "action": ACTION, "language": (PROMPT,)}
+
+
+@dataclass
+class GrootWire:
+    """A GR00T server; see `libero_eval.servers.wires.Wire`.
+
+    It must have been started with `--use-sim-policy-wrapper`, as GR00T's own evaluation on LIBERO does. One request
+    has the observations of at most `limits.in_flight` simulations; the server computes them together. The environment
+    variable `LIBERO_API_KEY` is sent as `api_token`.
+
+    Attributes:
+        address: URL of the server, `tcp://host:port`.
+        limits: How long the server is waited for.
+        announced: Modality configuration of the policy, by modality.
+    """
+
+    address: str
+    limits: Limits = Limits()
+    announced: Mapping[str, Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._zmq = need("zmq")
+        self._context = self._zmq.Context()
+        self._socket: Any = None
+        try:
+            self._wait()
+            self.announced = self._modalities()
+        except BaseException:
+            self.close()
+            raise
+
+    def open(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Reset the policy; see `Wire`. The server knows no single episodes."""
+        self._call("reset", {"options": None})
+
+    def ask(self, inputs: Mapping[int, PolicyInput]) -> dict[int, Any]:
+        """Return the predicted actions, unchecked; see `Wire`."""
+        found: dict[int, Any] = {}
+        order = sorted(inputs)
+        size = self.limits.in_flight or len(order) or 1
+        for start in range(0, len(order), size):
+            rows = order[start : start + size]
+            observation = observe([inputs[i] for i in rows], self.announced)
+            answer = self._call("get_action", {"observation": observation, "options": None})
+            found |= dict(zip(rows, self._actions(answer, len(rows)), strict=True))
+        return found
+
+    def finish(self, simulation: int, success: bool) -> None:
+        """Do nothing: the protocol has no message for it; see `Wire`."""
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._drop()
+        self._context.term()
+
+    def _wait(self) -> None:
+        """Wait until the server answers a ping."""
+        started = time.monotonic()
+        while True:
+            left = started + self.limits.connect - time.monotonic()
+            try:
+                self._call("ping", seconds=max(0.1, min(left, 2.0)))
+                return
+            except ServerError as error:
+                if left > 0 and isinstance(error.__cause__, self._zmq.Again):
+                    continue
+                if not isinstance(error.__cause__, self._zmq.Again):
+                    raise
+                raise ServerError(
+                    f"no GR00T server at {self.address} within {self.limits.connect:g} s"
+                ) from error
+
+    def _modalities(self) -> dict[str, Any]:
+        found = self._call("get_modality_config")
+        if not isinstance(found, Mapping):
+            raise ServerError(f"{self.address} sent a {type(found).__name__} as its modality configuration")
+        for modality, known in _KEYS.items():
+            config = found.get(modality)
+            config = config if isinstance(config, Mapping) else {}
+            keys = config.get("modality_keys")
+            if not keys or not set(keys) <= set(known):
+                raise ServerError(
+                    f"{self.address} has {modality} keys {keys}; LIBERO's are {', '.join(known)}: "
+                    "serve a policy of the embodiment libero_sim"
+                )
+            steps = config.get("delta_indices")
+            if modality in ("video", "state") and (steps is None or list(steps) != [0]):
+                raise ServerError(f"{self.address} wants {modality} of the steps {steps}; valid: [0]")
+        return dict(found)
+
+    def _actions(self, answer: Any, count: int) -> np.ndarray:
+        """Return the actions (B, H, 7) of an answer, which is a list of actions by key and of further data."""
+        actions = answer[0] if isinstance(answer, list | tuple) and answer else None
+        lacking = [k for k in ACTION if not isinstance(actions, Mapping) or f"action.{k}" not in actions]
+        if not isinstance(actions, Mapping) or lacking:
+            came = sorted(map(str, actions)) if isinstance(actions, Mapping) else type(answer).__name__
+            raise ServerError(
+                f"{self.address} answered {came} without {', '.join(f'action.{k}' for k in lacking)}; start it with "
+                "--use-sim-policy-wrapper"
+            )
+        parts = [np.asarray(actions[f"action.{key}"]) for key in ACTION]
+        shapes = sorted({part.shape for part in parts})
+        if len(shapes) > 1 or len(shapes[0]) != 3 or (shapes[0][0], shapes[0][2]) != (count, 1):
+            raise ServerError(
+                f"{self.address} sent actions of shapes {shapes}; expected ({count}, H, 1) each"
+            )
+        return np.concatenate(parts, axis=-1)
+
+    def _call(self, endpoint: str, data: Any = None, seconds: float | None = None) -> Any:
+        """Return the answer of an endpoint.
+
+        Raises:
+            ServerError: It fails, is too late, or sends something else.
+        """
+        seconds = self.limits.answer if seconds is None else seconds
+        request = {"endpoint": endpoint} | ({} if data is None else {"data": data})
+        if key := os.environ.get(API_KEY):
+            request["api_token"] = key
+        socket = self._connected()
+        for limit in (self._zmq.RCVTIMEO, self._zmq.SNDTIMEO):
+            socket.setsockopt(limit, max(1, round(1000 * seconds)))
+        try:
+            socket.send(GROOT.pack(request))
+            answer = GROOT.unpack(socket.recv())
+        except self._zmq.Again as error:
+            self._drop()  # a REQ socket sends nothing more before the answer
+            raise ServerError(
+                f"{self.address} sent nothing within {seconds:g} s ({endpoint}); --timeout sets the limit"
+            ) from error
+        except WireError as error:
+            raise ServerError(f"{self.address} sent {error} ({endpoint})") from error
+        except BaseException:
+            self._drop()
+            raise
+        if isinstance(answer, Mapping) and "error" in answer:
+            hint = ""
+            if "must contain a" in str(answer["error"]):
+                hint = "; start it with --use-sim-policy-wrapper"
+            raise ServerError(f"{self.address} failed ({endpoint}): {answer['error']}{hint}")
+        return answer
+
+    def _connected(self) -> Any:
+        if self._socket is None:
+            self._socket = self._context.socket(self._zmq.REQ)
+            self._socket.setsockopt(self._zmq.LINGER, 0)
+            self._socket.connect(self.address)
+        return self._socket
+
+    def _drop(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def observe(inputs: Sequence[PolicyInput], announced: Mapping[str, Any]) -> dict[str, Any]:
+    """Return GR00T's observation of simulations: images (B, 1, H, W, 3), parts of the state (B, 1, D), instructions.
+
+    Args:
+        inputs: Input of each simulation.
+        announced: Modality configuration of the policy.
+    """
+    keys = {modality: announced[modality]["modality_keys"] for modality in _KEYS}
+    found: dict[str, Any] = {
+        f"video.{key}": np.stack([camera_image(given, VIDEO[key], "GR00T's server") for given in inputs])[
+            :, None
+        ]
+        for key in keys["video"]
+    }
+    states = np.stack([given.state for given in inputs]).astype(np.float32)[:, None]
+    found |= {f"state.{key}": states[..., STATE[key]] for key in keys["state"]}
+    return found | {key: [given.prompt for given in inputs] for key in keys["language"]}

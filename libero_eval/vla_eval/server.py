@@ -1,0 +1,119 @@
+"""A model server of vla-eval with the policy of a run.
+
+    from libero_eval.vla_eval import RunServer
+    vla_eval.evaluate(RunServer("runs/..."), config, docker=False)
+
+It asks for `LiberoBenchmark` with the run's own observations, which reach it as they are, so that it acts as in
+`libero eval RUN`.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from libero_env.tasks import Task, get_suite
+from libero_eval.servers.sessions import PREFIX, ServedPolicy, Session
+from libero_eval.vla_eval.harness import PredictModelServer, require
+from lifelong.errors import PolicyError
+from lifelong.evaluation.restore import restore
+from lifelong.seeding import EVALUATION
+
+
+class RunServer(PredictModelServer):
+    """The policy of a run, for `libero_eval.vla_eval:LiberoBenchmark`.
+
+    Args:
+        run: Directory of the run, or one of its checkpoints.
+        after: The policy after this task, from 0; None for the last.
+        device: `auto`, `cpu`, `cuda`, `cuda:1`.
+        seed: Seed of stochastic policies.
+        allow: Packages whose classes the run's configuration may name besides this one's.
+
+    Raises:
+        MissingPackageError: vla-eval is not installed.
+        LifelongError: There is no such run or checkpoint.
+    """
+
+    def __init__(
+        self,
+        run: str,
+        after: int | None = None,
+        device: str = "auto",
+        seed: int = 0,
+        allow: Sequence[str] = (),
+    ):
+        require()
+        super().__init__()
+        self.served = ServedPolicy(restore(Path(run), after=after, device=device, allow=allow), seed=seed)
+        self.seed = seed
+        self._sessions: dict[str, Session] = {}
+        self._begins: dict[str, dict[str, Any]] = {}
+
+    def get_observation_params(self) -> dict[str, Any]:
+        """Return what the benchmark must send, as its constructor's arguments."""
+        spec, settings = self.served.run.policy.spec, self.served.run.eval
+        return {
+            "card": "libero",
+            "observations": [*spec.views, *spec.proprio],
+            "camera_size": list(spec.image_size),
+            "num_steps_wait": settings.settle_steps,
+            "max_steps": settings.horizon,
+        }
+
+    def get_action_spec(self) -> dict[str, Any]:
+        """Return the conventions of actions."""
+        from vla_eval.specs import GRIPPER_CLOSE_POS, POSITION_DELTA, ROTATION_AA
+
+        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, Any]:
+        """Return the names of the observations, and nothing on their conventions, which are our own."""
+        from vla_eval.specs import LANGUAGE, RAW
+
+        spec = self.served.run.policy.spec
+        return {"language": LANGUAGE, **{PREFIX + name: RAW for name in (*spec.views, *spec.proprio)}}
+
+    async def on_episode_start(self, config: dict[str, Any], ctx: Any) -> None:
+        """Let the next observation begin an episode, with the random numbers of `libero eval`.
+
+        Raises:
+            PolicyError: The client does not say which task and which initial state.
+        """
+        about = config.get("task") or {}
+        if not {"suite", "task_id", "episode_idx"} <= set(about):
+            raise PolicyError(
+                f"an episode has a task with suite, task_id and episode_idx; got {sorted(about) or 'nothing'}"
+            )
+        task: Task = get_suite(about["suite"]).tasks[int(about["task_id"])]
+        words = [self.seed, EVALUATION, task.index, int(about["episode_idx"])]
+        self._begins[ctx.session_id] = {
+            "reset": True,
+            "task": task.id,
+            "prompt": task.language,
+            "seed": words,
+        }
+        if ctx.session_id not in self._sessions:
+            self._sessions[ctx.session_id] = self.served.session()
+
+    def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
+        """Return the action of one step, (7,).
+
+        Raises:
+            PolicyError: The observation lacks something that the policy needs.
+        """
+        session = self._sessions.get(ctx.session_id)
+        if session is None:
+            raise PolicyError("an observation came before the start of an episode")
+        own = {key: value for key, value in obs.items() if key.startswith(PREFIX)}
+        if not own:
+            raise PolicyError(
+                "the observations have no names of ours; the benchmark is libero_eval.vla_eval:LiberoBenchmark"
+            )
+        answer = session.infer({**own, **self._begins.pop(ctx.session_id, {})})
+        return {"actions": answer["actions"][0]}
+
+
+if __name__ == "__main__":
+    from vla_eval.model_servers.serve import run_server
+
+    run_server(RunServer)

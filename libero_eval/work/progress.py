@@ -1,0 +1,131 @@
+"""Progress of an evaluation that several processes share, and its results as lines of a table."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from libero_env.tasks.published import parse_plus_id
+from libero_eval.evaluation_file import TaskResult, overall
+from libero_eval.work.folder import UnitResult
+from lifelong.results.metrics import Estimate
+
+PLUS = "libero_plus_"  # beginning of the names of suites of LIBERO-Plus
+RECENT = 50  # units from which the speed is taken
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an evaluation is, all processes together.
+
+    Attributes:
+        units: Number of units.
+        done: Number of units that are done.
+        episodes: Number of episodes.
+        episodes_done: Number of episodes of the units that are done.
+        running: Number of units that processes work on.
+        failed: Number of units that are not done and ended with an error.
+        per_hour: Episodes per hour of the recent units, over the time in which any process ran one; NaN at first.
+    """
+
+    units: int
+    done: int
+    episodes: int
+    episodes_done: int
+    running: int
+    failed: int
+    per_hour: float
+
+    @property
+    def seconds_left(self) -> float:
+        """Time until the end at this speed, [s]; NaN if the speed is not known."""
+        return 3600 * (self.episodes - self.episodes_done) / self.per_hour if self.per_hour else math.nan
+
+    def __str__(self) -> str:
+        """Return one line, such as `12 of 50 units, 120 of 500 episodes, 1,830 an hour, 12 min left, 3 running`."""
+        parts = [
+            f"{self.done} of {self.units} units",
+            f"{self.episodes_done} of {self.episodes} episodes",
+        ]
+        if math.isfinite(self.per_hour):
+            parts += [f"{self.per_hour:,.0f} an hour"]
+            parts += [f"{show_time(self.seconds_left)} left"] if self.done < self.units else []
+        parts += [f"{self.running} running"] if self.running else []
+        parts += [f"{self.failed} with errors"] if self.failed else []
+        return ", ".join(parts)
+
+
+def measure_progress(
+    units: Mapping[str, int], done: Mapping[str, UnitResult], running: int = 0, failed: int = 0
+) -> Progress:
+    """Return the progress of an evaluation.
+
+    Args:
+        units: Number of episodes of each unit, by its name.
+        done: Results by name of the unit.
+        running: Number of units that processes work on.
+        failed: Number of units with errors.
+    """
+    recent = sorted(done.values(), key=lambda found: found.finished)[-RECENT:]
+    busy = busy_seconds((found.started, found.finished) for found in recent)
+    count = sum(len(found.result.init_states) for found in recent)
+    return Progress(
+        units=len(units),
+        done=sum(name in done for name in units),
+        episodes=sum(units.values()),
+        episodes_done=sum(count for name, count in units.items() if name in done),
+        running=running,
+        failed=failed,
+        per_hour=3600 * count / busy if busy else math.nan,
+    )
+
+
+def busy_seconds(spans: Iterable[tuple[float, float]]) -> float:
+    """Return the length of the union of time spans (start, end), [s]: interruptions do not count."""
+    total, until = 0.0, -math.inf
+    for start, end in sorted(spans):
+        total += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return total
+
+
+def show_time(seconds: float) -> str:
+    """Return a duration as text, such as `40 s`, `12 min` or `3.4 h`."""
+    if not math.isfinite(seconds):
+        return "unknown time"
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"
+
+
+def table_row(result: TaskResult) -> str:
+    """Format a task's row under `HEADER`: successes, rate and interval in percent, mean steps of the successes."""
+    wins = f"{sum(result.successes)}/{len(result.successes)}"
+    steps = f"{result.steps:.0f}" if math.isfinite(result.steps) else "-"
+    raised = sum(error is not None for error in result.errors)
+    note = f"  ({raised} ended with an error)" if raised else ""
+    return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
+
+
+def total_rows(results: Sequence[TaskResult]) -> list[str]:
+    """Format the rows of each suite and of each kind of LIBERO-Plus, where there are several, and of all together."""
+    suites: dict[str, list[TaskResult]] = {}
+    kinds: dict[str, list[TaskResult]] = {}
+    for result in results:
+        suites.setdefault(suite := result.task.partition("/")[0], []).append(result)
+        if suite.startswith(PLUS):
+            kinds.setdefault(f"  {parse_plus_id(result.name).kind}", []).append(result)
+    rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
+    return [_total_row(name, found) for name, found in {**rows, "mean over tasks": results}.items()]
+
+
+def _total_row(name: str, results: Sequence[TaskResult]) -> str:
+    wins, episodes = sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results)
+    return f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}"
+
+
+def _percent(e: Estimate) -> str:
+    interval = f"[{100 * e.low:.1f}, {100 * e.high:.1f}]"
+    return f"{100 * e.value:6.1f} {interval:>13}"

@@ -1,0 +1,297 @@
+"""Success of a policy on tasks of the benchmark, from fixed initial states.
+
+An evaluation is a list of units, each a task and a range of its initial states. Any number of processes take units from
+a folder they share, see `libero_eval.work.worker`; each may be killed, and the result is that of one process.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from libero_env.errors import LiberoError
+from libero_env.tasks import Task
+from libero_env.timing import CONTROL_PERIOD
+from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.protocols.protocol import Card
+from libero_eval.work.claims import LEASE
+from libero_eval.work.folder import PLAN_FORMAT, UnitResult, WorkFolder, describe, this_process
+from libero_eval.work.progress import busy_seconds
+from libero_eval.work.units import UNIT_STARTS, Unit, partition
+from lifelong.errors import ConfigError
+from lifelong.evaluation.actors import Actor, WatchesWorld
+from lifelong.evaluation.environment_record import common_environment, describe_environment
+from lifelong.evaluation.environments import EnvPool, VectorEnv
+from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_animation
+from lifelong.results.provenance import installed_versions
+from lifelong.results.summary import json_safe
+
+# Memory, as measured with libero_10/0
+PROCESS_BYTES, SIMULATION_BYTES, IMAGE_COPIES = 600e6, 2e6, 7
+DECISIVE = ("mujoco", "models", "models_digest")  # versions that the results of one evaluation must share
+
+
+@dataclass(frozen=True)
+class SuiteEvaluation:
+    """An evaluation of a policy on tasks.
+
+    Attributes:
+        identity: Plain data that identify the policy; a folder holds results of one policy only.
+        tasks: Tasks of the benchmark.
+        init_states: Initial states of each task.
+        protocol: How episodes are run.
+        out: Folder of the results.
+        env: Function that builds the environment of a task with the given number of simulations.
+        actor: Function that returns the context manager of the actor of a task and its initial states.
+        unit_starts: Number of initial states of a unit, which are run in one batch.
+        retries: How often a unit that ends with an error is tried again.
+        errors_are_failures: Whether an episode that ends with an error is a failed one, as some protocols have it.
+            Otherwise its unit is not counted, and there is no result until it has been run without an error.
+        videos: Number of recorded episodes of each task.
+        record_every: Number of control steps between two frames.
+        progress: Whether to show progress bars.
+        versions: Versions of the packages and models.
+        policy_threads: Number of threads of the policy on the CPU, on which its bits depend; None where the policy is
+            not one of this package, or runs elsewhere. Whoever runs the evaluation sets it.
+        lease: Time after which a unit of a silent process is given to another, [s].
+    """
+
+    identity: Mapping[str, Any]
+    tasks: Sequence[Task]
+    init_states: tuple[int, ...]
+    protocol: Card
+    out: Path
+    env: Callable[[Task, int], VectorEnv]
+    actor: Callable[[Task, Sequence[int]], AbstractContextManager[Actor]]
+    unit_starts: int = UNIT_STARTS
+    retries: int = 1
+    errors_are_failures: bool = False
+    videos: int = 0
+    record_every: int = 4
+    progress: bool = False
+    versions: Mapping[str, str] = field(default_factory=installed_versions)
+    policy_threads: int | None = None
+    lease: float = LEASE
+
+    @cached_property
+    def units(self) -> tuple[Unit, ...]:
+        """Units in order."""
+        return partition(self.tasks, self.init_states, self.unit_starts)
+
+    @cached_property
+    def folder(self) -> WorkFolder:
+        """The folder of the results, which other processes may share."""
+        simulation = {k: v for k, v in self.versions.items() if k in DECISIVE}
+        plan = {
+            "format": PLAN_FORMAT,
+            "evaluated": dict(self.identity),
+            "protocol": self._resolved_protocol,
+            "init_states": self.init_states,
+            "unit_starts": self.unit_starts,
+            "errors_are_failures": self.errors_are_failures,
+            "policy_threads": self.policy_threads,
+            "simulation": simulation,
+        }
+        return WorkFolder(self.out, plan, self.lease)
+
+    @property
+    def _resolved_protocol(self) -> dict[str, Any]:
+        return json_safe(self.protocol.resolved())
+
+    def memory(self, workers: int) -> float:
+        """Return an estimate of the memory that so many processes need, [bytes]; policies need theirs besides."""
+        height, width = self.protocol.pixels.render_size or (128, 128)
+        image = 3 * height * width * len(self.protocol.pixels.cameras)
+        batch = min(self.unit_starts, len(self.init_states))
+        steps = max((self.protocol.steps(task) for task in self.tasks), default=0) if self.videos else 0
+        frames = min(self.videos, batch) * -(-steps // self.record_every)
+        return workers * (PROCESS_BYTES + batch * (SIMULATION_BYTES + IMAGE_COPIES * image) + frames * image)
+
+    def pool(self) -> EnvPool:
+        """Return a pool that keeps the environment of the last unit open, for the next one of the same task."""
+        by_id = {task.id: task for task in self.tasks}
+        return EnvPool(lambda key: self.env(by_id[key[0]], key[1]), capacity=1)
+
+    def evaluate(self, unit: Unit, pool: EnvPool, label: str = "") -> UnitResult:
+        """Run the episodes of a unit.
+
+        Args:
+            unit: Unit of this evaluation.
+            pool: Open environments, see `pool`.
+            label: Text before the progress bar.
+        """
+        started = time.time()
+        env = pool.get((unit.task.id, len(unit.starts)))
+        done = self._run(unit, env, label)
+        self._save_videos(unit, done)
+        return self._unit_result(unit, done, env, started)
+
+    def evaluate_apart(self, unit: Unit, pool: EnvPool, *, has_worked: bool) -> UnitResult:
+        """Run the episodes of a unit one by one; those that end with an error are failures.
+
+        Args:
+            unit: Unit of this evaluation.
+            pool: Open environments, see `pool`.
+            has_worked: Whether the policy is known to run; otherwise one episode must.
+
+        Raises:
+            LiberoError: The policy's answers are not valid, or it cannot be reached: nothing is counted.
+            Exception: No episode has ever run: the error is that of the policy and not of an episode.
+        """
+        started, parts = time.time(), []
+        errors: list[str | None] = []
+        for start in unit.starts:
+            alone = Unit(unit.task, (start,))
+            env = pool.get((unit.task.id, 1))
+            try:
+                parts.append(self._run(alone, env))
+                errors.append(None)
+            except LiberoError:
+                raise
+            except Exception as error:  # noqa: BLE001 - policies raise errors of any type
+                if not has_worked and len(errors) == len(unit.starts) - 1 and all(errors):
+                    raise
+                atoms = tuple(getattr(env, "atoms", ()))
+                none = (False,) * len(atoms)
+                parts.append(Rollouts((Episode(start, False, 0, none, none, none),), 0.0, atoms))
+                errors.append(describe(error))
+        done = Rollouts(tuple(p.episodes[0] for p in parts), sum(p.seconds for p in parts), parts[0].atoms)
+        return self._unit_result(unit, done, env, started, tuple(errors))
+
+    def task_result(self, task: Task, done: Mapping[str, UnitResult]) -> TaskResult | None:
+        """Return the results of a task from those of its units, or None while some are missing."""
+        names = [unit.name for unit in self.units if unit.task is task]
+        if not all(name in done for name in names):
+            return None
+        return _joined([done[name].result for name in names])
+
+    def result(self, done: Mapping[str, UnitResult]) -> EvaluationResult:
+        """Return the results of all tasks with all that they depend on; it depends on the units' files only.
+
+        Args:
+            done: Results of all units by name.
+
+        Raises:
+            ConfigError: A unit is missing.
+        """
+        tasks = [self.task_result(task, done) for task in self.tasks]
+        found = [done[unit.name] for unit in self.units if unit.name in done]
+        if len(found) != len(self.units):
+            raise ConfigError(f"{len(found)} of {len(self.units)} units are done: there is no result yet")
+        return EvaluationResult(
+            evaluated=self.identity,
+            protocol=self._resolved_protocol,
+            init_states=self.init_states,
+            versions=common_environment([one.versions for one in found]),
+            environment=common_environment([one.environment for one in found]),
+            unit_starts=self.unit_starts,
+            tasks=tuple(task for task in tasks if task is not None),
+            times=self._times(done),
+        )
+
+    def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
+        filmed = [i for i, start in enumerate(unit.starts) if start in self.init_states[: self.videos]]
+        with self.actor(_acted_task(env, unit), unit.starts) as actor:
+            if isinstance(actor, WatchesWorld):
+                actor.watch(env.world)  # type: ignore[attr-defined]  # of every environment of this package
+            return run_episodes(
+                actor,
+                env,
+                unit.starts,
+                horizon=self.protocol.steps(unit.task),
+                settle_steps=self.protocol.settle_steps,
+                settle_action=self.protocol.settle_action,
+                record_every=self.record_every if filmed else 0,
+                recorded=filmed,
+                label=label or unit.task.id,
+                progress=self.progress,
+            )
+
+    def _unit_result(
+        self,
+        unit: Unit,
+        done: Rollouts,
+        env: VectorEnv,
+        started: float,
+        errors: tuple[str | None, ...] = (),
+    ) -> UnitResult:
+        result = TaskResult(
+            task=unit.task.id,
+            name=unit.task.name,
+            instruction=_acted_task(env, unit).language,
+            init_states=tuple(e.init_state for e in done.episodes),
+            successes=tuple(e.success for e in done.episodes),
+            lengths=tuple(e.length for e in done.episodes),
+            atoms=done.atoms,
+            atoms_ever=tuple(e.ever for e in done.episodes),
+            atoms_at_end=tuple(e.at_end for e in done.episodes),
+            errors=errors if any(errors) else (),
+            actions=tuple(e.actions for e in done.episodes),
+            attempts=tuple(e.attempts for e in done.episodes)
+            if any(e.attempts for e in done.episodes)
+            else (),
+        )
+        environment = describe_environment(env)
+        return UnitResult(result, environment, self.versions, this_process(), started, time.time())
+
+    def _times(self, done: Mapping[str, UnitResult]) -> dict[str, Any]:
+        spans = {unit: done[unit.name] for unit in self.units}
+        started, finished = (
+            min(s.started for s in spans.values()),
+            max(s.finished for s in spans.values()),
+        )
+        return {
+            "started": _iso(started),
+            "finished": _iso(finished),
+            "busy_seconds": round(busy_seconds((s.started, s.finished) for s in spans.values()), 2),
+            "seconds": {
+                task.id: round(sum(s.finished - s.started for u, s in spans.items() if u.task is task), 2)
+                for task in self.tasks
+            },
+            "processes": len({s.process for s in spans.values()}),
+        }
+
+    def _save_videos(self, unit: Unit, done: Rollouts) -> None:
+        folder, seconds = self.out / "videos", CONTROL_PERIOD * self.record_every
+        filmed = [e for e in done.episodes if e.init_state in self.init_states[: self.videos]]
+        for frames, episode in zip(done.recordings, filmed, strict=False):
+            if frames:
+                outcome = "success" if episode.success else "failure"
+                name = (
+                    f"{unit.task.suite}_{unit.task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
+                )
+                save_animation(frames, folder / name, seconds_per_frame=seconds)
+
+
+def _acted_task(env: VectorEnv, unit: Unit) -> Task:
+    """Return the task that a policy is told: that of the environment, which perturbations may have changed."""
+    task = getattr(env, "task", None)
+    return task if isinstance(task, Task) else unit.task
+
+
+def _joined(parts: Sequence[TaskResult]) -> TaskResult:
+    """Return the results of a task from those of parts of its episodes, in order."""
+    first = parts[0]
+    raised = any(part.errors for part in parts)
+    return TaskResult(
+        task=first.task,
+        name=first.name,
+        instruction=first.instruction,
+        init_states=tuple(i for part in parts for i in part.init_states),
+        successes=tuple(won for part in parts for won in part.successes),
+        lengths=tuple(n for part in parts for n in part.lengths),
+        atoms=first.atoms,
+        atoms_ever=tuple(row for part in parts for row in part.atoms_ever),
+        atoms_at_end=tuple(row for part in parts for row in part.atoms_at_end),
+        errors=tuple(e for p in parts for e in (p.errors or (None,) * len(p.init_states))) if raised else (),
+        actions=tuple(digest for part in parts for digest in part.actions),
+        attempts=tuple(row for part in parts for row in part.attempts),
+    )
+
+
+def _iso(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")

@@ -1,0 +1,190 @@
+"""One process of an evaluation: it takes units from the folder until all are done, and writes the result."""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+
+from libero_env.errors import LiberoError, printable
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
+from libero_eval.work.claims import Claim
+from libero_eval.work.folder import UnitErrors, UnitResult, describe
+from libero_eval.work.progress import Progress, measure_progress
+from libero_eval.work.suite import SuiteEvaluation
+from libero_eval.work.units import Unit
+from lifelong.errors import ConnectionLost, EvaluationIncompleteError
+
+POLL = 0.5  # s between two looks at the folder while other processes work on the last units
+SAY_EVERY = 30.0  # s between two lines of progress
+FAILURES_IN_A_ROW = 3  # of units, which end a process
+
+
+class Worker:
+    """A process of an evaluation.
+
+    Args:
+        evaluation: What is evaluated.
+        on_result: Function called with each task's result as soon as it is known, whoever ran it.
+        on_progress: Function called with the progress of all processes every half minute, and at the end.
+        on_error: Function called with a text when a unit ends with an error.
+        on_wait: Function called between units, and regularly while there are none, with the number of units done.
+    """
+
+    def __init__(
+        self,
+        evaluation: SuiteEvaluation,
+        *,
+        on_result: Callable[[TaskResult], None] = lambda _: None,
+        on_progress: Callable[[Progress], None] = lambda _: None,
+        on_error: Callable[[str], None] = lambda text: print(printable(text), file=sys.stderr, flush=True),
+        on_wait: Callable[[int], None] = lambda _: None,
+    ):
+        self._evaluation, self._folder = evaluation, evaluation.folder
+        self._on_result, self._on_progress = on_result, on_progress
+        self._on_error, self._on_wait = on_error, on_wait
+        self._attempts_before: dict[str, int] = {}
+        self._announced: set[str] = set()
+        self._succeeded, self._in_a_row, self._said = False, 0, -math.inf
+        self._task: str | None = None
+
+    def run(self) -> EvaluationResult:
+        """Evaluate units until all are done, whoever does them; write `eval.json` and return its content.
+
+        Raises:
+            ConfigError: The folder holds another evaluation.
+            EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
+        """
+        found = self.work(wait=True)
+        assert found is not None
+        return found
+
+    def work(self, *, wait: bool) -> EvaluationResult | None:
+        """Evaluate units; write `eval.json` and return its content if all are done.
+
+        Args:
+            wait: Whether to wait for units that others work on; otherwise None is returned where no other is left.
+
+        Raises:
+            ConfigError: The folder holds another evaluation.
+            EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
+        """
+        evaluation, folder = self._evaluation, self._folder
+        folder.join(evaluation.units)
+        self._attempts_before = {name: found.attempts for name, found in folder.errors().items()}
+        if done := self._look():  # somebody has begun
+            self._say(done)
+        with evaluation.pool() as self._pool:
+            while len(done := self._look()) < len(evaluation.units):
+                self._on_wait(len(done))
+                errors, held = folder.errors(), set(folder.held())
+                choice = self._order(done, errors, held)
+                if taken := folder.take(choice):
+                    self._work(*taken)
+                elif not wait:
+                    return None
+                elif choice or held:
+                    self._say(done)
+                    time.sleep(POLL)
+                elif len(folder.done(evaluation.units)) == len(done):
+                    raise self._incomplete(errors)
+        result = evaluation.result(done)
+        result.write(evaluation.out / FILE_NAME)
+        return result
+
+    def _look(self) -> Mapping[str, UnitResult]:
+        """Return the units that are done; announce the tasks that are complete."""
+        done = self._folder.done(self._evaluation.units)
+        for task in self._evaluation.tasks:
+            if task.id not in self._announced and (found := self._evaluation.task_result(task, done)):
+                self._announced.add(task.id)
+                self._on_result(found)
+        return done
+
+    def _order(
+        self, done: Mapping[str, UnitResult], errors: Mapping[str, UnitErrors], held: set[str]
+    ) -> list[Unit]:
+        """Return the units to choose from, best first: the open task's, then those of a task nobody works on."""
+        open_units = [u for u in self._evaluation.units if u.name not in done and u.name not in held]
+        left = [unit for unit in open_units if self._tries(unit, errors) <= self._evaluation.retries]
+        busy = {unit.task.id for unit in self._evaluation.units if unit.name in held}
+        counts: dict[str, int] = {}
+        for unit in left:
+            counts[unit.task.id] = counts.get(unit.task.id, 0) + 1
+
+        def preference(unit: Unit) -> tuple:
+            task = unit.task.id
+            tried, others = self._tries(unit, errors) > 0, task in busy
+            return tried, task != self._task, others, -counts[task] if others else 0
+
+        return sorted(left, key=preference)
+
+    def _tries(self, unit: Unit, errors: Mapping[str, UnitErrors]) -> int:
+        found = errors.get(unit.name)
+        return found.attempts - self._attempts_before.get(unit.name, 0) if found else 0
+
+    def _work(self, unit: Unit, claim: Claim) -> None:
+        self._task = unit.task.id
+        with self._folder.claims.keeping(claim, on_beat=self._beat):
+            try:
+                found: UnitResult | None = self._evaluation.evaluate(unit, self._pool, self._label(unit))
+            except Exception as error:  # noqa: BLE001 - policies raise errors of any type
+                self._pool.close()
+                found = self._after_error(unit, error)
+            if found is not None:
+                self._folder.publish(unit, found)
+                self._succeeded, self._in_a_row = True, 0
+        self._say(self._folder.done(self._evaluation.units))
+
+    def _after_error(self, unit: Unit, error: Exception) -> UnitResult | None:
+        """Record an error; return a result if the protocol counts it; raise it if going on makes no sense."""
+        if isinstance(error, OSError) and str(self._evaluation.out) in str(error.filename or ""):
+            raise error
+        found = self._folder.add_error(unit, error)
+        tries = self._tries(unit, {unit.name: found})
+        self._on_error(
+            f"{unit.name}: attempt {tries} ended with {describe(error)}; traceback in {found.path}"
+        )
+        if self._evaluation.errors_are_failures and not isinstance(error, LiberoError):
+            if tries <= self._evaluation.retries:
+                return None
+            return self._evaluation.evaluate_apart(unit, self._pool, has_worked=self._folder.has_results)
+        self._in_a_row += 1
+        never_worked = not self._succeeded and not self._folder.has_results
+        if isinstance(error, ConnectionLost) and tries <= self._evaluation.retries:
+            return None
+        if never_worked or self._in_a_row >= FAILURES_IN_A_ROW:
+            raise error
+        return None
+
+    def _incomplete(self, errors: Mapping[str, UnitErrors]) -> EvaluationIncompleteError:
+        shown = "; ".join(f"{name}: {found.last}" for name, found in list(errors.items())[:3])
+        more = f"; and {len(errors) - 3} more" if len(errors) > 3 else ""
+        return EvaluationIncompleteError(
+            f"{len(errors)} of {len(self._evaluation.units)} units ended with errors and are not counted "
+            f"({shown}{more}). Tracebacks are in {self._evaluation.out / 'errors'}; "
+            "the same command tries these units again"
+        )
+
+    def _beat(self) -> None:
+        if time.monotonic() - self._said > SAY_EVERY:
+            with suppress(LiberoError, OSError):  # the loop reports what is wrong
+                self._say(self._folder.done(self._evaluation.units))
+
+    def _say(self, done: Mapping[str, UnitResult]) -> None:
+        """Report the progress, but not too often; always when everything is done."""
+        now = time.monotonic()
+        if now - self._said > SAY_EVERY or len(done) == len(self._evaluation.units):
+            self._said = now
+            self._on_progress(self._progress(done))
+
+    def _progress(self, done: Mapping[str, UnitResult]) -> Progress:
+        running, failed = len(self._folder.held()), len(self._folder.errors())
+        sizes = {unit.name: len(unit.starts) for unit in self._evaluation.units}
+        return measure_progress(sizes, done, running, failed)
+
+    def _label(self, unit: Unit) -> str:
+        if not self._evaluation.progress:
+            return ""
+        done = self._folder.done(self._evaluation.units)
+        return f"{self._progress(done)} | {unit.task.id}"

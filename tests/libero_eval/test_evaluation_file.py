@@ -1,0 +1,124 @@
+"""`eval.json`: written and read to the same values; other formats, broken files and edited ones are refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from libero_eval.evaluation_file import FIRST_FORMAT, FORMAT, EvaluationResult, TaskResult
+from lifelong.errors import EvaluationFileError, ResultsError
+
+pytestmark = pytest.mark.unit
+
+
+def task(name: str = "libero_goal/0", **changes) -> TaskResult:
+    values = {
+        "task": name,
+        "name": "open_the_drawer",
+        "instruction": "open the drawer",
+        "init_states": (0, 1, 2),
+        "successes": (True, False, True),
+        "lengths": (40, 300, 52),
+        "atoms": ("(Open drawer)",),
+        "atoms_ever": ((True,), (False,), (True,)),
+        "atoms_at_end": ((True,), (False,), (True,)),
+        "errors": (None, "ServerError: closed", None),
+    }
+    return TaskResult(**(values | changes))
+
+
+def result(**changes) -> EvaluationResult:
+    values = {
+        "evaluated": {"policy": "mine:make", "seed": 0},
+        "protocol": {"horizon": 300},
+        "init_states": (0, 1, 2),
+        "versions": {"mujoco": "4.0.0"},
+        "tasks": (task(), task("libero_spatial/4")),
+        "environment": {"models": "builtin"},
+        "unit_starts": 10,
+        "times": {"finished": "2026-01-01T00:00:00+00:00"},
+    }
+    return EvaluationResult(**(values | changes))
+
+
+def test_what_is_written_is_read(tmp_path):
+    path = result().write(tmp_path / "eval.json")
+    assert EvaluationResult.read(path) == EvaluationResult.read(tmp_path) == result()
+    values = json.loads(path.read_text())
+    assert values["format"] == FORMAT == EvaluationResult.read(path).format
+    assert set(values["suites"]) == {"libero_goal", "libero_spatial"}
+    assert values["success"]["value"] == pytest.approx(2 / 3) and values["tasks"][0]["mean_steps"] == 46
+
+
+def test_the_digest_is_that_of_the_outcomes():
+    first = result()
+    assert replace(first, times={}, environment={"models": "x"}, versions={}).outcomes == first.outcomes
+    assert replace(first, tasks=first.tasks[::-1]).outcomes == first.outcomes
+    changed = task(lengths=(40, 300, 53))
+    assert replace(first, tasks=(changed, first.tasks[1])).outcomes != first.outcomes
+
+
+def test_the_digest_of_actions_tells_bits_apart_that_outcomes_do_not_show():
+    first, second = (result(tasks=(task(actions=("01", "02", last)),)) for last in ("03", "04"))
+    assert first.outcomes == second.outcomes and first.actions != second.actions
+    assert result().actions is None, "they were not recorded"
+
+
+def test_files_of_the_first_version_are_read(tmp_path):
+    values = result(tasks=(task(errors=()),)).to_plain()
+    for key in ("format", "unit_starts", "environment", "outcomes", "actions", "times"):
+        del values[key]
+    del values["tasks"][0]["errors"], values["tasks"][0]["actions"]
+    values["tasks"][0]["seconds"], values["finished"] = 3.5, "2026-01-01T00:00:00+00:00"
+    (tmp_path / "eval.json").write_text(json.dumps(values))
+    found = EvaluationResult.read(tmp_path)
+    assert found.format == FIRST_FORMAT and found.tasks == (task(errors=()),)
+    assert found.times == {"finished": values["finished"]} and found.unit_starts is None
+    again = EvaluationResult.read(found.write(tmp_path / "converted.json"))
+    assert again.tasks == found.tasks and again.format == FORMAT
+
+
+def edited(**changes) -> str:
+    return json.dumps(result().to_plain() | changes)
+
+
+def with_task(**changes) -> str:
+    values = result().to_plain()
+    values["tasks"][0] |= changes
+    return json.dumps(values)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (edited(format="libero-evaluation/3"), "libero-evaluation/3; this version reads"),
+        (edited(format="lerobot/1"), "has the format 'lerobot/1'; expected libero-evaluation/2"),
+        (json.dumps({"results": []}), "has no format"),
+        (json.dumps([1]), "expected a JSON object"),
+        (edited()[:300], "broken or incomplete"),
+        (edited(tasks={}), "tasks is {}; expected a list"),
+        (edited(tasks=[]), "no tasks"),
+        (json.dumps({"format": FORMAT}), "evaluated is missing; protocol is missing"),
+        (with_task(successes=[True]), "libero_goal/0: successes has 1 entries, init_states has 3"),
+        (with_task(successes=[1, 0, 1]), "task 0.successes.0 is 1; expected true or false"),
+        (with_task(lengths=[1, 2, -3]), "lengths.2 is -3; expected at least 0"),
+        (with_task(lengths=None), "lengths is None; expected a list"),
+        (with_task(init_states=[0, 1, 1]), "counted twice"),
+        (with_task(atoms_ever=[[True], [False], []]), "a column for each"),
+        (with_task(task="libero_spatial/4"), "tasks are counted twice: libero_spatial/4"),
+        (with_task(actions=["00"]), "actions has 1 entries"),
+        (with_task(successes=[True, True, True]), "the file was edited"),
+    ],
+)
+def test_other_files_are_refused_by_name(tmp_path, text, message):
+    (tmp_path / "eval.json").write_text(text)
+    with pytest.raises(EvaluationFileError, match=r"eval\.json.*" + message):
+        EvaluationResult.read(tmp_path)
+
+
+def test_a_missing_file_and_one_that_cannot_be_written(tmp_path):
+    with pytest.raises(EvaluationFileError, match="does not exist"):
+        EvaluationResult.read(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultsError, match="cannot be written"):
+        result().write(tmp_path / "file" / "eval.json")

@@ -1,0 +1,350 @@
+"""Comparison of evaluated policies: what may be compared, what is counted, texts, pages, exports and commands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+pytest.importorskip("statsmodels")
+
+from libero_eval.cli.main import main  # noqa: E402
+from libero_eval.exports import export_lerobot, export_vla_eval  # noqa: E402
+from libero_eval.judging.comparability import Side, check_comparable, match, settings  # noqa: E402
+from libero_eval.judging.comparison import Judgement, judge, write_judgement  # noqa: E402
+from libero_eval.judging.group_scores import group_scores  # noqa: E402
+from libero_eval.judging.text import render  # noqa: E402
+from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
+from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
+
+pytestmark = pytest.mark.unit
+
+
+def side(label: str, *results) -> Side:
+    return Side(label, results, tuple(f"{label}{i}" for i in range(len(results))))
+
+
+@pytest.fixture(scope="module")
+def found() -> Judgement:
+    """Two policies on two suites, and the first again with another seed."""
+    suites = ("libero_goal", "libero_object")
+    return judge(
+        [
+            side("good", drawn_result(0.9, 1, suites=suites)),
+            side("bad", drawn_result(0.75, 2, suites=suites, policy="other:make")),
+            side("good again", drawn_result(0.9, 3, suites=suites, seed=1)),
+        ]
+    )
+
+
+def test_differences_are_those_of_the_same_starts(found):
+    first = found.comparisons[0]
+    total = first.total.difference
+    assert (first.first, first.second, total.pairs) == ("good", "bad", 1000)
+    assert total.value == pytest.approx(total.first - total.second)
+    assert total.value == pytest.approx((total.counts.only_first - total.counts.only_second) / 1000)
+    assert total.score.low < total.value < total.score.high and first.total.adjusted < 0.001
+    assert [p.name for p in first.suites] == ["libero_goal", "libero_object"] and len(first.tasks) == 20
+    assert np.mean([p.difference.value for p in first.tasks]) == pytest.approx(total.value)
+    assert sum(p.difference.counts.discordant for p in first.tasks) == total.counts.discordant
+
+
+def test_one_policy_twice_is_the_control_arm(found):
+    assert [(c.first, c.second) for c in found.controls] == [("good", "good again")]
+    assert [(c.first, c.second) for c in found.comparisons] == [("good", "bad"), ("bad", "good again")]
+    control = found.controls[0].total
+    assert control.adjusted is None and control.difference.by_chance > 0
+    assert not any("no control arm" in note for note in found.notes)
+
+
+def test_holm_is_over_comparisons_suites_and_tasks(found):
+    totals = [c.total for c in found.comparisons]
+    assert all(t.adjusted >= t.difference.p_value for t in totals)
+    suites = [p for c in found.comparisons for p in c.suites]
+    smallest = min(suites, key=lambda p: p.difference.p_value)
+    assert smallest.adjusted == pytest.approx(min(1, 4 * smallest.difference.p_value))
+    tasks = found.comparisons[0].tasks
+    smallest = min(tasks, key=lambda p: p.difference.p_value)
+    assert smallest.adjusted == pytest.approx(min(1, 20 * smallest.difference.p_value))
+
+
+def test_the_order_of_the_policies_turns_the_sign_only():
+    sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.8, 2, policy="b:b"))]
+    one, other = (judge(order).comparisons[0].total.difference for order in (sides, sides[::-1]))
+    assert (one.value, one.score.low) == pytest.approx((-other.value, -other.score.high))
+    assert one.p_value == other.p_value
+
+
+def test_texts_name_what_is_shown_and_what_is_not(found):
+    text = render(found)
+    assert (
+        "good is better than bad in these starts: +" in text
+        and "Stopped at any time: decided for good" in text
+    )
+    assert "control arm: good − good again, one policy twice" in text
+    assert "tasks that differ most (of 20)" in text and len(render(found, tasks=True)) > len(text)
+    equal = judge([side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b"))])
+    text = render(equal)
+    assert "No difference is shown: a − b" in text and "in four of five cases" in text
+    assert "not decided after 500 pairs" in text and "note: no control arm" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "field", "values"),
+    [
+        ({"protocol": PROTOCOL | {"settle_steps": 5}}, "protocol.settle_steps", "10 in a, 5 in b"),
+        (
+            {"environment": ENVIRONMENT | {"robot": "robosuite-1.4.1"}},
+            "environment.robot",
+            "libero in a, robosuite",
+        ),
+        (
+            {"environment": ENVIRONMENT | {"drawing": "faithful"}},
+            "environment.drawing",
+            "fast in a, faithful in b",
+        ),
+        (
+            {"environment": ENVIRONMENT | {"models": "original"}},
+            "environment.models",
+            "builtin in a, original in b",
+        ),
+        (
+            {"protocol": {**PROTOCOL, "horizon": {"libero_goal": 600}}},
+            "protocol.horizon.libero_goal",
+            "300 in a, 600",
+        ),
+    ],
+)
+def test_results_made_differently_are_refused(changes, field, values):
+    sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b", **changes))]
+    with pytest.raises(ComparisonError, match="cannot be compared") as error:
+        judge(sides)
+    assert f"{field}: {values}" in str(error.value) and f"--allow {field}" in str(error.value)
+    allowed = [field, *([] if "horizon" not in field else ["protocol.horizon"])]
+    notes = judge(sides, allow=allowed).notes
+    assert any(note.startswith(f"{field}: {values}") and note.endswith("; allowed") for note in notes)
+    assert check_comparable(sides, allow=[field.partition(".")[0]])
+
+
+def test_other_instructions_are_refused():
+    sides = [
+        side("a", result_of(task_result("libero_goal/0", [1, 0]))),
+        side("b", result_of(task_result("libero_goal/0", [1, 0], instruction="open it"), policy="b:b")),
+    ]
+    with pytest.raises(
+        ComparisonError, match="tasks.libero_goal/0.instruction: do what libero_goal/0 asks in a, open it"
+    ):
+        judge(sides)
+
+
+def test_versions_and_renderers_are_told_but_not_refused():
+    other = {"versions": {"mujoco": "3.3.2"}, "environment": ENVIRONMENT | {"renderer": "osmesa"}}
+    notes = judge(
+        [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b", **other))]
+    ).notes
+    assert "versions.mujoco: 4.0.0 in a, 3.3.2 in b" in notes
+    assert "environment.renderer: egl in a, osmesa in b" in notes
+
+
+def test_what_older_files_do_not_record_is_told():
+    notes = check_comparable(
+        [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, environment={}))]
+    )
+    assert "environment.robot: libero in a, not recorded in b; taken to be the same" in notes
+
+
+def test_episodes_without_a_partner_are_dropped_and_counted():
+    sides = [
+        side("a", result_of(task_result("s/0", [1, 1, 0, 0]), task_result("s/1", [1, 1]))),
+        side("b", result_of(task_result("s/0", [1, 0, 0], starts=(2, 3, 9)), policy="b:b")),
+    ]
+    matched = match(*sides)
+    assert matched.dropped == (4, 1) and matched.tasks == ("s/0",)
+    assert matched.pairs.starts.tolist() == [2, 3] and matched.pairs.second[:, 0].tolist() == [True, False]
+    assert any(
+        "2 pairs; without a partner and not counted: 4 episodes of a, 1 of b" in n for n in judge(sides).notes
+    )
+
+
+def test_no_common_start_is_refused():
+    sides = [
+        side("a", result_of(task_result("s/0", [1, 1]))),
+        side("b", result_of(task_result("s/0", [1, 0, 0], starts=(7, 8, 40)), policy="b:b")),
+    ]
+    with pytest.raises(
+        ComparisonError, match="1 tasks from s/0, starts 0–1 against 1 tasks from s/0, starts 7–8, 40"
+    ):
+        judge(sides)
+
+
+def test_a_single_task_with_one_start_is_judged():
+    sides = [
+        side("a", result_of(task_result("s/0", [1]))),
+        side("b", result_of(task_result("s/0", [0]), policy="b:b")),
+    ]
+    only = judge(sides).comparisons[0]
+    assert only.total.adjusted == 1.0 and only.suites == () and only.total.difference.over_tasks is None
+    interval = only.total.difference.interval
+    assert -1 < interval.low < 0 < interval.high == 1
+
+
+def test_equal_outcomes_of_a_control_arm_are_told():
+    twins = [side("a", drawn_result(0.9, 1)), side("a2", drawn_result(0.9, 1, seed=1))]
+    judged = judge([], control=(twins[0], twins[1]))
+    assert judged.comparisons == () and any("equal to the bit" in note for note in judged.notes)
+    wrong = judge([], control=(twins[0], side("b", drawn_result(0.9, 1, policy="b:b"))))
+    assert any("not results of one policy" in note for note in wrong.notes)
+
+
+def test_one_policy_under_two_protocols_is_no_control_arm():
+    sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, protocol={"name": "libero"}))]
+    judged = judge(sides, allow=["protocol"])
+    assert len(judged.comparisons) == 1 and not judged.controls
+
+
+def test_weights_identify_a_policy():
+    first, second = (
+        {"run": path, "weights": "abc", "seed": s} for s, path in enumerate(("runs/a", "/x/runs/a"))
+    )
+    sides = [
+        side("a", drawn_result(0.9, 1, evaluated=first)),
+        side("b", drawn_result(0.9, 2, evaluated=second)),
+    ]
+    assert len(judge(sides).controls) == 1
+
+
+def test_too_few_results_and_equal_names_are_refused():
+    one = side("a", drawn_result(0.9, 1))
+    with pytest.raises(ConfigError, match="needs two results"):
+        judge([one])
+    with pytest.raises(ConfigError, match="two policies are called a"):
+        judge([one, side("a", drawn_result(0.8, 2, policy="b:b"))])
+
+
+def test_runs_of_methods_are_aggregated_by_rliable():
+    metrics = pytest.importorskip("rliable.metrics")
+    groups = [
+        [drawn_result(rate, d, evaluated={"weights": f"{rate}{d}"}) for d in range(3)] for rate in (0.9, 0.7)
+    ]
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    judged = judge([side("good", *groups[0]), side("bad", *groups[1])])
+    assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
+    found = judged.groups
+    scores = np.array([[np.mean(t.successes) for t in r.tasks] for r in groups[0]])
+    assert found.iqm["good"].value == pytest.approx(metrics.aggregate_iqm(scores))
+    assert found.iqm["good"].low <= found.iqm["good"].value <= found.iqm["good"].high
+    assert found.improvement["good", "bad"].value > 0.8 and found.runs == {"good": 3, "bad": 3}
+    only = judged.comparisons[0]
+    assert only.sequential is None and only.total.difference.counts is None and only.total.adjusted < 0.01
+    assert "a run of good beats one of bad" in render(judged)
+    other = np.array([[np.mean(t.successes) for t in r.tasks] for r in groups[1]])
+    expected = metrics.probability_of_improvement(scores, other)
+    assert found.improvement["good", "bad"].value == pytest.approx(expected)
+    assert (
+        group_scores({"good": scores, "bad": other}).iqm["good"] == found.iqm["good"]
+    )  # whatever was drawn before
+
+
+def test_the_file_holds_everything(found, tmp_path):
+    values = json.loads(write_judgement(found, tmp_path / "c.json").read_text())
+    assert values["format"] == "libero-comparison/1" and len(values["comparisons"][0]["tasks"]) == 20
+    assert len(values["comparisons"][0]["sequential"]["log_e"]) == 1000
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultsError, match="cannot be written"):
+        write_judgement(found, tmp_path / "file" / "c.json")
+
+
+def test_the_page_needs_no_other_file(found, tmp_path):
+    pytest.importorskip("matplotlib")
+    from libero_eval.judging.page import write_page
+
+    text = write_page(found, tmp_path / "new" / "compare.html").read_text()
+    assert text.count("<svg") == 3 and "http" not in text.replace("http://www.w3.org", "")
+    assert "<h2>good − bad</h2>" in text and "Control arm" in text and "libero_object/9" in text
+
+
+def test_exports_to_vla_eval(tmp_path):
+    errors = (None, "ServerError: closed", None)
+    result = result_of(
+        task_result("libero_goal/3", [1, 0, 1], errors=errors), task_result("libero_object/0", [0, 0, 0])
+    )
+    paths = export_vla_eval(result, tmp_path)
+    assert [p.name for p in paths] == ["libero_goal_aggregate.json", "libero_object_aggregate.json"]
+    values = json.loads(paths[0].read_text())
+    assert (
+        values["mean_success"] == 0.6667
+        and values["num_errors"] == 1
+        and values["metric_keys"] == {"success": "mean"}
+    )
+    collector = pytest.importorskip("vla_eval.results.collector", reason="vla-eval is not installed here")
+    expected = collector.ResultCollector("libero_goal", metric_keys={"success": "mean"})
+    for episode in values["tasks"][0]["episodes"]:
+        expected.record(values["tasks"][0]["task"], dict(episode))
+    theirs = expected.get_benchmark_result(values["config"])
+    assert values["tasks"] == theirs["tasks"] and theirs.keys() - {"created_at"} <= values.keys()
+
+
+def test_exports_to_lerobot(tmp_path):
+    result = result_of(task_result("libero_goal/3", [1, 0, 1]), task_result("libero_object/0", [0, 0, 0]))
+    values = json.loads(export_lerobot(result, tmp_path)[0].read_text())
+    assert (tmp_path / "eval_info.json").is_file()
+    assert [(t["task_group"], t["task_id"]) for t in values["per_task"]] == [
+        ("libero_goal", 3),
+        ("libero_object", 0),
+    ]
+    assert values["per_task"][0]["metrics"]["successes"] == [True, False, True]
+    assert values["per_group"]["libero_goal"]["pc_success"] == pytest.approx(200 / 3)
+    assert values["overall"]["pc_success"] == pytest.approx(100 / 3) and values["overall"]["eval_ep_s"] == 10
+
+
+def written(folder: Path, **results) -> None:
+    for name, result in results.items():
+        result.write(folder / name / "eval.json")
+
+
+def test_commands(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    written(
+        tmp_path, a=drawn_result(0.9, 1), b=drawn_result(0.8, 2, policy="b:b"), c=drawn_result(0.9, 3, seed=1)
+    )
+    assert main(["compare", "pi0=a", "b/eval.json", "--control", "a", "c", "--out", "report"]) == 0
+    out = capsys.readouterr().out
+    assert "pi0 is better than b" in out and "control arm: a − c" in out
+    assert sorted(p.name for p in Path("report").iterdir()) == ["compare.html", "compare.json"]
+    assert main(["power", "a", "b"]) == 0 and "observed in 500 pairs" in capsys.readouterr().out
+    assert main(["power", "--difference", "0.03", "--correlation", "0.3", "--tests", "4"]) == 0
+    assert "over 4 comparisons" in capsys.readouterr().out
+    assert main(["power", "--episodes", "500"]) == 0 and "worse by" in capsys.readouterr().out
+    assert main(["results", "export", "a", "--as", "lerobot", "--out", "x"]) == 0
+    assert capsys.readouterr().out.strip() == "x/eval_info.json"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["compare", "a"], "needs two results"),
+        (["compare", "a", "nothing"], "nothing does not exist"),
+        (["compare", "a", "old"], "the format is libero-evaluation/99"),
+        (["compare", "a", "nan"], "successes.3 is nan; expected true or false"),
+        (["compare", "--group", "a"], "--group NAME RESULT"),
+        (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
+        (["power", "a"], "takes two results, not 1"),
+        (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
+    ],
+)
+def test_bad_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, a=drawn_result(0.9, 1), b=drawn_result(0.8, 2, policy="b:b"))
+    values = json.loads(Path("a/eval.json").read_text())
+    Path("old").write_text(json.dumps(values | {"format": "libero-evaluation/99"}))
+    values["tasks"][0]["successes"][3] = float("nan")
+    Path("nan").write_text(json.dumps(values))
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_settings_are_flat():
+    found = settings(drawn_result(0.9, 1, tasks=1))
+    assert found["protocol.horizon.libero_goal"] == 300 and found["environment.robot"] == "libero"
+    assert "environment.renderer" not in found

@@ -1,0 +1,106 @@
+"""An evaluation under perturbations: recorded, told to the policy, paired with the plain one, and run again."""
+
+import numpy as np
+import pytest
+
+from libero_env.perturbations import KINDS
+from libero_env.tasks import get_task
+from libero_eval.cli.main import main
+from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.judging.comparability import Side, check_comparable, match
+from libero_eval.protocols.environment import ProtocolEnv, make_env
+from libero_eval.protocols.files import load_card, parse_card
+from lifelong.errors import ComparisonError, ProtocolError
+
+EVAL = ["eval", "told_policy:make", "--suite", "libero_goal/1", "--episodes", "3", "--horizon", "3"]
+EVAL += ["--threads", "1"]
+POLICY = """
+import numpy as np
+
+
+class Told:
+    cameras, camera_size, observations = ("agentview",), (32, 32), ("rgb", "proprioception")
+
+    def reset(self, instruction, num_envs):
+        with open("told.txt", "a") as file:
+            print(instruction, file=file)
+
+    def predict(self, observations):
+        moved = observations["agentview_rgb"].mean(axis=(1, 2, 3)) / 255
+        return np.outer(moved, [1, 0, 0, 0, 0, 0, -1])
+
+
+def make():
+    return Told()
+"""
+
+
+def test_a_card_without_perturbations_is_as_it_was():
+    card = load_card("libero")
+    assert card.world.perturb == "" and "perturb" not in card.resolved()["world"]
+    moved = card.changed({"world.perturb": "camera=0.3"})
+    assert moved.digest != card.digest and moved.changed({"world.perturb": ""}).digest == card.digest
+    assert parse_card(moved.resolved(), "libero", "here") == moved
+    for wrong in ("camra=0.3", "camera=2", "noise=0.1,camera=0.3"):
+        with pytest.raises(ProtocolError, match="world.perturb"):
+            card.changed({"world.perturb": wrong})
+
+
+def test_an_evaluation_records_its_perturbations(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "told_policy.py").write_text(POLICY)
+    perturb = ["--perturb", "noise=0.2,instruction=0.5,robot=0.4,distractors=0.1"]
+    assert main([*EVAL, "--out", "plain", "--perturb", "camera=0"]) == 0
+    assert main([*EVAL, "--out", "changed", *perturb]) == 0
+    plain, changed = (EvaluationResult.read(tmp_path / name) for name in ("plain", "changed"))
+    assert "perturb" not in plain.protocol["world"] and plain.tasks[0].attempts == ()
+    assert changed.protocol["world"]["perturb"] == "distractors=0.1,instruction=0.5,robot=0.4,noise=0.2"
+    assert np.shape(changed.tasks[0].attempts) == (3, 4)
+    told = (tmp_path / "told.txt").read_text().splitlines()
+    assert told == ["put the bowl on the stove", changed.tasks[0].instruction] and len(set(told)) == 2
+    assert changed.tasks[0].name == plain.tasks[0].name and "_" not in told[1]
+
+    sides = [Side("plain", (plain,)), Side("changed", (changed,))]
+    with pytest.raises(ComparisonError, match="protocol.world.perturb"):
+        check_comparable(sides)
+    check_comparable(sides, allow=["protocol", "tasks"])
+    assert len(match(*sides).pairs.starts) == 3
+
+    capsys.readouterr()
+    again = ["eval", "changed", "--allow", "told_policy", "--out", "again", "--threads", "1"]
+    assert main(again) == 0
+    assert EvaluationResult.read(tmp_path / "again").actions == changed.actions
+    assert (
+        main([*EVAL, "--out", "changed", "--perturb", "camera=0.1"]) == 2
+    )  # another evaluation is in the folder
+    assert "world.perturb" in capsys.readouterr().err
+
+
+def test_a_units_episodes_do_not_depend_on_the_unit(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "told_policy.py").write_text(POLICY)
+    perturb = ["--perturb", "light=0.5,robot=0.4,noise=0.2,action_noise=0.3"]
+    for size in ("1", "3"):
+        assert main([*EVAL, *perturb, "--unit-starts", size, "--out", size]) == 0
+    found = [EvaluationResult.read(tmp_path / size).tasks[0] for size in ("1", "3")]
+    assert found[0].lengths == found[1].lengths and found[0].actions == found[1].actions
+
+
+def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypatch):
+    monkeypatch.setattr(
+        ProtocolEnv, "_stored", lambda self: self.env.world.init_states
+    )  # LIBERO's may not be here
+    card = load_card("openpi").changed({"pixels.render_size": (32, 32)})
+    found = []
+    for perturb in ("", "layout=0.3,distractors=0.3,robot=0.4"):
+        env = make_env(
+            get_task("libero_goal/3"), 2, card.changed({"world.perturb": perturb}), cameras=(), threads=1
+        )
+        env.reset(options={"init_state": np.array([3, 7])})
+        plate = [view.body_pos("plate_1") for view in env.world.views]
+        found.append((env.world.simulations.fixtures.copy(), np.array(plate)))
+        assert env.task.language == env.world.base_task.language and len(env.step(np.zeros((2, 7)))) == 5
+        env.close()
+    assert np.array_equal(found[0][0], found[1][0])
+    moved = np.linalg.norm(found[1][1] - found[0][1], axis=1)
+    assert moved == pytest.approx(KINDS["layout"].amount(0.3))  # the same for all starts

@@ -1,0 +1,473 @@
+"""Clients of policy servers: formats, chunks, and servers that fail, are late or send what is not valid."""
+
+import asyncio
+import sys
+import threading
+import time
+
+import msgpack
+import numpy as np
+import pytest
+
+from libero_env.errors import MissingPackageError
+from libero_env.tasks import get_suite
+from libero_eval.servers.actor import RemoteActor, checked_actions
+from libero_eval.servers.codecs import GROOT, OPENPI, VLA_EVAL
+from libero_eval.servers.connections import Connection, Limits
+from libero_eval.servers.groot import GrootWire
+from libero_eval.servers.packages import need
+from libero_eval.servers.wires import EpisodeStart, OpenpiDialect, VlaEvalDialect, WebSocketWire
+from lifelong.errors import ConnectionLost, ServerError, WireError
+from lifelong.evaluation.inputs import PolicyInput
+from lifelong.evaluation.rollout import run_episodes
+from tests.harness import policy_servers
+
+pytestmark = pytest.mark.unit
+TASK = get_suite("libero_goal").tasks[0]
+SHORT = Limits(connect=5, answer=5)
+
+
+class Plain:
+    """An adapter that sends the simulation's number and step, and doubles actions."""
+
+    cameras, observations = ("agentview", "robot0_eye_in_hand"), ("rgb",)
+
+    def __init__(self):
+        self.asked = []
+
+    def inputs(self, obs, rows=None):
+        self.asked.append(list(rows))
+        image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+        images = {"agentview": image, "robot0_eye_in_hand": image[::-1]}
+        extra = {"controller_states": np.ones(8, np.float32)}
+        return [PolicyInput(images, obs["x"][i], TASK.language, extra) for i in rows]
+
+    def actions(self, predicted):
+        return 2 * predicted
+
+
+def observations(count: int, step: int) -> dict[str, np.ndarray]:
+    x = np.zeros((count, 8))
+    x[:, 0], x[:, 1] = np.arange(count), step
+    return {"x": x, "image": np.zeros((count, 1, 1, 3), np.uint8)}
+
+
+def chunk(state: np.ndarray, length: int) -> np.ndarray:
+    """Actions that tell simulation, step of the observation and position in the chunk."""
+    actions = np.zeros((length, 7))
+    actions[:, 0], actions[:, 1], actions[:, 2] = state[0], state[1], np.arange(length)
+    return actions
+
+
+def ask(address: str, limits: Limits = SHORT, replan: int | None = 2) -> np.ndarray:
+    wire = WebSocketWire(address, OpenpiDialect(), limits)
+    try:
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 7)], replan=replan)
+        actor.reset(1)
+        return actor.act(observations(1, 0))
+    finally:
+        wire.close()
+
+
+def test_arrays_keep_their_bits_in_every_encoding():
+    arrays = [np.arange(6, dtype=kind).reshape(2, 3) for kind in ("<f4", ">f8", "u1", "i8")]
+    arrays += [np.zeros((0, 7)), np.array(2.5), np.arange(48, dtype=np.uint8).reshape(4, 4, 3)]
+    for codec in (OPENPI, VLA_EVAL, GROOT):
+        found = codec.unpack(codec.pack({"a": arrays, "text": "ä", "none": None, "number": np.float32(0.1)}))
+        for value, array in zip(found["a"], arrays, strict=True):
+            assert value.dtype == array.dtype and value.flags.writeable
+            np.testing.assert_array_equal(value, array)
+        assert found["text"] == "ä" and found["none"] is None and found["number"] == np.float32(0.1)
+
+
+def test_the_maps_that_stand_for_arrays():
+    array = np.zeros((1, 2), np.float32)
+    assert msgpack.unpackb(OPENPI.pack({"a": array}))["a"] == {
+        b"__ndarray__": True,
+        b"data": bytes(8),
+        b"dtype": "<f4",
+        b"shape": [1, 2],
+    }
+    assert msgpack.unpackb(OPENPI.pack(np.int16(3))) == {b"__npgeneric__": True, b"data": 3, b"dtype": "<i2"}
+    image = msgpack.unpackb(VLA_EVAL.pack(np.zeros((2, 2, 3), np.uint8)))
+    assert image["__image__"] and image["format"] == "png" and image["data"].startswith(b"\x89PNG")
+    assert msgpack.unpackb(VLA_EVAL.pack(array))["__ndarray__"]
+    assert msgpack.unpackb(GROOT.pack(array))["as_npy"].startswith(b"\x93NUMPY")
+
+
+@pytest.mark.parametrize("codec", [OPENPI, VLA_EVAL, GROOT], ids=lambda c: c.name)
+def test_values_and_bytes_that_are_refused(codec):
+    for value in (np.array([object()]), np.zeros(1, "f4,f4"), object()):
+        with pytest.raises(WireError, match=codec.name):
+            codec.pack({"a": value})
+    if codec is not GROOT:
+        with pytest.raises(WireError, match="refused"):
+            codec.pack(np.zeros(1, complex))
+    for data in (b"", b"\xc1garbage", codec.pack(1) + b"more"):
+        with pytest.raises(WireError, match=f"no {codec.name} message"):
+            codec.unpack(data)
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    for module, package in (("msgpack", "msgpack"), ("zmq", "pyzmq"), ("websockets", "websockets")):
+        monkeypatch.setitem(sys.modules, module, None)
+        message = rf"package {package}, which.*pip install 'libero-lifelong\[servers\]'"
+        with pytest.raises(MissingPackageError, match=message):
+            need(module)
+
+
+def test_an_array_that_does_not_fit_its_bytes_is_refused():
+    for changes in ({b"shape": [3]}, {b"dtype": "O"}, {b"shape": [-1, -2]}, {b"data": b""}):
+        lie = {b"__ndarray__": True, b"data": bytes(8), b"dtype": "<f4", b"shape": [2]} | changes
+        with pytest.raises(WireError, match="no openpi message"):
+            OPENPI.unpack(msgpack.packb(lie))
+
+
+def test_openpi_observations_and_chunks():
+    seen = []
+
+    def answer(observation):
+        seen.append(observation)
+        return {"actions": chunk(observation["observation/state"], 5), "server_timing": {"infer_ms": 1.0}}
+
+    with policy_servers.openpi(answer, {"name": "mine", "size": 224}) as address:
+        wire = WebSocketWire(address, OpenpiDialect(), SHORT)
+        assert wire.announced == {"name": "mine", "size": 224}
+        adapter = Plain()
+        actor = RemoteActor(wire, adapter, [EpisodeStart(TASK, i) for i in range(3)], replan=3)
+        actor.reset(3)
+        over = np.zeros(3, bool)
+        for step in range(7):
+            over[1] = step >= 2
+            actor.note(over, over)
+            actions = actor.act(observations(3, step))
+            for i in np.flatnonzero(~over):
+                np.testing.assert_array_equal(actions[i, :3], [2 * i, 2 * (step // 3 * 3), 2 * (step % 3)])
+            assert not actions[over].any()
+        wire.close()
+    assert adapter.asked == [[0, 1, 2], [0, 2], [0, 2]], "only running simulations without actions"
+    assert set(seen[0]) == {
+        "observation/image",
+        "observation/wrist_image",
+        "observation/state",
+        "prompt",
+    }
+    assert seen[0]["observation/image"].dtype == np.uint8 and seen[0]["prompt"] == TASK.language
+
+
+class Drawing:
+    """An environment that notes when it draws; its episodes end after nine steps."""
+
+    num_envs = 1
+
+    def reset(self, *, seed=None, options=None):
+        self.drawn, self.step_ = [self.render_images], 0
+        return observations(1, 0), {"success": np.zeros(1, bool)}
+
+    def step(self, actions):
+        self.drawn.append(self.render_images)
+        self.step_ += 1
+        over = np.array([self.step_ == 9])
+        return observations(1, self.step_), np.zeros(1), over, over, {"success": over}
+
+
+@pytest.mark.parametrize(
+    ("settle", "record", "drawn"),
+    [(0, 0, {0, 3, 6}), (2, 0, {2, 5, 8}), (0, 4, {0, 3, 4, 6, 8})],
+)
+def test_only_images_that_are_seen_are_drawn(settle, record, drawn):
+    answer = lambda observation: {"actions": chunk(observation["observation/state"], 3)}  # noqa: E731
+    env = Drawing()
+    env.render_images = True
+    with policy_servers.openpi(answer) as address:
+        wire = WebSocketWire(address, OpenpiDialect(), SHORT)
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 0)], replan=3, views=("image",))
+        rollouts = run_episodes(actor, env, [0], horizon=20, settle_steps=settle, record_every=record)
+        wire.close()
+    assert {i for i, seen in enumerate(env.drawn) if seen} - {9} == drawn, "9: it was not known to be over"
+    assert rollouts.episodes[0].success and env.render_images
+
+
+def test_the_order_of_answers_makes_no_difference():
+    found = []
+    for slow in (0, 2):
+
+        async def handler(socket, slow=slow):
+            await socket.send(OPENPI.pack({}))
+            async for data in socket:
+                state = OPENPI.unpack(data)["observation/state"]
+                await asyncio.sleep(0.1 if state[0] == slow else 0)
+                await socket.send(OPENPI.pack({"actions": chunk(state, 1)}))
+
+        with policy_servers.web_socket(handler) as address:
+            wire = WebSocketWire(address, OpenpiDialect(), SHORT)
+            actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=1)
+            actor.reset(3)
+            found.append([actor.act(observations(3, step)) for step in range(2)])
+            wire.close()
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0][1][:, 0], [0, 2, 4])
+
+
+@pytest.mark.parametrize("in_flight", [1, 2, None])
+def test_requests_in_flight(in_flight):
+    waiting, most = 0, 0
+
+    async def handler(socket):
+        nonlocal waiting, most
+        await socket.send(OPENPI.pack({}))
+        async for data in socket:
+            waiting += 1
+            most = max(most, waiting)
+            await asyncio.sleep(0.05)
+            waiting -= 1
+            await socket.send(OPENPI.pack({"actions": chunk(OPENPI.unpack(data)["observation/state"], 1)}))
+
+    with policy_servers.web_socket(handler) as address:
+        wire = WebSocketWire(address, OpenpiDialect(), Limits(5, 5, in_flight))
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(5)], replan=1)
+        actor.reset(5)
+        actor.act(observations(5, 0))
+        wire.close()
+    assert most == (in_flight or 5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ({"actions": np.full((4, 7), np.nan)}, "not finite .nan."),
+        ({"actions": np.zeros((4, 8))}, r"shape \(4, 8\); expected \(H, 7\) numbers with H >= 2"),
+        ({"actions": np.zeros((1, 4, 7))}, r"shape \(1, 4, 7\)"),
+        ({"actions": np.zeros((1, 7))}, "1 actions; the protocol executes 2"),
+        ({"actions": np.zeros((4, 7), "S1")}, r"dtype \|S1"),
+        ({"actions": [["a"] * 7] * 2}, "dtype <U1"),
+        ({"actions": [[1.0], [2.0, 3.0]]}, "no array"),
+        ({"actions": None}, "dtype object"),
+        ({"action": np.zeros((4, 7))}, r"\['action'\] and without `actions`"),
+        ({}, "with nothing and without"),
+        ([1, 2], "sent a list as answer; expected a map"),
+        (b"\xc1\x00garbage", "9 bytes that are no openpi message"),
+        ("Traceback ...\nValueError: no such key", "(?s)its traceback:.*no such key"),
+    ],
+)
+def test_answers_that_are_not_valid_are_named(answer, message):
+    with (
+        policy_servers.openpi(lambda _: answer) as address,
+        pytest.raises(ServerError, match=message) as caught,
+    ):
+        ask(address)
+    assert address in str(caught.value) and not isinstance(caught.value, ConnectionLost)
+
+
+def test_single_actions():
+    assert checked_actions(list(range(7)), None, "it").shape == (1, 7)
+    assert checked_actions(np.arange(7, dtype=np.int64), 1, "it").dtype == np.float64
+    with pytest.raises(ServerError, match="chunk_size"):
+        checked_actions(np.zeros((4, 7)), None, "it")
+
+
+def test_a_server_that_is_silent():
+    with (
+        policy_servers.openpi(lambda _: time.sleep(1) or {}) as address,
+        pytest.raises(ServerError, match=r"nothing within 0\.2 s \(actions\); --timeout"),
+    ):
+        ask(address, Limits(5, 0.2))
+
+    async def mute(socket):
+        await socket.wait_closed()
+
+    with (
+        policy_servers.web_socket(mute) as address,
+        pytest.raises(ServerError, match="nothing within .* metadata"),
+    ):
+        ask(address, Limits(5, 0.2))
+
+
+@pytest.mark.parametrize("code", [1001, 1011])
+def test_a_connection_that_breaks(code):
+    async def handler(socket):
+        await socket.send(OPENPI.pack({}))
+        await socket.recv()
+        await socket.close(code, "going away")
+
+    with (
+        policy_servers.web_socket(handler) as address,
+        pytest.raises(ConnectionLost, match=f"{address} was closed with {code} going away"),
+    ):
+        ask(address)
+
+
+def test_a_server_that_takes_no_request_and_one_that_sends_too_much(monkeypatch):
+    class Full:
+        async def send(self, data):
+            await asyncio.sleep(60)
+
+    with pytest.raises(ServerError, match=r"ws://it took no request within 0\.1 s; --timeout"):
+        asyncio.run(Connection(Full(), "ws://it", OPENPI, Limits(1, 0.1)).send({}))
+    monkeypatch.setattr("libero_eval.servers.connections.MAX_MESSAGE_BYTES", 1000)
+    with (
+        policy_servers.openpi(lambda _: {"actions": np.zeros((100, 7))}) as address,
+        pytest.raises(ConnectionLost, match="closed with 1009"),
+    ):
+        ask(address)
+
+
+def test_a_server_that_comes_later_is_waited_for():
+    with policy_servers.openpi(lambda _: {}) as address:
+        port = int(address.rpartition(":")[2])
+    with pytest.raises(ServerError, match=r"no policy server at .* within 0\.3 s"):
+        ask(address, Limits(0.3, 1))
+    found = []
+    client = threading.Thread(target=lambda: found.append(WebSocketWire(address, OpenpiDialect(), SHORT)))
+    client.start()
+    time.sleep(0.3)
+
+    async def handler(socket):
+        await socket.send(OPENPI.pack({"late": True}))
+        await socket.wait_closed()
+
+    async def main(on_ready):
+        async with policy_servers.serve(handler, "127.0.0.1", port) as server:
+            on_ready(port)
+            await server.serve_forever()
+
+    with policy_servers.running(main):
+        client.join(10)
+        assert found[0].announced == {"late": True}
+        found[0].close()
+
+
+def test_a_server_that_changes_its_policy_is_refused():
+    versions = iter(range(9))
+
+    async def handler(socket):
+        await socket.send(OPENPI.pack({"version": next(versions)}))
+        await socket.wait_closed()
+
+    with (
+        policy_servers.web_socket(handler) as address,
+        pytest.raises(ServerError, match="'version': 1.*at first.*'version': 0"),
+    ):
+        ask(address)
+
+
+def test_vla_eval_episodes():
+    heard, hello = [], {"harness_version": "0.8.0", "observation_params": {"send_wrist_image": True}}
+    hello["observation_params"]["send_state"] = True
+    answer = lambda payload: {"actions": chunk(payload["states"], 1)[0]}  # noqa: E731
+    with policy_servers.vla_eval(answer, hello, heard) as address:
+        wire = WebSocketWire(address, VlaEvalDialect(), SHORT)
+        assert wire.announced == hello
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 4)], replan=None)
+        actor.reset(1)
+        for step in range(2):
+            np.testing.assert_array_equal(actor.act(observations(1, step))[0, :2], [0, 2 * step])
+        actor.note(np.array([True]), np.array([True]))
+        wire.close()
+    assert [m["type"] for m in heard] == [
+        "hello",
+        "hello",
+        "episode_start",
+        "observation",
+        "observation",
+        "episode_end",
+    ]
+    assert [m["seq"] for m in heard] == [1, 1, 2, 3, 4, 5]
+    assert heard[2]["payload"]["task"] == {
+        "name": TASK.language,
+        "suite": "libero_goal",
+        "task_id": 0,
+        "episode_idx": 4,
+    }
+    sent = heard[3]["payload"]
+    assert sent["images"]["wrist"].shape == (4, 4, 3) and sent["task_description"] == TASK.language
+    assert sent["controller_states"].dtype == np.float32
+    assert heard[5]["payload"]["metrics"] == {"success": True}
+
+
+def test_vla_eval_errors_and_messages_out_of_order():
+    heard = []
+    with policy_servers.vla_eval(
+        lambda _: {"error": "observation_failed: KeyError"}, {"x": 1}, heard
+    ) as address:
+        wire = WebSocketWire(address, VlaEvalDialect(), SHORT)
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 4)], replan=None)
+        actor.reset(1)
+        with pytest.raises(ServerError, match="failed: observation_failed: KeyError"):
+            actor.act(observations(1, 0))
+        wire.close()
+
+    async def handler(socket):
+        async for data in socket:
+            message = VLA_EVAL.unpack(data)
+            kind = "hello" if message["type"] == "hello" else "action"
+            reply = {"type": kind, "payload": {}, "seq": 1, "timestamp": 0.0}
+            await socket.send(VLA_EVAL.pack(reply))
+
+    with policy_servers.web_socket(handler) as address:
+        wire = WebSocketWire(address, VlaEvalDialect(), SHORT)
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 4)])
+        actor.reset(1)
+        with pytest.raises(ServerError, match="sent action with seq 1; expected action with 3"):
+            actor.act(observations(1, 0))
+        wire.close()
+
+
+def test_groot_observations_of_many_simulations():
+    seen = []
+
+    def get_action(observation, options):
+        seen.append(observation)
+        states = np.concatenate([observation["state.x"], observation["state.y"]], -1)[:, 0]
+        return policy_servers.flat(np.stack([chunk(state, 8) for state in states]))
+
+    with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
+        wire = GrootWire(address, Limits(5, 5, 2))
+        assert wire.announced["video"]["modality_keys"] == ["image", "wrist_image"]
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=8)
+        actor.reset(3)
+        for step in range(9):
+            actions = actor.act(observations(3, step))
+            np.testing.assert_array_equal(actions[:, 0], [0, 2, 4])
+            assert (actions[:, 1] == 2 * (step // 8 * 8)).all() and (actions[:, 2] == 2 * (step % 8)).all()
+        wire.close()
+    assert [len(o["state.x"]) for o in seen] == [2, 1, 2, 1], "two simulations in a request"
+    assert seen[0]["video.image"].shape == (2, 1, 4, 4, 3) and seen[0]["video.image"].dtype == np.uint8
+    assert seen[0]["state.gripper"].shape == (2, 1, 2) and seen[0]["state.x"].dtype == np.float32
+    assert seen[0]["annotation.human.action.task_description"] == [TASK.language] * 2
+
+
+@pytest.mark.parametrize(
+    ("get_action", "message"),
+    [
+        (lambda **_: policy_servers.flat(np.full((1, 8, 7), np.inf)), r"not finite \(inf\)"),
+        (
+            lambda **_: policy_servers.flat(np.zeros((2, 8, 7))),
+            r"shapes \[\(2, 8, 1\)\]; expected \(1, H, 1\)",
+        ),
+        (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
+        (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
+        (lambda **_: "what?", "answered str without"),
+        (lambda **_: b"\xc1", "1 bytes that are no GR00T message"),
+        (lambda observation, options: {}["key"], r"failed \(get_action\): 'key'"),
+        (lambda **_: time.sleep(1), r"nothing within 0\.3 s \(get_action\)"),
+    ],
+)
+def test_groot_answers_that_are_not_valid_are_named(get_action, message):
+    with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
+        wire = GrootWire(address, Limits(5, 0.3))
+        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 0)], replan=2)
+        actor.reset(1)
+        with pytest.raises(ServerError, match=message):
+            actor.act(observations(1, 0))
+        wire.close()
+
+
+def test_groot_servers_of_other_embodiments_and_none_at_all():
+    with (
+        policy_servers.groot(policy_servers.groot_endpoints(None, state=["left_arm"])) as address,
+        pytest.raises(ServerError, match=r"state keys \['left_arm'\]; LIBERO's are x, y"),
+    ):
+        GrootWire(address, SHORT)
+    with pytest.raises(ServerError, match="no GR00T server at .* within 0.3 s"):
+        GrootWire(address, Limits(0.3, 1))

@@ -1,0 +1,307 @@
+"""Steps until a forgotten task is back: the measurement, its records, and what reports say."""
+
+import copy
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from libero_eval import relearning
+from libero_eval.cli.main import build_parser
+from libero_eval.relearning import (
+    FailureShare,
+    HeldOutError,
+    Lesson,
+    RelearnSettings,
+    error_on,
+    relearn,
+    steps_until,
+)
+from lifelong.algorithms import Sequential
+from lifelong.errors import ConfigError, LifelongError
+from lifelong.report.page import write_report
+from lifelong.results.log import ResultLog
+from lifelong.results.provenance import start_record
+from lifelong.results.records import RelearnRecord, from_line, to_line
+from lifelong.results.relearning import FILE_NAME, read_relearning, savings, savings_rows, savings_tables
+from lifelong.training.fit import fit
+from lifelong.training.settings import FitSettings
+from lifelong.types import Batch
+from tests.harness.fakes import LinearPolicy, Windows
+
+pytestmark = pytest.mark.unit
+FIT = FitSettings(epochs=1, batch_size=10, lr=0.05, warmup_steps=5, weight_decay=0.0, precision="fp32")
+SETTINGS = RelearnSettings(steps=200, every=5, tolerance=0.05, held_out=1)
+
+
+class Linear(LinearPolicy):
+    def predict(self, batch):
+        return self.linear(batch.observation.proprio["x"])
+
+
+def policy(seed: int = 0) -> Linear:
+    torch.manual_seed(seed)
+    return Linear()
+
+
+def learned(found: Linear, task: int, steps: int = 120) -> Linear:
+    fit(found, Windows(task), Sequential(), settings=replace(FIT, steps_per_epoch=steps), seed=(task,))
+    return found
+
+
+def lesson(error: float, task: int = 0) -> Lesson:
+    """A task that counts as back at an error of at most 1.05 times the given one."""
+    return Lesson(task, Windows(task), HeldOutError(held_out(task)), 1.05 * error)
+
+
+def held_out(task: int = 0) -> Batch:
+    return Windows(task).batch(torch.arange(20))
+
+
+def again(found: Linear, goal: Lesson, settings: RelearnSettings = SETTINGS):
+    return steps_until(found, goal, settings=settings, fit_settings=FIT, seed=(1, 5, 0))
+
+
+def test_a_task_is_back_at_the_first_measurement_within_the_tolerance() -> None:
+    then = error_on(learned(policy(), 0), held_out())
+    forgotten = learned(learned(policy(), 0), 1)
+    steps, errors = again(forgotten, lesson(then))
+    assert errors[0] > 1.05 * then, "it was forgotten"
+    assert errors[-1] <= 1.05 * then and all(error > 1.05 * then for error in errors[:-1])
+    assert steps == list(range(0, steps[-1] + 1, 5)) and 0 < steps[-1] < 200
+    assert error_on(forgotten, held_out()) == errors[-1], "training ended there"
+
+
+def test_what_is_not_forgotten_needs_no_step() -> None:
+    kept = learned(policy(), 0)
+    before = copy.deepcopy(kept.state_dict())
+    assert again(kept, lesson(error_on(kept, held_out())))[0] == [0]
+    assert all(torch.equal(value, before[name]) for name, value in kept.state_dict().items())
+
+
+def test_what_does_not_come_back_is_given_up() -> None:
+    steps, errors = again(policy(), lesson(0.0), replace(SETTINGS, steps=12))
+    assert steps == [0, 5, 10, 15] and errors[-1] > 0
+
+
+def test_the_same_call_gives_the_same_bits_and_touches_no_generator() -> None:
+    state = torch.random.get_rng_state()
+    assert again(policy(1), lesson(0.3)) == again(policy(1), lesson(0.3))
+    torch.random.set_rng_state(state)
+    again(copy.deepcopy(policy(1)), lesson(0.3))
+    torch.manual_seed(1)
+    expected = torch.rand(1)
+    torch.manual_seed(1)
+    again(learned(Linear(), 0, 2), lesson(10.0))
+    torch.manual_seed(1)
+    assert torch.equal(torch.rand(1), expected)
+
+
+def test_the_error_is_the_mean_absolute_one_and_the_mode_stays() -> None:
+    found, batch = policy(), Windows(0, size=300).batch(torch.arange(300))
+    expected = (found.predict(batch) - batch.actions).abs().mean().item()
+    assert error_on(found.train(), batch) == pytest.approx(expected, rel=1e-6)
+    assert found.training
+
+
+# --- records
+
+
+def record(
+    task: int, start: str, errors: tuple[float, ...], then: float = 0.1, rate: float = 1e-3, episodes: int = 0
+) -> RelearnRecord:
+    steps = tuple(range(0, 10 * len(errors), 10))
+    return RelearnRecord(
+        task=task,
+        start=start,
+        learned_error=then,
+        tolerance=0.05,
+        held_out=5 * (not episodes),
+        rate=rate,
+        steps=steps,
+        errors=errors,
+        seconds=1.0,
+        episodes=episodes,
+    )
+
+
+def test_savings_pair_the_starts_of_each_task() -> None:
+    records = [
+        record(0, "initial", (0.5, 0.4, 0.3, 0.2, 0.1)),
+        record(0, "final", (0.3, 0.1)),
+        record(1, "initial", (0.5, 0.1)),
+        record(1, "final", (0.3, 0.2, 0.1)),
+        record(2, "final", (0.1,)),
+        record(2, "initial", (0.5, 0.1), rate=1e-4),  # under other conditions
+        record(3, "final", (0.3, 0.2)),
+        record(3, "initial", (0.5, 0.1)),
+        record(4, "initial", (0.5, 0.1)),
+    ]
+    found = savings(records)
+    assert [(s.task, s.again, s.first, s.share) for s in found] == [
+        (0, 10, 40, 0.75),
+        (1, 20, 10, -1.0),
+        (2, 0, None, None),
+        (3, None, 10, None),
+    ]
+    assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
+    assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
+    assert savings_tables(records).count("\n") == 4
+
+
+def test_records_are_read_back_and_refuse_what_does_not_fit(tmp_path) -> None:
+    found = record(3, "final", (0.3, 0.2))
+    assert from_line(to_line(found)) == found and found.needed is None
+    assert record(3, "final", (0.3, 0.105)).needed == 10, "within the tolerance"
+    with pytest.raises(ValueError, match="2 steps have 1 errors"):
+        replace(found, errors=(0.3,))
+    assert read_relearning(tmp_path) == []
+
+
+def test_success_is_back_where_it_falls_short_by_the_tolerance_at_most() -> None:
+    def needed(then: float, *errors: float) -> int | None:
+        return record(0, "final", errors, then=then, episodes=20).needed
+
+    assert needed(0.1, 1.0, 0.15) == 10, "17 of 20 where it was 18"
+    assert needed(0.1, 1.0, 0.2) is None
+    assert needed(0.0, 1.0, 0.05) == 10, "a task without failures is back, too"
+    found = [record(0, "final", (0.9, 0.1), episodes=20), record(0, "initial", (1.0, 0.5, 0.1), episodes=20)]
+    assert savings_rows(found) == [("1", "90 %", "10 %", "10", "20", "50 %")]
+    text = savings_tables([record(0, "final", (0.3, 0.1)), *found])
+    assert text.index("error just learned") < text.index("success just learned")
+    assert [s.first for s in savings([record(0, "initial", (0.1,)), found[0]])] == [None], (
+        "measures do not mix"
+    )
+
+
+def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
+    names = ["a", "b"]
+    kinds = {"algo": "x", "benchmark": "y", "policy": "z", "seed": 1, "preset": ""}
+    ResultLog(tmp_path / "results.jsonl").append(
+        start_record(**kinds, tasks=names, instructions=names, config="")
+    )
+    before = (tmp_path / "results.jsonl").read_bytes()
+    assert "Relearning" not in write_report([tmp_path]).read_text(encoding="utf-8")
+    log = ResultLog(tmp_path / FILE_NAME)
+    log.append(record(0, "final", (0.3, 0.1)))
+    log.append(record(0, "initial", (0.5, 0.4, 0.1)))
+    log.append(record(0, "final", (0.75, 0.1), episodes=20))
+    page = write_report([tmp_path]).read_text(encoding="utf-8")
+    assert "<h2>Relearning</h2>" in page and "50 %" in page
+    assert "Error at the end" in page and "Success at the end" in page and "25 %" in page
+    assert (tmp_path / "results.jsonl").read_bytes() == before
+
+
+# --- the whole measurement
+
+
+def test_rollouts_are_those_of_the_run(monkeypatch) -> None:
+    called = {}
+
+    def rollout(found, env, states, **settings):
+        called.update(settings, policy=found, env=env, states=list(states))
+        return SimpleNamespace(rate=0.75)
+
+    protocol = SimpleNamespace(horizon=70, settle_steps=3, precision="fp32")
+    run = SimpleNamespace(
+        eval=protocol, learned_task=lambda k: f"task {k}", embed=str.upper, seed=9, device="cpu"
+    )
+    monkeypatch.setattr(relearning, "rollout", rollout)
+    measured = policy()
+    assert FailureShare(run, 2, "env", 4)(measured) == 0.25
+    assert called.pop("policy") is measured
+    assert (called["env"], called["states"], called["language"]) == ("env", [0, 1, 2, 3], "TASK 2")
+    assert (called["horizon"], called["settle_steps"], called["precision"]) == (70, 3, "fp32")
+
+
+@pytest.fixture
+def finished(tmp_path, monkeypatch):
+    """A finished run of three tasks: its folder, and the policies it would be restored with."""
+    ends = [learned(policy(), 0)]
+    for task in (1, 2):
+        ends.append(learned(copy.deepcopy(ends[-1]), task))
+
+    def restore(path: Path, *, after: int | None = None, **_):
+        end = ends[-1 if after is None else after]
+        return SimpleNamespace(
+            path=path,
+            tasks=("a", "b", "c"),
+            learned=len(ends) - 1,
+            stages=((0,), (1,), (2,)),
+            acting=lambda task: nullcontext(end),
+            device=torch.device("cpu"),
+            seed=1,
+        )
+
+    def read_config(*_):
+        return SimpleNamespace(build={"train": FIT}.get, values={"train": {}})
+
+    monkeypatch.setattr(relearning, "restore", restore)
+    monkeypatch.setattr(relearning, "read_config", read_config)
+    monkeypatch.setattr(relearning, "_windows", lambda run, task, *_: (Windows(task), held_out(task)))
+    return tmp_path, ends
+
+
+def outcome(path: Path) -> list[RelearnRecord]:
+    return [replace(r, seconds=0.0) for r in read_relearning(path)]
+
+
+def test_a_killed_measurement_goes_on_and_changes_nothing_else(finished, monkeypatch) -> None:
+    folder, ends = finished
+    before = copy.deepcopy([end.state_dict() for end in ends])
+    for part in ("whole", "killed"):
+        (folder / part).mkdir()
+    relearn(folder / "whole", policy(), settings=SETTINGS)
+    assert [(r.task, r.start) for r in outcome(folder / "whole")] == [
+        (task, start) for task in (0, 1) for start in ("final", "initial")
+    ]
+    for kept in (0, 1, 3):
+        with monkeypatch.context() as patch:
+            left, append = [kept - len(outcome(folder / "killed"))], ResultLog.append
+
+            def guarded(log, found, left=left, append=append) -> None:
+                if not left[0]:
+                    raise KeyboardInterrupt
+                left[0] -= 1
+                append(log, found)
+
+            patch.setattr(ResultLog, "append", guarded)
+            with pytest.raises(KeyboardInterrupt):
+                relearn(folder / "killed", policy(), settings=SETTINGS)
+    relearn(folder / "killed", policy(), settings=SETTINGS)
+    assert outcome(folder / "killed") == outcome(folder / "whole")
+    relearn(folder / "killed", policy(), settings=SETTINGS)
+    assert len(outcome(folder / "killed")) == 4, "nothing is measured twice"
+    relearn(folder / "killed", policy(), settings=replace(SETTINGS, tolerance=0.2), tasks=[0])
+    assert len(outcome(folder / "killed")) == 6, "under other settings it is"
+    for end, state in zip(ends, before, strict=True):
+        assert all(torch.equal(value, state[name]) for name, value in end.state_dict().items())
+
+
+def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(finished) -> None:
+    folder, _ = finished
+    with pytest.raises(LifelongError, match="has tasks 0 to 2; there is no task 7"):
+        relearn(folder, policy(), tasks=[7], settings=SETTINGS)
+    for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}, {"episodes": 51}):
+        with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
+            RelearnSettings(**change)
+    assert build_parser().parse_args(["relearn", str(folder), "--tasks", "0", "2"]).tasks == [0, 2]
+
+
+def test_the_options_of_the_command_default_to_the_settings() -> None:
+    args = build_parser().parse_args(["relearn", "run"])
+    assert (
+        RelearnSettings(args.steps, args.every, args.tolerance, args.held_out, args.episodes)
+        == RelearnSettings()
+    )
+
+
+def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:
+    folder, _ = finished
+    unfinished = SimpleNamespace(learned=0, tasks=("a", "b"))
+    monkeypatch.setattr(relearning, "restore", lambda *_, **__: unfinished)
+    with pytest.raises(LifelongError, match="is not finished: 1 of 2 tasks are learned"):
+        relearn(folder, policy(), settings=SETTINGS)

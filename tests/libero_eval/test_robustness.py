@@ -1,0 +1,140 @@
+"""What perturbations take: areas, where half is lost, interactions, the page."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.robustness.figures import curves_figure
+from libero_eval.robustness.page import Robustness, render, verdict, write_robustness
+from libero_eval.robustness.results import Condition, Outcomes, half_severity, name_of
+from lifelong.errors import ResultsError
+
+pytestmark = pytest.mark.unit
+
+TASKS, STARTS = ("libero_goal/0", "libero_goal/1"), tuple(range(10))
+A, B = (("camera", 0.5),), (("camera", 1.0),)
+C, BOTH = (("light", 1.0),), (("camera", 1.0), ("light", 1.0))
+
+
+def outcomes(rates: dict[Condition, int], starts: int = 10) -> Outcomes:
+    """Return outcomes in which each task's first starts succeed, `rates` of them."""
+    rows = [[[s < n for s in range(starts)] for _ in TASKS] for n in rates.values()]
+    return Outcomes(TASKS, tuple(range(starts)), tuple(rates), np.array(rows))
+
+
+def result(wins: int, starts: tuple[int, ...] = STARTS) -> EvaluationResult:
+    tasks = tuple(
+        TaskResult(name, name, "do it", starts, tuple(s < wins for s in starts), (5,) * len(starts))
+        for name in TASKS
+    )
+    return EvaluationResult({"run": "r"}, {}, starts, {}, tasks)
+
+
+def test_area_and_kept_are_those_of_the_trapezoids() -> None:
+    camera = outcomes({(): 10, A: 6, B: 0}).axes()[0]
+    assert camera.kind == "camera" and camera.severities == (0.0, 0.5, 1.0)
+    assert camera.area.value == pytest.approx((1 + 0.6) / 4 + (0.6 + 0) / 4)
+    assert camera.kept.value == pytest.approx(camera.area.value)
+    halved = outcomes({(): 5, A: 3, B: 0}).axes()[0]
+    assert halved.kept.value == pytest.approx(halved.area.value / 0.5)
+    assert camera.area.low < camera.area.value < camera.area.high
+
+
+@pytest.mark.parametrize(
+    ("rates", "half"),
+    [
+        ((1.0, 0.6, 0.4), 0.75),
+        ((1.0, 0.5, 0.5), 0.5),
+        ((0.8, 0.7, 0.6), math.inf),
+        ((0.8, 0.2, 0.8), 1 / 3),  # the first time
+        ((0.0, 0.0, 0.0), math.inf),  # nothing to lose
+    ],
+)
+def test_half_is_lost_where_the_line_first_falls_to_half(rates: tuple[float, ...], half: float) -> None:
+    assert half_severity((0.0, 0.5, 1.0), np.array(rates)) == pytest.approx(half)
+
+
+def test_a_kind_that_changes_nothing_has_no_p_value_to_speak_of_and_keeps_all() -> None:
+    axis = outcomes({(): 7, A: 7, B: 7}).axes()[0]
+    assert axis.kept.value == 1 and axis.p_value == 1 and axis.half.value == math.inf
+    assert axis.kept.high - axis.kept.low < 0.25, "paired starts leave no more than one episode's doubt"
+    assert axis.area.high - axis.area.low > axis.kept.high - axis.kept.low
+
+
+def test_a_kind_that_takes_everything_is_shown_to() -> None:
+    camera, light = outcomes({(): 10, A: 3, B: 0, C: 9}).axes()
+    assert (camera.kind, light.kind) == ("camera", "light"), "the most harmful first"
+    assert camera.p_value < 0.01 < light.p_value
+    assert camera.half.value == pytest.approx(0.5 / 0.7 * 0.5)
+
+
+def test_two_that_act_independently_have_no_excess() -> None:
+    rng = np.random.default_rng(0)
+    base, camera, light = (rng.random((2, 400)) < p for p in (0.9, 0.6, 0.5))
+    found = Outcomes(
+        TASKS,
+        tuple(range(400)),
+        ((), B, C, BOTH),
+        np.array([base, base & camera, base & light, base & camera & light]),
+    )
+    (pair,) = found.interactions()
+    assert pair.expected == pytest.approx(0.27, abs=0.05)
+    assert pair.excess.low < 0 < pair.excess.high and abs(pair.excess.value) < 0.04
+    worse = Outcomes(
+        found.tasks, found.starts, found.conditions, np.array([base, base & camera, base & light, base & 0])
+    )
+    assert worse.interactions()[0].excess.high < -0.2
+
+
+def test_a_pair_whose_parts_were_not_run_alone_at_the_same_severity_is_no_interaction() -> None:
+    assert not outcomes({(): 10, A: 6, C: 5, BOTH: 2}).interactions()
+
+
+def test_results_are_paired_by_task_and_start() -> None:
+    found = Outcomes.of({B: result(2), (): result(8)})
+    assert found.conditions == ((), B) and found.rates.tolist() == [0.8, 0.2]
+    with pytest.raises(ResultsError, match=r"camera=1 was not run in the same tasks and starts"):
+        Outcomes.of({(): result(8), B: result(2, tuple(range(1, 11)))})
+    with pytest.raises(ResultsError, match="without perturbations"):
+        Outcomes.of({B: result(2)})
+
+
+def test_the_page_and_the_text_say_the_same_numbers(tmp_path) -> None:
+    policy = Robustness(
+        "sequential",
+        outcomes({(): 10, A: 3, B: 0, C: 9, BOTH: 0}),
+        ("eval/a",),
+        {name_of(B): 2, name_of(C): 0},
+    )
+    expert = Robustness("expert", outcomes({(): 10, A: 10, B: 10, C: 10}))
+    page = write_robustness(
+        [policy, expert], tmp_path, units={"camera": "60 degrees"}, facts=[("suite", "libero_goal")]
+    )
+    text = page.read_text()
+    assert "Robustness of sequential" in text and "60 degrees" in text and text.count("<svg") == 2
+    assert "camera=1" in text and ">2</td>" in text, "draws that were given up are told"
+    assert "camera=1,light=1" in text, "so are interactions"
+    assert verdict(policy) in text.replace("&#39;", "'") and "camera" in verdict(policy)
+    lines = {line.split()[0]: line.split() for line in render(policy).splitlines() if line}
+    assert lines["camera"][1:4] == ["100", "30", "0"]
+    record = json.loads((tmp_path / "robustness.json").read_text())
+    camera = next(a for a in record["policies"][0]["axes"] if a["kind"] == "camera")
+    assert camera["area"]["value"] == pytest.approx(0.4) and camera["half"]["value"] is not None
+    assert np.array(record["policies"][0]["outcomes"]["camera=1"]).sum() == 0
+
+
+def test_the_legend_names_a_policy_that_was_not_measured_along_the_first_kind() -> None:
+    both = outcomes({(): 10, A: 3, B: 0, C: 9})
+    policies = {"a": Robustness("a", both).axes, "b": Robustness("b", outcomes({(): 10, C: 9})).axes}
+    assert policies["a"][0].kind == "camera"
+    legend = curves_figure(policies, {}).legends[0]
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
+
+
+def test_a_policy_that_never_succeeds_has_nothing_to_lose(tmp_path) -> None:
+    policy = Robustness("none", outcomes({(): 0, A: 0, B: 0}))
+    assert "nothing to lose" in verdict(policy)
+    assert write_robustness([policy], tmp_path, units={}).exists() and "none" in render(policy)

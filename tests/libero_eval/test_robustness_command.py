@@ -1,0 +1,122 @@
+"""`libero robustness` and the scripted expert as a policy."""
+
+import argparse
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from libero_eval.cli import robustness
+from libero_eval.cli.main import main
+from libero_eval.evaluation_file import EvaluationResult
+
+pytestmark = pytest.mark.sim
+
+POLICY = """
+import numpy as np
+
+
+class Still:
+    cameras, camera_size, observations = ("agentview",), (16, 16), ("rgb",)
+
+    def predict(self, observations):
+        return np.zeros((len(observations["agentview_rgb"]), 7))
+
+
+def make():
+    return Still()
+"""
+WORDS = [
+    "still_policy:make",
+    "--suite",
+    "libero_goal/1",
+    "--episodes",
+    "2",
+    "--horizon",
+    "2",
+    "--threads",
+    "1",
+]
+KINDS = ["--kinds", "noise", "robot", "--severities", "1", "0.5", "--pairs", "noise=0.5,robot=0.5"]
+
+
+@pytest.fixture
+def still(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "still_policy.py").write_text(POLICY)
+    return tmp_path
+
+
+def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> None:
+    assert main(["robustness", *WORDS, *KINDS, "--out", "found"]) == 0
+    said = capsys.readouterr().out
+    folders = sorted(path.parent.name for path in still.glob("found/conditions/*/eval.json"))
+    assert folders == ["noise=0.5", "noise=1", "none", "robot=0.5", "robot=0.5,noise=0.5", "robot=1"]
+    assert "6/6" in said and "nothing to lose" in said
+    record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
+    assert record["label"] == "still_policy:make" and len(record["axes"]) == 2
+    assert [pair["condition"] for pair in record["interactions"]] == ["robot=0.5,noise=0.5"]
+    assert "robot" in (still / "found" / "robustness.html").read_text()
+    for folder, perturb in (("none", None), ("robot=1", "robot=1")):
+        result = EvaluationResult.read(still / "found" / "conditions" / folder)
+        assert result.protocol["world"].get("perturb") == perturb and len(result.tasks[0].successes) == 2
+
+    before = {path: path.stat().st_mtime_ns for path in still.glob("found/conditions/*/units/*")}
+    assert main(["robustness", *WORDS, *KINDS, "--out", "found"]) == 0, "what is done is not run again"
+    assert before == {path: path.stat().st_mtime_ns for path in still.glob("found/conditions/*/units/*")}
+
+    assert main(["robustness", "--report", "first=found", "second=found", "--out", "both"]) == 0
+    assert "first" in (still / "both" / "robustness.html").read_text()
+    labels = [p["label"] for p in json.loads((still / "both" / "robustness.json").read_text())["policies"]]
+    assert labels == ["first", "second"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--kinds", "camra"], "Did you mean 'camera'"),
+        (["--severities", "2"], "--severities"),
+        (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),
+        (["--pairs", "noise=1"], "expected two perturbations"),
+        (["--beside", "other=nowhere"], "nowhere holds no finished conditions"),
+    ],
+)
+def test_mistakes_take_one_line_before_anything_is_run(still, words, told, capsys) -> None:
+    try:
+        status = main(["robustness", *WORDS, *words, "--out", "found"])
+    except SystemExit as ended:  # as argparse does
+        status = ended.code
+    assert status == 2
+    error = capsys.readouterr().err
+    assert told in error and len(error.strip().splitlines()[-1:]) == 1 and not (still / "found").exists()
+
+
+def test_default_kinds_and_pairs_exist() -> None:
+    from libero_env.perturbations import KINDS as ALL
+    from libero_env.perturbations import parse_perturbations
+
+    assert set(robustness.KINDS) <= set(ALL) and len(robustness.KINDS) == 12
+    for text in robustness.PAIRS:
+        pair = parse_perturbations(text)
+        assert {one.kind for one in pair} <= set(robustness.KINDS)
+        assert {one.severity for one in pair} <= set(robustness.SEVERITIES)
+
+
+def test_worker_processes_find_the_same_conditions() -> None:
+    """Arguments are pickled on their way to them; the default pairs of kinds that are not run are left out."""
+    args = argparse.Namespace(kinds=["noise"], severities=[0.4], pairs=robustness.PAIRS, perturb_seed=0)
+    found = robustness._conditions(args)
+    assert found == ["", "noise=0.4"] == robustness._conditions(pickle.loads(pickle.dumps(args)))
+
+
+def test_the_expert_is_a_policy_that_can_be_evaluated(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["eval", "expert", "--suite", "libero_goal/7", "--threads", "1", "--out"]
+    assert main([*words, "both", "--episodes", "2"]) == 0
+    both = EvaluationResult.read(tmp_path / "both")
+    assert both.evaluated["policy"] == "expert" and both.tasks[0].successes == (True, True)
+    assert main([*words, "one", "--episodes", "1"]) == 0
+    one = EvaluationResult.read(tmp_path / "one")
+    assert one.tasks[0].actions == both.tasks[0].actions[:1], "what it does does not depend on the batch"
+    assert np.all(np.array(both.tasks[0].lengths) < 120)

@@ -1,0 +1,112 @@
+"""Saliency maps against a policy whose input is known."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from libero_eval.saliency import SaliencySettings, contact_sheet, overlay, saliency, window_at
+from lifelong.data import fake_batch
+from lifelong.errors import ConfigError
+from lifelong.policies.base import Policy
+from lifelong.seeding import generator
+from lifelong.types import Batch, PolicySpec
+
+pytestmark = pytest.mark.unit
+SPEC = PolicySpec(image_size=(64, 96), proprio={"x": 2}, language_dim=3, seq_len=2)
+PATCH = (slice(20, 28), slice(60, 70))  # of the second camera
+
+
+class OnePatch(Policy):
+    """Returns the mean of one patch of one camera."""
+
+    def window_losses(self, batch: Batch) -> Tensor:
+        return (self.predict(batch) - batch.actions).square().mean((1, 2))
+
+    def predict(self, batch: Batch) -> Tensor:
+        assert not self.training
+        patch = batch.observation.images[:, :, 1, *PATCH].float().mean((2, 3, 4)) / 255
+        return patch[..., None].expand(-1, -1, 7)
+
+    def reset(self, num_envs: int) -> None: ...
+
+    def _act(self, observation, generators):
+        raise AssertionError("saliency does not act")
+
+
+def window() -> Batch:
+    """Noise to one side of the patch's middle, black to the other, so that blurring changes the patch's mean."""
+    batch = fake_batch(SPEC, 1, generator(0))
+    batch.observation.images[..., PATCH[0], 65:, :] = 255
+    batch.observation.images[..., PATCH[0], :60, :] = 0
+    return batch
+
+
+@pytest.mark.parametrize("measure", ["action", "loss"])
+def test_saliency_is_high_at_the_used_patch_and_zero_elsewhere(measure):
+    policy = OnePatch(SPEC).train()
+    settings = SaliencySettings(stride=8, sigma=4, blur=6)
+    heat = saliency(policy, window(), settings, measure=measure)
+    assert policy.training, "the mode stays"
+    assert heat.shape == (2, 64, 96) and heat.dtype == torch.float32 and (heat >= 0).all()
+    assert (heat[0] == 0).all(), "the other camera does not matter"
+    reach = 3 * 4 * 64 / 128 + 2 * 8 * 64 / 128  # of the mask, and of interpolation
+    ys, xs = torch.meshgrid(torch.arange(64), torch.arange(96), indexing="ij")
+    far = (ys < 20 - reach) | (ys > 27 + reach) | (xs < 60 - reach) | (xs > 69 + reach)
+    assert (heat[1][far] == 0).all() and far.float().mean() > 0.7
+    y, x = divmod(int(heat[1].argmax()), 96)
+    assert 18 <= y <= 29 and 56 <= x <= 73
+    assert heat[1].max() > (1e-5 if measure == "action" else 1e-4)
+
+
+def test_a_blurred_place_is_half_the_squared_difference_of_actions():
+    """Eq. 1 and 2 at one place, by hand in NumPy."""
+    policy, batch = OnePatch(SPEC).eval(), window()
+    settings = SaliencySettings(stride=128, sigma=40, blur=6)  # one place: the middle of the image
+    heat = saliency(policy, batch, settings)
+    image = batch.observation.images[0, -1, 1].numpy().astype(float)
+    sigma, blur = 20.0, 3.0
+    kernel = np.exp(-(np.arange(-9, 10) ** 2) / (2 * blur**2))
+    kernel /= kernel.sum()
+    padded = np.pad(image, ((9, 9), (9, 9), (0, 0)), mode="edge")
+    blurred = np.zeros_like(image)
+    for dy in range(19):
+        for dx in range(19):
+            blurred += kernel[dy] * kernel[dx] * padded[dy : dy + 64, dx : dx + 96]
+    centres = [(31.5, 23.5), (31.5, 71.5)]  # 96 wide: two places side by side
+    for (cy, cx), column in zip(centres, (0, 95), strict=True):
+        squares = (np.arange(64)[:, None] - cy) ** 2 + (np.arange(96) - cx) ** 2
+        mask = np.where(squares <= (3 * sigma) ** 2, np.exp(-squares / (2 * sigma**2)), 0)[..., None]
+        changed = np.round(image * (1 - mask) + blurred * mask)
+        difference = (image[PATCH].mean() - changed[PATCH].mean()) / 255
+        assert heat[1, 0, column].item() == pytest.approx(0.5 * 7 * difference**2, rel=1e-3)
+
+
+def test_invalid_batches_and_measures_are_refused():
+    policy = OnePatch(SPEC)
+    with pytest.raises(ConfigError, match="one window; this one has 2"):
+        saliency(policy, fake_batch(SPEC, 2, generator(0)))
+    with pytest.raises(ConfigError, match="valid: action, loss"):
+        saliency(policy, window(), measure="logits")
+    with pytest.raises(ConfigError, match="stride is 0"):
+        SaliencySettings(stride=0)
+
+
+def test_overlays_are_grey_where_saliency_is_zero():
+    draws = np.random.default_rng(0)
+    image = draws.integers(0, 256, (8, 8, 3), np.uint8)
+    heat = np.zeros((8, 8))
+    heat[2, 3] = 2.0
+    drawn = overlay(image, heat, strongest=2.0).astype(int)
+    plain = overlay(image, np.zeros((8, 8)), strongest=0.0).astype(int)
+    changed = np.abs(drawn - plain).sum(-1) > 0
+    assert changed[2, 3] and changed.sum() == 1
+    sheet = contact_sheet([image[None], image[None]], [heat[None], heat[None]], enlarge=3, gap=4)
+    assert sheet.shape == (2 * (3 * 8 + 4), 2 * (3 * 8 + 4), 3)
+    np.testing.assert_array_equal(sheet[2:26:3, 2:26:3], image)
+
+
+def test_windows_end_at_the_step():
+    frames = [{"x": torch.full((1, 1, 1), float(step))} for step in range(5)]
+    assert window_at(frames, 3, 2)["x"].flatten().tolist() == [2, 3]
+    assert window_at(frames, 1, 4)["x"].flatten().tolist() == [0, 1]

@@ -1,0 +1,305 @@
+"""Evaluation of policies on tasks: fixed initial states, resumption, user-defined policies."""
+
+import argparse
+import json
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero_env import memory
+from libero_eval.candidates import UserPolicy, load_callable
+from libero_eval.cli import main as cli
+from libero_eval.cli.evaluate import plan_eval
+from libero_eval.evaluation_file import EvaluationResult, overall
+from libero_eval.protocols.packaged import PROTOCOLS, choose_init_states
+from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
+from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
+from lifelong.results.metrics import wilson_interval
+from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate
+
+pytestmark = pytest.mark.unit
+MODULE = """
+import numpy as np
+
+class Policy:
+    cameras = ()
+    observations = ("proprioception", "ee_quat")
+    calls = []
+
+    def reset(self, instruction, num_envs):
+        self.calls.append((instruction, num_envs))
+
+    def predict(self, observations):
+        up = np.zeros((len(observations[{key!r}]), 7))
+        up[:, 2] = 1
+        return up
+
+def make():
+    return Policy()
+
+def nothing():
+    return object()
+"""
+
+
+def test_success_with_intervals_overall_and_by_task(tmp_path):
+    policy = Still()
+    result = evaluate(tmp_path, policy)
+    results = result.tasks
+    assert [r.successes for r in results] == [(True, True, True, False)] * 2
+    assert results[0].lengths == (3, 4, 9, 10) and results[0].steps == pytest.approx(16 / 3)
+    low, high = wilson_interval(3, 4)
+    assert (results[0].success.low, results[0].success.high) == (low, high)
+    assert set(policy.instructions) == {t.language for t in TASKS}
+    found = json.loads((tmp_path / "eval.json").read_text())
+    assert EvaluationResult.read(tmp_path) == result
+    assert found["success"]["value"] == 0.75
+    both = overall(results)
+    assert low < both.low < 0.75 < both.high < high, "two tasks tell more than one"
+    assert found["predicates"] == {"Turnon": 1.0, "On": 0.75}
+    assert found["init_states"] == [3, 4, 9, 20] and found["evaluated"] == {"policy": "still"}
+
+
+def test_tasks_with_results_are_not_evaluated_again(tmp_path):
+    first = evaluate(tmp_path, tasks=TASKS[:1])
+
+    def env(task, count):
+        assert task is TASKS[1], "the first task's results are on disk"
+        return Countdown(count)
+
+    assert evaluate(tmp_path, env=env).tasks[0] == first.tasks[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"identity": {"policy": "moving"}},
+        {"protocol": QUICK.changed({"episode.horizon": 11})},
+        {"init_states": (3, 4, 9, 21)},
+        {"versions": {"mujoco": "4"}},
+    ],
+    ids=lambda c: next(iter(c)),
+)
+def test_results_of_another_evaluation_are_not_mixed_in(tmp_path, changes):
+    evaluate(tmp_path)
+    name = {"identity": "evaluated.policy", "versions": "simulation.mujoco"}.get(*changes, *changes)
+    with pytest.raises(ConfigError, match=rf"another evaluation: {name}.* there and .* here.*--again"):
+        evaluate(tmp_path, **changes)
+
+
+def test_selection_and_reporting_states_are_disjoint():
+    chosen, reported = (choose_init_states(which, None, range(15)) for which in ("selection", "reporting"))
+    assert set(chosen).isdisjoint(reported) and set(chosen) | set(reported) == set(
+        choose_init_states("all", None)
+    )
+    assert len(chosen) == 15 and choose_init_states("reporting", 4, range(15)) == (15, 16, 17, 18)
+    assert choose_init_states("reporting", 2) == (0, 1) and len(choose_init_states("selection", None)) == 20
+    with pytest.raises(ConfigError, match="1 to 15"):
+        choose_init_states("selection", 16, range(15))
+    with pytest.raises(ConfigError, match="valid: all, selection, reporting"):
+        choose_init_states("test", None)
+
+
+def test_protocols_know_every_suite():
+    assert PROTOCOLS["openpi"].steps(TASKS[0]) == 300 and PROTOCOLS["libero"].steps(TASKS[0]) == 600
+
+
+def test_names_and_conventions_of_the_original():
+    frames = np.arange(2 * 3 * 4 * 3).reshape(2, 3, 4, 3)
+    found = as_original(
+        {"agentview_rgb": frames, "ee_quat": np.array([[1.0, 0, 0, 0]]), "other": np.zeros(2)}
+    )
+    np.testing.assert_array_equal(found["agentview_image"], frames[:, ::-1])
+    np.testing.assert_array_equal(found["robot0_eef_quat"], [[0, 0, 0, 1]])
+    assert "other" in found and set(ORIGINAL_NAMES) >= {"agentview_rgb", "ee_quat"}
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [(np.zeros((3, 6)), r"\(3, 6\); expected \(3, 7\)"), (np.full((3, 7), np.nan), "not finite")],
+)
+def test_invalid_actions_are_refused(answer, message):
+    policy = argparse.Namespace(predict=lambda observations: answer)
+    with pytest.raises(PolicyError, match=message):
+        CallableActor(policy, "do it", ()).act({"x": np.zeros((3, 1))})
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    (tmp_path / "my_own_policy.py").write_text(MODULE.replace("{key!r}", "'robot0_eef_pos'"))
+    monkeypatch.chdir(tmp_path)
+    yield "my_own_policy"
+    sys.modules.pop("my_own_policy", None)
+
+
+def test_a_policy_from_a_module_of_the_working_directory(module):
+    before = list(sys.path)
+    assert load_callable(f"{module}:make").calls == []
+    assert sys.path == before
+    for text, message in (
+        ("nowhere_at_all:make", "no module nowhere_at_all"),
+        (f"{module}:mend", "mend"),
+        (f"{module}:nothing", "predict"),
+    ):
+        with pytest.raises(LifelongError, match=message):
+            load_callable(text)
+
+
+@pytest.mark.sim
+def test_a_result_is_run_again_from_its_file(module, tmp_path, capsys):
+    command = ["eval", f"{module}:make", "--suite", "libero_goal/3", "--episodes", "2", "--horizon", "3"]
+    command += ["--protocol", "openpi", "--seed", "4", "--names", "original", "--threads", "1"]
+    assert cli.main([*command, "--out", "found"]) == 0
+    capsys.readouterr()
+    assert cli.main(["eval", "found/eval.json", "--threads", "1"]) == 2
+    assert f"--allow {module}" in capsys.readouterr().err, "a result may be somebody else's"
+    assert cli.main(["eval", "found/eval.json", "--threads", "1", "--allow", module]) == 0
+    first, again = EvaluationResult.read("found"), EvaluationResult.read("found/again")
+    assert (first.outcomes, first.actions) == (again.outcomes, again.actions)
+    assert (first.evaluated, first.protocol, first.init_states) == (
+        again.evaluated,
+        again.protocol,
+        again.init_states,
+    )
+    other = replace(first, versions={**first.versions, "mujoco": "3.0.0"})
+    other.write(tmp_path / "other" / "eval.json")
+    capsys.readouterr()
+    assert cli.main(["eval", "other/eval.json", "--allow", module]) == 2
+    assert "mujoco: 3.0.0 in the result" in (err := capsys.readouterr().err) and "--despite mujoco" in err
+    assert cli.main(["eval", "other", "--threads", "1", "--allow", module, "--despite", "mujoco"]) == 0
+    assert EvaluationResult.read("other/again").actions == first.actions
+
+
+@pytest.mark.sim
+def test_a_user_defined_policy_from_the_command_line(module, tmp_path, capsys):
+    command = ["eval", f"{module}:make", "--suite", "libero_object/3", "--episodes", "2", "--horizon", "3"]
+    command += ["--protocol", "openpi", "--out", "found", "--threads", "1"]
+    assert cli.main(command) == 0
+    printed = capsys.readouterr().out
+    assert "libero_object/3" in printed and "0/2" in printed and "mean over tasks" in printed
+    found = json.loads((tmp_path / "found" / "eval.json").read_text())
+    assert found["tasks"][0]["lengths"] == [3, 3] and found["protocol"]["episode"]["settle_steps"] == 10
+    calls = sys.modules[module].Policy.calls
+    assert calls == [(found["tasks"][0]["instruction"], 2)]
+    assert cli.main(command) == 0 and len(calls) == 1, "it is done"
+    assert cli.main([*command, "--again"]) == 0 and len(calls) == 2
+    assert cli.main([*command[:-4], "--out", "found", "--starts", "selection"]) == 2
+    assert "--again" in capsys.readouterr().err
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_path, capsys, monkeypatch):
+    command = ["eval", f"{module}:make", "--suite", "libero_object/3", "libero_goal/0", "--episodes", "5"]
+    command += ["--protocol", "openpi", "--horizon", "3", "--unit-starts", "2"]
+    assert cli.main([*command, "--out", "one"]) == 0
+    assert cli.main([*command, "--out", "two", "--workers", "2"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.count("libero_goal/0") == 2 and "6 of 6 units, 10 of 10 episodes" in printed.err
+    one, two = (EvaluationResult.read(tmp_path / name) for name in ("one", "two"))
+    assert one == two and one.actions == two.actions and one.unit_starts == 2
+    assert (one.environment["robot"], one.environment["models"]) == ("robosuite-1.4.1", "builtin")
+    assert cli.main([*command, "--out", "two", "--unit-starts", "5"]) == 2
+    assert "unit_starts is 2 there and 5 here" in capsys.readouterr().err
+    monkeypatch.setattr(memory, "available_memory", lambda: 10**9)
+    assert cli.main([*command, "--out", "three", "--workers", "3"]) == 2
+    assert "by 3 processes needs about 1.8 GB" in capsys.readouterr().err and not Path("three").exists()
+
+
+FEELING = """
+import numpy as np
+
+class Policy:
+    cameras, observations = (), ("proprioception", "ee_quat")
+
+    def predict(self, observations):
+        position = next(x for name, x in observations.items() if name in ("ee_pos", "robot0_eef_pos"))
+        return np.tanh(10 * np.concatenate([position, np.sin(1e6 * position), position[:, :1]], axis=1))
+
+def make():
+    return Policy()
+"""
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("protocol", ["libero", "openpi"])
+def test_a_unit_does_not_depend_on_those_before_it(protocol, tmp_path, monkeypatch):
+    """The actions depend on every bit of the position, and their digest is part of the result."""
+    (tmp_path / "feeling_policy.py").write_text(FEELING)
+    monkeypatch.chdir(tmp_path)
+    words = [
+        "eval",
+        "feeling_policy:make",
+        "--suite",
+        "libero_goal/0",
+        "--episodes",
+        "4",
+        "--unit-starts",
+        "2",
+    ]
+    plan = plan_eval(cli.build_parser().parse_args([*words, "--protocol", protocol, "--horizon", "5"]))
+    monkeypatch.delitem(sys.modules, "feeling_policy")
+    with plan.pool() as pool:
+        in_turn = [plan.evaluate(unit, pool).result for unit in plan.units]
+    with plan.pool() as pool:
+        alone = plan.evaluate(plan.units[1], pool).result
+    assert alone == in_turn[1] and len({*in_turn[0].actions, *in_turn[1].actions}) == 4
+
+
+def test_the_robot_of_an_evaluation_can_be_chosen(module):
+    words = ["eval", f"{module}:make", "--suite", "libero_object/3", "--robot"]
+    plan = plan_eval(cli.build_parser().parse_args([*words, "robosuite-1.4.1"]))
+    assert plan.protocol.world.robot == "robosuite-1.4.1"
+    with pytest.raises(ProtocolError, match="expected one of libero, robosuite-1.4.1"):
+        plan_eval(cli.build_parser().parse_args([*words, "panda"]))
+
+
+@pytest.mark.sim
+def test_at_sigterm_a_unit_is_given_back_and_the_same_command_goes_on(module, tmp_path, capsys, monkeypatch):
+    command = ["eval", f"{module}:make", "--suite", "libero_object/3", "--episodes", "2", "--horizon", "2"]
+    command += ["--protocol", "openpi", "--out", "found", "--unit-starts", "1"]
+    policy = load_callable(f"{module}:make")
+    asked = []
+
+    def predict(self, observations):
+        asked.append(1)
+        if len(asked) == 3:  # in the second unit
+            signal.raise_signal(signal.SIGTERM)
+        return np.zeros((1, 7))
+
+    monkeypatch.setattr(type(policy), "predict", predict)
+    assert cli.main(command) == 143
+    assert "found keeps what is done; the same command goes on" in capsys.readouterr().err
+    assert not list((tmp_path / "found" / "claims").iterdir())
+    assert len(list((tmp_path / "found" / "units").iterdir())) == 1
+    assert cli.main(command) == 0 and len(asked) == 5
+
+
+def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):
+    arguments = argparse.Namespace(policy=f"{module}:make", names=None)
+    first = UserPolicy(arguments).identity
+    assert first["policy"] == f"{module}:make" and len(first["source"]) == 16
+    file = tmp_path / f"{module}.py"
+    file.write_text(file.read_text() + "\nPolicy.identity = {'weights': '0123'}")
+    sys.modules.pop(module)
+    second = UserPolicy(arguments).identity
+    assert second["source"] != first["source"] and second["weights"] == "0123"
+
+
+def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
+    for argv, message in (
+        ([f"{module}:make"], "no tasks are given"),
+        (
+            [f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"],
+            "Did you mean 'openvla-oft'?",
+        ),
+        ([str(tmp_path / "no_run")], "no_run does not exist; give the directory of a run"),
+        ([str(tmp_path)], "no run directory"),
+    ):
+        assert cli.main(["eval", *argv]) == 2
+        err = capsys.readouterr().err
+        assert message in err and err.count("\n") == 1

@@ -1,0 +1,425 @@
+"""Units of work: every episode counts once, whoever runs it, whoever is killed, whatever the files hold."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.work.claims import Claims, this_machine
+from libero_eval.work.progress import busy_seconds, measure_progress
+from libero_eval.work.status import describe_status
+from libero_eval.work.units import Unit, partition
+from libero_eval.work.worker import Worker
+from libero_eval.work.workers import Crew
+from lifelong.errors import ConfigError, EvaluationIncompleteError, LifelongError, ResultsError
+from tests.harness.evaluations import TASKS, Countdown, Still, evaluate, evaluation
+
+pytestmark = pytest.mark.unit
+STARTS = (3, 4, 9, 20)
+TWO = {"unit_starts": 2}  # four units
+
+
+@pytest.fixture(autouse=True)
+def hasty(monkeypatch):
+    monkeypatch.setattr("libero_eval.work.worker.POLL", 0.01)
+
+
+class Raising(Still):
+    """Raises an error on some tasks, the first few times."""
+
+    def __init__(self, *tasks: int, times: int = 100, error: Exception | None = None):
+        super().__init__()
+        self.tasks, self.times, self.calls = {TASKS[i].language for i in tasks}, times, 0
+        self.error = error or RuntimeError("the socket is closed")
+
+    def predict(self, observations):
+        if observations["instruction"] in self.tasks and self.calls < self.times:
+            self.calls += 1
+            raise self.error
+        return super().predict(observations)
+
+
+def test_every_start_is_in_one_unit_and_units_do_not_depend_on_other_tasks():
+    units = partition(TASKS, range(50), 20)
+    assert [len(u.starts) for u in units] == [20, 20, 10] * 2
+    assert [i for u in units[:3] for i in u.starts] == list(range(50))
+    assert partition(TASKS[1:], range(50), 20) == units[3:]
+    assert units[1].name == "libero_goal_00_starts_20_39"
+    for starts, size in (((0, 1), 0), ((), 10), ((1, 1), 10)):
+        with pytest.raises(ConfigError):
+            partition(TASKS, starts, size)
+
+
+def test_the_result_is_the_same_however_episodes_are_divided(tmp_path):
+    whole = evaluate(tmp_path / "whole", unit_starts=4)
+    parts = evaluate(tmp_path / "parts", **TWO)
+    assert parts.tasks == whole.tasks and parts.outcomes == whole.outcomes and parts.actions == whole.actions
+    assert (whole.unit_starts, parts.unit_starts) == (4, 2)
+    assert len(list((tmp_path / "parts" / "units").iterdir())) == 4
+
+
+def test_processes_share_the_units_and_all_return_the_same(tmp_path):
+    counted, results = [], []
+
+    class Counting(Still):
+        def reset(self, instruction, num_envs):
+            counted.append((instruction, num_envs))
+
+    def work():
+        results.append(evaluate(tmp_path, Counting(), unit_starts=1))
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(counted) == 8, "no unit is run twice"
+    assert results[0] == results[1] == results[2] == EvaluationResult.read(tmp_path)
+    assert (
+        results[0].outcomes == evaluate(tmp_path.with_name(f"{tmp_path.name}_alone"), unit_starts=1).outcomes
+    )
+    assert not list((tmp_path / "claims").iterdir()) and not list(tmp_path.rglob("*.part"))
+
+
+def test_who_assembles_the_result_makes_no_difference(tmp_path):
+    evaluate(tmp_path, **TWO)
+    written = (tmp_path / "eval.json").read_bytes()
+    (tmp_path / "eval.json").unlink()
+    time.sleep(1.1)  # times have seconds
+    evaluate(tmp_path, **TWO)
+    assert (tmp_path / "eval.json").read_bytes() == written
+
+
+def test_an_open_environment_is_used_for_all_units_of_its_task(tmp_path):
+    built = []
+
+    def env(task, count):
+        built.append((task.id, count))
+        return Countdown(count)
+
+    evaluate(tmp_path, env=env, unit_starts=1)
+    assert built == [(task.id, 1) for task in TASKS]
+
+
+def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
+    plan, begun = evaluation(tmp_path, **TWO), []
+    plan.folder.join(plan.units)
+    plan.folder.claims.take(plan.units[0].name)
+
+    def env(task, count):
+        begun.append(task.id)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(tmp_path, env=env, **TWO)
+    assert begun == [TASKS[1].id]
+    assert list(plan.folder.held()) == [plan.units[0].name], "the other unit was given back"
+
+
+def test_a_process_that_does_not_wait_leaves_what_others_hold(tmp_path):
+    plan = evaluation(tmp_path)
+    claim = plan.folder.claims.take(plan.units[0].name)
+    assert Worker(plan).work(wait=False) is None
+    assert set(plan.folder.done(plan.units)) == {unit.name for unit in plan.units[1:]}
+    plan.folder.claims.release(claim)
+    assert Worker(plan).work(wait=False) == evaluate(tmp_path / "other")
+
+
+def test_tasks_are_announced_once_each_and_progress_is_that_of_all(tmp_path):
+    rows, lines = [], []
+    evaluate(tmp_path, tasks=TASKS[:1], **TWO)
+    Worker(evaluation(tmp_path, **TWO), on_result=rows.append, on_progress=lines.append).run()
+    assert [row.task for row in rows] == [task.id for task in TASKS]
+    last = lines[-1]
+    assert (last.done, last.units, last.episodes_done, last.episodes) == (4, 4, 8, 8)
+    assert last.per_hour > 0 and last.seconds_left == 0
+    assert str(last).startswith("4 of 4 units, 8 of 8 episodes, ")
+
+
+def test_the_speed_is_that_of_the_time_in_which_anybody_worked():
+    assert busy_seconds([(0, 10), (5, 15), (100, 110)]) == 25
+    assert busy_seconds([]) == 0
+    assert np.isnan(measure_progress({"a": 10}, {}).seconds_left)
+    assert str(measure_progress({"a": 10}, {}, running=2)) == "0 of 1 units, 0 of 10 episodes, 2 running"
+
+
+# --- claims
+
+
+def test_a_claim_is_held_until_it_is_released(tmp_path):
+    first, second = Claims(tmp_path), Claims(tmp_path)
+    claim = first.take("a")
+    assert claim.pid == os.getpid() and claim.machine == this_machine()
+    assert second.take("a") is None and list(second.held()) == ["a"]
+    with first.keeping(claim):
+        assert second.take("b") is not None
+    assert list(first.held()) == ["b"] and second.take("a") is not None
+
+
+def test_a_claim_of_a_killed_process_of_this_machine_is_taken_over_at_once(tmp_path):
+    code = f"from pathlib import Path\nfrom libero_eval.work.claims import Claims\n\
+Claims(Path({str(tmp_path)!r})).take('a')\nprint('taken', flush=True)\ninput()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout.readline() == b"taken\n"
+        assert Claims(tmp_path).take("a") is None
+        holder.kill()
+        while Claims(tmp_path).held():  # it has ended when it is a zombie, though nobody has waited for it
+            time.sleep(0.01)
+    assert Claims(tmp_path).take("a").pid == os.getpid()
+
+
+def of_another_machine(path: Path) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"machine": "elsewhere", "pid": 1}))
+
+
+def test_a_claim_of_another_machine_lasts_as_long_as_its_lease(tmp_path):
+    claims = Claims(tmp_path, lease=60)
+    claims.take("a")
+    of_another_machine(tmp_path / "a.json")
+    assert claims.take("a") is None
+    os.utime(tmp_path / "a.json", (time.time() - 50,) * 2)
+    assert claims.take("a") is None
+    os.utime(tmp_path / "a.json", (time.time() - 70,) * 2)
+    assert not claims.held() and claims.take("a").pid == os.getpid()
+
+
+def test_a_holder_keeps_its_claim_alive_and_notices_that_it_was_taken_over(tmp_path):
+    claims, beats = Claims(tmp_path, lease=0.4), []
+    claim = claims.take("a")
+    of_another_machine(tmp_path / "a.json")  # so that only the lease counts
+    found = claims.held()["a"].claim
+    with claims.keeping(found, on_beat=lambda: beats.append(1)):
+        time.sleep(1.0)
+        assert claims.take("a") is None and beats
+    assert claims.take("a"), "it was given back"
+    with claims.keeping(claim, on_beat=lambda: beats.append(1)):
+        pass
+    assert claims.held(), "what others hold is not given back"
+
+
+def test_a_claim_that_was_never_written_is_abandoned_after_the_lease(tmp_path):
+    claims = Claims(tmp_path, lease=60)
+    (tmp_path / "a.json").write_text("")
+    assert claims.take("a") is None and claims.held()["a"].claim is None
+    os.utime(tmp_path / "a.json", (time.time() - 70,) * 2)
+    assert claims.take("a")
+
+
+def test_a_unit_that_two_processes_run_counts_once(tmp_path):
+    one, other = evaluation(tmp_path, **TWO), evaluation(tmp_path, **TWO)
+    unit = one.units[0]
+    with one.pool() as pool:
+        found = one.evaluate(unit, pool)
+    one.folder.publish(unit, found)
+    other.folder.publish(unit, replace(found, result=replace(found.result, lengths=(1, 1))))
+    assert one.folder.done([unit])[unit.name].result == found.result
+    assert other.folder.done([unit])[unit.name].result == found.result, "the first one wins"
+
+
+# --- errors
+
+
+def test_a_unit_that_fails_once_is_tried_again_after_the_others(tmp_path):
+    said = []
+    policy = Raising(1, times=1)
+    result = Worker(evaluation(tmp_path, policy, **TWO), on_error=said.append).run()
+    assert result.outcomes == evaluate(tmp_path.with_name(f"{tmp_path.name}_alone"), **TWO).outcomes
+    assert len(said) == 1 and "attempt 1 ended with RuntimeError: the socket is closed" in said[0]
+    assert not list((tmp_path / "errors").iterdir())
+
+
+def test_units_that_fail_are_not_counted_and_the_others_are_kept(tmp_path):
+    with pytest.raises(EvaluationIncompleteError, match="2 of 4 units .*not counted.*socket is closed"):
+        evaluate(tmp_path, Raising(1), **TWO, retries=0)
+    assert not (tmp_path / "eval.json").exists()
+    entry = json.loads((tmp_path / "errors" / "libero_goal_01_starts_03_04.json").read_text())
+    assert "Traceback" in entry["errors"][0]["traceback"]
+    assert "error     libero_goal_01_starts_03_04, 1 attempts: RuntimeError" in describe_status(tmp_path)
+    policy = Still()
+    assert len(evaluate(tmp_path, policy, **TWO).tasks) == 2
+    assert set(policy.instructions) == {TASKS[1].language}, "the first task was kept"
+
+
+def test_a_policy_that_never_works_ends_the_evaluation_with_its_own_error(tmp_path):
+    policy = Raising(0, error=KeyError("agentview_image"))
+    with pytest.raises(KeyError, match="agentview_image"):
+        evaluate(tmp_path, policy, **TWO)
+    assert policy.calls == 1
+    assert not list((tmp_path / "claims").iterdir()), "it holds nothing any more"
+
+
+def test_errors_are_failures_only_where_the_protocol_says_so(tmp_path):
+    class Stumbling(Still):
+        def predict(self, observations):
+            if (observations["x"] < 0).any():
+                raise RuntimeError("lost the cup")
+            return super().predict(observations)
+
+    class Falling(Countdown):
+        def reset(self, *, seed=None, options=None):
+            obs, info = super().reset(seed=seed, options=options)
+            return {"x": np.where(self.goal == 9, -1.0, 0.0)[:, None]}, info
+
+    changes = {"env": lambda task, count: Falling(count), "unit_starts": 4}
+    with pytest.raises(RuntimeError, match="lost the cup"):
+        evaluate(tmp_path / "strict", Stumbling(), **changes)
+    result = evaluate(tmp_path / "lenient", Stumbling(), errors_are_failures=True, **changes)
+    assert [r.successes for r in result.tasks] == [(True, True, False, False)] * 2
+    assert result.tasks[0].errors == (None, None, "RuntimeError: lost the cup", None)
+    assert EvaluationResult.read(tmp_path / "lenient") == result
+    alone = evaluate(
+        tmp_path / "alone", Stumbling(), errors_are_failures=True, **changes | {"unit_starts": 1}
+    )
+    assert alone.outcomes == result.outcomes
+    with pytest.raises(RuntimeError, match="socket"):  # no episode has ever run: that is no failed one
+        evaluate(tmp_path / "down", Raising(0, 1), errors_are_failures=True)
+
+
+# --- bad input
+
+
+def test_a_unit_file_that_is_cut_off_or_from_another_evaluation_is_not_counted(tmp_path):
+    evaluate(tmp_path, **TWO)
+    path = tmp_path / "units" / "libero_goal_00_starts_03_04.json"
+    whole = path.read_text()
+    path.write_text(whole[:200])
+    with pytest.raises(LifelongError, match=r"starts_03_04\.json is not a valid result.*remove it"):
+        evaluate(tmp_path, **TWO)
+    path.write_text(whole.replace("libero-evaluation-unit/1", "libero-evaluation-unit/9"))
+    with pytest.raises(LifelongError, match="the format is 'libero-evaluation-unit/9'"):
+        evaluate(tmp_path, **TWO)
+    values = json.loads(whole)
+    path.write_text(json.dumps(values | {"digest": "0123"}))
+    with pytest.raises(ConfigError, match="another evaluation"):
+        evaluate(tmp_path, **TWO)
+    path.unlink()
+    evaluate(tmp_path, **TWO)
+    again = json.loads(path.read_text())
+    assert again["result"] == values["result"]
+
+
+def test_a_folder_of_an_earlier_version_or_of_something_else_is_refused(tmp_path):
+    (tmp_path / "old" / "tasks").mkdir(parents=True)
+    with pytest.raises(ConfigError, match="earlier version.*--again"):
+        evaluate(tmp_path / "old")
+    (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/7"}')
+    with pytest.raises(ConfigError, match="libero-evaluation-plan/7"):
+        evaluate(tmp_path)
+    (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/1"}')
+    with pytest.raises(LifelongError, match="it is broken; name another folder"):
+        evaluate(tmp_path)
+    with pytest.raises(LifelongError, match="holds no evaluation"):
+        describe_status(tmp_path / "old")
+
+
+def test_every_difference_to_the_evaluation_of_the_folder_is_named(tmp_path):
+    evaluate(tmp_path, **TWO)
+    with pytest.raises(
+        ConfigError, match=r"init_states is \[3, 4, 9, 20\] there and \[3\] here; unit_starts is 2"
+    ):
+        evaluate(tmp_path, init_states=(3,), unit_starts=1)
+    with pytest.raises(ConfigError, match="policy_threads is null there and 2 here"):
+        evaluate(tmp_path, policy_threads=2, **TWO)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultsError, match=r"file/eval.*cannot be written.*Not a directory"):
+        evaluate(tmp_path / "file" / "eval")
+
+
+def test_a_full_disk_counts_nothing_and_the_same_command_goes_on(tmp_path, monkeypatch):
+    """The limit on the size of files makes writing fail as a full disk does: in the middle of the file."""
+    resource = pytest.importorskip("resource")
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    class Filling(Still):
+        def predict(self, observations):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+            return super().predict(observations)
+
+    try:
+        with pytest.raises(ResultsError, match="cannot be written, it is not counted.*too large"):
+            evaluate(tmp_path, Filling(), **TWO)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    assert not list((tmp_path / "units").iterdir()) and not list((tmp_path / "claims").iterdir())
+    assert (
+        evaluate(tmp_path, **TWO).outcomes
+        == evaluate(tmp_path.with_name(f"{tmp_path.name}_alone"), **TWO).outcomes
+    )
+
+
+def test_repeating_is_refused_while_others_work(tmp_path):
+    evaluate(tmp_path, **TWO)
+    folder = evaluation(tmp_path, **TWO).folder
+    folder.claims.take("libero_goal_00_starts_03_04")
+    with pytest.raises(ConfigError, match="works on libero_goal_00_starts_03_04; end it"):
+        folder.clear()
+    (tmp_path / "claims" / "libero_goal_00_starts_03_04.json").unlink()
+    (tmp_path / "videos").mkdir()
+    folder.clear()
+    assert [path.name for path in tmp_path.iterdir()] == ["videos"]
+
+
+def test_the_status_says_who_holds_what_and_what_is_left(tmp_path):
+    plan = evaluation(tmp_path, **TWO)
+    plan.folder.join(plan.units)
+    with plan.pool() as pool:
+        plan.folder.publish(plan.units[0], plan.evaluate(plan.units[0], pool))
+    assert "stopped" in describe_status(tmp_path)
+    plan.folder.claims.take(plan.units[1].name)
+    text = describe_status(tmp_path)
+    assert "1 of 4 units, 2 of 8 episodes" in text and "policy    policy still" in text
+    assert f"running   {plan.units[1].name} by " in text and f":{os.getpid()}, seen 0 s ago" in text
+
+
+def test_what_processes_measured_differently_is_listed(tmp_path):
+    plan = evaluation(tmp_path, **TWO)
+    plan.folder.join(plan.units)
+    with plan.pool() as pool:
+        for i, unit in enumerate(plan.units):
+            found = plan.evaluate(unit, pool)
+            changed = {**found.environment, "instruction_set": "AVX2" if i else "AVX512"}
+            plan.folder.publish(unit, replace(found, environment=changed))
+    result = evaluate(tmp_path, **TWO)
+    assert result.environment["instruction_set"] == ["AVX512", "AVX2"]
+    assert isinstance(result.environment["policy_threads"], int)
+
+
+# --- further processes
+
+
+@pytest.mark.slow
+def test_a_killed_process_is_replaced_while_there_is_progress(capfd):
+    with pytest.raises(KeyboardInterrupt), Crew(1, time.sleep, 600) as crew:
+        for deaths in range(1, 5):
+            (pid,) = crew.pids
+            os.kill(pid, signal.SIGKILL)
+            while crew.pids == [pid]:
+                time.sleep(0.01)
+            crew.tend(done=0)
+            assert len(crew.pids) == (deaths <= 3), "the fourth without progress is not replaced"
+        assert capfd.readouterr().err.count("another is started") == 3
+        raise KeyboardInterrupt
+    with Crew(1, time.sleep, 0) as crew:
+        while crew.pids:
+            time.sleep(0.01)
+        crew.tend(done=0)
+        assert crew.pids == [], "it has ended by itself"
+
+
+def test_units_are_plain_values():
+    unit = Unit(TASKS[0], (1, 2))
+    assert asdict(unit)["starts"] == (1, 2) and hash(unit) == hash(Unit(TASKS[0], (1, 2)))
