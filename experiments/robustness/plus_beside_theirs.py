@@ -26,7 +26,7 @@ from liberoplus.liberoplus.envs.bddl_base_domain import TASK_MAPPING
 from PIL import Image
 
 from libero_env.assets.arena import workspace_of_problem
-from libero_env.sim.corruptions import corrupt
+from libero_env.perturbations.corruptions import corrupt
 from libero_env.tasks import bddl
 from libero_env.tasks.published.plus_id import NOISES, POSES, parse_plus_id
 from libero_env.tasks.published.plus_values import camera_pose, joint_pose

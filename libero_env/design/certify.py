@@ -23,7 +23,6 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
-from libero_env.init_states.store import scene_digest
 from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.sim.scene import build_scene
 from libero_env.storage import atomic_write_text
@@ -241,7 +240,7 @@ def _environment(task: Task, pack: Pack) -> tuple[BatchEnv, Shapes]:
 def _digest(task: Task, pack: Pack, disturb: bool) -> str:
     """Return a digest of the task, its scene, and the versions of expert and MuJoCo, 16 hexadecimal digits."""
     try:
-        scene = scene_digest(build_scene(task.problem, pack))
+        scene = build_scene(task.problem, pack).digest
     except MissingPackageError:
         raise  # it concerns all tasks
     except LiberoError as error:

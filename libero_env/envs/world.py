@@ -118,7 +118,7 @@ class World:
         goal = self.task.problem.goal
         self.goals = make_goals(goal, self.atoms, self.views, config.semantics, self.simulations)
 
-    @property
+    @cached_property
     def init_states(self) -> np.ndarray:
         """Stored initial states of `base_task`, rows as of `libero_env.init_states.generate_init_states`."""
         return load_init_states(self.base_task, self.base_scene)

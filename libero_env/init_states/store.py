@@ -95,7 +95,7 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
     Raises:
         LiberoError: The states of the package were made for another model, or their file is damaged.
     """
-    task, digest = task.start_task, scene_digest(scene)
+    task, digest = task.start_task, scene.digest
     packaged = packaged_states(task.suite).get(task.name)
     if packaged is not None and (packaged[0] == digest or scene.pack.name == BUILTIN):
         if packaged[0] != digest:
@@ -167,7 +167,7 @@ def cache_init_states(task: Task) -> Path:
     """Return the file with the initial states of a task that the package has none of; they are generated once."""
     scene = build_scene(task.problem)
     load_init_states(task, scene)
-    return _cached_path(task, scene_digest(scene))
+    return _cached_path(task, scene.digest)
 
 
 def _cached_path(task: Task, digest: str) -> Path:
@@ -200,28 +200,12 @@ def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
 
 def _generate(task: Task) -> tuple[np.ndarray, str]:
     scene = build_scene(task.problem)
-    return generate_init_states(task, scene), scene_digest(scene)
+    return generate_init_states(task, scene), scene.digest
 
 
 def shipped_path(suite: str) -> Path:
     """Return the file of the package with the initial states of a suite."""
     return Path(str(resources.files("libero_env"))) / "tasks" / "init_states" / f"{suite}.npz"
-
-
-def scene_digest(scene: Scene) -> str:
-    """Return a digest, 16 hex digits, of what initial states depend on: joints, shapes and masses of entities."""
-    model = scene.model
-    parts: list[tuple] = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
-    for name, item in scene.entities.items():
-        if item.digest:
-            parts.append((name, item.digest))
-        for body in scene.bodies[name]:
-            for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
-                if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
-                    values = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
-                    parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in values)))
-            parts.append((name, f"{model.body_mass[body]:.6f}"))
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
 @lru_cache(maxsize=8)

@@ -6,9 +6,9 @@ import numpy as np
 
 from libero_env.assets.arena import workspace_of_problem
 from libero_env.perturbations.channels import ObservationChannel, ObservationFilter
+from libero_env.perturbations.corruptions import corrupt
 from libero_env.perturbations.drawing import DrawKey
 from libero_env.perturbations.starts import RobotJoints, StartChange
-from libero_env.sim.corruptions import corrupt
 from libero_env.sim.look import CameraView, Look
 from libero_env.tasks.published.plus_values import camera_pose, joint_pose
 from libero_env.tasks.published.task import PublishedTask
@@ -20,7 +20,7 @@ _PICTURE = f"{CAMERA}_rgb"
 
 @dataclass(frozen=True)
 class Corruption(ObservationFilter):
-    """Noise on the pictures of `agentview`, drawn anew for each, see `libero_env.sim.corruptions`.
+    """Noise on the pictures of `agentview`, drawn anew for each, see `libero_env.perturbations.corruptions`.
 
     LIBERO-Plus' code leaves the first picture after an initial state is set without noise; here it has it too.
 

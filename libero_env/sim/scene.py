@@ -5,6 +5,7 @@ that states of the original have the same layout. The poses of fixtures belong t
 `Simulations` has them.
 """
 
+import hashlib
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
@@ -106,6 +107,22 @@ class Scene:
                 if (body := int(model.site_bodyid[site])) in bodies:
                     owners[model.site(site).name] = tuple(j for j in own if model.jnt_bodyid[j] == body)
         return owners
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest, 16 hex digits, of what initial states depend on: joints, shapes and masses of entities."""
+        model = self.model
+        parts: list[tuple] = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
+        for name, item in self.entities.items():
+            if item.digest:
+                parts.append((name, item.digest))
+            for body in self.bodies[name]:
+                for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+                    if model.geom_contype[g] and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
+                        values = (*model.geom_size[g], *model.geom_pos[g], *model.geom_quat[g])
+                        parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in values)))
+                parts.append((name, f"{model.body_mass[body]:.6f}"))
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def owner(self, address: str) -> str | None:
         """Return the object or fixture of a name or of a region's address; None if it belongs to neither."""

@@ -221,8 +221,8 @@ def test_stored_initial_states_are_reproducible():
 
 def test_initial_states_of_another_model_are_an_error(monkeypatch):
     task = get_suite("libero_object").tasks[4]
-    scene = build_scene(task.problem)
-    monkeypatch.setattr(init_states, "scene_digest", lambda scene: "0" * 16)
+    scene = dataclasses.replace(build_scene(task.problem))
+    monkeypatch.setitem(vars(scene), "digest", "0" * 16)
     with pytest.raises(LiberoError, match="libero tasks init-states libero_object"):
         load_init_states(task, scene)
 

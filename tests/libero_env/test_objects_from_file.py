@@ -21,7 +21,6 @@ from libero_env.design.objects.collision import (
 )
 from libero_env.design.objects.mesh_file import bounds, is_closed, merge_vertices, read_mesh, signed_volume
 from libero_env.errors import LiberoError
-from libero_env.init_states.store import scene_digest
 from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
@@ -305,7 +304,7 @@ def test_what_is_kept_of_a_scene_depends_on_the_files(tmp_path):
             scene="floor", objects=["brick"], place={"brick": (0, 0)}, goal="Up brick_1", language="x"
         )
         build_scene.__globals__["_build_scene"].cache_clear()
-        return scene_digest(build_scene(task.problem))
+        return build_scene(task.problem).digest
 
     (tmp_path / "brick.xml").write_text(ORIGINAL)
     place = add_object(tmp_path / "brick.xml").folder

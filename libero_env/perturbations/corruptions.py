@@ -14,6 +14,7 @@ Images of other sizes, for which that code ends with an error, have fog of their
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from scipy import ndimage
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.parallel import compiled
@@ -88,8 +89,7 @@ def _zoom(image: np.ndarray, level: int, rng: np.random.Generator) -> np.ndarray
     own = (image / 255.0).astype(np.float32)
     total, factors = np.zeros_like(own), np.arange(1, last, step)
     for factor in factors:
-        rows, columns = (_sampling(side, float(factor)) for side in image.shape[:2])
-        _add_sampled(total, own, *rows, *columns)
+        total += _enlarged(own, float(factor))
     return _levels((own + total) / (len(factors) + 1))
 
 
@@ -132,67 +132,17 @@ def _levels(image: np.ndarray) -> np.ndarray:
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
     """Return an image (H, W, 3) float64 after a Gaussian filter whose edges repeat."""
-    radius = int(_TRUNCATE * sigma + 0.5)
-    weights = np.exp(-0.5 / (sigma * sigma) * np.arange(-radius, radius + 1) ** 2)
-    weights = (weights / weights.sum())[radius:]
-    down = np.empty_like(image)
-    _filter_rows(image, weights, down)
-    across = np.empty_like(image)
-    _filter_rows(down.transpose(1, 0, 2), weights, across.transpose(1, 0, 2))
-    return across
+    return ndimage.gaussian_filter(image, (sigma, sigma, 0), mode="nearest", truncate=_TRUNCATE)
 
 
-@compiled
-def _filter_rows(image: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
-    """Filter an image (H, W, 3) along its first axis with a symmetric kernel, given from its middle on."""
-    height, width, channels = image.shape
-    for row in range(height):
-        for column in range(width):
-            for channel in range(channels):
-                total = image[row, column, channel] * weights[0]
-                for k in range(len(weights) - 1, 0, -1):
-                    above, below = max(row - k, 0), min(row + k, height - 1)
-                    total += (image[above, column, channel] + image[below, column, channel]) * weights[k]
-                out[row, column, channel] = total
-
-
-def _sampling(side: int, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return where an enlarged image is sampled along an axis.
-
-    Returns:
-        Indices of the pixels, (side,), and the weights of each and the next one, (side, 2).
-    """
-    kept = int(np.ceil(side / factor))
-    enlarged = round(kept * factor)
-    first, trimmed = (side - kept) // 2, (enlarged - side) // 2
-    place = np.arange(trimmed, trimmed + side) * ((kept - 1) / (enlarged - 1))
-    low = np.floor(place)
-    weights = np.stack([1.0 - (place - low), 1.0 - (1.0 - (place - low))], axis=1)
-    weights[place > kept - 1] = 0.0  # beyond the last pixel by the last bit, which counts as outside
-    return first + low.astype(np.int64), weights
-
-
-@compiled
-def _add_sampled(
-    total: np.ndarray,
-    image: np.ndarray,
-    rows: np.ndarray,
-    row_weights: np.ndarray,
-    columns: np.ndarray,
-    column_weights: np.ndarray,
-) -> None:
-    """Add samples of an image (H, W, 3) float32 between its pixels to another."""
-    height, width, channels = image.shape
-    for i in range(height):
-        row, below = rows[i], min(rows[i] + 1, height - 1)
-        for j in range(width):
-            column, right = columns[j], min(columns[j] + 1, width - 1)
-            for c in range(channels):
-                value = image[row, column, c] * row_weights[i, 0] * column_weights[j, 0]
-                value += image[row, right, c] * row_weights[i, 0] * column_weights[j, 1]
-                value += image[below, column, c] * row_weights[i, 1] * column_weights[j, 0]
-                value += image[below, right, c] * row_weights[i, 1] * column_weights[j, 1]
-                total[i, j, c] += np.float32(value)
+def _enlarged(image: np.ndarray, factor: float) -> np.ndarray:
+    """Return the middle of an image (H, W, 3), enlarged to its size."""
+    sides = np.array(image.shape[:2])
+    kept = np.ceil(sides / factor).astype(int)
+    (top, left), (height, width) = (sides - kept) // 2, kept
+    large = ndimage.zoom(image[top : top + height, left : left + width], (factor, factor, 1), order=1)
+    (top, left), (height, width) = (large.shape[:2] - sides) // 2, sides
+    return large[top : top + height, left : left + width]
 
 
 def _plasma(side: int, decay: float, rng: np.random.Generator) -> np.ndarray:
