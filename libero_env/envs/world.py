@@ -30,7 +30,6 @@ from libero_env.sim.observations import is_of_joints, make_observer
 from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
-from libero_env.tasks.problem import atoms_of
 from libero_env.tasks.published.task import require_available
 from libero_env.validation import validate
 from libero_env.validation.messages import shown
@@ -113,8 +112,8 @@ class World:
             cameras=config.cameras,
             camera_size=config.camera_size,
         )
-        self.atoms = tuple(a for a in atoms_of(self.task.problem.goal) if all(map(self._exists, a.args)))
-        self.atom_names = tuple(f"({a.predicate} {' '.join(a.args)})" for a in self.atoms)
+        self.atoms = tuple(a for a in self.task.problem.goal.atoms() if all(map(self._exists, a.args)))
+        self.atom_names = tuple(map(str, self.atoms))
         goal = self.task.problem.goal
         self.goals = make_goals(goal, self.atoms, self.views, config.semantics, self.simulations)
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from libero_env.expert.arm.kinematics import limit_elbow_extension
 from libero_env.expert.arm.servo import OPEN
-from libero_env.expert.planning.goal_plan import JOINT_STATES, Step, plan_goal
+from libero_env.expert.planning.goal_plan import Step, plan_goal
 from libero_env.expert.planning.pick_planner import is_graspable
 from libero_env.expert.shapes import Shapes
 from libero_env.expert.skills.drag import Drag
@@ -13,6 +13,7 @@ from libero_env.expert.skills.move_joint import MoveJoint
 from libero_env.expert.skills.pick_place import PickPlace
 from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import MotionStyle
+from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 
@@ -104,8 +105,8 @@ class Expert:
 
     def _skill_for(self, step: Step, view: StateView, shapes: Shapes) -> Skill:
         atom, style = step.atom, self.style
-        if atom.predicate in JOINT_STATES:
-            return MoveJoint(atom.args[0], JOINT_STATES[atom.predicate], style=style)
+        if atom.predicate.lower() in OPPOSITE_STATES:
+            return MoveJoint(atom.args[0], atom.predicate.lower(), style=style)
         container = DropIntoContainer.find_container(view, shapes, atom)
         if container is not None:
             return DropIntoContainer(atom, container, style=style, shapes=shapes)

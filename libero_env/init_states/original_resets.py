@@ -18,7 +18,7 @@ import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_to_mat
-from libero_env.objects.model import ObjectModel, rest_quat
+from libero_env.objects.model import OPPOSITE_STATES, ObjectModel, rest_quat
 from libero_env.sim.scene import Scene
 from libero_env.tasks.problem import Atom, Region
 
@@ -26,7 +26,6 @@ _ARM_JOINTS = 7
 _MAX_TRIES = 5000  # of one object, as in the original
 _MAX_RESETS = 100  # for one episode: the original repeats a reset whose objects do not fit, without end
 _LIFT = 0.01  # [m] of objects over their surface, and of fixtures over the underside of the table top
-_JOINT_STATES = ("Open", "Close", "Turnon", "Turnoff")
 _WITHIN_BOUNDS = (
     "libero_tabletop",
     "libero_floor",
@@ -203,7 +202,7 @@ class _Plan:
         joints: list[Atom] = []
         items, on, within, on_objects = list[_Item](), list[_Item](), list[_Item](), list[_Item]()
         for atom in scene.problem.init:
-            if atom.predicate in _JOINT_STATES:
+            if atom.predicate.lower() in OPPOSITE_STATES:
                 joints.append(atom)
             elif len(atom.args) == 2:
                 item = _item(scene, atom)

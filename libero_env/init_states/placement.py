@@ -9,8 +9,7 @@ import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_to_mat
-from libero_env.objects.model import ROOT_BODY
-from libero_env.sim.model_checks import STATES
+from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY
 from libero_env.sim.scene import ROBOT, Scene, fixture_pose, initial_qpos
 from libero_env.tasks.problem import Atom, Region
 
@@ -156,7 +155,7 @@ def _place_of(scene: Scene, atom: Atom) -> Place:
         if region is not None and region.target in targets:
             return Place(region.target, region, atom.predicate == "In")
     raise PlacementError(
-        f"init atom ({atom.predicate} {' '.join(atom.args)}) cannot be placed; expected On or In, and as the place "
+        f"init atom {atom} cannot be placed; expected On or In, and as the place "
         f"{scene.workspace_name}_<region>, an object, a fixture, or a named site of one"
     )
 
@@ -173,7 +172,8 @@ def _sample_fixtures(scene: Scene, rng: np.random.Generator) -> np.ndarray:
 def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) -> None:
     """Sample the joints that init atoms require to be open, closed, turned on or off."""
     for atom in scene.problem.init:
-        if (state := STATES.get(atom.predicate)) is None:
+        state = atom.predicate.lower()
+        if state not in OPPOSITE_STATES:
             continue
         owner = scene.owner(atom.args[0])
         ranges = scene.entities[owner].articulation if owner is not None else {}

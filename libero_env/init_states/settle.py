@@ -104,7 +104,7 @@ def start_faults(view: StateView) -> list[str]:
         else:
             is_true = evaluate(atom, view)
         if not is_true:
-            faults.append(f"({atom.predicate} {' '.join(atom.args)}) does not hold")
+            faults.append(f"{atom} does not hold")
     if evaluate(view.scene.problem.goal, view):
         faults.append("the goal holds already")
     return faults

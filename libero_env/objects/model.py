@@ -11,6 +11,9 @@ from libero_env.geometry import quat_from_axis_angle
 ROOT_BODY = "main"
 GLOW_GROUP = 2  # geom group of sites that are visible only while their object is turned on
 
+OPPOSITE_STATES = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}
+"""State of joints -> the state at the other end; the predicate of a state is its name, capitalised."""
+
 
 @dataclass(frozen=True)
 class ObjectModel:

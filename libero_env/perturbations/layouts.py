@@ -11,7 +11,7 @@ from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.drawing import direction
 from libero_env.perturbations.starts import carried, contacts, shifted
 from libero_env.sim.scene import Scene
-from libero_env.tasks.problem import Atom, Problem, Region, atoms_of
+from libero_env.tasks.problem import Atom, Problem, Region
 from libero_env.tasks.task import Task
 
 _DIRECTIONS = 200  # tries for each object
@@ -44,7 +44,7 @@ def move_layout(metres: float, rng: np.random.Generator, task: Task, scene: Scen
 
 def _groups(problem: Problem) -> list[list[str]]:
     """Return the objects that stand on the workspace and are moved; those of a group by the same."""
-    roots, atoms = carried(problem), atoms_of(problem.goal)
+    roots, atoms = carried(problem), problem.goal.atoms()
     taken = [atom.args[0] for atom in atoms if atom.args[0] in problem.objects]
     counts = Counter(problem.objects.values())
     if any(

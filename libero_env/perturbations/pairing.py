@@ -17,7 +17,7 @@ from libero_env.perturbations.drawing import DrawKey
 from libero_env.perturbations.starts import contacts, posed
 from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.scene import Scene, zone_boxes
-from libero_env.tasks.problem import Problem, Region, atoms_of
+from libero_env.tasks.problem import Problem, Region
 
 _GAP = 0.02  # [m] between a new object and what is there, seen from above
 _LIFT = 0.001  # [m] above the surface, from where it settles
@@ -140,7 +140,7 @@ class Pairing:
         for name in self.scene.entities:
             if name not in self.added:
                 yield from self._boxes(row, name)
-        for atom in atoms_of(self.scene.problem.goal):
+        for atom in self.scene.problem.goal.atoms():
             region = self.scene.problem.region(atom.args[-1])
             if region is not None and region.ranges and region.target == self.scene.workspace_name:
                 for centre, half in zone_boxes(region, self.scene.workspace):

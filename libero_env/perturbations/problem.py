@@ -18,7 +18,7 @@ from libero_env.perturbations.layouts import move_layout
 from libero_env.perturbations.starts import carried
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
-from libero_env.tasks.problem import Atom, Problem, Region, atoms_of
+from libero_env.tasks.problem import Atom, Problem, Region
 from libero_env.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -82,11 +82,7 @@ def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -
     """Return the task with others in the place of objects that neither goal nor instruction are about."""
     problem = task.problem
     used = {
-        n
-        for atom in atoms_of(problem.goal)
-        for arg in atom.args
-        for n in problem.objects
-        if arg.startswith(n)
+        n for atom in problem.goal.atoms() for arg in atom.args for n in problem.objects if arg.startswith(n)
     }
     free = _unnamed(task, scene)
     roots = carried(problem)

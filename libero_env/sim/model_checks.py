@@ -4,20 +4,13 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from libero_env.tasks.checks import ProblemError, spell
-from libero_env.tasks.problem import atoms_of
+from libero_env.objects.model import OPPOSITE_STATES
+from libero_env.tasks.checks import ProblemError
 from libero_env.tasks.problem_types import Fault
 from libero_env.validation import suggest
 
 if TYPE_CHECKING:
     from libero_env.sim.scene import Scene
-
-STATES = {
-    "Open": "open",
-    "Close": "close",
-    "Turnon": "turnon",
-    "Turnoff": "turnoff",
-}  # of joints, by predicate
 
 
 def check_models(scene: "Scene") -> None:
@@ -33,7 +26,7 @@ def check_models(scene: "Scene") -> None:
 def _check_sites(scene: "Scene") -> None:
     """Check that a region in an atom, which has no rectangle, is a site of its target's model."""
     problem, model = scene.problem, scene.model
-    for atom in (*problem.init, *atoms_of(problem.goal)):
+    for atom in (*problem.init, *problem.goal.atoms()):
         for region in filter(None, map(problem.region, atom.args)):
             if region.ranges or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address) >= 0:
                 continue
@@ -48,11 +41,11 @@ def _check_sites(scene: "Scene") -> None:
 
 def _check_states(scene: "Scene") -> None:
     """Check that what a goal wants open or turned on has a range for that state, if it has a joint at all."""
-    for i, atom in enumerate(atoms_of(scene.problem.goal)):
-        state, owner = STATES.get(atom.predicate), scene.owner(atom.args[0]) if atom.args else None
-        if state is None or owner is None or not scene.joints.get(atom.args[0]):
+    for i, atom in enumerate(scene.problem.goal.atoms()):
+        state, owner = atom.predicate.lower(), scene.owner(atom.args[0]) if atom.args else None
+        if state not in OPPOSITE_STATES or owner is None or not scene.joints.get(atom.args[0]):
             continue
         if state not in (known := scene.entities[owner].articulation):
-            what = f"{spell(atom)}: the state {state!r} of a {scene.entities[owner].category} is not defined"
+            what = f"{atom}: the state {state!r} of a {scene.entities[owner].category} is not defined"
             fault = Fault("no-joint", what, f"one of {', '.join(sorted(known)) or 'no state'}", ":goal", i)
             raise ProblemError(fault, scene.problem.language)

@@ -4,7 +4,7 @@ By default their semantics are the original's: objects are points (the origin of
 box is |R size|, and being on a region of the table needs no contact. `semantics="strict"` requires more; see `STRICT`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -162,7 +162,7 @@ def register_predicate(name: str, predicate: Predicate) -> None:
 
 
 def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:
-    """Return the truth of a goal in a state.
+    """Return whether a goal holds in a state.
 
     Args:
         expression: Goal or atom.
@@ -173,24 +173,23 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
         UnknownNameError: A predicate, object or region does not exist.
         LiberoError: A predicate does not apply to the entity, such as opening a plate.
     """
-    match expression:
-        case Atom(predicate, args):
-            table = SEMANTICS[semantics]
-            if predicate not in table:
-                raise UnknownNameError("predicate", predicate, table)
-            return table[predicate](view, *args)
-        case And(parts):
-            return all(evaluate(part, view, semantics) for part in parts)
-        case Or(parts):
-            return any(evaluate(part, view, semantics) for part in parts)
-        case Not(part):
-            return not evaluate(part, view, semantics)
-        case ForAll(variables, body):
-            return all(
-                evaluate(_bind(body, binding), view, semantics)
-                for binding in _bindings(variables, view.scene)
-            )
-    raise TypeError(f"not a goal: {expression!r}")
+
+    def holds(node: Expression, parts: Iterator[bool]) -> bool:
+        match node:
+            case Atom(predicate, args):
+                table = SEMANTICS[semantics]
+                if predicate not in table:
+                    raise UnknownNameError("predicate", predicate, table)
+                return table[predicate](view, *args)
+            case Or():
+                return any(parts)
+            case Not():
+                return not next(parts)
+            case ForAll(variables, body):
+                return all(_bind(body, binding).fold(holds) for binding in _bindings(variables, view.scene))
+        return all(parts)
+
+    return expression.fold(holds)
 
 
 def glowing_sites(view: StateView) -> set[int]:
@@ -257,16 +256,10 @@ def state_bound(model: ObjectModel, state: str, opposite: str) -> tuple[float, b
 
 def ground(expression: Expression, scene: Scene) -> Expression:
     """Return a goal with quantifiers replaced by conjunctions over the objects of a scene."""
-    match expression:
-        case And(parts):
-            return And(tuple(ground(part, scene) for part in parts))
-        case Or(parts):
-            return Or(tuple(ground(part, scene) for part in parts))
-        case Not(part):
-            return Not(ground(part, scene))
-        case ForAll(variables, body):
-            return And(tuple(ground(_bind(body, one), scene) for one in _bindings(variables, scene)))
-    return expression
+    if isinstance(expression, ForAll):
+        bindings = _bindings(expression.variables, scene)
+        return And(tuple(ground(_bind(expression.body, binding), scene) for binding in bindings))
+    return expression.map(lambda part: ground(part, scene))
 
 
 def _bindings(variables: tuple[tuple[str, str], ...], scene: Scene) -> list[dict[str, str]]:
@@ -280,15 +273,6 @@ def _bindings(variables: tuple[tuple[str, str], ...], scene: Scene) -> list[dict
 
 def _bind(expression: Expression, binding: Mapping[str, str]) -> Expression:
     """Replace variables by the names of objects."""
-    match expression:
-        case Atom(predicate, args):
-            return Atom(predicate, tuple(binding.get(arg, arg) for arg in args))
-        case And(parts):
-            return And(tuple(_bind(part, binding) for part in parts))
-        case Or(parts):
-            return Or(tuple(_bind(part, binding) for part in parts))
-        case Not(part):
-            return Not(_bind(part, binding))
-        case ForAll(variables, body):
-            return ForAll(variables, _bind(body, binding))
-    raise TypeError(f"not a goal: {expression!r}")
+    if isinstance(expression, Atom):
+        return Atom(expression.predicate, tuple(binding.get(arg, arg) for arg in expression.args))
+    return expression.map(lambda part: _bind(part, binding))

@@ -17,12 +17,12 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import UnknownNameError
+from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.scene import zone_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
 REWARDS = ("sparse", "staged")
-_OPPOSITE = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}
 _REACH_WEIGHT, _MOVE_WEIGHT = 0.3, 0.6
 _BEST_WITHOUT_SUCCESS = 0.99
 
@@ -75,7 +75,7 @@ def atom_progress(view: StateView, atom: Atom) -> float:
     if kind in ("on", "in", "stack", "incontact") and len(atom.args) == 2:
         moved = position_of(view, atom.args[0])
         done = _closeness(moved, position_of(view, atom.args[1]))
-    elif kind in _OPPOSITE and len(atom.args) == 1:
+    elif kind in OPPOSITE_STATES and len(atom.args) == 1:
         moved, done = position_of(view, atom.args[0]), joint_progress(view, atom.args[0], kind)
     elif kind == "up" and len(atom.args) == 1:
         moved = position_of(view, atom.args[0])
@@ -114,9 +114,9 @@ def joint_progress(view: StateView, address: str, state: str) -> float:
     owner = view.scene.owner(address)
     ranges: Mapping[str, tuple[float, float]] = view.scene.entities[owner].articulation if owner else {}
     values = np.array(list(view.joint_positions(address).values()))
-    if state not in ranges or _OPPOSITE[state] not in ranges or not values.size:
+    if state not in ranges or OPPOSITE_STATES[state] not in ranges or not values.size:
         return 0.0
-    required, opposite = np.array(ranges[state]), np.array(ranges[_OPPOSITE[state]])
+    required, opposite = np.array(ranges[state]), np.array(ranges[OPPOSITE_STATES[state]])
     # The far end of the opposite range, and the near end of the required one.
     start = opposite[np.abs(opposite - required.mean()).argmax()]
     end = required[np.abs(required - opposite.mean()).argmin()]

@@ -35,7 +35,7 @@ from libero_env.tasks import bddl
 from libero_env.tasks.builder import KEYS, build_problem, language_from_name
 from libero_env.tasks.checks import faults
 from libero_env.tasks.expansion import EMPTY, expand, is_placement, model_regions, workspace_of
-from libero_env.tasks.problem import Problem, atoms_of
+from libero_env.tasks.problem import Problem
 from libero_env.tasks.source import Source, Trace
 from libero_env.tasks.task import Task, check_name
 from libero_env.validation import suggest
@@ -167,10 +167,10 @@ def _problem(expanded: dict[str, Any], source: Source, trace: Trace) -> Problem:
         expanded["goal"] = goal[0]
     problem = build_problem({}, expanded)
     for fault in faults(problem):
-        parts = {":init": problem.init, ":goal": atoms_of(problem.goal)}.get(fault.section, ())
+        parts = {":init": problem.init, ":goal": problem.goal.atoms()}.get(fault.section, ())
         label = str(fault.part)
         if isinstance(fault.part, int) and fault.part < len(parts):
-            label = " ".join((parts[fault.part].predicate, *parts[fault.part].args))
+            label = str(parts[fault.part])[1:-1]
         where = trace.at(label, _SECTIONS.get(fault.section, ""))
         raise InvalidInputError(f"{where}: {fault.what}; expected {fault.expected}")
     return problem

@@ -116,8 +116,8 @@ def write(problem: Problem) -> str:
             _block(":scene_properties", [f"(:{k} {v})" for k, v in problem.scene_properties.items()])
         )
     sections += [
-        _block(":init", map(_expression_text, problem.init)),
-        _block(":goal", [_expression_text(problem.goal)]),
+        _block(":init", map(str, problem.init)),
+        _block(":goal", [str(problem.goal)]),
     ]
     return f"(define (problem {problem.name})\n" + "\n".join(sections) + "\n)\n"
 
@@ -143,20 +143,6 @@ def _region_text(region: Region) -> str:
 
 def _numbers(values: tuple[float, ...]) -> str:
     return f"({' '.join(repr(float(value)) for value in values)})"
-
-
-def _expression_text(node: Expression) -> str:
-    match node:
-        case Atom(predicate, args):
-            return f"({' '.join((predicate, *args))})"
-        case And(parts) | Or(parts):
-            return f"({' '.join((type(node).__name__, *map(_expression_text, parts)))})"
-        case Not(part):
-            return f"(Not {_expression_text(part)})"
-        case ForAll(variables, body):
-            names = " ".join(f"{name} - {category}" for name, category in variables)
-            return f"(ForAll ({names}) {_expression_text(body)})"
-    raise TypeError(f"not a goal expression: {node!r}")
 
 
 class _Reader:

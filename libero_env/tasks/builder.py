@@ -29,7 +29,7 @@ from typing import Any
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.storage import parse_yaml
 from libero_env.tasks import bddl
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Problem, Region
+from libero_env.tasks.problem import And, Expression, Problem, Region
 from libero_env.tasks.sexpr import number
 
 KEYS = (
@@ -140,17 +140,8 @@ def language_from_name(name: str) -> str:
 def entities_in_goal(goal: Expression, regions: Iterable[Region], *declared: Iterable[str]) -> list[str]:
     """Return the declared names that a goal refers to, in the order declared; for a region its target."""
     targets = {region.address: region.target for region in regions}
-    named = {targets.get(name, name) for name in _arguments(goal)}
+    named = {targets.get(name, name) for atom in goal.atoms() for name in atom.args}
     return [name for names in declared for name in names if name in named]
-
-
-def _arguments(node: Expression) -> Iterable[str]:
-    if isinstance(node, Atom):
-        return node.args
-    if isinstance(node, ForAll):
-        return _arguments(node.body)
-    parts = (node.part,) if isinstance(node, Not) else node.parts
-    return [name for part in parts for name in _arguments(part)]
 
 
 def _sites(regions: Mapping[str, Any] | None) -> dict[str, Any]:

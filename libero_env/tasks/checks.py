@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sized
 
 from libero_env.errors import InvalidInputError
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, Region, atoms_of
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, Region
 from libero_env.tasks.problem_types import Fault, type_faults
 from libero_env.tasks.signatures import KINDS
 
@@ -55,7 +55,7 @@ def faults(problem: Problem) -> Iterator[Fault]:
     yield from _names(problem)
     for region in problem.regions:
         yield from _numbers(region)
-    used = {name for atom in (*problem.init, *atoms_of(problem.goal)) for name in atom.args}
+    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args}
     for region in problem.regions:
         if region.address in used:
             yield from _target(problem, region)
@@ -83,11 +83,6 @@ def kind_of(problem: Problem, name: str) -> str:
     if category := problem.fixtures.get(name):
         return "workspace" if category in WORKSPACES else "fixture"
     return "region" if name not in problem.objects and problem.region(name) is not None else "object"
-
-
-def spell(atom: Atom) -> str:
-    """Return an atom as task files contain it."""
-    return f"({' '.join((atom.predicate, *atom.args))})"
 
 
 def article(kind: str) -> str:
@@ -188,7 +183,7 @@ def _atom(problem: Problem, atom: Atom, bound: frozenset[str], section: str, ind
     """Check number and kinds of the arguments of an atom."""
     kinds = KINDS.get(atom.predicate)
     if kinds is not None and len(atom.args) != len(kinds):
-        what = f"{spell(atom)} has {_count(atom.args)}"
+        what = f"{atom} has {_count(atom.args)}"
         yield Fault("arity", what, f"{len(kinds)}: {atom.predicate} takes {_count(kinds)}", section, index)
         return
     for i, name in enumerate(atom.args):
@@ -199,11 +194,9 @@ def _atom(problem: Problem, atom: Atom, bound: frozenset[str], section: str, ind
         kind = "object" if name in bound else kind_of(problem, name)
         if kinds is not None and kind not in kinds[i]:
             allowed = " or ".join(article(k) for k in sorted(kinds[i]))
-            yield Fault(
-                "kind", f"{spell(atom)}: {name} is {article(kind)}", f"{allowed} there", section, index
-            )
+            yield Fault("kind", f"{atom}: {name} is {article(kind)}", f"{allowed} there", section, index)
     if kinds is not None and len(atom.args) == 2 and atom.args[0] == atom.args[1]:
-        yield Fault("kind", f"{spell(atom)} is of {atom.args[0]} and itself", "two names", section, index)
+        yield Fault("kind", f"{atom} is of {atom.args[0]} and itself", "two names", section, index)
 
 
 def _count(names: Sized) -> str:
@@ -230,7 +223,7 @@ def _places(problem: Problem) -> Iterator[Fault]:
             seen.add(name)
             name = on[name]
         if name == atom.args[0] and name in seen and atom.args[0] != atom.args[1]:
-            what = f"{spell(atom)} places it, by way of others, on itself"
+            what = f"{atom} places it, by way of others, on itself"
             yield Fault("placed-in-a-circle", what, "one of them on the workspace", ":init", i)
 
 

@@ -1,7 +1,10 @@
 """The dataclass `Problem`, its parts, and the comparison of two problems."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from typing import TypeVar
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -29,44 +32,111 @@ class Region:
         return f"{self.target}_{self.name}"
 
 
+class Expression:
+    """A condition on a state: an atom, or one made of other conditions. As a text it is as in task files."""
+
+    @property
+    def children(self) -> "tuple[Expression, ...]":
+        """Conditions that it is made of."""
+        return ()
+
+    def map(self, function: "Callable[[Expression], Expression]") -> "Expression":
+        """Return the same condition made of what a function returns for each child; an atom is returned as it is."""
+        return self
+
+    def fold(self, function: "Callable[[Expression, Iterator[Value]], Value]") -> Value:
+        """Return what a function makes of a node and of the values of its children, which are computed when asked for.
+
+        Args:
+            function: Function of a node and its children's values, called from the leaves upwards.
+        """
+        return function(self, (child.fold(function) for child in self.children))
+
+    def atoms(self) -> "tuple[Atom, ...]":
+        """Return all atoms, in reading order."""
+        return tuple(atom for child in self.children for atom in child.atoms())
+
+    def __str__(self) -> str:
+        return f"({' '.join((type(self).__name__, *map(str, self.children)))})"
+
+
 @dataclass(frozen=True)
-class Atom:
+class Atom(Expression):
     """A predicate applied to names, such as `On butter_1 floor_bin_region`; its predicate is capitalised."""
 
     predicate: str
     args: tuple[str, ...]
 
+    def atoms(self) -> "tuple[Atom, ...]":
+        """Return the atom itself."""
+        return (self,)
+
+    def __str__(self) -> str:
+        return f"({' '.join((self.predicate, *self.args))})"
+
+
+class _Several(Expression):
+    """A node with any number of children."""
+
+    parts: tuple[Expression, ...]
+
+    @property
+    def children(self) -> tuple[Expression, ...]:
+        return self.parts
+
+    def map(self, function: Callable[[Expression], Expression]) -> Expression:
+        return type(self)(tuple(map(function, self.parts)))
+
 
 @dataclass(frozen=True)
-class And:
-    """Conjunction: true if all parts are true."""
+class And(_Several):
+    """Conjunction: holds if all parts hold."""
 
-    parts: "tuple[Expression, ...]"
-
-
-@dataclass(frozen=True)
-class Or:
-    """Disjunction: true if any part is true."""
-
-    parts: "tuple[Expression, ...]"
+    parts: tuple[Expression, ...]
 
 
 @dataclass(frozen=True)
-class Not:
-    """Negation: true if the part is false."""
+class Or(_Several):
+    """Disjunction: holds if any part holds."""
 
-    part: "Expression"
+    parts: tuple[Expression, ...]
 
 
 @dataclass(frozen=True)
-class ForAll:
-    """Quantifier: true if the body is true for each object of the categories; variables are (`?name`, category)."""
+class Not(Expression):
+    """Negation: holds if the part does not."""
+
+    part: Expression
+
+    @property
+    def children(self) -> tuple[Expression, ...]:
+        """The part."""
+        return (self.part,)
+
+    def map(self, function: Callable[[Expression], Expression]) -> Expression:
+        """Return the negation of what a function returns for the part."""
+        return Not(function(self.part))
+
+
+@dataclass(frozen=True)
+class ForAll(Expression):
+    """Quantifier: holds if the body holds for each object of the categories; variables are (`?name`, category)."""
 
     variables: tuple[tuple[str, str], ...]
-    body: "Expression"
+    body: Expression
 
+    @property
+    def children(self) -> tuple[Expression, ...]:
+        """The body."""
+        return (self.body,)
 
-Expression = Atom | And | Or | Not | ForAll
+    def map(self, function: Callable[[Expression], Expression]) -> Expression:
+        """Return the quantifier with what a function returns for the body."""
+        return ForAll(self.variables, function(self.body))
+
+    def __str__(self) -> str:
+        variables = " ".join(f"{name} - {category}" for name, category in self.variables)
+        return f"(ForAll ({variables}) {self.body})"
 
 
 @dataclass(frozen=True)
@@ -110,18 +180,6 @@ class Problem:
         return next((region for region in self.regions if region.address == address), None)
 
 
-def atoms_of(expression: Expression) -> tuple[Atom, ...]:
-    """Return all atoms of a goal, in reading order."""
-    match expression:
-        case Atom():
-            return (expression,)
-        case And(parts) | Or(parts):
-            return tuple(atom for part in parts for atom in atoms_of(part))
-        case Not(part) | ForAll(_, part):
-            return atoms_of(part)
-    raise TypeError(f"not a goal: {expression!r}")
-
-
 def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
     """Return the differences in meaning of two problems, one line each; empty if they describe the same task.
 
@@ -142,7 +200,7 @@ def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
         "obj_of_interest": (set(a.obj_of_interest), set(b.obj_of_interest)),
         "scene_properties": (dict(a.scene_properties), dict(b.scene_properties)),
         "init": (set(a.init), set(b.init)),
-        "goal": (_meaning(a.goal), _meaning(b.goal)),
+        "goal": (a.goal.fold(_meaning), b.goal.fold(_meaning)),
     }
     found = [f"{what}: {x} is not {y}" for what, (x, y) in pairs.items() if x != y]
     regions_a, regions_b = ({region.address: region for region in p.regions} for p in (a, b))
@@ -158,15 +216,11 @@ def same_meaning(a: Problem, b: Problem) -> bool:
     return not differences(a, b)
 
 
-def _meaning(node: Expression) -> object:
-    match node:
-        case And(parts) | Or(parts):
-            return type(node).__name__, frozenset(map(_meaning, parts))
-        case Not(part):
-            return "Not", _meaning(part)
-        case ForAll(variables, body):
-            return "ForAll", variables, _meaning(body)
-    return node
+def _meaning(node: Expression, parts: Iterator[object]) -> object:
+    """Return a value that is equal for nodes with the same parts in any order."""
+    if isinstance(node, Atom):
+        return node
+    return type(node).__name__, getattr(node, "variables", ()), frozenset(parts)
 
 
 def _same_region(x: Region, y: Region, tolerance: float) -> bool:

@@ -28,7 +28,7 @@ from libero_env.geometry import Pose, rotation_between, surface_points
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.regions import contains, is_over, region_boxes
 from libero_env.tasks import get_suite, get_task
-from libero_env.tasks.problem import And, Atom, Not, Or, atoms_of
+from libero_env.tasks.problem import And, Atom, Not, Or
 
 X_AXIS = np.array([1.0, 0.0, 0.0])
 NOTHING = np.zeros((0, 3))
@@ -206,7 +206,7 @@ def test_every_goal_of_a_suite_has_a_plan(suite, view_of):
         seen.add(task.problem.goal)
         view = view_of(task.id)
         atoms = {step.atom for step in plan_goal(task.problem.goal, view)}
-        assert {atom for atom in atoms_of(task.problem.goal) if not evaluate(atom, view)} <= atoms
+        assert {atom for atom in task.problem.goal.atoms() if not evaluate(atom, view)} <= atoms
 
 
 @pytest.mark.sim

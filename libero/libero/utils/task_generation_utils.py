@@ -21,7 +21,6 @@ from libero_env.assets.arena import WORKSPACES
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks.bddl import parse
 from libero_env.tasks.builder import entities_in_goal
-from libero_env.tasks.problem import atoms_of
 
 # Errors in user-defined scenes and tasks; each is reported for its task alone.
 _FAULTS: tuple[type[Exception], ...] = (LiberoError, ArithmeticError, AttributeError, LookupError)
@@ -123,7 +122,7 @@ def bddl_text(task: TaskInfoTuple) -> str:
     for category in [*problem.fixtures.values(), *problem.objects.values()]:
         if category not in categories:
             raise UnknownNameError("object category", category, categories)
-    for atom in [*problem.init, *atoms_of(problem.goal)]:
+    for atom in [*problem.init, *problem.goal.atoms()]:
         get_predicate_fn(atom.predicate)
     return text
 

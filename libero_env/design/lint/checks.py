@@ -17,8 +17,8 @@ from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
 from libero_env.tasks.authoring import FILE
 from libero_env.tasks.builder import language_from_name
-from libero_env.tasks.checks import faults, kind_of, spell
-from libero_env.tasks.problem import Problem, atoms_of
+from libero_env.tasks.checks import faults, kind_of
+from libero_env.tasks.problem import Problem
 from libero_env.tasks.sexpr import List, Word, parse_tree
 
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
@@ -159,25 +159,23 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
 
 def _check_atoms(report: Report, problem: Problem) -> None:
     """Check that predicates exist, and that fixtures stand in regions of the workspace."""
-    atoms = zip(
-        (*problem.init, *atoms_of(problem.goal)), (*report.lines.init, *report.lines.goal), strict=True
-    )
+    atoms = zip((*problem.init, *problem.goal.atoms()), (*report.lines.init, *report.lines.goal), strict=True)
     for atom, line in atoms:
         if atom.predicate not in PREDICATES:
-            what = f"the predicate of {spell(atom)} does not exist"
+            what = f"the predicate of {atom} does not exist"
             report.error(line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
     for atom, line in zip(problem.init, report.lines.init, strict=True):
         if atom.args[0] in problem.fixtures and atom.predicate in ("On", "In"):
             region = problem.region(atom.args[-1])
             if region is None or not region.ranges:
-                what = f"{spell(atom)} does not place it: a fixture stands in a region of the workspace"
+                what = f"{atom} does not place it: a fixture stands in a region of the workspace"
                 remedy = "name a region with :ranges whose target is the workspace"
                 report.error(line, "kind", what, remedy)
 
 
 def _check_regions(report: Report, problem: Problem) -> None:
-    used = {name for atom in (*problem.init, *atoms_of(problem.goal)) for name in atom.args}
-    goal = {name for atom in atoms_of(problem.goal) for name in atom.args}
+    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args}
+    goal = {name for atom in problem.goal.atoms() for name in atom.args}
     seen: dict[tuple, str] = {}
     for region in problem.regions:
         line, address = report.lines.regions.get(region.address, 1), region.address

@@ -7,8 +7,7 @@ from libero_env.assets.arena import WORKSPACES
 from libero_env.assets.pack import Pack
 from libero_env.design.lint.report import Report
 from libero_env.tasks import Task
-from libero_env.tasks.checks import spell
-from libero_env.tasks.problem import Problem, atoms_of
+from libero_env.tasks.problem import Problem
 
 # words of categories that do not name the object
 _QUALITIES = {
@@ -65,7 +64,7 @@ def check_words(report: Report, task: Task, pack: Pack) -> None:
 def _check_goal_named(report: Report, problem: Problem, text: str, line: int, source: str) -> None:
     """Check that the instruction names everything in the goal."""
     words = set(_words(text))
-    for atom in atoms_of(problem.goal):
+    for atom in problem.goal.atoms():
         for name in atom.args:
             region = problem.region(name)
             entity = region.target if region is not None else name
@@ -74,7 +73,7 @@ def _check_goal_named(report: Report, problem: Problem, text: str, line: int, so
                 continue
             known = [*_words_for(category), *(_tokens(region.name) if region is not None else ())]
             if not any(_same(token, word) for token in known for word in words):
-                what = f"no word of the instruction{source} names {name} of the goal's {spell(atom)}"
+                what = f"no word of the instruction{source} names {name} of the goal's {atom}"
                 report.warning(
                     line, "instruction", what, f"name it {' '.join(_tokens(category))}, or fix the goal"
                 )
@@ -99,9 +98,7 @@ def _check_sides(report: Report, problem: Problem, text: str, line: int, source:
     """Check that the goal does not require another side than the one that the instruction names."""
     words = _words(text)
     mentioned = {word for word, after in zip(words, [*words[1:], ""], strict=True) if after in _PARTS}
-    regions = [
-        r for atom in atoms_of(problem.goal) for n in atom.args if (r := problem.region(n)) is not None
-    ]
+    regions = [r for atom in problem.goal.atoms() for n in atom.args if (r := problem.region(n)) is not None]
     for sides in _SIDES:
         asked = {token for region in regions for token in _tokens(region.name)} & sides
         named = mentioned & sides

@@ -14,15 +14,15 @@ from libero_env.errors import LiberoError, PlacementError
 from libero_env.init_states.placement import sample_start
 from libero_env.init_states.settle import settle, start_faults
 from libero_env.init_states.store import load_init_states, split_row
+from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.back_ends import LoopSimulations
-from libero_env.sim.model_checks import STATES
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene, initial_qpos
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 from libero_env.tasks.authoring import FILE
-from libero_env.tasks.checks import ProblemError, spell
-from libero_env.tasks.problem import And, Atom, Region, atoms_of
+from libero_env.tasks.checks import ProblemError
+from libero_env.tasks.problem import And, Atom, Region
 from libero_env.timing import CONTROL_HZ
 
 # The Panda's dimensions, [m] and [rad]: height of the shoulder above the base, upper arm and forearm (both offset by
@@ -73,21 +73,21 @@ def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
 def _check_joints(report: Report, scene: Scene) -> None:
     """Check that what is opened or turned on has a joint."""
     for atom, line in _atoms(report, scene):
-        owner = scene.owner(atom.args[0]) if atom.predicate in STATES else None
+        owner = scene.owner(atom.args[0]) if atom.predicate.lower() in OPPOSITE_STATES else None
         if owner is not None and not scene.joints.get(atom.args[0]):
             remedy = "use an object with a joint, or a region on its moving part"
-            report.error(line, "no-joint", f"{spell(atom)}: it has no joint", remedy)
+            report.error(line, "no-joint", f"{atom}: it has no joint", remedy)
 
 
 def _atoms(report: Report, scene: Scene) -> Iterator[tuple[Atom, int]]:
     yield from zip(scene.problem.init, report.lines.init, strict=True)
-    yield from zip(atoms_of(scene.problem.goal), report.lines.goal, strict=True)
+    yield from zip(scene.problem.goal.atoms(), report.lines.goal, strict=True)
 
 
 def _check_tables(report: Report, scene: Scene) -> None:
     """Check that regions of the workspace are on it, and that those of the goal are within reach."""
     init = {atom.args[1]: atom.args[0] for atom in scene.problem.init if len(atom.args) == 2}
-    goal = {name for atom in atoms_of(scene.problem.goal) for name in atom.args}
+    goal = {name for atom in scene.problem.goal.atoms() for name in atom.args}
     surfaces = _surfaces(scene)
     for region in scene.problem.regions:
         placed = init.get(region.address)
@@ -205,7 +205,7 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
     """Report a fault of initial states: an error if all have it, a warning if only some have (they are resampled)."""
     add = report.error if count == starts else report.warning
     atoms = list(zip(scene.problem.init, report.lines.init, strict=True))
-    line = next((at for atom, at in atoms if spell(atom) in what), report.lines.section(":init"))
+    line = next((at for atom, at in atoms if str(atom) in what), report.lines.section(":init"))
     if rule == "unstable-start":
         add = report.warning
         line = next((at for atom, at in atoms if atom.args[0] == what), line)
@@ -229,7 +229,7 @@ def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
         return
     for part in goal.parts:
         if isinstance(part, Atom) and evaluate(part, view):
-            what = f"{spell(part)} holds from the beginning"
+            what = f"{part} holds from the beginning"
             report.info(
                 report.lines.section(":goal"), "goal-at-start", what, "correct if it is intended to stay so"
             )
@@ -238,7 +238,7 @@ def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
 def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
     """Check that objects and regions of the goal are within the arm's length, in any orientation of the hand."""
     shoulder = np.array(scene.workspace.robot_base_pos) + (0.0, 0.0, _SHOULDER)
-    for atom, line in zip(atoms_of(scene.problem.goal), report.lines.goal, strict=True):
+    for atom, line in zip(scene.problem.goal.atoms(), report.lines.goal, strict=True):
         for name in atom.args:
             if name in scene.entities:
                 pos = view.body_pos(name)

@@ -1,23 +1,15 @@
 """From a goal and a state to the steps that are left."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from libero_env.errors import LiberoError
+from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.regions import contains, region_boxes
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or
 
-JointState = Literal["open", "close", "turnon", "turnoff"]
-JOINT_STATES: dict[str, JointState] = {
-    "Open": "open",
-    "Close": "close",
-    "Turnon": "turnon",
-    "Turnoff": "turnoff",
-}
-OPPOSITES = {"Open": "Close", "Close": "Open", "Turnon": "Turnoff", "Turnoff": "Turnon"}
 PLACES = ("On", "In", "Stack")
 
 
@@ -85,8 +77,9 @@ def _required_atoms(goal: Expression, view: StateView) -> list[Atom]:
         case Or(parts):
             choices = [_required_atoms(part, view) for part in parts]
             return min(choices, key=lambda atoms: sum(not evaluate(atom, view) for atom in atoms))
-        case Not(Atom(predicate, args)) if predicate in OPPOSITES:
-            return [] if evaluate(goal, view) else [Atom(OPPOSITES[predicate], args)]
+        case Not(Atom(predicate, args)) if predicate.lower() in OPPOSITE_STATES:
+            opposite = OPPOSITE_STATES[predicate.lower()].capitalize()
+            return [] if evaluate(goal, view) else [Atom(opposite, args)]
         case Not() | ForAll():
             if evaluate(goal, view):
                 return []
@@ -97,7 +90,7 @@ def _required_atoms(goal: Expression, view: StateView) -> list[Atom]:
 
 
 def _check(atom: Atom, scene: Scene) -> None:
-    joint = atom.predicate in JOINT_STATES and scene.owner(atom.args[0]) is not None
+    joint = atom.predicate.lower() in OPPOSITE_STATES and scene.owner(atom.args[0]) is not None
     place = atom.predicate in PLACES and len(atom.args) == 2 and atom.args[0] in scene.objects
     if not joint and not place:
         raise UnsupportedGoalError(_unsupported(atom))
@@ -105,7 +98,7 @@ def _check(atom: Atom, scene: Scene) -> None:
 
 def _unsupported(atom: Atom) -> str:
     return (
-        f"no skill reaches ({atom.predicate} {' '.join(atom.args)}); supported are (On OBJECT PLACE), "
+        f"no skill reaches {atom}; supported are (On OBJECT PLACE), "
         "(In OBJECT REGION), (Stack OBJECT PLACE), (Open PART), (Close PART), (Turnon FIXTURE), (Turnoff FIXTURE)"
     )
 

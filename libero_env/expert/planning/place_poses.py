@@ -78,8 +78,7 @@ def find_place_poses(placement: Placement) -> list[PlacePose]:
     if not found:
         found = _search(placement, [*even, *parallel], 8 * overlap)
     if not found:
-        name, args = placement.atom.args[0], " ".join(placement.atom.args)
-        raise PlaceError(f"({placement.atom.predicate} {args}): there is no room for {name}")
+        raise PlaceError(f"{placement.atom}: there is no room for {placement.atom.args[0]}")
     lowest = min(place.pos[2] for place in found)
     found = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
     return sorted(found, key=lambda place: place.cost)

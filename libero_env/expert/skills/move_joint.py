@@ -9,11 +9,11 @@ from libero_env.expert.grasping.grasps import GraspError
 from libero_env.expert.grasping.handle_candidates import HandleGrasp
 from libero_env.expert.grasping.handle_grasps import grasp_handle, grasp_knob
 from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
-from libero_env.expert.planning.goal_plan import OPPOSITES, JointState
 from libero_env.expert.skills.approach import funnel_lift
 from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
+from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
@@ -49,7 +49,7 @@ class MoveJoint(Skill):
 
     NOISE_SCALES = {"reach": 1.0, "close": 0.3, "withdraw": 0.7, "move": 0.4}
 
-    def __init__(self, address: str, state: JointState, *, style: MotionStyle | None = None):
+    def __init__(self, address: str, state: str, *, style: MotionStyle | None = None):
         super().__init__(style or MotionStyle())
         self.address, self.state = address, state
         self._plan: tuple[Part, HandleGrasp] | None = None  # the grasp in the frame of the part
@@ -140,7 +140,7 @@ class MoveJoint(Skill):
         assert owner is not None
         ranges = view.scene.entities[owner].articulation
         low, high = sorted(ranges[self.state])
-        opposite = OPPOSITES[self.state.capitalize()].lower()
+        opposite = OPPOSITE_STATES[self.state]
         upwards = opposite not in ranges or low + high > sum(ranges[opposite])
         return (low, high, high - low, 1.0) if upwards else (high, low, high - low, -1.0)
 

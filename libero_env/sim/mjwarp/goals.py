@@ -5,7 +5,7 @@ entities touch, and a formula over their truths. Atoms with predicates that have
 semantics, and users' own) are evaluated on the host, one simulation after the other.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -29,7 +29,7 @@ from libero_env.sim.mjwarp.truths import (
 from libero_env.sim.predicates import SEMANTICS, evaluate, ground, state_bound
 from libero_env.sim.scene import Scene, zone_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Expression, Not, Or, Region
+from libero_env.tasks.problem import Atom, Expression, Not, Or, Region
 
 Truth = Callable[[np.ndarray], np.ndarray]  # truths of the conditions, (num, n) -> (num,)
 
@@ -59,7 +59,7 @@ class WarpGoals:
         scene = views[0].scene
         self._goal, self._atoms, self._views, self._semantics = ground(goal, scene), atoms, views, semantics
         self._simulations, formulas = simulations, _Formulas(scene, semantics)
-        needed = dict.fromkeys([*atoms, *_atoms(self._goal)])
+        needed = dict.fromkeys([*atoms, *self._goal.atoms()])
         self._formulas = {atom: formulas.make(atom) for atom in needed}
         self.on_host = tuple(atom for atom, formula in self._formulas.items() if formula is None)
         self._conditions = Conditions(simulations, scene, formulas.conditions)
@@ -193,26 +193,17 @@ def all_of(parts: Sequence[Truth]) -> Truth:
     return lambda truths: np.all([part(truths) for part in parts] or [np.ones(len(truths), bool)], axis=0)
 
 
-def _atoms(expression: Expression) -> list[Atom]:
-    match expression:
-        case And(parts) | Or(parts):
-            return [atom for part in parts for atom in _atoms(part)]
-        case Not(part):
-            return _atoms(part)
-        case Atom():
-            return [expression]
-    raise TypeError(f"not a goal: {expression!r}")
+def _combine(expression: Expression, of_atoms: Mapping[Atom, np.ndarray], count: int) -> np.ndarray:
+    """Return whether a goal without quantifiers holds, from the same of its atoms, (count,) bool."""
 
+    def holds(node: Expression, parts: Iterator[np.ndarray]) -> np.ndarray:
+        match node:
+            case Atom():
+                return of_atoms[node]
+            case Or():
+                return np.any([*parts] or [np.zeros(count, bool)], axis=0)
+            case Not():
+                return ~next(parts)
+        return np.all([*parts] or [np.ones(count, bool)], axis=0)
 
-def _combine(expression: Expression, found: dict[Atom, np.ndarray], count: int) -> np.ndarray:
-    """Return the truth of a goal without quantifiers from those of its atoms, (count,)."""
-    match expression:
-        case And(parts):
-            return np.all([_combine(part, found, count) for part in parts] or [np.ones(count, bool)], axis=0)
-        case Or(parts):
-            return np.any([_combine(part, found, count) for part in parts] or [np.zeros(count, bool)], axis=0)
-        case Not(part):
-            return ~_combine(part, found, count)
-        case Atom():
-            return found[expression]
-    raise TypeError(f"not a goal: {expression!r}")
+    return expression.fold(holds)
