@@ -1,9 +1,10 @@
 """Errors of the package; all derive from `LiberoError`."""
 
-import difflib
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+
+from libero_env.text import closest
 
 DEBUG_VARIABLE = "LIBERO_DEBUG"  # environment variable that asks for every traceback
 MAX_LISTED = 64  # valid names in a message; all categories of objects fit
@@ -36,13 +37,6 @@ class UnknownNameError(LiberoError, LookupError):
         hint = f" Did you mean {near!r}?" if near is not None else ""
         more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
         super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names[:MAX_LISTED])}{more}")
-
-
-def closest(name: str, valid: Iterable[str]) -> str | None:
-    """Return the valid name that is most like another one, upper or lower case; None where none is like it."""
-    folded = {one.casefold(): one for one in valid}
-    near = difflib.get_close_matches(name.casefold(), folded, n=1)
-    return folded[near[0]] if near else None
 
 
 class MissingPackageError(LiberoError):
@@ -97,11 +91,6 @@ class DemoError(LiberoError, ValueError):
 def is_debugging() -> bool:
     """Return whether the user wants to see every traceback, also those of errors that say everything."""
     return os.environ.get(DEBUG_VARIABLE, "0") not in ("", "0")
-
-
-def printable(text: str) -> str:
-    """Return a text as a terminal may be given it: control characters that came from a file or a user are escaped."""
-    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextmanager

@@ -19,7 +19,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from libero_env.memory import physical_memory
-from libero_env.storage import atomic_path, show_bytes
+from libero_env.storage import atomic_path
+from libero_env.text import show_bytes
 from lifelong.errors import CheckpointError, DamagedCheckpointError
 
 FORMAT = "lifelong-2"

@@ -16,7 +16,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from libero_env.errors import LiberoError, UnknownNameError, closest
+from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.text import closest
 from lifelong.errors import ConfigError, require_package
 from lifelong.results.saved_config import upgrade_config
 

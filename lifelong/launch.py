@@ -19,8 +19,9 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.cli import ending
-from libero_env.errors import LiberoError, printable
+from libero_env.errors import LiberoError
 from libero_env.parallel import end_with_parent
+from libero_env.text import printable
 from lifelong import experiment
 from lifelong.composition import (
     check_choices,

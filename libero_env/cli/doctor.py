@@ -21,7 +21,8 @@ from libero_env.assets.robot import (
 )
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir, demos_dir
-from libero_env.storage import check_trusted, show_bytes
+from libero_env.storage import check_trusted
+from libero_env.text import show_bytes
 
 GL_REMEDY = (
     "as root: apt-get install libegl1 libopengl0 libgl1-mesa-dri libosmesa6 (`make gl` does it), and leave MUJOCO_GL "

@@ -24,7 +24,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from libero_env.errors import DEBUG_VARIABLE, RAISED_BY, LiberoError, is_debugging, printable
+from libero_env.errors import DEBUG_VARIABLE, RAISED_BY, LiberoError, is_debugging
+from libero_env.text import printable
 
 MISTAKE, DEFECT, SIGNALLED = 2, 70, 128
 DEBUG = "--debug"

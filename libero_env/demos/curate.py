@@ -23,10 +23,10 @@ from libero_env.demos.header import demo_attributes, file_attributes, json_attri
 from libero_env.demos.write import DemoWriter, Episode
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.paths import demos_dir
-from libero_env.storage import show_bytes
 from libero_env.tasks import Task, bddl, get_suite
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.problem import same_meaning
+from libero_env.text import show_bytes
 
 NOOP_THRESHOLD = 1e-3  # [action units] largest motion that counts as none
 _DERIVED = (

@@ -19,7 +19,7 @@ from h5py import h5a, h5d, h5g, h5l, h5o, h5t, h5z
 
 from libero_env.errors import DemoError
 from libero_env.memory import host_memory
-from libero_env.storage import show_bytes
+from libero_env.text import show_bytes
 
 MAX_LINKS = 300_000  # of a file; 20,000 demonstrations have them
 MAX_DEPTH = 8

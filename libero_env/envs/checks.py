@@ -17,7 +17,7 @@ from libero_env.errors import (
     UnknownNameError,
 )
 from libero_env.sim.osc import ACTION_DIM
-from libero_env.validation.messages import shown
+from libero_env.text import shown
 
 Shape = tuple[int, ...]
 _MAX_SEED_BITS = 4096

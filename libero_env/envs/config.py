@@ -17,8 +17,8 @@ from libero_env.sim.engine import MUJOCO, BackEnd
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
+from libero_env.text import shown
 from libero_env.validation import validate_arguments
-from libero_env.validation.messages import shown
 
 AFTER, SUBSTEP = OBSERVED = ("after", "substep")
 Pixels = Annotated[int, Field(ge=1)]  # the renderer knows the largest size

@@ -27,8 +27,8 @@ from libero_env.envs.vector import LiberoVectorEnv
 from libero_env.envs.worker import Failure, Worker, checked_space, shut_down, wait_for
 from libero_env.envs.worker_host import open_libero
 from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.text import shown
 from libero_env.validation import validate
-from libero_env.validation.messages import shown
 
 EnvSpec = Mapping[str, Any] | Callable[[], gymnasium.Env]
 Seconds = Annotated[float, Field(gt=0, le=1e6)]

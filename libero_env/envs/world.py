@@ -31,8 +31,8 @@ from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.published.task import require_available
+from libero_env.text import shown
 from libero_env.validation import validate
-from libero_env.validation.messages import shown
 
 Count = Annotated[int, Field(ge=1)]
 Threads = Annotated[int, Field(ge=0, le=4096)]

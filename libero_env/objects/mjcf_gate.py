@@ -17,7 +17,7 @@ import numpy as np
 from libero_env.errors import InvalidInputError
 from libero_env.objects.references import MAX_FACES, MAX_PIXELS, file_inside, mesh_faces, texture_pixels
 from libero_env.objects.xml_file import explain, parse_xml, place_of, write_xml
-from libero_env.validation import suggest
+from libero_env.text import suggest
 
 # Largest number of elements, those that <replicate> makes included.
 LIMITS = MappingProxyType(

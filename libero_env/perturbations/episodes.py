@@ -23,7 +23,7 @@ from libero_env.sim.look import Look, joined
 from libero_env.sim.scene import Scene
 from libero_env.tasks import Task
 from libero_env.tasks.problem import Problem
-from libero_env.validation.messages import shown
+from libero_env.text import shown
 
 Change = Look | StartChange | ObservationFilter | ActionFilter
 TRIES = 200  # draws of a start until one is valid

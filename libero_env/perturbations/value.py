@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from libero_env.errors import InvalidInputError
 from libero_env.perturbations.catalog import KINDS, get_kind
 from libero_env.perturbations.kind import Kind
-from libero_env.validation.messages import shown
+from libero_env.text import shown
 
 EXPECTED = "expected KIND=SEVERITY, or several with commas between: camera=0.3,light=0.5"
 _MAX_SEED = 2**63 - 1

@@ -7,7 +7,7 @@ import importlib.util
 from dataclasses import dataclass
 
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
-from libero_env.validation.messages import shown
+from libero_env.text import shown
 
 MUJOCO, WARP = BACK_ENDS = ("mujoco", "warp")
 DEFAULT_CONTACTS = 192  # of a simulation; scenes rest on 24 to 90, and a hand that works adds up to 60

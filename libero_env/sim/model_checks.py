@@ -7,7 +7,7 @@ import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.tasks.checks import ProblemError
 from libero_env.tasks.problem_types import Fault
-from libero_env.validation import suggest
+from libero_env.text import suggest
 
 if TYPE_CHECKING:
     from libero_env.sim.scene import Scene

@@ -17,9 +17,10 @@ from .files import (
     create_text,
     open_for_owner,
     parse_yaml,
+    read_json,
     read_yaml,
-    show_bytes,
     sync_folder,
+    write_json,
 )
 
 __all__ = [
@@ -38,13 +39,14 @@ __all__ = [
     "parse_yaml",
     "read_cache",
     "read_cached_record",
+    "read_json",
     "read_npz",
     "read_packaged_npz",
     "read_record",
     "read_yaml",
-    "show_bytes",
     "sync_folder",
     "write_cache",
     "write_cached_record",
+    "write_json",
     "write_record",
 ]

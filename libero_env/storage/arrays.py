@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from libero_env.errors import BrokenFileError
-from libero_env.storage.files import atomic_path, open_for_owner, show_bytes
+from libero_env.storage.files import atomic_path, open_for_owner
+from libero_env.text import show_bytes
 
 Arrays = dict[str, np.ndarray]
 

@@ -1,5 +1,6 @@
 """YAML files of the package, and files and folders that are replaced in one step."""
 
+import json
 import os
 import secrets
 import shutil
@@ -10,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.text import to_json
 
 PART_SUFFIX = ".part"  # of files and folders that are not yet complete
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
@@ -71,6 +75,29 @@ def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # half a character of UTF-16
 
 
+def write_json(target: Path, value: Any, *, fsync: bool = False) -> None:
+    """Write data to a JSON file in one step; see `libero_env.text.to_json` and `atomic_path`."""
+    atomic_write_text(target, to_json(value), fsync=fsync)
+
+
+def read_json(path: Path, error: type[LiberoError] = InvalidInputError) -> Any:
+    """Return the content of a JSON file.
+
+    Args:
+        path: File to read.
+        error: Type of the error.
+
+    Raises:
+        LiberoError: The file cannot be read, or is not JSON, in one line; of the type `error`.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as failure:
+        raise error(f"{path}: {failure.strerror or failure}") from failure
+    except (ValueError, RecursionError) as failure:
+        raise error(f"{path} is not JSON ({failure}): it is broken or incomplete") from None
+
+
 def create_text(target: Path, text: str) -> bool:
     """Write a UTF-8 text file in one step unless it exists; of several processes that try, the first one wins.
 
@@ -127,12 +154,3 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         os.rename(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def show_bytes(count: float) -> str:
-    """Return a number of bytes as text, such as `1.5 GB`."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.1f} TB"

@@ -38,7 +38,7 @@ from libero_env.tasks.expansion import EMPTY, expand, is_placement, model_region
 from libero_env.tasks.problem import Problem
 from libero_env.tasks.source import Source, Trace
 from libero_env.tasks.task import Task, check_name
-from libero_env.validation import suggest
+from libero_env.text import suggest
 
 __all__ = ["EMPTY", "FILE", "make_task", "model_regions", "task_from_definition"]
 

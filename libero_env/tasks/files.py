@@ -4,13 +4,14 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError, closest
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl
 from libero_env.tasks.authoring import FILE, check_keys, task_from_definition
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.source import merged_lines, read_definition
 from libero_env.tasks.suites import get_suite, is_suite, suite_names
 from libero_env.tasks.task import Suite, Task
+from libero_env.text import closest
 
 MAX_TASKS = 1000  # of a file
 OWN = "own"  # suite of user-defined task files

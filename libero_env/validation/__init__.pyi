@@ -1,4 +1,4 @@
-from .messages import Key, LineOf, suggest
+from .messages import Key, LineOf
 from .values import OneOf, Parameters, accepted, is_plain, parameters_of, validate, validate_arguments
 from .yaml_files import MAX_YAML_BYTES, YamlFile, parse_yaml_text, read_yaml_file
 
@@ -14,7 +14,6 @@ __all__ = [
     "parameters_of",
     "parse_yaml_text",
     "read_yaml_file",
-    "suggest",
     "validate",
     "validate_arguments",
 ]

@@ -1,11 +1,12 @@
 """Faults of values in words: where each is, what the value is, and what is valid."""
 
-import difflib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+from libero_env.text import shown, suggest
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
 Key = str | int
 LineOf = Callable[[Sequence[Key]], int | None]
 
-_MAX_SHOWN = 80  # characters of a value in a message
 _MAX_FAULTS = 4  # in a message
 
 
@@ -79,21 +79,6 @@ _BOUNDS = {
     "maximum": "at most",
     "exclusiveMaximum": "below",
 }
-
-
-def suggest(name: object, valid: Iterable[object]) -> str:
-    """Return ` Did you mean 'x'?` for the nearest valid name, or an empty text where none is near."""
-    close = difflib.get_close_matches(str(name), [str(one) for one in valid], n=1)
-    return f" Did you mean {close[0]!r}?" if close else ""
-
-
-def shown(value: Any) -> str:
-    """Return a value as it is shown in a message: shortened."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # a whole number of more than 4300 digits
-        return f"a value of type {type(value).__name__} that is too large to be shown"
-    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
 
 
 def children(kind: Any) -> dict[Any, Any]:

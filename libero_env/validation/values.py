@@ -13,7 +13,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
 from libero_env.errors import InvalidInputError, LiberoError
-from libero_env.validation.messages import Key, LineOf, children, find_faults, in_words, message, shown
+from libero_env.text import shown
+from libero_env.validation.messages import Key, LineOf, children, find_faults, in_words, message
 
 if TYPE_CHECKING:
     from pydantic import ConfigDict, TypeAdapter

@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
-from libero_env.errors import LiberoError, printable
+from libero_env.errors import LiberoError
+from libero_env.text import printable
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.work.claims import Claim
 from libero_eval.work.folder import UnitErrors, UnitResult, describe

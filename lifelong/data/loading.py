@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from libero_env.memory import host_memory
-from libero_env.storage import show_bytes
+from libero_env.text import show_bytes
 from lifelong.data import frame_cache
 from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.robomimic_backend import RobomimicWindows

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Any, get_type_hints
 
 from libero_env.errors import InvalidInputError
-from libero_env.validation import suggest, validate_arguments
+from libero_env.text import suggest
+from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
 from lifelong.settings.nodes import as_truth, build_checked, node_faults, raise_faults
 from lifelong.settings.run import RunSettings

@@ -15,7 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.errors import InvalidInputError
-from libero_env.validation import is_plain, parameters_of, suggest, validate_arguments
+from libero_env.text import suggest
+from libero_env.validation import is_plain, parameters_of, validate_arguments
 from lifelong.errors import ConfigError
 from lifelong.settings.targets import find_target
 from lifelong.types import CompletedWith

@@ -48,7 +48,7 @@ from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
 from libero_env.sim.state import StateView
-from libero_env.validation.messages import shown
+from libero_env.text import shown
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz

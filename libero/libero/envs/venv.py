@@ -21,8 +21,8 @@ from libero._adapters.envs.workers import (  # noqa: F401 - names of the origina
     WorkerError,
 )
 from libero_env.errors import ClosedEnvironmentError, InvalidInputError, LiberoError
+from libero_env.text import shown
 from libero_env.validation import validate
-from libero_env.validation.messages import shown
 
 # Attributes of a vector that are those of its environments, in a list.
 GYM_RESERVED_KEYS = ["metadata", "reward_range", "spec", "action_space", "observation_space"]
