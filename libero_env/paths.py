@@ -4,7 +4,8 @@ import os
 from pathlib import Path
 
 from libero_env.errors import LiberoError
-from libero_env.validation import read_yaml_file, validate
+from libero_env.storage import read_yaml_file
+from libero_env.validation import validate
 
 _KEYS = (
     *("benchmark_root", "bddl_files", "init_states", "datasets", "assets", "objects", "robot"),

@@ -7,10 +7,10 @@ from math import hypot
 import yaml
 
 from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.storage import parse_yaml_text
 from libero_env.tasks.authoring import EMPTY, make_task, model_regions
 from libero_env.tasks.builder import load_scene, scene_names
 from libero_env.tasks.task import Task
-from libero_env.validation import parse_yaml_text
 
 # Places of objects (x, y) [m] in the original's scenes, and of furniture (x, y, yaw).
 _SLOTS = ((-0.05, 0.0), (0.05, 0.2), (-0.2, 0.15), (0.1, -0.02), (-0.18, -0.12), (-0.05, 0.3))

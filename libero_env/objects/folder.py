@@ -16,7 +16,8 @@ from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.objects.mjcf_gate import Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.paths import objects_dir
-from libero_env.validation import read_yaml_file, validate
+from libero_env.storage import read_yaml_file
+from libero_env.validation import validate
 
 MODEL, PROPERTIES, PREVIEW = "object.xml", "object.yaml", "preview.png"
 _OPTIONAL = ("joint_damping", "rotation", "rotation_axis", "articulation")

@@ -16,16 +16,17 @@ from .files import (
     atomic_write_text,
     create_text,
     open_for_owner,
-    parse_yaml,
     read_json,
-    read_yaml,
     sync_folder,
     write_json,
 )
+from .yaml_files import MAX_YAML_BYTES, YamlFile, parse_yaml, parse_yaml_text, read_yaml, read_yaml_file
 
 __all__ = [
     "Arrays",
+    "MAX_YAML_BYTES",
     "PART_SUFFIX",
+    "YamlFile",
     "atomic_folder",
     "atomic_path",
     "atomic_write_npz",
@@ -37,6 +38,7 @@ __all__ = [
     "make_cache_folder",
     "open_for_owner",
     "parse_yaml",
+    "parse_yaml_text",
     "read_cache",
     "read_cached_record",
     "read_json",
@@ -44,6 +46,7 @@ __all__ = [
     "read_packaged_npz",
     "read_record",
     "read_yaml",
+    "read_yaml_file",
     "sync_folder",
     "write_cache",
     "write_cached_record",

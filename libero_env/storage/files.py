@@ -1,4 +1,4 @@
-"""YAML files of the package, and files and folders that are replaced in one step."""
+"""Files and folders that are replaced in one step."""
 
 import json
 import os
@@ -6,31 +6,13 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib import resources
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.text import to_json
 
 PART_SUFFIX = ".part"  # of files and folders that are not yet complete
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
-
-
-def parse_yaml(text: str) -> Any:
-    """Return the content of a YAML text; nothing in it is executed."""
-    loader = _LOADER(text)
-    try:
-        return loader.get_single_data()
-    finally:
-        loader.dispose()
-
-
-def read_yaml(path: str) -> Any:
-    """Return the content of one of the package's YAML files; the path is relative to `libero_env`."""
-    return parse_yaml(resources.files("libero_env").joinpath(*path.split("/")).read_text(encoding="utf-8"))
 
 
 @contextmanager

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.errors import InvalidInputError
+from libero_env.storage import read_yaml_file
 from libero_env.tasks.task import MAX_NAME_BYTES
-from libero_env.validation import Key, LineOf, read_yaml_file
+from libero_env.validation import Key, LineOf
 
 MAX_FILES = 20  # each of which is the scene of the one before
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.errors import InvalidInputError, UnknownNameError
-from libero_env.validation import read_yaml_file
+from libero_env.storage import read_yaml_file
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from libero_eval.protocols.protocol import SECTIONS, Card
 from lifelong.errors import EvaluationFileError, ProtocolError

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.errors import InvalidInputError
-from libero_env.validation import read_yaml_file
+from libero_env.storage import read_yaml_file
 from lifelong.errors import ConfigError
 
 Node = dict[str, Any]

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from libero_env.validation import parse_yaml_text
+from libero_env.storage import parse_yaml_text
 from tests.harness.fuzz import examples, survive
 
 pytestmark = pytest.mark.unit

@@ -1,21 +1,37 @@
-"""YAML files with the line of each value; nothing in them is executed, and none grows beyond what a person writes."""
+"""YAML files: those of the package, and those of users, with the line of each value; nothing in them is executed."""
 
 import math
 import stat
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from libero_env.errors import InvalidInputError
-from libero_env.validation.messages import Key
 
 MAX_YAML_BYTES = 4 << 20
 _MAX_NODES = 200_000  # of a document, each alias counted as often as it is used
 _MAX_DEPTH = 60
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
+
+Key = str | int
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the content of a YAML text of this package."""
+    loader = _LOADER(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
+
+
+def read_yaml(path: str) -> Any:
+    """Return the content of one of the package's YAML files; the path is relative to `libero_env`."""
+    return parse_yaml(resources.files("libero_env").joinpath(*path.split("/")).read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
