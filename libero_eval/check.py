@@ -9,15 +9,13 @@ from typing import Any, Literal
 
 from libero_env.errors import LiberoError
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
-from lifelong import checkpoints
 from lifelong.errors import CheckpointError, LifelongError
 from lifelong.results.checkpoint_folder import BROKEN_SUFFIX, CheckpointFolder
 from lifelong.results.coverage import measured_tasks
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.results import Results
-from lifelong.results.run_directory import RunDirectory
-from lifelong.results.saved_config import read_saved_config, upgrade_config
+from lifelong.results.run_directory import RunDirectory, read_saved_config
 from lifelong.results.summary import json_safe, summarize
 
 _COMPARED = (
@@ -90,7 +88,7 @@ class _Examiner:
         self.found: list[Finding] = []
 
     def examine(self) -> Examination:
-        if self._try(lambda: upgrade_config(read_saved_config(self.path / "config.yaml"))) is None:
+        if self._try(lambda: read_saved_config(self.path / "config.yaml")) is None:
             self.folder = CheckpointFolder(self.folder.path)  # whose checkpoints may be of any run
         results = self._try(lambda: ResultLog(self.path / "results.jsonl").read())
         if results is not None:
@@ -99,7 +97,7 @@ class _Examiner:
         for file in sorted(self.path.glob(f"**/{FILE_NAME}")):
             if self._try(partial(EvaluationResult.read, file)) is not None:
                 self.counts["evaluations"] += 1
-        for file in sorted({*self.path.rglob(".*.part"), *self.path.rglob(".tmp*")}):
+        for file in sorted(self.path.rglob(".*.part")):
             self._note(f"{file} was left by a process that was killed; a resume removes it")
         return Examination(self.path, self.counts, tuple(self.found))
 
@@ -138,12 +136,6 @@ class _Examiner:
             return self._fault(f"{file} is broken: expected an object; the run's command writes it again")
         now = json.loads(json.dumps(json_safe(summarize(results))))
         earlier = written.get("statistics") != now["statistics"]  # other intervals from the same records
-        for summary in (written, now):
-            if now["tasks_learned"] <= len(results.run.groups[0]) and isinstance(
-                summary.get("metrics"), dict
-            ):
-                summary["metrics"].pop("nbt", None)  # of one task; earlier versions wrote 0
-                summary["metrics"].pop("by_task", None)
         compared = [key for key in _COMPARED if not (earlier and key == "metrics")]
         differing = [key for key in compared if not _alike(written.get(key), now[key])]
         if differing:
@@ -172,8 +164,6 @@ class _Examiner:
             return
         try:
             load(path)
-            if not checkpoints.is_sealed(path):
-                self._note(f"{path} is readable, but has no checksum: an earlier version wrote it")
             self.counts["checkpoints"] += 1
         except CheckpointError as error:
             self._fault(str(error))

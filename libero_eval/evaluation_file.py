@@ -23,12 +23,8 @@ from lifelong.results.metrics import Estimate, combine_intervals, wilson_interva
 from lifelong.results.subgoals import predicate_of
 from lifelong.results.summary import json_safe
 
-FORMAT = "libero-evaluation/2"
-FIRST_FORMAT = (
-    "libero-evaluation/1"  # not named in the file: what `libero eval` wrote before formats had names
-)
+FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
-FIRST_KEYS = ("evaluated", "protocol", "init_states", "versions", "tasks")
 
 _Count = Annotated[int, Field(ge=0, le=2**31)]
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -159,7 +155,6 @@ class EvaluationResult:
         unit_starts: Number of episodes that were run in one batch; the bits of a policy may depend on it. None: all
             episodes of a task.
         times: When and how long it was run; not part of `outcomes`.
-        format: Format of the file that it was read from, or is written as.
     """
 
     evaluated: Mapping[str, Any]
@@ -170,7 +165,6 @@ class EvaluationResult:
     environment: Mapping[str, Any] = field(default_factory=dict)
     unit_starts: int | None = None
     times: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    format: str = field(default=FORMAT, compare=False)
 
     def __post_init__(self) -> None:
         names = [result.task for result in self.tasks]
@@ -309,8 +303,7 @@ def task_result(values: Any, where: str = "a task") -> TaskResult:
 def _from_plain(values: Any) -> EvaluationResult:
     if not isinstance(values, dict):
         raise EvaluationFileError("this is not the result of an evaluation: expected a JSON object")
-    written_as = values.get("format", FIRST_FORMAT if {*FIRST_KEYS} <= values.keys() else None)
-    _check_format(written_as)
+    _check_format(values.get("format"))
     known = {key: value for key, value in values.items() if key in _Content.__annotations__}
     content = validate(_Content, known, error=EvaluationFileError)
     result = EvaluationResult(
@@ -321,10 +314,9 @@ def _from_plain(values: Any) -> EvaluationResult:
         tasks=tuple(task_result(row, f"task {i}") for i, row in enumerate(content["tasks"])),
         environment=content.get("environment", {}),
         unit_starts=content.get("unit_starts"),
-        times=content.get("times", {"finished": values.get("finished")}),
-        format=str(written_as),
+        times=content.get("times", {}),
     )
-    if written_as == FORMAT and values.get("outcomes") != result.outcomes:
+    if values.get("outcomes") != result.outcomes:
         raise EvaluationFileError("the digest `outcomes` is not that of the tasks: the file was edited")
     return result
 
@@ -340,11 +332,11 @@ def _digest(rows: Any) -> str:
 
 
 def _check_format(name: Any) -> None:
-    if name in (FORMAT, FIRST_FORMAT):
+    if name == FORMAT:
         return
     if str(name).partition("/")[0] == FORMAT.partition("/")[0]:
         raise EvaluationFileError(
-            f"the format is {name}; this version reads {FIRST_FORMAT} and {FORMAT}: "
+            f"the format is {name}; this version reads {FORMAT}: "
             "update libero-lifelong, or read it with the version that wrote it"
         )
     stated = "has no format" if name is None else f"has the format {name!r}"

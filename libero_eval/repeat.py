@@ -104,7 +104,7 @@ def repeated_card(result: EvaluationResult, where: str) -> Card:
     """Return the protocol of a result.
 
     Raises:
-        ProtocolError: The result is of the first version, which did not store the whole protocol, or was edited.
+        ProtocolError: The result was edited.
     """
     return parse_card(result.protocol, str(result.protocol.get("name", "result")), where)
 

@@ -23,8 +23,7 @@ from libero_env.storage import atomic_path
 from libero_env.text import show_bytes
 from lifelong.errors import CheckpointError, DamagedCheckpointError
 
-FORMAT = "lifelong-2"
-FIRST_FORMAT = "lifelong-1"  # without a checksum
+FORMAT = "lifelong-checkpoint/1"
 MAX_DEPTH = 64  # dictionaries within dictionaries
 MAX_TREE = 64 << 20  # [bytes] of everything but the tensors
 
@@ -80,13 +79,11 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     try:
         _check_size(path)
         with safe_open(path, framework="pt", device="cpu") as file:
-            metadata = file.metadata() or {}
-            head = _head(metadata)
+            head = _head(file.metadata() or {})
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        if head["format"] == FORMAT:
-            text = json.dumps(head["tree"], separators=(",", ":"))
-            if _digest(text, tensors) != head["sha256"]:
-                raise ValueError("its content does not have the checksum that it was written with")
+        text = json.dumps(head["tree"], separators=(",", ":"))
+        if _digest(text, tensors) != head["sha256"]:
+            raise ValueError("its content does not have the checksum that it was written with")
         placed = {name: tensor.to(device) for name, tensor in tensors.items()}
         tree = _decode(head["tree"], placed, 0)
         if not isinstance(tree, dict):
@@ -94,12 +91,6 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         return tree
     except (OSError, SafetensorError, ValueError, RecursionError) as error:
         raise DamagedCheckpointError(f"{path} is broken, or is no checkpoint ({error})") from error
-
-
-def is_sealed(path: Path) -> bool:
-    """Return whether a readable file has a checksum; those of earlier versions have none."""
-    with safe_open(path, framework="pt", device="cpu") as file:
-        return _ENTRY in (file.metadata() or {})
 
 
 @dataclass(frozen=True)
@@ -219,14 +210,12 @@ def _decode_dict(items: list[Any], tensors: Mapping[str, Tensor], depth: int) ->
 
 def _head(metadata: Mapping[str, str]) -> dict[str, Any]:
     """Return the entry of the header with the tree; raise ValueError where there is none."""
-    if metadata.get("format") == FIRST_FORMAT:
-        return {"format": FIRST_FORMAT, "tree": json.loads(metadata.get("tree", ""))}
     if _ENTRY not in metadata:
         raise ValueError("a safetensors file of another program")
     head = json.loads(metadata[_ENTRY])
     if not isinstance(head, dict) or head.get("format") != FORMAT or not {"sha256", "tree"} <= head.keys():
         stated = head.get("format") if isinstance(head, dict) else None
-        raise ValueError(f"the format is {stated!r}; this version reads {FIRST_FORMAT!r} and {FORMAT!r}")
+        raise ValueError(f"the format is {stated!r}; this version reads {FORMAT!r}")
     return head
 
 

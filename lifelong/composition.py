@@ -19,7 +19,6 @@ from omegaconf.errors import OmegaConfBaseException
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.text import closest
 from lifelong.errors import ConfigError, require_package
-from lifelong.results.saved_config import upgrade_config
 
 # launcher -> package of its plug-in, and the extra that installs it
 LAUNCHERS = {
@@ -328,7 +327,7 @@ def _without_key(name: str, words: Sequence[str], folders: Sequence[Path]) -> Li
             break
     if valid in ([], [group]):
         return _without_keys(name, files[group], words, folders)
-    near = next(iter(_renamed(plain, name)), None) or closest(name, valid)
+    near = closest(name, valid)
     hint = f" Did you mean {near}?" if near else ""
     return ConfigError(
         f"unknown key {name} of the configuration.{hint} Valid: {', '.join(sorted(valid))}; "
@@ -382,22 +381,6 @@ def _dotted(node: Any, prefix: str = "") -> list[str]:
         for key, part in node.items()
         for name in _dotted(part, f"{prefix}.{key}" if prefix else str(key))
     ]
-
-
-def _renamed(config: dict[str, Any], name: str) -> list[str]:
-    """Return the key of today for a key of earlier versions, such as `policy.head_hidden`."""
-    group, _, key = name.partition(".")
-    if group not in ("policy", "algo") or group not in config:
-        return []
-    target, marked = {"_target_": config[group].get("_target_")}, "\0"  # a value that can be found again
-    upgraded = upgrade_config({group: {**target, key: marked}})
-    return [found for found in _dotted(upgraded) if found != name and _value(upgraded, found) == marked]
-
-
-def _value(config: Any, name: str) -> Any:
-    for key in name.split("."):
-        config = config[key]
-    return config
 
 
 def _is_choice(group: str, name: str, folders: Sequence[Path]) -> bool:

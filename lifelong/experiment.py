@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from libero_env.assets.pack import select_pack
 from libero_env.demos.read import demo_origin
@@ -298,7 +298,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             instructions=context.instructions,
             perturbed=[format_perturbations(found) for found in context.perturb],
             backend=context.eval.back_end.name,
-            config=OmegaConf.to_yaml(OmegaConf.create(plain)),
+            config=plain,
             group_sizes=context.group_sizes,
             cells=context.eval.cells,
             conditions=present_conditions(

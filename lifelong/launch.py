@@ -35,13 +35,13 @@ from lifelong.composition import (
 )
 from lifelong.errors import ConfigError
 from lifelong.report.page import write_report
+from lifelong.results.run_directory import config_digest
 from lifelong.settings import plain_data
 from lifelong.sweeps import (
     FOLDER,
     JOB_FILE,
     JobRecord,
     begin_sweep,
-    config_key,
     job_suffix,
     read_sweep,
     run_job,
@@ -142,7 +142,7 @@ def _job(config: DictConfig) -> Path | None:
                 raise SystemExit(_process["status"]) from error
             return None
     file = Path(hydra_config.runtime.output_dir) / JOB_FILE
-    key = config_key(plain_data(config))
+    key = config_digest(plain_data(config))
     job = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
     done = run_job(file, job, learn, _report_line, again=ranks.size > 1)
     if done.exit_status and ranks.size > 1:

@@ -1,9 +1,6 @@
 """What a policy knows before the first task: the weights of another run, or a suite learned jointly."""
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +15,7 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
-from lifelong.results.run_directory import RunDirectory, result_relevant
-from lifelong.results.saved_config import read_saved_config, upgrade_config
+from lifelong.results.run_directory import RunDirectory, config_digest
 from lifelong.seeding import INIT, seeded
 from lifelong.settings import Configuration, PretrainSettings
 from lifelong.streams import StreamSettings
@@ -147,16 +143,5 @@ def pretraining_directory(folder: Path, config: Mapping[str, Any]) -> RunDirecto
     Args:
         folder: Folder of all pretrainings on the suite.
         config: The part of the run's configuration that affects the pretraining.
-
-    Returns:
-        The directory of an equal pretraining, also by an earlier version, or else that of a new one.
     """
-    relevant = result_relevant(config)
-    digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
-    for file in sorted(folder.glob("*/config.yaml")):
-        with suppress(
-            ConfigError
-        ):  # a broken one belongs to another pretraining, or says so when it is opened
-            if result_relevant(upgrade_config(read_saved_config(file))) == relevant:
-                return RunDirectory(file.parent)
-    return RunDirectory(folder / digest)
+    return RunDirectory(folder / config_digest(config))

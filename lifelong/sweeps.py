@@ -28,7 +28,6 @@ from libero_env.storage import atomic_write_text
 from libero_env.validation import validate
 from lifelong.errors import ResultsError, RunLockedError
 from lifelong.results.provenance import utc_now
-from lifelong.results.run_directory import result_relevant
 from lifelong.results.summary import json_safe
 
 SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
@@ -201,12 +200,6 @@ def read_job(file: Path) -> JobRecord | None:
     known = {f.name for f in fields(JobRecord)}
     content = {key: value for key, value in _read_json(file).items() if key in known}
     return validate(JobRecord, content, prefix=(str(file),), error=ResultsError)
-
-
-def config_key(config: Mapping[str, Any]) -> str:
-    """Return the digest of what the results of a configuration depend on, 12 hex digits."""
-    text = json.dumps(result_relevant(config), sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def run_job(

@@ -37,7 +37,6 @@ from lifelong.data.demonstrations import find_demos
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.run_directory import result_relevant
-from lifelong.results.saved_config import upgrade_config
 from lifelong.settings import Configuration, plain_data
 
 HERE = Path(__file__).parent
@@ -125,7 +124,7 @@ class Planned:
             return False
         saved = yaml.safe_load(_read(self.record)["config"])
         known = set(result_relevant(self.config))  # a saved configuration also names how pictures were drawn
-        was = {k: v for k, v in result_relevant(upgrade_config(saved)).items() if k in known}
+        was = {k: v for k, v in result_relevant(saved).items() if k in known}
         now = {k: v for k, v in result_relevant(self.config).items() if v is not None}
         return {k: v for k, v in was.items() if k in now} == now
 

@@ -97,8 +97,6 @@ def check_comparable(sides: Sequence[Side], allow: Iterable[str] = ()) -> list[s
 def settings(result: EvaluationResult) -> dict[str, Any]:
     """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
     world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
-    if "models" not in world and "models" in result.versions:  # files of the first format
-        world["models"] = result.versions["models"]
     tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
     return _flat({"protocol": result.protocol, "environment": world, "tasks": tasks})
 

@@ -270,27 +270,13 @@ class Card:
 
     def resolved(self) -> dict[str, Any]:
         """Return the card as plain data, with a digest of everything that decides a result."""
-        plain = asdict(self)
-        for name in self._later_defaults:
-            del plain["world"][name]
-        return {**plain, "digest": self.digest}
+        return {**asdict(self), "digest": self.digest}
 
     @property
     def digest(self) -> str:
         """Digest of all values, 16 hex digits; names and sources are not part of it."""
         values = {k: v for k, v in self.flat().items() if "." in k and not k.startswith("sources")}
-        for name in self._later_defaults:
-            del values[f"world.{name}"]
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
-
-    @property
-    def _later_defaults(self) -> list[str]:
-        """Fields of the world with the only value that there was before they were fields; digests are without them."""
-        return [
-            name
-            for name, only in (("perturb", ""), ("backend", "mujoco"))
-            if getattr(self.world, name) == only
-        ]
 
     def steps(self, task: Task) -> int:
         """Return the maximum number of the policy's steps on a task.

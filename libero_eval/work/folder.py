@@ -34,7 +34,7 @@ PLAN_NAME = "evaluation.json"
 PLAN_FORMAT = "libero-evaluation-plan/1"
 UNIT_FORMAT = "libero-evaluation-unit/1"
 AGAIN = "name another folder with --out, or repeat the evaluation with --again"
-OWN_PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors", "tasks")  # tasks: of the first version
+OWN_PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,6 @@ class WorkFolder:
         """
         with _named_errors(self.path, "the folder of the evaluation cannot be written"):
             self.path.mkdir(parents=True, exist_ok=True)
-            if (self.path / "tasks").is_dir() and not (self.path / PLAN_NAME).exists():
-                raise ConfigError(
-                    f"{self.path} holds an evaluation of an earlier version, which this one cannot resume: {AGAIN}"
-                )
             sizes = {unit.name: len(unit.starts) for unit in units}
             known = self._read_plan()
             if known is None:

@@ -30,8 +30,7 @@ class DERpp(Rehearsal):
       are not augmented there: z was not.
     """
 
-    # a tensor is a mean action, which earlier versions kept
-    state_form = {"memory": MEMORY_FORM, "outputs": {int: (Tensor, {str: Tensor})}}
+    state_form = {"memory": MEMORY_FORM, "outputs": {int: {str: Tensor}}}
     tuned = {"alpha": (0.01, 0.03, 0.1, 0.3, 1.0), "ratio": (0.5, 1.0, 2.0)}
 
     def __init__(self, *, budget: Count = 10_000, ratio: NonNegative = 1.0, alpha: NonNegative = 0.3):
@@ -82,13 +81,11 @@ class DERpp(Rehearsal):
         """Add the task's windows to the memory, with the policy's outputs on them."""
         super().end_task(task_index, dataset, policy, generator)
         before, self._kept = set(self._kept), self._held()
-        # as an earlier version kept
-        only_means = any("mean" in answers for answers in self._outputs.values())
         for task, kept in self._kept.items():
             if task in before:  # a smaller share is a prefix of the larger one
                 self._outputs[task] = {n: z[: len(kept)].clone() for n, z in self._outputs[task].items()}
             else:
-                self._outputs[task] = _outputs(policy, dataset, kept, only_means)
+                self._outputs[task] = _outputs(policy, dataset, kept)
 
     def state_dict(self) -> dict[str, Any]:
         """Return which windows are kept, and their outputs, which cannot be computed again later."""
@@ -99,22 +96,15 @@ class DERpp(Rehearsal):
         """Restore what `state_dict` returned; the frames come from the datasets."""
         super().load_state_dict(state, datasets)
         self._kept = self._held()
-        self._outputs = {
-            task: {"mean": kept} if isinstance(kept, Tensor) else dict(kept)
-            for task, kept in state["outputs"].items()
-        }
+        self._outputs = {task: dict(answers) for task, answers in state["outputs"].items()}
 
     def _held(self) -> dict[int, Tensor]:
         return {int(task): kept for task, kept in self.memory.state_dict()["indices"].items()}
 
 
 @torch.no_grad()
-def _outputs(policy: Policy, dataset: TaskWindows, windows: Tensor, only_means: bool) -> dict[str, Tensor]:
+def _outputs(policy: Policy, dataset: TaskWindows, windows: Tensor) -> dict[str, Tensor]:
     """Return the policy's answers on windows, in evaluation mode, each (n, T, ...)."""
-
-    def answers(batch: Batch) -> dict[str, Tensor]:
-        return {"mean": policy.predict(batch)} if only_means else policy.answers(batch)
-
     with in_mode(policy, training=False):
-        parts = [answers(dataset.batch(i).to(device_of(policy))) for i in windows.split(_CHUNK)]
+        parts = [policy.answers(dataset.batch(i).to(device_of(policy))) for i in windows.split(_CHUNK)]
     return {name: torch.cat([part[name].float() for part in parts]) for name in parts[0]}

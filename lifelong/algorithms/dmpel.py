@@ -20,7 +20,6 @@ from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Posi
 
 _QUERY = "routing_query"  # key among the readings of a batch; policies read only those of their spec
 _ROUTER = {"enter": Tensor, "middle": Tensor, "leave": Tensor, "bias": Tensor}
-_FIRST_ROUTER = {"enter": Tensor, "keys": Tensor, "bias": Tensor}  # a softmax, in earlier versions
 
 
 class DMPEL(RoutedExperts):
@@ -55,7 +54,7 @@ class DMPEL(RoutedExperts):
     state_form = {
         **RoutedExperts.place_form,
         "library": ExpertLibrary.form,
-        "router": ({}, _FIRST_ROUTER, _ROUTER),
+        "router": ({}, _ROUTER),
         "memory": {int: {"queries": Tensor, "coefficients": Tensor}},
         "episodes": ({}, {"queries": Tensor, "of_window": Tensor}),
     }
@@ -234,14 +233,8 @@ class DMPEL(RoutedExperts):
         """Restore what `state_dict` returned.
 
         Raises:
-            CheckpointError: The shapes of the router, the experts or the stored contexts do not go together, or the
-                router is of an earlier kind.
+            CheckpointError: The shapes of the router, the experts or the stored contexts do not go together.
         """
-        if "keys" in state["router"]:
-            raise CheckpointError(
-                "its router is the softmax of earlier versions, which starved new experts and is no longer there: "
-                "learn the run again with resume=false"
-            )
         self._router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
         _check_shapes(state, self._router)
         self._load_place(state)

@@ -18,8 +18,7 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, LifelongError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
-from lifelong.results.run_directory import RunDirectory
-from lifelong.results.saved_config import read_saved_config, upgrade_config
+from lifelong.results.run_directory import RunDirectory, read_saved_config
 from lifelong.settings import BenchmarkSettings, Configuration
 from lifelong.streams import Stages, StreamSettings, learning_stages
 from lifelong.training.distributed import Ranks
@@ -225,7 +224,7 @@ def read_config(file: Path, allow: Sequence[str]) -> Configuration:
     """
     if not file.is_file():
         raise LifelongError(f"{file} is missing: a checkpoint needs the configuration of its run")
-    values = upgrade_config(read_saved_config(file))
+    values = read_saved_config(file)
     language = values.get("language")
     if isinstance(language, dict):  # nothing is written into a folder that the file names
         values["language"] = {key: value for key, value in language.items() if key != "cache_dir"}

@@ -9,7 +9,6 @@ Shape legend: N texts, L embedding.
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources, util
@@ -34,7 +33,6 @@ _HUB_NAMES = {
     "gpt2": "gpt2",
     "roberta": "roberta-base",
 }
-_MAX_EMBEDDING_BYTES = 1 << 20
 MODELS = ("minilm", *_HUB_NAMES, "onehot")
 
 
@@ -186,12 +184,6 @@ def _cached(
 
 def _stored(path: Path) -> Tensor | None:
     """Return an embedding of the cache; None where there is none that is intact."""
-    older = path.with_suffix(".npy")  # of earlier versions, without a checksum
-    if older.is_file() and not path.exists() and older.stat().st_size < _MAX_EMBEDDING_BYTES:
-        with suppress(ValueError, EOFError, OSError):
-            vector = np.load(older, allow_pickle=False)
-            if _is_embedding({"embedding": vector}) and np.isfinite(vector).all():
-                write_cache(path, {"embedding": vector})
     stored = read_cache(path, _is_embedding)
     return None if stored is None else torch.from_numpy(stored["embedding"])
 

@@ -15,7 +15,6 @@ from lifelong.results.log import ResultLog
 from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import RunRecord
 from lifelong.results.results import Results
-from lifelong.results.saved_config import upgrade_config
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
 # sections of the config
@@ -218,4 +217,4 @@ def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:
         config = yaml.safe_load(text)
     except yaml.YAMLError as error:
         return {}, text, [f"{path.name} is not valid YAML ({' '.join(str(error).split())})."]
-    return (upgrade_config(config) if isinstance(config, dict) else {}), text, []
+    return (config if isinstance(config, dict) else {}), text, []

@@ -95,7 +95,7 @@ class CheckpointFolder:
     def load_best(self, device: torch.device | str = "cpu") -> dict[str, Any]:
         """Return the state in `best_path`; errors are those of `load_task`."""
         state = checkpoints.load(self.best_path, device)
-        return self._checked({"own": [], **state}, _BEST, self.best_path)
+        return self._checked(state, _BEST, self.best_path)
 
     def set_aside(self, path: Path) -> Path:
         """Give a damaged checkpoint a name under which nothing reads it, and return that."""
@@ -105,12 +105,10 @@ class CheckpointFolder:
 
     def clear_unfinished(self) -> None:
         """Remove what processes left that were killed while they wrote a checkpoint."""
-        for pattern in (f".*{PART_SUFFIX}", ".tmp*"):  # the latter of earlier versions
-            for file in self.path.glob(pattern):
-                file.unlink(missing_ok=True)
+        for file in self.path.glob(f".*{PART_SUFFIX}"):
+            file.unlink(missing_ok=True)
 
     def _checked(self, state: dict[str, Any], form: Any, path: Path) -> dict[str, Any]:
-        state = {"run": None, **state}  # earlier versions did not record it
         checkpoints.check(state, form, path)
         known = self._run()
         if None not in (known, state["run"]) and state["run"] != known:

@@ -1,6 +1,5 @@
 """Where results come from: when a run started, from which source, with which versions."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -8,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from lifelong.results.coverage import MatrixCells
 from lifelong.results.curves import Transfer
 from lifelong.results.records import RunRecord
+from lifelong.results.run_directory import config_digest
 
 VERSIONED_PACKAGES = (
     "libero-lifelong",
@@ -37,7 +37,7 @@ def start_record(
     preset: str,
     tasks: Sequence[str],
     instructions: Sequence[str],
-    config: str,
+    config: Mapping[str, Any],
     group_sizes: Sequence[int] = (),
     conditions: Mapping[str, str] | None = None,
     cells: MatrixCells = "all",
@@ -55,7 +55,7 @@ def start_record(
         preset: Name of the preset.
         tasks: Names of the tasks in learning order.
         instructions: Instructions of the tasks, in the same order.
-        config: Resolved configuration as text, of which the SHA-256 is recorded.
+        config: Resolved configuration as plain data, whose digest is recorded.
         group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
         conditions: What decides the bits of its results, see `lifelong.results.conditions`.
         cells: Cells of the success matrix that are measured.
@@ -72,7 +72,7 @@ def start_record(
         preset=preset,
         tasks=tuple(tasks),
         instructions=tuple(instructions),
-        config_digest=hashlib.sha256(config.encode()).hexdigest(),
+        config_digest=config_digest(config),
         versions=installed_versions(),
         commit=source_commit(),
         cpu_count=os.cpu_count() or 1,

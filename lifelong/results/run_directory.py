@@ -17,11 +17,12 @@ from typing import Any
 
 import yaml
 
+from libero_env.errors import InvalidInputError
 from libero_env.storage import PART_SUFFIX, atomic_write_text
+from libero_env.validation import read_yaml_file
 from lifelong.errors import ConfigError, RunLockedError
 from lifelong.results.checkpoint_folder import CheckpointFolder
 from lifelong.results.log import ResultLog
-from lifelong.results.saved_config import read_saved_config, upgrade_config
 
 # Keys that may differ between the start of a run and its resumption, because they change no result.
 VOLATILE = (
@@ -36,12 +37,6 @@ VOLATILE = (
     "data.backend",
     "eval.transfer",  # how records are read, not what they hold
     "eval.shift",  # evaluations besides all others
-)
-# Keys that are not part of a run's digest, which its checkpoints carry. Never changed, so that runs of earlier versions
-# resume: the digest is that of the saved configuration, which stays as the run's first process wrote it.
-_NOT_IN_DIGEST = (
-    *("device", "progress", "resume", "run_id", "runs_dir", "threads", "wandb"),
-    *("data.memory", "data.backend"),
 )
 
 
@@ -85,7 +80,7 @@ class RunDirectory:
             text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
             atomic_write_text(file, text, fsync=True)
             return
-        was, now = result_relevant(upgrade_config(read_saved_config(file))), result_relevant(config)
+        was, now = result_relevant(read_saved_config(file)), result_relevant(config)
         changed = [k for k in {**was, **now} if was.get(k, "absent") != now.get(k, "absent")]
         if changed:
             pairs = [(k, was.get(k, "absent"), now.get(k, "absent")) for k in changed[:4]]
@@ -99,8 +94,28 @@ class RunDirectory:
     def _identity(self) -> str | None:
         """Return the digest of the saved configuration, by which checkpoints of this run are known."""
         if self._digest is None and (self.path / "config.yaml").exists():
-            self._digest = run_digest(read_saved_config(self.path / "config.yaml"))
+            self._digest = config_digest(read_saved_config(self.path / "config.yaml"))
         return self._digest
+
+
+def read_saved_config(path: str | Path) -> dict[str, Any]:
+    """Return the content of a run's or pretraining's config.yaml as plain data.
+
+    A run directory may be somebody else's, so nothing in it is executed or resolved: a text with `${...}` is a text.
+
+    Args:
+        path: File config.yaml.
+
+    Raises:
+        ConfigError: The file is missing, is not valid YAML, or holds no keys with values.
+    """
+    try:
+        config = read_yaml_file(path).data
+    except InvalidInputError as error:
+        raise ConfigError(f"{error}; expected the configuration that a run has saved") from error
+    if not isinstance(config, dict) or not config or not all(isinstance(key, str) for key in config):
+        raise ConfigError(f"{path} is no configuration of a run: expected keys with values, such as seed: 1")
+    return config
 
 
 def result_relevant(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,11 +124,10 @@ def result_relevant(config: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in _flat(dict(config)).items() if not f"{k}.".startswith(volatile)}
 
 
-def run_digest(saved: Mapping[str, Any]) -> str:
-    """Return 16 hex digits that identify a run by its config.yaml, wherever and on whatever device it is run."""
-    left_out = tuple(f"{key}." for key in _NOT_IN_DIGEST)
-    kept = {k: v for k, v in _flat(dict(saved)).items() if not f"{k}.".startswith(left_out)}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:16]
+def config_digest(config: Mapping[str, Any]) -> str:
+    """Return 16 hex digits that change with whatever affects the results of a configuration."""
+    text = json.dumps(result_relevant(config), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @contextmanager

@@ -36,7 +36,7 @@ START = start_record(
     preset="",
     tasks=NAMES,
     instructions=NAMES,
-    config="seed: 1",
+    config={"seed": 1},
 )
 
 

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from lifelong import checkpoints
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.data.fake import fake_observation
+from lifelong.results.checkpoint_folder import CheckpointFolder
 from lifelong.seeding import generator, seeded
 from lifelong.settings import build
 from lifelong.types import PolicySpec
@@ -43,7 +44,7 @@ def make_run(folder: Path, *overrides: str):
     spec = build(config.data).spec(build(config.language).embed([t.language for t in tasks]).shape[1])
     with seeded(3):
         policy, algorithm, states = build(config.policy, spec=spec), build(config.algo), []
-    batch = fake_batch(spec, 4, generator(0))
+    batch, saved = fake_batch(spec, 4, generator(0)), CheckpointFolder(folder / "checkpoints")
     for task in range(2):
         windows = make_windows(task, spec)
         algorithm.begin_task(task, windows, policy)
@@ -54,8 +55,7 @@ def make_run(folder: Path, *overrides: str):
         algorithm.after_step(policy)
         algorithm.end_phase(algorithm.phases()[0], policy)
         algorithm.end_task(task, windows, policy, generator(task))
-        state = {"task": task, "policy": policy.state_dict(), "algorithm": algorithm.state_dict()}
-        checkpoints.save(folder / "checkpoints" / f"task_{task}.safetensors", state)
+        saved.save_task(task, policy.state_dict(), algorithm.state_dict())
         states.append(checkpoints.load(folder / "checkpoints" / f"task_{task}.safetensors")["policy"])
     answers = []
     for task in range(2):

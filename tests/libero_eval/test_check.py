@@ -33,7 +33,7 @@ def finished(tmp_path_factory):
             preset="",
             tasks=names,
             instructions=names,
-            config="seed: 1",
+            config={"seed": 1},
         )
         context.directory.log.append(start)
         sequence(context).run()
@@ -89,7 +89,7 @@ def test_checkpoints_of_other_tasks_and_runs_are_found(run):
     ]
     config = yaml.safe_load((run / "config.yaml").read_text())
     (run / "config.yaml").write_text(yaml.safe_dump(config | {"seed": 2}))
-    assert all("of another configuration" in text for text in faults(run)) and len(faults(run)) == 4
+    assert all("of another configuration" in text for text in faults(run)) and len(faults(run)) == 3
 
 
 def test_every_lost_or_changed_line_is_found(run):
@@ -127,10 +127,10 @@ def test_a_broken_configuration_is_found(run, content):
 
 def test_what_is_left_over_is_noted(run):
     folder = run / "checkpoints"
-    for name in (".tmpAbC", ".x.1234.part", "task_0.safetensors.broken"):
+    for name in (".x.1234.part", "task_0.safetensors.broken"):
         (folder / name).touch()
     (folder / "task_0.safetensors").unlink()
-    assert not faults(run) and len(notes(run)) == 4
+    assert not faults(run) and len(notes(run)) == 3
     (folder / "task_1.safetensors").unlink()
     assert "no checkpoints after tasks 0, 1" in faults(run)[0]
     (run / "eval").mkdir()

@@ -181,7 +181,7 @@ def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
     names = ["a", "b"]
     kinds = {"algo": "x", "benchmark": "y", "policy": "z", "seed": 1, "preset": ""}
     ResultLog(tmp_path / "results.jsonl").append(
-        start_record(**kinds, tasks=names, instructions=names, config="")
+        start_record(**kinds, tasks=names, instructions=names, config={})
     )
     before = (tmp_path / "results.jsonl").read_bytes()
     assert "Relearning" not in write_report([tmp_path]).read_text(encoding="utf-8")

@@ -278,23 +278,6 @@ def test_derpp_has_no_penalty_while_the_outputs_are_the_same():
     assert algorithm.penalty(policy) is None  # the draw of one step is not used in another
 
 
-def test_derpp_goes_on_from_the_mean_actions_that_an_earlier_version_kept():
-    torch.manual_seed(0)
-    policy, algorithm = Deep(), DERpp(budget=25)
-    for task in (0, 1):
-        learn(algorithm, policy, task)
-    state = algorithm.state_dict()
-    earlier = {**state, "outputs": {task: answers["mean"] for task, answers in state["outputs"].items()}}
-    checkpoints.check(earlier, DERpp.state_form, "a run")
-    other = DERpp(budget=25)
-    other.load_state_dict(earlier, {0: Windows(0), 1: Windows(1)})
-    sequences.assert_same(other.state_dict(), state)
-    learn(other, policy, 2)
-    batch = other.memory.sample(25, generator(0))
-    assert other.stored_outputs(batch).keys() == {"mean"}
-    assert policy.divergence(batch, other.stored_outputs(batch)).isfinite().all()
-
-
 # --- LwF
 
 

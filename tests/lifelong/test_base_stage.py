@@ -31,7 +31,7 @@ ALGORITHMS = sorted(f.stem for f in FILES if str(f.parent) == "algo")
 def record(sizes: tuple[int, ...]) -> RunRecord:
     names = [f"t{k}" for k in range(sum(sizes))]
     kinds = {"algo": "x", "benchmark": "y", "policy": "z", "seed": 1, "preset": ""}
-    return start_record(**kinds, tasks=names, instructions=names, config="", group_sizes=sizes)
+    return start_record(**kinds, tasks=names, instructions=names, config={}, group_sizes=sizes)
 
 
 def context(path: Path, algorithm) -> RunContext:

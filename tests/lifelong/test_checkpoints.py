@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError
+from tests.harness.checkpoints import write_forged
 
 
 def test_a_tree_is_loaded_as_it_was_saved(tmp_path):
@@ -116,15 +117,6 @@ def test_any_flipped_byte_is_found(tmp_path):
     assert not silent
 
 
-def test_files_of_earlier_versions_are_read_without_a_checksum(tmp_path):
-    path = tmp_path / "x.safetensors"
-    tree = {"dict": [["task", {"value": 1}], ["w", {"tensor": "/w"}]]}
-    entries = {"format": "lifelong-1", "tree": json.dumps(tree)}
-    save_file({"": torch.zeros(0), "/w": torch.ones(2)}, path, entries)
-    found = checkpoints.load(path)
-    assert found["task"] == 1 and found["w"].tolist() == [1, 1] and not checkpoints.is_sealed(path)
-
-
 @pytest.mark.parametrize(
     "tree",
     [
@@ -138,13 +130,11 @@ def test_files_of_earlier_versions_are_read_without_a_checksum(tmp_path):
         '{"list": {"value": 1}}',
         '{"dict": [], "list": []}',
         '{"list": [' * 200 + '{"value": 1}' + "]}" * 200,
-        "[" * 100_000,
-        "{",
     ],
 )
 def test_a_tree_that_was_not_written_here_is_refused(tmp_path, tree):
     path = tmp_path / "x.safetensors"
-    save_file({"": torch.zeros(0)}, path, {"format": "lifelong-1", "tree": tree})
+    write_forged(path, {"": torch.zeros(0)}, json.loads(tree))
     with pytest.raises(CheckpointError, match=r"x\.safetensors is broken, or is no checkpoint"):
         checkpoints.load(path)
 

@@ -30,7 +30,7 @@ START = start_record(
     preset="smoke",
     tasks=["a"],
     instructions=["do a"],
-    config="",
+    config={},
     conditions=present_conditions(torch.device("cpu"), renderer="llvmpipe"),
 )
 SETTINGS = RunSettings(

@@ -319,8 +319,6 @@ def test_deterministic_divergence_is_the_squared_distance_of_the_actions() -> No
     teacher, student = head(randn(2, 5, 4)), head(randn(2, 5, 4) + 1)
     expected = (student["means"] - teacher["means"]).square().sum(-1)
     assert torch.equal(head.divergence(head.answers(teacher), student), expected)
-    only_mean = {"mean": torch.zeros(5, 2)}  # of a mixture, from a memory that an earlier version kept
-    assert torch.equal(gmm().divergence(only_mean, mixture(0)), gmm().mean(mixture(0)).square().sum(-1))
 
 
 def test_proprio_is_of_order_one_and_dropout_takes_whole_windows() -> None:

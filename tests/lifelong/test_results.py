@@ -34,7 +34,7 @@ START = start_record(
     preset="smoke",
     tasks=["first_task", "second_task"],
     instructions=["pick up the first", "pick up the second"],
-    config="seed: 1",
+    config={"seed": 1},
 )
 
 

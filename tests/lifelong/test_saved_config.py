@@ -5,7 +5,7 @@ import os
 import pytest
 
 from lifelong.errors import ConfigError
-from lifelong.results.saved_config import read_saved_config
+from lifelong.results.run_directory import read_saved_config
 
 BOMB = "a: &a [1,1,1,1,1,1,1,1,1]\n" + "".join(
     f"{b}: &{b} [{','.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefg", "bcdefgh", strict=True)

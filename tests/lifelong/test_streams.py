@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from libero_env.storage import atomic_write_text
 from libero_env.tasks import get_suite
 from lifelong import checkpoints
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
@@ -26,7 +24,6 @@ from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.provenance import start_record, utc_now
 from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
-from lifelong.results.saved_config import upgrade_config
 from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
 from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
@@ -201,7 +198,7 @@ def four(path: Path, algorithm, **changes) -> RunContext:
         preset="",
         tasks="abcd",
         instructions="abcd",
-        config="",
+        config={},
         group_sizes=changes.get("stream", context.stream).group_sizes(4, changes.get("group_size", 2)),
     )
     if not context.directory.log.read().records:
@@ -264,7 +261,7 @@ def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
             preset="",
             tasks="abcd",
             instructions="abcd",
-            config="",
+            config={},
             group_sizes=(2, 2),
         )
     )
@@ -355,23 +352,13 @@ def test_pretraining_is_joint_without_evaluation_and_done_once(tmp_path, monkeyp
     assert_same(dict(again.policy.state_dict()), dict(trained))
 
 
-def test_an_equal_pretraining_of_an_earlier_version_is_reused(tmp_path) -> None:
-    flat = {
-        "_target_": "lifelong.policies.bc_rnn.BCRNN",
-        "image_embed": 64,
-        "text_embed": 32,
-        "image_width": 16,
-        "rnn_hidden": 256,
-        "head": "deterministic",
-        "head_hidden": 256,
-    }
-    earlier = {"pretrain": {"suite": "libero_90"}, "policy": flat, "seed": 1}
-    atomic_write_text(tmp_path / "0123456789ab" / "config.yaml", yaml.safe_dump(earlier))
-    now = upgrade_config(earlier)
-    assert now["policy"]["temporal"]["hidden"] == 256, "the keys are those of today"
-    assert pretraining_directory(tmp_path, now).path == tmp_path / "0123456789ab"
-    other = pretraining_directory(tmp_path, now | {"seed": 2}).path
-    assert other.parent == tmp_path and other.name != "0123456789ab"
+def test_an_equal_pretraining_is_reused(tmp_path) -> None:
+    config = {"pretrain": {"suite": "libero_90"}, "policy": {"width": 16}, "seed": 1, "device": "cpu"}
+    path = pretraining_directory(tmp_path, config).path
+    assert (
+        path.parent == tmp_path and pretraining_directory(tmp_path, config | {"device": "cuda"}).path == path
+    )
+    assert pretraining_directory(tmp_path, config | {"seed": 2}).path != path
 
 
 def test_a_policy_may_start_from_a_finished_runs_weights(tmp_path) -> None:

@@ -44,7 +44,7 @@ def test_metrics_of_three_tasks_from_their_records():
             preset="",
             tasks=names,
             instructions=names,
-            config="",
+            config={},
         )
     ]
     for task, (curve, row) in enumerate(zip(curves, rows, strict=True)):

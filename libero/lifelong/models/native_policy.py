@@ -21,15 +21,74 @@ from libero.lifelong.models.modules.rgb_modules import configure_resnet, resnet_
 from libero.lifelong.models.policy_head import HEADS, GMMHead, check_activation, wrap_head
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import sinusoidal_positions
+from lifelong.policies import BCRNN, BCTransformer, BCViLT
 from lifelong.policies.history import HistoryPolicy
-from lifelong.results.saved_config import upgrade_policy
 from lifelong.settings import build
+
+# Flat key -> key of the component of the network. Keys that are not listed are those of the network itself.
+_RESNET = {
+    "image_width": "width",
+    "stage_blocks": "stage_blocks",
+    "stem_kernel": "stem_kernel",
+    "stem_stride": "stem_stride",
+    "stem_pool": "stem_pool",
+    "keypoints": "keypoints",
+    "keypoint_temperature": "temperature",
+    "readout": "readout",
+    "norm": "norm",
+}
+_PATCHES = {
+    "patch_width": "width",
+    "stem_kernel": "stem_kernel",
+    "stem_stride": "stem_stride",
+    "patch": "patch",
+    "norm": "norm",
+}
+_SPATIAL = {
+    "spatial_layers": "layers",
+    "spatial_heads": "heads",
+    "spatial_head_dim": "head_dim",
+    "spatial_mlp_dim": "mlp_dim",
+    "dropout": "dropout",
+}
+_TRANSFORMER = {key: key for key in ("layers", "heads", "head_dim", "mlp_dim", "dropout")}
+_LSTM = {"rnn_hidden": "hidden", "rnn_layers": "layers", "dropout": "dropout"}
+_TRUNK = {"head_hidden": "hidden", "head_layers": "layers"}
+_HEADS = {
+    "deterministic": ("DeterministicHead", {**_TRUNK, "head_norm": "norm"}),
+    "gmm": (
+        "GMMHead",
+        {
+            **_TRUNK,
+            "head_norm": "norm",
+            "modes": "modes",
+            "min_std": "min_std",
+            "low_eval_noise": "low_eval_noise",
+        },
+    ),
+    "flow": ("FlowHead", {**_TRUNK, "chunk": "chunk", "execute": "execute", "flow_steps": "steps"}),
+}
+_COMPONENTS: dict[type[HistoryPolicy], dict[str, tuple[str, dict[str, str]]]] = {
+    BCTransformer: {
+        "encoder": ("ResNetFiLMEncoder", _RESNET),
+        "temporal": ("TemporalTransformer", _TRANSFORMER),
+    },
+    BCRNN: {
+        "encoder": ("ResNetFiLMEncoder", _RESNET),
+        "temporal": ("TemporalLSTM", _LSTM),
+    },
+    BCViLT: {
+        "encoder": ("PatchEncoder", _PATCHES),
+        "spatial": ("SpatialTransformer", _SPATIAL),
+        "temporal": ("TemporalTransformer", _TRANSFORMER),
+    },
+}
 
 
 class NativePolicy(BasePolicy):
     """Policy with a `HistoryPolicy` as `network`, whose checkpoints and this policy's weights are interchangeable.
 
-    `cfg.policy.native` holds further arguments of the network, as flat keys (see `upgrade_policy`). With `norm: batch`,
+    `cfg.policy.native` holds further arguments of the network, as flat keys. With `norm: batch`,
     `normalise_proprio: false` and `standardise_language: false` the network computes exactly what the original does.
 
     Raises:
@@ -45,8 +104,7 @@ class NativePolicy(BasePolicy):
         self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
         arguments = {**self._arguments(policy), **_head_arguments(policy)}
         arguments |= plain(policy.get("native") or {})
-        node = upgrade_policy({"_target_": f"{self.kind.__module__}.{self.kind.__name__}", **arguments})
-        self.network: Any = build(OmegaConf.create(node), spec=self.spec)
+        self.network: Any = build(OmegaConf.create(_node(self.kind, arguments)), spec=self.spec)
         self._configure(policy)
         loss = policy.policy_head.get("loss_kwargs") or {}
         head = wrap_head(self.network.head, float(loss.get("loss_coef", 1.0)))
@@ -103,6 +161,17 @@ class NativePolicy(BasePolicy):
         """Append a frame to the history; return its latent (B, E)."""
         self.latent_queue = [*self.latent_queue, self.spatial_encode(data)][-self.max_seq_len :]
         return self.temporal_encode(torch.cat(self.latent_queue, dim=1))[:, -1]
+
+
+def _node(kind: type[HistoryPolicy], arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a network from flat keys, such as `image_width` for the width of its encoder."""
+    components = {**_COMPONENTS[kind], "head": _HEADS[arguments.pop("head")]}
+    flat = {key for _, keys in (*components.values(), *_HEADS.values()) for key in keys}
+    node = {key: value for key, value in arguments.items() if key not in flat}
+    for name, (target, keys) in components.items():
+        values = {new: arguments[old] for old, new in keys.items() if old in arguments}
+        node[name] = {"_target_": f"lifelong.nn.{target}", "_partial_": True, **values}
+    return {"_target_": f"{kind.__module__}.{kind.__name__}", **node}
 
 
 def resnet_sizes(policy: Any) -> dict[str, Any]:
