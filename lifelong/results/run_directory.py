@@ -18,8 +18,7 @@ from typing import Any
 import yaml
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import PART_SUFFIX, atomic_write_text
-from libero_env.validation import read_yaml_file
+from libero_env.storage import PART_SUFFIX, atomic_write_text, read_yaml_file
 from lifelong.errors import ConfigError, RunLockedError
 from lifelong.results.checkpoint_folder import CheckpointFolder
 from lifelong.results.log import ResultLog
