@@ -9,7 +9,7 @@ import yaml
 
 from libero_env.envs.env import LiberoEnv
 from libero_env.objects import catalog
-from libero_env.objects.builtin import BUILDERS
+from libero_env.objects.builtin import builtin_names
 from libero_env.tasks import Task, get_suite, suite_names
 from libero_env.tasks.builder import build_problem, load_scene
 
@@ -99,7 +99,9 @@ def test_the_gallery_is_whole():
         for suite in suite_names()
         for task in get_suite(suite).tasks
     }
-    assert sorted(shown) == sorted([*tasks, *(f"images/gallery/objects/{name}.jpg" for name in BUILDERS)])
+    assert sorted(shown) == sorted(
+        [*tasks, *(f"images/gallery/objects/{name}.jpg" for name in builtin_names())]
+    )
     assert not [path for path in shown if not (docs / path).exists()]
     for path, task in tasks.items():
         assert re.search(f'"{re.escape(path)}"[^>]*><br>{task.index}: {task.language} \\|', text), task.id

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.objects import folder
-from libero_env.objects.builtin import BUILDERS
+from libero_env.objects import builtin, folder
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 
 Builder = Callable[[], ObjectModel]
@@ -26,20 +25,20 @@ def get_object(category: str) -> ObjectModel:
         LiberoError: A registered builder returned something that a scene cannot attach, or a file in the user's
             folder is missing or broken.
     """
-    builder = _registered.get(category) or BUILDERS.get(category)
-    if builder is None:
-        if (place := folder.find(category)) is not None:
-            return folder.load(place, category)
-        raise UnknownNameError("object category", category, object_names())
-    model = builder()
     if category in _registered:
+        model = _registered[category]()
         _check(category, model)
-    return model
+        return model
+    if category in builtin.builtin_names():
+        return builtin.build(category)
+    if (directory := folder.find(category)) is not None:
+        return folder.load(directory, category)
+    raise UnknownNameError("object category", category, object_names())
 
 
 def object_names() -> tuple[str, ...]:
     """Return all categories that `get_object` accepts, sorted."""
-    return tuple(sorted({*BUILDERS, *user_defined_names()}))
+    return tuple(sorted(builtin.builtin_names() | user_defined_names()))
 
 
 def user_defined_names() -> frozenset[str]:

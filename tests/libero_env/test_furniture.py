@@ -7,12 +7,19 @@ import numpy as np
 import pytest
 
 from libero_env.objects import get_object
-from libero_env.objects.builtin import books, containers, racks, shelves
 
 pytestmark = pytest.mark.sim
 
-FURNITURE = sorted(
-    {**books.APPEARANCES, **containers.APPEARANCES, **racks.APPEARANCES, **shelves.APPEARANCES}
+BOOKS = ("black_book", "yellow_book")
+FURNITURE = (
+    *BOOKS,
+    "desk_caddy",
+    "rack",
+    "white_storage_box",
+    "wine_rack",
+    "wooden_shelf",
+    "wooden_tray",
+    "wooden_two_layer_shelf",
 )
 OPENINGS = {  # category -> (site of the region, the way into it from outside)
     "desk_caddy": [(f"{place}_contain_region", (0, 0, -1)) for place in ("left", "right", "front", "back")],
@@ -84,7 +91,7 @@ def test_shelves_and_boxes_stand_with_their_tops_up():
         assert data.site(name).xpos[2] > 0.13
 
 
-@pytest.mark.parametrize("category", sorted(books.APPEARANCES))
+@pytest.mark.parametrize("category", BOOKS)
 def test_books_show_their_colour_from_all_sides_but_the_pages(category):
     pixels = get_object(category).spec.compile().tex_data.reshape(-1, 3).astype(float)
     dark, yellow = pixels.max(axis=1) < 60, (pixels[:, 0] > 200) & (pixels[:, 2] < 90) & (pixels[:, 1] > 150)

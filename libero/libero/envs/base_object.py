@@ -15,7 +15,7 @@ from libero._adapters.envs.models import assets_folder, facade_pack
 from libero._adapters.lookup import lookup
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
-from libero_env.objects.builtin import BUILDERS
+from libero_env.objects.builtin import builtin_names
 from libero_env.objects.builtin.physics import Physics, load_physics
 from libero_env.sim.predicates import reaches_state
 
@@ -33,7 +33,7 @@ def register_object(target_class: Any) -> Any:
     category = category_of(target_class.__name__)
     if hasattr(target_class, "_get_object_subtree"):
         accept_plain_files(target_class)
-    if not (issubclass(target_class, BuiltinObject) and category in BUILDERS):
+    if not (issubclass(target_class, BuiltinObject) and category in builtin_names()):
         register_model(category, lambda: model_of(target_class(name=category), category))
     OBJECTS_DICT[category] = target_class
     return target_class
@@ -159,7 +159,7 @@ class BuiltinObject(BaseObject):
         self.name = name or self.category_name
         if model is not None:
             self.__dict__["model"] = model
-        if self.family and self.category_name not in BUILDERS:
+        if self.family and self.category_name not in builtin_names():
             self._own_file(obj_name or self.category_name, joints)
             return
         physics = model or _parameters(self.category_name)

@@ -8,7 +8,7 @@ import numpy as np
 
 from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
 from libero.libero.envs.objects.site_object import SiteObject
-from libero_env.objects.builtin import BUILDERS
+from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
 from libero_env.sim.scene import Scene
 
@@ -33,7 +33,7 @@ def _instance(name: str, model: ObjectModel) -> BaseObject:
     if found is None:  # a category that is registered only with `libero_env`
         found = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
         return found(name=name, model=model)
-    ours = issubclass(found, BuiltinObject) and model.category in BUILDERS
+    ours = issubclass(found, BuiltinObject) and model.category in builtin_names()
     return found(name=name, model=model) if ours else found(name=name)
 
 

@@ -25,7 +25,7 @@ from libero_env.design.objects.mjcf_write import Body, store_mesh
 from libero_env.design.objects.trial import try_object
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects import catalog, folder
-from libero_env.objects.builtin import BUILDERS
+from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
 from libero_env.objects.references import MAX_FACES
 from libero_env.paths import cache_dir, objects_dir
@@ -189,7 +189,7 @@ def check_name(name: str, *, reject_existing: bool = True) -> str:
         )
     if keyword.iskeyword(name):
         raise InvalidInputError(f"{name} is a reserved word of Python; choose another (--name my_{name})")
-    if name in BUILDERS:
+    if name in builtin_names():
         raise LiberoError(f"{name} is the name of a builtin object; choose another (--name my_{name})")
     if reject_existing and name in folder.names():
         raise LiberoError(

@@ -1,67 +1,33 @@
-"""Build an `ObjectModel` from the physics of a category and the appearance that a function makes."""
+"""The models of the builtin objects, from their physics (`parameters/`) and their appearance (`appearance/`)."""
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cache, partial
+from collections.abc import Iterator
 from itertools import count
-from types import MappingProxyType
 
 import mujoco
-import numpy as np
 
 from libero_env.mujoco_compat import set_damping
-from libero_env.objects.builtin.mesh import Mesh
-from libero_env.objects.builtin.physics import Part, Physics, load_physics
-from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel, rest_quat
+from libero_env.objects.builtin.appearance import Appearance, appearance_of
+from libero_env.objects.builtin.physics import Part, Physics, categories, load_physics
+from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel
 
 HIDDEN_GROUP = 3
 GLOWING_SITES = ("burner",)
+TARGET_ZONE = "target_zone"
 
 
-@dataclass(frozen=True)
-class Appearance:
-    """Visual of a body: a mesh and its texture.
+def builtin_names() -> frozenset[str]:
+    """Return the categories of the builtin pack."""
+    return frozenset((*categories(), TARGET_ZONE))
 
-    Attributes:
-        mesh: Triangles in the frame that `frame` names, [m]: z up, front towards +x.
-        image: Texture as PNG bytes; the first row of the file is v = 0.
-        specular: Strength of highlights, in [0, 1].
-        shininess: Sharpness of highlights, in [0, 1].
-        alpha: Opacity, in [0, 1]; 1 is opaque.
-        frame: `rest` (origin at the root, axes of the world when the object is at rest) or `body` (frame of the body).
+
+def build(category: str) -> ObjectModel:
+    """Return a new model of a builtin category at each call.
+
+    Raises:
+        KeyError: No builtin object has this name.
     """
-
-    mesh: Mesh
-    image: bytes
-    specular: float = 0.25
-    shininess: float = 0.4
-    alpha: float = 1.0
-    frame: str = "rest"
-
-
-# Appearance of the root body, or body name (`main` is the root) -> one or several, such as a window's frame and glass.
-Appearances = Appearance | Mapping[str, Appearance | tuple[Appearance, ...]]
-AppearanceFunction = Callable[[], Appearances]
-
-
-def builders_of(functions: Mapping[str, AppearanceFunction]) -> Mapping[str, Callable[[], ObjectModel]]:
-    """Return a builder for each category; an appearance is drawn once per process, on its first use.
-
-    Args:
-        functions: Category -> function that makes its appearance.
-    """
-    return MappingProxyType(
-        {category: partial(build, category, cache(function)) for category, function in functions.items()}
-    )
-
-
-def build(category: str, make_appearance: AppearanceFunction) -> ObjectModel:
-    """Build the model of a builtin category.
-
-    Args:
-        category: Name of the category in `parameters/`.
-        make_appearance: Returns what the bodies look like.
-    """
+    if category == TARGET_ZONE:
+        return _target_zone()
     physics = load_physics(category)
     spec = mujoco.MjSpec()
     spec.modelname = category
@@ -75,14 +41,9 @@ def build(category: str, make_appearance: AppearanceFunction) -> ObjectModel:
         _add_joint(bodies[name], part)
         _add_collision(bodies[name], part, physics, numbers)
         _add_sites(bodies[name], part, name == ROOT_BODY)
-    appearances = make_appearance()
-    turned = _conjugate(rest_quat(physics.rotation))
-    for name, several in (
-        appearances.items() if isinstance(appearances, Mapping) else [(ROOT_BODY, appearances)]
-    ):
-        for index, one in enumerate(several if isinstance(several, tuple) else (several,)):
-            mesh = one.mesh if one.frame == "body" else one.mesh.rotated(turned)
-            _add_visual(spec, bodies[name], category, one, mesh, suffix=f"_{index}" if index else "")
+    for name, several in appearance_of(category).items():
+        for index, appearance in enumerate(several):
+            _add_visual(spec, bodies[name], category, appearance, suffix=f"_{index}" if index else "")
     return ObjectModel(
         category=category,
         spec=spec,
@@ -137,11 +98,10 @@ def _add_visual(
     body: mujoco.MjsBody,
     category: str,
     appearance: Appearance,
-    mesh: Mesh,
     *,
     suffix: str,
 ) -> None:
-    root = body.name == ROOT_BODY
+    root, mesh = body.name == ROOT_BODY, appearance.mesh
     prefix = (category if root else f"{category}_{body.name}") + suffix
     # The category is a prefix of each name: scenes share one namespace for textures and materials.
     # A file in `assets`, not a buffer: MuJoCo cannot write buffers as XML.
@@ -195,5 +155,13 @@ def _padded(size: tuple[float, ...]) -> tuple[float, ...]:
     return (*size, 0.0, 0.0, 0.0)[:3]
 
 
-def _conjugate(quat: np.ndarray) -> np.ndarray:
-    return quat * (1.0, -1.0, -1.0, -1.0)
+def _target_zone() -> ObjectModel:
+    """Return a flat translucent rectangle that marks a place; its site `default_site` is slightly above it."""
+    spec, box, half = mujoco.MjSpec(), mujoco.mjtGeom.mjGEOM_BOX, (0.05, 0.05, 0.001)
+    spec.modelname = TARGET_ZONE
+    spec.compiler.degree = False
+    body = spec.worldbody.add_body(name=ROOT_BODY, explicitinertial=True, mass=0.0, inertia=(0.0, 0.0, 0.0))
+    color, clear = (0.85, 0.15, 0.15, 0.5), (0.0, 0.0, 0.0, 0.0)
+    body.add_geom(name="visual", type=box, size=half, rgba=color, group=1, contype=0, conaffinity=0, mass=0.0)
+    body.add_site(name="default_site", type=box, size=(*half[:2], 0.007), rgba=clear, group=HIDDEN_GROUP)
+    return ObjectModel(category=TARGET_ZONE, spec=spec, horizontal_radius=half[0])

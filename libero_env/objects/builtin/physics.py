@@ -141,6 +141,32 @@ class Physics:
         return self.root.mass + sum(part.mass for part in self.parts.values())
 
 
+def categories() -> tuple[str, ...]:
+    """Return the categories that have parameters."""
+    return tuple(_texts("parameters"))
+
+
+def read_section(folder: str, category: str) -> dict[str, Any]:
+    """Return what a folder of YAML files beside this module says about a category, parsed at each call.
+
+    Raises:
+        KeyError: No builtin object has this name.
+    """
+    return parse_yaml(_texts(folder)[category])[category]
+
+
+@cache
+def _texts(folder: str) -> dict[str, str]:
+    """Return category -> its section of the files, not yet parsed: a scene needs a few of many."""
+    paths = [path for path in (files(__package__) / folder).iterdir() if path.name.endswith(".yaml")]
+    sections = [
+        section
+        for path in paths
+        for section in re.split(r"^(?=\w+:)", path.read_text(encoding="utf-8"), flags=re.M)
+    ]
+    return {section.split(":", 1)[0]: section for section in sections if not section.startswith("#")}
+
+
 _ROOT_KEYS = ("mass", "com", "inertia", "boxes", "sites")
 
 
@@ -151,7 +177,7 @@ def load_physics(category: str) -> Physics:
     Raises:
         KeyError: No builtin object has this name.
     """
-    raw = parse_yaml(_texts()[category])[category]
+    raw = read_section("parameters", category)
     root = _part({key: raw.pop(key) for key in _ROOT_KEYS if key in raw})
     parts = {name: _part(part) for name, part in raw.pop("parts", {}).items()}
     for key in ("rotation", "articulation"):
@@ -166,15 +192,6 @@ def _part(raw: Mapping[str, Any]) -> Part:
     if "joint" in values:
         values["joint"] = Joint(**_tuples(values["joint"]))
     return Part(**_tuples(values))
-
-
-@cache
-def _texts() -> dict[str, str]:
-    """Return category -> its section of the files, not yet parsed: a scene needs a few of many."""
-    folder = files(__package__) / "parameters"
-    texts = [file.read_text(encoding="utf-8") for file in folder.iterdir() if file.name.endswith(".yaml")]
-    parts = [part for text in texts for part in re.split(r"^(?=\w+:\n)", text, flags=re.M)]
-    return {part.split(":", 1)[0]: part for part in parts if not part.startswith("#")}
 
 
 def _tuples(mapping: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,24 +1,13 @@
-"""Parts of furniture (panels, bars, turned parts), textured with the tiles of one image.
-
-Meshes are in the frame of the object's root body with joints at zero: z up, metres. `in_body` transforms them into the
-frame of the body that they belong to.
-"""
+"""Parts of furniture: panels, bars, turned parts, each with a cell (u0, v0, u1, v1) of the texture. Metres, z up."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations, product
 
 import mujoco
 import numpy as np
 
-from libero_env.objects.builtin.mesh import Mesh, Ring, loft, merge
-from libero_env.objects.builtin.paint import png
-from libero_env.objects.builtin.physics import load_physics
-from libero_env.objects.model import ROOT_BODY
-
-TILE = 128  # [pixels] side of a tile
-
-Cell = tuple[float, float, float, float]  # u0, v0, u1, v1
+from libero_env.objects.builtin.mesh import CORNERS, Mesh, Ring, loft, merge
+from libero_env.objects.builtin.paint import Cell
 
 _FACES = {  # face -> (to the right, upwards), seen from outside
     "x+": ((0, 1, 0), (0, 0, 1)),
@@ -28,26 +17,6 @@ _FACES = {  # face -> (to the right, upwards), seen from outside
     "z+": ((1, 0, 0), (0, 1, 0)),
     "z-": ((1, 0, 0), (0, -1, 0)),
 }
-
-
-@dataclass(frozen=True)
-class Palette:
-    """Tiles side by side in one image.
-
-    Attributes:
-        tiles: Name -> image (TILE, TILE, 3) uint8, first row on top.
-    """
-
-    tiles: Mapping[str, np.ndarray]
-
-    def __getitem__(self, name: str) -> Cell:
-        """Return the bounds of a tile, slightly inset so that its neighbours do not bleed in."""
-        index, count, margin = list(self.tiles).index(name), len(self.tiles), 3.0 / TILE
-        return ((index + margin) / count, margin, (index + 1 - margin) / count, 1.0 - margin)
-
-    def png(self) -> bytes:
-        """Return the image of all tiles as PNG."""
-        return png(np.concatenate(list(self.tiles.values()), axis=1))
 
 
 def block(
@@ -73,16 +42,16 @@ def block(
     pieces = []
     for face, (right, up) in _FACES.items():
         middle = np.cross(right, up) * half
-        corners = [middle + s * np.multiply(right, inner) + t * np.multiply(up, inner) for s, t in _CORNERS]
+        corners = [middle + s * np.multiply(right, inner) + t * np.multiply(up, inner) for s, t in CORNERS]
         pieces.append(_facet(corners, half, face, cells.get(face, cell)))
     for corners in _chamfers(half, inner) if bevel else ():
         # A chamfer continues the texture of the face that is nearest in orientation.
         pieces.append(_facet(corners, half, _face_of(corners, half), cell))
     mesh = merge(pieces)
-    return Mesh(mesh.vertices + center, mesh.faces, mesh.texcoords)
+    return mesh.moved(center)
 
 
-def prism(outline: Sequence[tuple[float, float]], low: float, high: float, cell: Cell) -> Mesh:
+def prism(outline: Sequence[Sequence[float]], low: float, high: float, cell: Cell) -> Mesh:
     """Return the prism from y = low to y = high of a convex outline (x, z), counter-clockwise seen from -y."""
     points = np.array(outline, float)
     near, far = (np.column_stack([points[:, 0], np.full(len(points), y), points[:, 1]]) for y in (low, high))
@@ -95,11 +64,11 @@ def prism(outline: Sequence[tuple[float, float]], low: float, high: float, cell:
         along = np.abs(points[two] - points[one])
         pieces.append(_facet(side, half, "z+" if along[0] > along[1] else "x+", cell))
     mesh = merge(pieces)
-    return Mesh(mesh.vertices + center, mesh.faces, mesh.texcoords)
+    return mesh.moved(center)
 
 
 def turned(
-    profile: Sequence[tuple[float, float]],
+    profile: Sequence[Sequence[float]],
     cell: Cell,
     *,
     base: Sequence[float] = (0.0, 0.0, 0.0),
@@ -121,11 +90,23 @@ def turned(
     rings = [Ring(z, r, r, v, crease=not smooth) for (z, r), v in zip(points, way, strict=True)]
     mesh, quat = loft(rings, segments), np.empty(4)
     mujoco.mju_quatZ2Vec(quat, np.asarray(axis, float))
-    mesh = mesh.rotated(quat)
-    return Mesh(mesh.vertices + np.asarray(base), mesh.faces, _within(mesh.texcoords, cell))
+    mesh = mesh.rotated(quat).moved(base)
+    return Mesh(mesh.vertices, mesh.faces, _within(mesh.texcoords, cell))
 
 
-def outline_of(profile: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+def arch(length: float, height: float, thickness: float, half_width: float, cell: Cell) -> Mesh:
+    """Return a bent board along y, of half length `length`, whose ends are on the floor."""
+    y = np.linspace(-length, length, 9)
+    top = height - (height - thickness) * np.abs(y / length) ** 1.5
+    pieces = []
+    for i in range(len(y) - 1):
+        low = [(y[i], top[i] - thickness), (y[i + 1], top[i + 1] - thickness)]
+        pieces.append(prism([*low, (y[i + 1], top[i + 1]), (y[i], top[i])], -half_width, half_width, cell))
+    quarter = np.sqrt(0.5) * np.array([1.0, 0.0, 0.0, 1.0])  # the outline's x becomes y
+    return merge(pieces).rotated(quarter)
+
+
+def outline_of(profile: Sequence[Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
     """Return a profile closed at the axis, (n, 2), and the share of its length at each point, (n,) in [0, 1]."""
     points = np.array([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -155,27 +136,12 @@ def capsule(
     return turned(profile, cell, base=start, axis=(way / length).tolist(), segments=segments, smooth=True)
 
 
-def in_body(mesh: Mesh, category: str, body: str) -> Mesh:
-    """Return a mesh, given in the frame of the root body, in the frame of another body of the object."""
-    parts, chain = load_physics(category).parts, []
-    while body != ROOT_BODY:
-        chain.append(parts[body])
-        body = parts[body].parent
-    for part in reversed(chain):
-        away = Mesh(mesh.vertices - np.asarray(part.pos), mesh.faces, mesh.texcoords)
-        mesh = away.rotated(np.multiply(part.quat, (1.0, -1.0, -1.0, -1.0)))
-    return mesh
-
-
-_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-
-
 def _chamfers(half: np.ndarray, inner: np.ndarray) -> list[list[np.ndarray]]:
     """Return the chamfers of the twelve edges and eight corners of a box around the origin."""
     outer, cuts = np.diag(half - inner), []
     for one, two in combinations(range(3), 2):
         third = 3 - one - two
-        for s, t in _CORNERS:
+        for s, t in CORNERS:
             sign = np.ones(3)
             sign[one], sign[two] = s, t
             back = sign.copy()
