@@ -105,7 +105,8 @@ def test_a_folder_of_runs_is_no_run(inside, shown, tmp_path, capsys):
 
 @pytest.fixture
 def demo_file(tmp_path) -> Path:
-    from libero_env.demos.write import DemoWriter, Episode, make_header
+    from libero_env.demos.read import Episode
+    from libero_env.demos.write import DemoWriter, make_header
 
     frames = np.zeros((4, 8, 8, 3), np.uint8)
     obs = {"agentview_rgb": frames, "ee_pos": np.zeros((4, 3)), "ee_ori": np.zeros((4, 3))}

@@ -11,8 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from libero_env.demos.config import DemoConfig, RecordingJob
-from libero_env.demos.generate import make_demos
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.generate import RecordingJob, make_demos
 from libero_env.parallel import cpu_count
 from libero_env.tasks import get_suite
 

@@ -23,7 +23,7 @@ from hydra import compose, initialize_config_dir
 from scipy.stats import binomtest
 from torch import Tensor
 
-from libero_env.demos.read import Demo, read_demos
+from libero_env.demos.read import Episode, read_demos
 from libero_env.envs.batch import BatchEnv
 from lifelong.algorithms import Sequential
 from lifelong.composition import config_folder
@@ -103,7 +103,7 @@ def learn(words: Sequence[str], suite: str, task: int, seed: int, demos: int) ->
     return result
 
 
-def held_out_error(policy: Policy, demos: Sequence[Demo], language: Tensor) -> dict[str, float]:
+def held_out_error(policy: Policy, demos: Sequence[Episode], language: Tensor) -> dict[str, float]:
     """Return the mean absolute error of the actions of demonstrations, on all frames and on those near the grasp."""
     data = SequenceVLDataset.from_demos(demos, spec=replace(policy.spec, seq_len=1), language=language)
     policy.eval()

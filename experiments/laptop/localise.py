@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from libero_env.demos.generate import ensure_demos
-from libero_env.demos.read import Demo, read_demos
+from libero_env.demos.read import Episode, read_demos
 from libero_env.envs.env import LiberoEnv
 from libero_env.tasks import Task, get_suite
 from lifelong.nn import RandomShift, ResNetFiLMEncoder
@@ -24,13 +24,13 @@ STEPS, BATCH, RATE, UNIT = 800, 64, 2e-3, 0.03  # UNIT: [m] of the position that
 LOW = 0.10  # [m] of the hand above the object
 
 
-def positions(task: Task, demos: Sequence[Demo]) -> Tensor:
+def positions(task: Task, demos: Sequence[Episode]) -> Tensor:
     """Return the position of the goal's first object from the grip site in every frame, (F, 3), [m]."""
     env = LiberoEnv(task, cameras=())
     view, found = env.world.views[0], []
     name = env.world.atoms[0].args[0]
     for demo in demos:
-        for state in demo.states if demo.states is not None else ():
+        for state in demo.states:
             env.set_state(state)
             found.append(view.body_pos(name) - view.eef_pos)
     env.close()

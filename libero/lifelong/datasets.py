@@ -171,5 +171,5 @@ def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
             raise DemoError(
                 f"{file}: {', '.join(missing)} missing from obs; it has {', '.join(obs) or 'nothing'}"
             )
-        check_demo(handle["data"][names[0]], file, names[0], keys)
+        check_demo(handle["data"][names[0]], f"{file}: {names[0]}", keys)
         return {key: tuple(obs[key].shape[1:]) for key in keys}

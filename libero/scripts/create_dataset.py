@@ -9,10 +9,11 @@ import h5py
 
 from libero.libero.utils.dataset_utils import get_dataset_info
 from libero.scripts.command import option, script
+from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import LOW_DIM_KEYS
-from libero_env.demos.curate import recorded_task
-from libero_env.demos.observe import RenderConfig
-from libero_env.demos.replay import rerender, rerun_actions
+from libero_env.demos.observe import recorded_task
+from libero_env.demos.rendering import rerender
+from libero_env.demos.replay import rerun_actions
 from libero_env.storage import atomic_path
 
 

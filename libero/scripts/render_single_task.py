@@ -59,5 +59,5 @@ def task_and_states(args: argparse.Namespace) -> tuple[str, Sequence[np.ndarray]
         raise LiberoError("which task? Pass --benchmark_name and --task_id, or --bddl_file")
     if args.demo_file:
         demos = read_demos(args.demo_file, (), args.num)
-        states = [demo.states[0] for demo in demos if demo.states is not None]
+        states = [demo.states[0] for demo in demos if demo.states.shape[1]]
     return file, states

@@ -132,8 +132,7 @@ def run_download(args: argparse.Namespace) -> None:
 
 def run_generate(args: argparse.Namespace) -> int:
     """Record what is missing, then list the files and the failures; return 1 if a task is not complete."""
-    from libero_env.demos.config import RecordingJob
-    from libero_env.demos.generate import demo_path, make_demos
+    from libero_env.demos.generate import RecordingJob, demo_path, make_demos
     from libero_env.paths import demos_dir
 
     root = args.folder or demos_dir()

@@ -124,9 +124,10 @@ def run_replay(args: argparse.Namespace) -> int:
 
 def run_rerender(args: argparse.Namespace) -> None:
     """Write the new file and describe it."""
+    from libero_env.demos.config import RenderConfig
     from libero_env.demos.curate import describe
-    from libero_env.demos.observe import RenderConfig
-    from libero_env.demos.replay import recorded_rendering, rerender
+    from libero_env.demos.observe import recorded_rendering
+    from libero_env.demos.rendering import rerender
     from libero_env.perturbations import parse_perturbations
 
     config = RenderConfig(drawing=args.drawing)
@@ -155,7 +156,7 @@ def run_export(args: argparse.Namespace) -> None:
     """Write the data set and print its size."""
     from libero_env.demos.curate import find_demo_files
     from libero_env.demos.lerobot import export_lerobot, export_published
-    from libero_env.demos.regenerate import Regeneration
+    from libero_env.demos.replay import Regeneration
 
     files = find_demo_files(args.files)
     if args.published is None:

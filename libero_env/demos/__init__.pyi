@@ -1,13 +1,11 @@
-from .config import DemoConfig, RecordingJob, Variation
-from .generate import ensure_demos, make_demos
+from .config import DemoConfig, RenderConfig, Variation
+from .generate import RecordingJob, ensure_demos, make_demos
 from .lerobot import export_lerobot
-from .observe import RenderConfig
-from .read import Demo, DemoOrigin, demo_lengths, demo_origin, iter_demos, read_demos
-from .replay import rerender
-from .write import DemoWriter, Episode
+from .read import DemoOrigin, Episode, demo_lengths, demo_origin, iter_demos, read_demos
+from .rendering import rerender
+from .write import DemoWriter
 
 __all__ = [
-    "Demo",
     "DemoConfig",
     "DemoOrigin",
     "DemoWriter",

@@ -1,12 +1,12 @@
-"""What the demonstrations of a task depend on, and what a file states about how it was made."""
+"""What demonstrations depend on: how they are recorded, what is rendered, and what a file states about both."""
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from importlib import metadata
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import mujoco
 import numpy as np
@@ -15,22 +15,47 @@ from pydantic import Field
 from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS, robosuite_version
 from libero_env.demos.contents import Pairing
-from libero_env.demos.observe import RenderConfig
-from libero_env.demos.write import DemoWriter, make_header
-from libero_env.errors import UnknownNameError
+from libero_env.demos.write import make_header
+from libero_env.errors import InvalidInputError
+from libero_env.perturbations.catalog import KINDS
+from libero_env.perturbations.episodes import checked_perturbations
+from libero_env.perturbations.value import Perturbation, format_perturbations
 from libero_env.sim.engine import MUJOCO, BackEnd
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
-from libero_env.sim.scene import FAST, build_scene, default_drawing
+from libero_env.sim.scene import DRAWINGS, FAST, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
-from libero_env.validation import validate, validate_arguments
+from libero_env.validation import OneOf, validate_arguments
 
 GENERATOR = "scripted-expert-14"  # change it when the same seed yields different demonstrations
+PERTURBED_HEADER = ("perturb", "perturb_draws")  # attributes of a file that was rendered under perturbations
+PERTURB_DRAWS = 1  # change it when the same perturbation of the same demonstration gives other observations
+
+_IN_PATH = ("source", "camera_size", "seed")  # options that the path of a file names anyhow
+
+Pixels = Annotated[int, Field(ge=1)]
+Drawing = Annotated[str, OneOf(DRAWINGS)]
+Robot = Annotated[str, OneOf(ROBOTS)]
+
+
+class _Settings:
+    """Base of dataclasses whose values are checked against the annotations of their fields."""
+
+    _unchecked: tuple[str, ...] = ()  # fields that check themselves
+
+    def __post_init__(self) -> None:
+        values = {name: value for name, value in vars(self).items() if name not in self._unchecked}
+        validate_arguments(type(self), values)
+
+    def changes(self) -> dict[str, Any]:
+        """Return the values that are not the defaults."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {name: value for name, value in values.items() if value != getattr(type(self), name, None)}
 
 
 @dataclass(frozen=True)
-class Variation:
+class Variation(_Settings):
     """How the demonstrations of a task differ from each other.
 
     Attributes:
@@ -46,17 +71,76 @@ class Variation:
     push_rate: Annotated[float, Field(ge=0, le=1)] = 0.02
     reserved: bool = False
 
-    def __post_init__(self) -> None:
-        validate_arguments(Variation, vars(self))
 
-    def header(self) -> dict[str, str]:
-        """Return the attributes of a file: the values that are not the defaults."""
-        changed = {key: value for key, value in vars(self).items() if value != getattr(Variation, key)}
-        return {"variation": json.dumps(changed)} if changed else {}
+@dataclass(frozen=True)
+class RenderConfig(_Settings):
+    """What is rendered of each state.
+
+    Attributes:
+        cameras: Names of the cameras in the model.
+        size: (height, width) of the images, pixels.
+        modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
+            and `segmentation_element`.
+        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
+        perturb: Perturbations, as for `EnvConfig`, of kinds that change what is seen or said, and no physics.
+
+    Raises:
+        UnknownNameError: A kind of perturbation does not exist.
+        InvalidInputError: A value is not valid, or a perturbation changes what happens.
+    """
+
+    cameras: tuple[str, ...] = DEFAULT_CAMERAS
+    size: tuple[Pixels, Pixels] = (128, 128)
+    modalities: tuple[str, ...] = ("rgb",)
+    drawing: Drawing | None = None
+    perturb: str | Sequence[Perturbation] = ()
+
+    _unchecked = ("perturb",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "perturb", rendered_perturbations(self.perturb))
+
+    @property
+    def perturbations(self) -> tuple[Perturbation, ...]:
+        """Perturbations, in the order in which they are applied."""
+        return cast(tuple[Perturbation, ...], self.perturb)
+
+    def header(self) -> dict[str, Any]:
+        """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
+        attributes: dict[str, Any] = {"camera_size": list(self.size)}
+        if self.cameras != DEFAULT_CAMERAS:
+            attributes["cameras"] = list(self.cameras)
+        if self.modalities != ("rgb",):
+            attributes["pictures"] = list(self.modalities)
+        if self.drawing not in (None, FAST):
+            attributes["drawing"] = self.drawing
+        if self.perturb:
+            text = format_perturbations(self.perturbations)
+            attributes |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
+        return attributes
+
+
+def rendered_perturbations(perturb: str | Sequence[Perturbation]) -> tuple[Perturbation, ...]:
+    """Return perturbations under which recorded states can be rendered, those of severity 0 left out.
+
+    Raises:
+        UnknownNameError: A kind of perturbation does not exist.
+        InvalidInputError: A perturbation is not valid, or changes what happens and not only what is seen or said.
+    """
+    rendered = []
+    for one in checked_perturbations(perturb):
+        if not isinstance(one, Perturbation) or not one.definition.is_rendered:
+            valid = ", ".join(kind.name for kind in KINDS.values() if kind.is_rendered)
+            raise InvalidInputError(
+                f"{one} changes what happens, and recorded demonstrations show what happened without it; valid: {valid}"
+            )
+        rendered.append(one)
+    return tuple(rendered)
 
 
 @dataclass(frozen=True)
-class DemoConfig:
+class DemoConfig(_Settings):
     """What the demonstrations of a task depend on.
 
     Attributes:
@@ -66,32 +150,31 @@ class DemoConfig:
         pairing: Which observation is stored with an action, see `libero_env.demos.read`.
         disturb: Whether noise is added to the executed actions; the file then also holds the expert's own actions.
         variation: How the demonstrations differ from each other.
-        cameras: Names of the cameras in the model.
-        modalities: Kinds of image, see `RenderConfig`.
-        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
+        cameras: As for `RenderConfig`.
+        modalities: As for `RenderConfig`.
+        drawing: As for `RenderConfig`.
         robot: Model of the arm, see `libero_env.assets.robot`.
         backend: Back end of the physics, such as `warp,device=cuda:1`, see `libero_env.sim.engine`. Images are drawn
             from the states by OpenGL with all of them.
     """
 
     source: Task | str
-    camera_size: tuple[int, int] = (128, 128)
-    seed: int = 0
+    camera_size: tuple[Pixels, Pixels] = (128, 128)
+    seed: Annotated[int, Field(ge=0)] = 0
     pairing: Pairing = "aligned"
     disturb: bool = True
     variation: Variation = Variation()
     cameras: tuple[str, ...] = DEFAULT_CAMERAS
     modalities: tuple[str, ...] = ("rgb",)
-    drawing: str | None = None
-    robot: str = DEFAULT_ROBOT
+    drawing: Drawing | None = None
+    robot: Robot = DEFAULT_ROBOT
     backend: str = MUJOCO
 
+    _unchecked = ("source", "variation")
+
     def __post_init__(self) -> None:
-        validate(Annotated[int, Field(ge=0)], self.seed, prefix=("seed",))
+        super().__post_init__()
         self.back_end.require_installed()
-        validate(Pairing, self.pairing, prefix=("pairing",))
-        if self.robot not in ROBOTS:
-            raise UnknownNameError("robot", self.robot, ROBOTS)
 
     @cached_property
     def drawn(self) -> str:
@@ -120,14 +203,23 @@ class DemoConfig:
         """What is rendered of each state."""
         return RenderConfig(self.cameras, self.camera_size, self.modalities, self.drawn)
 
+    def options(self) -> dict[str, Any]:
+        """Return the options that are not the defaults, beside task, size and seed, as plain data."""
+        drawing = None if self.drawn == FAST else self.drawn
+        options = replace(self, drawing=drawing, backend=self.back_end.name).changes()
+        if "variation" in options:
+            options["variation"] = self.variation.changes()
+        return {name: value for name, value in options.items() if name not in _IN_PATH}
+
     def header(self) -> dict[str, Any]:
         """Return the attributes of the file. This compiles the scene, for its digest."""
-        task = self.task
-        versions = {
-            "mujoco": metadata.version("mujoco"),
-            "robosuite": robosuite_version(),
-            "h5py": metadata.version("h5py"),
-        }
+        task, pack = self.task, select_pack()
+        versions = {name: metadata.version(name) for name in ("mujoco", "h5py")}
+        extra = self.render_config.header()
+        if variation := self.variation.changes():
+            extra["variation"] = json.dumps(variation)
+        if self.back_end.is_warp:  # files without it are of MuJoCo
+            extra["backend"] = self.back_end.name
         return make_header(
             problem_name=task.problem.name,
             language=task.language,
@@ -139,56 +231,11 @@ class DemoConfig:
             generator=GENERATOR,
             disturbed=self.disturb,
             robot=self.robot,
-            **(
-                {"backend": self.back_end.name} if self.back_end.is_warp else {}
-            ),  # files without it are of mujoco
             model_digest=model_digest(task, self.drawn, self.robot),
-            models=json.dumps({"pack": (pack := select_pack()).name, "digest": pack.digest}),
-            versions=json.dumps(versions),
-            **self.render_config.header(),
-            **self.variation.header(),
+            models=json.dumps({"pack": pack.name, "digest": pack.digest}),
+            versions=json.dumps({**versions, "robosuite": robosuite_version()}),
+            **extra,
         )
-
-    def key(self) -> str:
-        """Return a text that is the same for equal configurations of any task.
-
-        Folders of recorded demonstrations are named by a checksum of it, so it must never change. It contains the names
-        that classes and fields had when the first files were recorded.
-        """
-        v = self.variation
-        variation = (
-            f"Variation(style={v.style!r}, noise={v.noise!r}, push_rate={v.push_rate!r}, "
-            f"reserved={v.reserved!r})"
-        )
-        robot = "" if self.robot == DEFAULT_ROBOT else f", robot={self.robot!r}"
-        robot += f", backend={self.back_end.name!r}" if self.back_end.is_warp else ""
-        return (
-            f"Recipe(source='', camera_size={self.camera_size!r}, seed={self.seed!r}, pairing={self.pairing!r}, "
-            f"disturb={self.disturb!r}, variation={variation}, cameras={self.cameras!r}, "
-            f"pictures={self.modalities!r}{'' if self.drawn == FAST else f', drawing={self.drawn!r}'}{robot})"
-        )
-
-
-@dataclass(frozen=True)
-class RecordingJob:
-    """A demonstration file to record.
-
-    Attributes:
-        config: What its demonstrations depend on.
-        path: File to write.
-        header: Attributes of the file.
-    """
-
-    config: DemoConfig
-    path: Path
-    header: dict[str, Any] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "header", self.config.header())
-
-    def writer(self) -> DemoWriter:
-        """Return a writer of the file."""
-        return DemoWriter(self.path, self.header)
 
 
 @lru_cache(maxsize=16)

@@ -1,40 +1,27 @@
-"""Demonstration files as a whole: which task they are of, what is in them, and files made of parts of them."""
+"""Demonstration files as a whole: where they are, what is in them, and files made of parts of them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from libero_env.demos.contents import (
-    LOW_DIM_KEYS,
     check_demo,
     count_steps,
     demo_names,
-    is_image,
-    reached_goal,
-    read_values,
+    file_attributes,
+    json_attribute,
+    read_header,
     value_fault,
 )
-from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file
-from libero_env.demos.header import demo_attributes, file_attributes, json_attribute, read_header
-from libero_env.demos.write import DemoWriter, Episode
-from libero_env.errors import DemoError, UnknownNameError
+from libero_env.demos.hdf5 import open_demo_file
+from libero_env.demos.read import NOOP_THRESHOLD, Episode, noop_steps, read_episodes
+from libero_env.demos.write import DemoWriter
+from libero_env.errors import DemoError
 from libero_env.paths import demos_dir
-from libero_env.tasks import Task, bddl, get_suite
-from libero_env.tasks.builder import language_from_name
-from libero_env.tasks.problem import same_meaning
 from libero_env.text import show_bytes
-
-NOOP_THRESHOLD = 1e-3  # [action units] largest motion that counts as none
-_DERIVED = (
-    "num_samples",
-    "init_state",
-    "success",
-    "fixtures",
-)  # attributes that follow from the episode's fields
 
 
 @dataclass(frozen=True)
@@ -62,104 +49,6 @@ class DemoStats:
         return f"{length}, {done}" + (f", rendered under {self.perturb}" if self.perturb else "")
 
 
-def recorded_robot(file: Path) -> str:
-    """Return the model of the arm that was recorded, one of `libero_env.assets.robot.ROBOTS`.
-
-    This package's files name it; those before it had a name have robosuite 1.4.1's. The original's have 1.4.0's.
-
-    Raises:
-        DemoError: It is not a demonstration file.
-    """
-    header = read_header(file)
-    return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else "libero"))
-
-
-def recorded_task(file: Path) -> Task:
-    """Return the task that was recorded.
-
-    It is the benchmark's task that the file names, if the file's task text means the same, and else the task that the
-    text describes.
-
-    Raises:
-        DemoError: The file names no task.
-        BDDLError: Its task text cannot be read.
-    """
-    header = read_header(file)
-    name, text = Path(str(header.get("bddl_file_name", ""))), str(header.get("bddl_file_content", ""))
-    try:
-        known = next((t for t in get_suite(name.parent.name).tasks if t.name == name.stem), None)
-    except UnknownNameError:
-        known = None
-    if not text.strip():
-        if known is None:
-            raise DemoError(
-                f"{file}: neither bddl_file_content nor bddl_file_name states which task was recorded"
-            )
-        return known
-    problem = bddl.parse(text, f"{file} bddl_file_content")
-    if known is not None and same_meaning(known.problem, problem):
-        return known
-    return Task("file", 0, name.stem, language_from_name(name.stem), problem.language, problem)
-
-
-def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[tuple[str, Episode]]:
-    """Yield the name of each demonstration with all that is recorded of it; images are upright.
-
-    Args:
-        file: Demonstration file.
-        check_values: Whether numbers that are not finite or absurd are refused.
-
-    Raises:
-        DemoError: A demonstration is broken, or has no states; those before it have been returned.
-    """
-    with open_demo_file(file) as handle:
-        for name in demo_names(handle, file):
-            group = handle["data"][name]
-            obs = group.get("obs") if isinstance(group, h5py.Group) else None
-            keys = _known(obs) if isinstance(obs, h5py.Group) else []
-            size = check_demo(group, file, name, keys)
-            check_memory(size, f"{file}: {name}", "record shorter ones or smaller images")
-            if "states" not in group:
-                raise BrokenDemoError(f"{file}: {name}/states is missing; expected (T, 1 + nq + nv)")
-            yield name, _read_episode(group, file, name, keys, check_values)
-
-
-def _known(obs: h5py.Group) -> list[str]:
-    return [key for key in obs if is_image(key) or key in LOW_DIM_KEYS]
-
-
-def _read_episode(group: h5py.Group, file: Path, name: str, keys: list[str], check: bool) -> Episode:
-    def read(key: str) -> Any:
-        return read_values(group, key, file, name, check=check)
-
-    attrs, rewards = demo_attributes(group, f"{file}: {name}"), read("rewards")
-    return Episode(
-        read("actions"),
-        read("states"),
-        robot_states=read("robot_states"),
-        obs={key: read(f"obs/{key}") for key in keys},
-        expert_actions=read("expert_actions"),
-        success=reached_goal(group, f"{file}: {name}", (rewards,)),
-        fixtures=attrs.get("fixtures"),
-        attrs={key: value for key, value in attrs.items() if key not in _DERIVED},
-    )
-
-
-def noop_steps(actions: np.ndarray, threshold: float = NOOP_THRESHOLD) -> np.ndarray:
-    """Return which actions do nothing: no motion, and the gripper command as before.
-
-    Args:
-        actions: (T, 7).
-        threshold: Largest entry of a motion that counts as none.
-
-    Returns:
-        (T,) bool.
-    """
-    still = (np.abs(actions[:, :6]) <= threshold).all(axis=1)
-    same_gripper = np.concatenate([[True], actions[1:, 6] == actions[:-1, 6]])
-    return still & same_gripper
-
-
 def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     """Read a file completely and return what is in it.
 
@@ -172,11 +61,11 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     """
     lengths, successes, noops, faults = [], 0, 0, []
     shapes: dict[str, tuple[int, ...]] = {}
-    for name, episode in read_episodes(file, check_values=False):
+    for episode in read_episodes(file, check_values=False):
         lengths.append(len(episode))
         successes += episode.success
         noops += int(noop_steps(episode.labels, threshold).sum())
-        faults += [f"{name}{fault}" for fault in _faults(episode, shapes)]
+        faults += [f"{episode.name}{fault}" for fault in _faults(episode, shapes)]
     if not lengths:
         raise DemoError(f"{file}: no demonstrations; expected at least data/demo_0. Record them again")
     with open_demo_file(file) as handle:
@@ -238,33 +127,17 @@ def filter_demos(
     )
     writer.discard_parts()  # of an interrupted call, perhaps with another file
     count = 0
-    for name, episode in read_episodes(file):
+    for episode in read_episodes(file):
         if success_only and not episode.success:
             continue
         keep = ~noop_steps(episode.labels, threshold) if without_noops else np.ones(len(episode), bool)
         keep[-1] = True
-        kept = select_steps(episode, keep)
-        writer.write(count, replace(kept, attrs={**episode.attrs, "source_demo": name}))
+        attrs = {**episode.attrs, "source_demo": episode.name}
+        writer.write(count, replace(episode.select(keep), attrs=attrs))
         count += 1
     if not count:
         raise DemoError(f"{file}: no demonstration is successful; nothing to write")
     return examine(writer.finish())
-
-
-def select_steps(episode: Episode, keep: np.ndarray) -> Episode:
-    """Return the episode with the steps of a mask (T,) only."""
-
-    def select(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[keep]
-
-    return replace(
-        episode,
-        actions=episode.actions[keep],
-        states=episode.states[keep],
-        robot_states=select(episode.robot_states),
-        expert_actions=select(episode.expert_actions),
-        obs={key: values[keep] for key, values in episode.obs.items()},
-    )
 
 
 def find_demo_files(paths: list[Path]) -> list[Path]:
@@ -300,12 +173,12 @@ def describe(file: Path) -> str:
     """
     with open_demo_file(file) as handle:
         names, header = demo_names(handle, file), file_attributes(handle, file)
-        steps = sum(count_steps(handle["data"][name], file, name) for name in names)
+        steps = sum(count_steps(handle["data"][name], f"{file}: {name}") for name in names)
         obs = handle["data"][names[0]].get("obs") if names else None
         colours = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
         images = "no images"
         if colours and isinstance(obs, h5py.Group):
-            check_demo(handle["data"][names[0]], file, names[0], colours)
+            check_demo(handle["data"][names[0]], f"{file}: {names[0]}", colours)
             images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3])
     models = json_attribute(header, "models", file).get("pack", "unknown")
     failed = header.get("num_failed_attempts", "unknown")

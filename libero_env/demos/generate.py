@@ -4,40 +4,153 @@ Demonstration k of a task depends on its configuration and on k alone: not on th
 recorded before, or on how often the recording was interrupted.
 """
 
+import json
 import sys
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace as changed
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from libero_env.assets.robot import DEFAULT_ROBOT
-from libero_env.demos.config import GENERATOR, DemoConfig, RecordingJob
+from libero_env.demos.config import GENERATOR, DemoConfig
 from libero_env.demos.contents import Pairing
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.record import (
-    RecorderCache,
-    RecordingReport,
-    initialize_worker,
-    record_chunk,
-    record_chunk_in_worker,
-)
-from libero_env.demos.write import OtherRecordingError
+from libero_env.demos.record import RecordingReport, record_chunk, recorders
+from libero_env.demos.write import DemoWriter, OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.parallel import as_finished, check_main_guard, cpu_count, progress_bar, spawn_pool
 from libero_env.paths import demos_dir
-from libero_env.sim.scene import FAST
 from libero_env.tasks import Task, get_suite
 
 _WAIT_SECONDS = 600.0  # between two lines about the process that is waited for
+T = TypeVar("T")
 
-# A chunk is the position of a job, and the demonstrations of it to record together; a report on it begins likewise.
-_Chunk = tuple[int, list[int]]
-_ChunkReports = Generator[tuple[int, RecordingReport], None, None]
+
+class DemoJob:
+    """A demonstration file to make, of which some demonstrations may be there.
+
+    Attributes:
+        path: File to write.
+    """
+
+    path: Path
+
+    def writer(self) -> DemoWriter:
+        """Return a writer of the file."""
+        raise NotImplementedError
+
+    def missing(self, n: int) -> set[int]:
+        """Return which of the first `n` demonstrations are not there.
+
+        Raises:
+            DemoError: What is there is broken, or of another configuration.
+        """
+        raise NotImplementedError
+
+    def is_complete(self, n: int) -> bool:
+        """Return whether the file is finished and has the first `n` demonstrations."""
+        try:
+            return self.path.is_file() and not self.writer().parts.exists() and not self.missing(n)
+        except DemoError:
+            return False
+
+    def discard(self, error: DemoError) -> None:
+        """Remove what there is of the file, and say why."""
+        tqdm.write(f"recording again: {error}", file=sys.stderr)
+        self.path.unlink(missing_ok=True)
+        self.writer().discard_parts()
+
+
+@dataclass(frozen=True)
+class RecordingJob(DemoJob):
+    """A demonstration file to record.
+
+    Attributes:
+        config: What its demonstrations depend on.
+        path: File to write.
+        header: Attributes of the file.
+    """
+
+    config: DemoConfig
+    path: Path
+    header: dict[str, Any] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "header", self.config.header())
+
+    def writer(self) -> DemoWriter:
+        """Return a writer of the file."""
+        return DemoWriter(self.path, self.header)
+
+    def missing(self, n: int) -> set[int]:
+        """Return which of the first `n` demonstrations are not recorded; see `DemoJob`."""
+        return set(range(n)) - self.writer().recorded()
+
+
+J = TypeVar("J", bound=DemoJob)
+
+
+@contextmanager
+def claim_incomplete(jobs: Iterable[tuple[J, int]]) -> Iterator[list[tuple[J, int]]]:
+    """Yield the jobs that are not complete, while no other process works in their folders.
+
+    Args:
+        jobs: Jobs, each with its number of demonstrations.
+    """
+    incomplete = [(job, n) for job, n in jobs if not job.is_complete(n)]
+    with ExitStack() as locks:
+        for folder in sorted({job.path.parent for job, _ in incomplete}):
+            locks.enter_context(_recording_lock(folder))
+        # another process may have finished some before the folders were locked
+        yield [(job, n) for job, n in incomplete if not job.is_complete(n)]
+
+
+def run_each(
+    function: Callable[..., T],
+    arguments: Sequence[tuple[Any, ...]],
+    workers: int,
+    is_needed: Callable[[int], bool] = lambda _: True,
+) -> Generator[tuple[int, T], None, None]:
+    """Call a function with each of several arguments, in this process or in a pool; yield position and result.
+
+    Args:
+        function: Function of a module.
+        arguments: Arguments of each call.
+        workers: Number of processes; 1 calls it in this process.
+        is_needed: Whether the call of a position shall still begin; asked after each result.
+    """
+    if workers < 2:
+        for i, one in enumerate(arguments):
+            if is_needed(i):
+                yield i, function(*one)
+        return
+    with spawn_pool(workers) as pool:
+        futures: dict[Future[T], int] = {pool.submit(function, *one): i for i, one in enumerate(arguments)}
+        for future in as_finished(futures):
+            if not future.cancelled():
+                yield futures[future], future.result()
+                for other, i in futures.items():
+                    if not is_needed(i):
+                        other.cancel()
+
+
+def number_of_processes(workers: int) -> int:
+    """Return a number of processes; 0 means one per core.
+
+    Raises:
+        InvalidInputError: It is negative.
+    """
+    if workers < 0:
+        raise InvalidInputError(
+            f"workers is {workers}; expected a number of processes, or 0 for one per core"
+        )
+    return workers or cpu_count()
 
 
 def generate(
@@ -147,30 +260,27 @@ def make_demos(
     Raises:
         DemoError: An existing file was recorded with another configuration, or a file cannot be written.
     """
-    if workers < 0:
-        raise InvalidInputError(
-            f"workers is {workers}; expected a number of processes, or 0 for one per core"
-        )
+    workers = number_of_processes(workers)
     reports = {job.path: RecordingReport(n) for job in jobs}
-    missing = [job for job in jobs if not _is_complete(job, n)]
-    with ExitStack() as locks:
-        for folder in sorted({job.path.parent for job in missing}):
-            locks.enter_context(recording_lock(folder))
-        # another process may have recorded some of them before the folders were locked
-        missing = [job for job in missing if not _is_complete(job, n)]
-        for job in missing if replace else ():
-            _remove_outdated(job)
-        if missing:
-            reports |= _record(missing, n, workers=workers, progress=progress)
+    with claim_incomplete((job, n) for job in jobs) as claimed:
+        incomplete = [job for job, _ in claimed]
+        for job in incomplete if replace else ():
+            try:
+                job.missing(n)
+            except (
+                BrokenDemoError,
+                OtherRecordingError,
+            ) as error:  # not one that merely cannot be opened now
+                job.discard(error)
+        if incomplete:
+            reports |= _record(incomplete, n, workers=workers, progress=progress)
     return reports
 
 
 def demo_path(root: Path, config: DemoConfig) -> Path:
     """Return where `ensure_demos` keeps the demonstrations of a configuration; the path contains all that matters."""
-    (height, width), task = config.camera_size, config.task
-    default = DemoConfig(config.source, config.camera_size, config.seed)
-    plain = changed(config, drawing=None) == default and config.drawn == FAST
-    suffix = "" if plain else f"-{zlib.crc32(config.key().encode()):08x}"
+    (height, width), task, options = config.camera_size, config.task, config.options()
+    suffix = f"-{zlib.crc32(json.dumps(options, sort_keys=True).encode()):08x}" if options else ""
     folder = f"{height}x{width}-seed{config.seed}-{GENERATOR}{suffix}"
     return root / task.suite / folder / f"{task.name}_demo.hdf5"
 
@@ -187,7 +297,7 @@ def _record(
 ) -> dict[Path, RecordingReport]:
     """Record as `make_demos` does, while no other process records in the same folders."""
     writers = [job.writer() for job in jobs]
-    missing = [sorted(set(range(n)) - writer.recorded()) for writer in writers]
+    missing = [sorted(job.missing(n)) for job in jobs]
     reports = [RecordingReport(n - len(numbers)) for numbers in missing]
     chunks = [
         (j, numbers[i : i + jobs[j].config.batch])
@@ -195,7 +305,7 @@ def _record(
         for i in range(0, len(numbers), jobs[j].config.batch)
     ]
     if progress is not False:
-        count = n * len(jobs) - sum(report.recorded for report in reports)
+        count = sum(map(len, missing))
         folders = ", ".join(sorted({str(job.path.parent.parent) for job in jobs}))
         tqdm.write(f"recording {count} demonstrations of {len(jobs)} tasks in {folders}", file=sys.stderr)
     bar = progress_bar(
@@ -209,10 +319,16 @@ def _record(
     for writer, numbers in zip(writers, missing, strict=True):
         if not numbers:  # a process was killed after the last part
             writer.finish()
-    workers = min(workers or cpu_count(), len(chunks))
-    chunk_reports = _in_processes(jobs, chunks, workers) if workers > 1 else _here(jobs, chunks)
-    with bar, closing(chunk_reports):
-        for j, report in chunk_reports:
+    arguments = [(jobs[j].config, writers[j], numbers) for j, numbers in chunks]
+    results = run_each(
+        record_chunk,
+        arguments,
+        min(workers, len(chunks)),
+        lambda i: not reports[chunks[i][0]].error,  # a job ends at its first error
+    )
+    with bar, closing(recorders), closing(results):
+        for i, report in results:
+            j = chunks[i][0]
             reports[j].add(report)
             bar.update(report.recorded)
             bar.set_postfix(failed=sum(r.failure_reasons.total() for r in reports), refresh=False)
@@ -221,60 +337,8 @@ def _record(
     return {job.path: report for job, report in zip(jobs, reports, strict=True)}
 
 
-def _here(jobs: Sequence[RecordingJob], chunks: list[_Chunk]) -> _ChunkReports:
-    """Record in this process and yield the report on each chunk. A job ends at its first error."""
-    failed: set[int] = set()
-    with closing(RecorderCache()) as recorders:
-        for j, numbers in chunks:
-            if j not in failed:
-                report = record_chunk(jobs[j], numbers, recorders)
-                if report.error:
-                    failed.add(j)
-                yield j, report
-
-
-def _in_processes(jobs: Sequence[RecordingJob], chunks: list[_Chunk], workers: int) -> _ChunkReports:
-    """Record as `_here` does, in a pool of processes; chunks that have begun are finished after an error."""
-    with spawn_pool(workers, initializer=initialize_worker) as pool:
-        owners: dict[Future[RecordingReport], int] = {
-            pool.submit(record_chunk_in_worker, jobs[j], numbers): j for j, numbers in chunks
-        }
-        for future in as_finished(owners):
-            if future.cancelled():
-                continue
-            report, j = future.result(), owners[future]
-            if report.error:
-                for other, owner in owners.items():
-                    if owner == j:
-                        other.cancel()
-            yield j, report
-
-
-def _is_complete(job: RecordingJob, n: int) -> bool:
-    """Return whether the file has the first `n` demonstrations of the job."""
-    writer = job.writer()
-    try:
-        return job.path.is_file() and not writer.parts.exists() and set(range(n)) <= writer.recorded()
-    except DemoError:
-        return False
-
-
-def _remove_outdated(job: RecordingJob) -> None:
-    """Remove a file or parts that are broken, or were recorded with an older version of the scene or the expert.
-
-    One that merely cannot be opened now stays.
-    """
-    writer = job.writer()
-    try:
-        writer.recorded()
-    except (BrokenDemoError, OtherRecordingError) as error:
-        tqdm.write(f"recording again: {error}", file=sys.stderr)
-        job.path.unlink(missing_ok=True)
-        writer.discard_parts()
-
-
 @contextmanager
-def recording_lock(folder: Path) -> Iterator[None]:
+def _recording_lock(folder: Path) -> Iterator[None]:
     """Let one process at a time record or render in a folder; the lock of a process that was killed is free."""
     check_main_guard()
     lock = FileLock(folder / ".recording.lock")

@@ -11,19 +11,17 @@ that is trained on them has to be evaluated on mirrored images, as the clients o
 import json
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from libero_env.demos.curate import read_episodes, recorded_task
+from libero_env.demos.contents import EXPORTED_STATE, json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.header import json_attribute, read_header
-from libero_env.demos.lerobot_layout import OWN, PUBLISHED, ExportedEpisode, Layout
-from libero_env.demos.lerobot_v2 import ImageDatasetWriter
-from libero_env.demos.lerobot_v3 import DatasetWriter, write_json
-from libero_env.demos.regenerate import Regeneration, regenerate
-from libero_env.demos.write import Episode
+from libero_env.demos.lerobot_layout import OWN, PUBLISHED, Layout
+from libero_env.demos.lerobot_writers import ImageDatasetWriter, VideoDatasetWriter, write_json
+from libero_env.demos.observe import recorded_robot, recorded_task
+from libero_env.demos.read import Episode, Labels, read_episodes
+from libero_env.demos.replay import Regeneration, regenerate
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
@@ -50,7 +48,7 @@ def export_lerobot(
     files: Sequence[Path],
     root: Path,
     *,
-    labels: Literal["expert", "executed"] = "expert",
+    labels: Labels = "expert",
     video_mb: float | None = None,
     progress: bool | None = None,
 ) -> tuple[int, int]:
@@ -71,11 +69,12 @@ def export_lerobot(
         LiberoError: PyArrow or PyAV is not installed.
     """
     _check_absent(root)
-    with atomic_folder(root) as folder, closing(DatasetWriter(folder, OWN, video_mb)) as dataset:
+    with atomic_folder(root) as folder, closing(VideoDatasetWriter(folder, OWN, video_mb)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
-            language, pairing = _language(file), read_header(file).get("pairing", "libero")
-            for name, episode in read_episodes(file):
-                dataset.add(_exported(f"{file}: {name}", episode, pairing, labels), language)
+            language = _language(file)
+            for episode in read_episodes(file):
+                where = f"{file}: {episode.name}"
+                dataset.add(_exported(episode, where, labels), language, where)
         dataset.close()
         size = dataset.finish()
         _write_origin(folder, OWN, {"labels": labels, "models": _recorded_models(files)})
@@ -108,22 +107,25 @@ def export_published(
         raise UnknownNameError("published data set", name, PUBLISHED)
     _check_absent(root)
     layout, config = PUBLISHED[name], config or Regeneration()
-    writer = ImageDatasetWriter if layout.codec is None else DatasetWriter
+    writer = ImageDatasetWriter if layout.codec is None else VideoDatasetWriter
     kept, failed = 0, []
     with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             language = recorded_task(file).language
             for episode in regenerate(file, config):
+                where = f"{file}: {episode.name}"
                 if episode.success:
-                    dataset.add(episode, language)
+                    dataset.add(episode, language, where)
                     kept += 1
                 else:
-                    failed.append(episode.where)
+                    failed.append(where)
         if failed and not kept:
             raise DemoError(f"{failed[0]}: neither this demonstration nor any other reaches its goal again")
         dataset.close()
         episodes, frames = dataset.finish()
-        _write_origin(folder, layout, config.record() | {"as": name, "left_out": len(failed)})
+        robots = ", ".join(sorted(set(map(recorded_robot, files))))
+        how = {"robot": robots, "as": name, "left_out": len(failed)}
+        _write_origin(folder, layout, config.record() | how)
     return PublishedExport(episodes, frames, tuple(failed))
 
 
@@ -137,25 +139,23 @@ def _language(file: Path) -> str:
     return stated if isinstance(stated, str) else recorded_task(file).language
 
 
-def _exported(where: str, episode: Episode, pairing: str, labels: str) -> ExportedEpisode:
-    actions = episode.labels if labels == "expert" else episode.actions
-    obs = episode.obs
-    for key in ("ee_pos", "ee_ori", "gripper_states"):
-        if key not in obs:
-            raise BrokenDemoError(f"{where}/obs/{key} is missing; expected it beside {', '.join(obs)}")
-    if pairing == "libero":  # the observation before action t + 1 is the one after action t
-        obs, actions = {key: values[:-1] for key, values in obs.items()}, actions[1:]
-    if not len(actions):
+def _exported(episode: Episode, where: str, labels: Labels) -> Episode:
+    """Return an episode with the actions to learn, each with the observation on which it was chosen."""
+    for key in EXPORTED_STATE:
+        if key not in episode.obs:
+            raise BrokenDemoError(
+                f"{where}/obs/{key} is missing; expected it beside {', '.join(episode.obs)}"
+            )
+    aligned = episode.aligned()
+    if not len(aligned):
         raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
-    state = np.concatenate([obs["ee_pos"], obs["ee_ori"], obs["gripper_states"]], axis=1).astype(np.float32)
-    images = {key: values for key, values in obs.items() if key.endswith("_rgb")}
-    return ExportedEpisode(state, actions.astype(np.float32), episode.success, images, where)
+    return replace(aligned, actions=aligned.labels if labels == "expert" else aligned.actions)
 
 
 def _recorded_models(files: Sequence[Path]) -> list[Any]:
-    """Return the models that the files state, each once; older files do not."""
-    found = [json_attribute(read_header(file), "models", file) for file in files]
-    texts = {json.dumps(models, sort_keys=True): models for models in found if models}
+    """Return the models that the files state, each once."""
+    stated = [json_attribute(read_header(file), "models", file) for file in files]
+    texts = {json.dumps(models, sort_keys=True): models for models in stated if models}
     return [texts[text] for text in sorted(texts)]
 
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from libero_env.demos.video import AV1, H264, PIXEL_FORMAT, Codec
 from libero_env.timing import CONTROL_HZ
 
@@ -98,54 +96,6 @@ class Layout:
         # The published sets do not say it. Here it keeps LeRobot from merging images of different orientation.
         orientation = {} if self.mirrored else {"image.first_row": "top", "image.mirrored": False}
         return {"info": info | orientation}
-
-
-@dataclass(frozen=True)
-class ExportedEpisode:
-    """One episode as it is exported.
-
-    Attributes:
-        state: (T, 8) float32.
-        action: (T, 7) float32.
-        success: Whether the goal was reached.
-        images: Observation such as `agentview_rgb` -> (T, H, W, 3) uint8.
-        where: File and demonstration, for error messages.
-    """
-
-    state: np.ndarray
-    action: np.ndarray
-    success: bool
-    images: Mapping[str, np.ndarray]
-    where: str
-
-
-def episode_columns(
-    layout: Layout, episode: ExportedEpisode, number: int, first: int, task: int
-) -> dict[str, np.ndarray]:
-    """Return the columns of an episode, without images.
-
-    Args:
-        layout: Names of the columns.
-        episode: Episode of T frames.
-        number: Number of the episode in the data set.
-        first: Number of frames before it.
-        task: Index of its task.
-    """
-    steps = len(episode.action)
-    columns = {
-        layout.state: episode.state,
-        layout.action: episode.action,
-        "timestamp": (np.arange(steps) / layout.fps).astype(np.float32),
-    }
-    if layout.outcome:
-        reward = np.append(np.zeros(steps - 1), float(episode.success)).astype(np.float32)
-        columns |= {"next.reward": reward, "next.done": np.append(np.zeros(steps - 1, bool), True)}
-    return columns | {
-        "frame_index": np.arange(steps),
-        "episode_index": np.full(steps, number),
-        "index": first + np.arange(steps),
-        "task_index": np.full(steps, task),
-    }
 
 
 OWN = Layout(

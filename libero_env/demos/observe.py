@@ -1,93 +1,88 @@
-"""Observations of recorded states: for new recordings, for replaying, and for rendering files again."""
+"""Observations of recorded states, in the scene that a demonstration file names."""
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
+import h5py
 import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT
+from libero_env.demos.config import RenderConfig
+from libero_env.demos.contents import demo_names, read_header
+from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
+from libero_env.demos.read import Episode
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
-from libero_env.demos.write import Episode
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import DemoError, InvalidInputError
+from libero_env.errors import DemoError, UnknownNameError
 from libero_env.objects.model import ROOT_BODY
-from libero_env.perturbations.catalog import KINDS
-from libero_env.perturbations.episodes import checked_perturbations
-from libero_env.perturbations.value import Perturbation, format_perturbations
-from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.scene import FAST, Scene
-from libero_env.tasks import Task
+from libero_env.tasks import Task, bddl, get_suite
+from libero_env.tasks.builder import language_from_name
+from libero_env.tasks.problem import same_meaning
 
-PERTURBED_HEADER = ("perturb", "perturb_draws")  # attributes of a file that was rendered under perturbations
-PERTURB_DRAWS = 1  # change it when the same perturbation of the same demonstration gives other observations
 
+def recorded_robot(file: Path) -> str:
+    """Return the model of the arm that was recorded, one of `libero_env.assets.robot.ROBOTS`.
 
-@dataclass(frozen=True)
-class RenderConfig:
-    """What is rendered of each state.
-
-    Attributes:
-        cameras: Names of the cameras in the model.
-        size: (height, width) of the images, pixels.
-        modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
-            and `segmentation_element`.
-        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
-        perturb: Perturbations, as for `EnvConfig`, of kinds that change what is seen or said, and no physics.
+    This package's files name it; those before it had a name have robosuite 1.4.1's. The original's have 1.4.0's.
 
     Raises:
-        UnknownNameError: A kind of perturbation does not exist.
-        InvalidInputError: A perturbation is not valid, or changes what happens.
+        DemoError: It is not a demonstration file.
     """
-
-    cameras: tuple[str, ...] = DEFAULT_CAMERAS
-    size: tuple[int, int] = (128, 128)
-    modalities: tuple[str, ...] = ("rgb",)
-    drawing: str | None = None
-    perturb: str | Sequence[Perturbation] = ()
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "perturb", rendered_perturbations(self.perturb))
-
-    @property
-    def perturbations(self) -> tuple[Perturbation, ...]:
-        """Perturbations, in the order in which they are applied."""
-        return rendered_perturbations(self.perturb)
-
-    def header(self) -> dict[str, Any]:
-        """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
-        values = {"cameras": list(self.cameras), "pictures": list(self.modalities)}
-        defaults = {"cameras": list(DEFAULT_CAMERAS), "pictures": ["rgb"]}
-        drawing = {} if self.drawing in (None, FAST) else {"drawing": self.drawing}
-        changed = {k: v for k, v in values.items() if v != defaults[k]}
-        found = {"camera_size": list(self.size), **changed, **drawing}
-        if self.perturb:
-            text = format_perturbations(self.perturbations)
-            found |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
-        return found
+    header = read_header(file)
+    return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else "libero"))
 
 
-def rendered_perturbations(perturb: str | Sequence[Perturbation]) -> tuple[Perturbation, ...]:
-    """Return perturbations under which recorded states can be rendered, those of severity 0 left out.
+def recorded_task(file: Path) -> Task:
+    """Return the task that was recorded.
+
+    It is the benchmark's task that the file names, if the file's task text means the same, and else the task that the
+    text describes.
 
     Raises:
-        UnknownNameError: A kind of perturbation does not exist.
-        InvalidInputError: A perturbation is not valid, or changes what happens and not only what is seen or said.
+        DemoError: The file names no task.
+        BDDLError: Its task text cannot be read.
     """
-    found = []
-    for one in checked_perturbations(perturb):
-        if not isinstance(one, Perturbation) or not one.definition.is_rendered:
-            valid = ", ".join(kind.name for kind in KINDS.values() if kind.is_rendered)
-            raise InvalidInputError(
-                f"{one} changes what happens, and recorded demonstrations show what happened without it; valid: {valid}"
+    header = read_header(file)
+    name, text = Path(str(header.get("bddl_file_name", ""))), str(header.get("bddl_file_content", ""))
+    try:
+        known = next((t for t in get_suite(name.parent.name).tasks if t.name == name.stem), None)
+    except UnknownNameError:
+        known = None
+    if not text.strip():
+        if known is None:
+            raise DemoError(
+                f"{file}: neither bddl_file_content nor bddl_file_name states which task was recorded"
             )
-        found.append(one)
-    return tuple(found)
+        return known
+    problem = bddl.parse(text, f"{file} bddl_file_content")
+    if known is not None and same_meaning(known.problem, problem):
+        return known
+    return Task("file", 0, name.stem, language_from_name(name.stem), problem.language, problem)
+
+
+def recorded_rendering(file: Path) -> RenderConfig:
+    """Return how the images of a file were rendered, without the perturbations under which they may have been.
+
+    Raises:
+        DemoError: It is not a demonstration file.
+    """
+    header, default = read_header(file), RenderConfig()
+    with open_demo_file(file) as handle:
+        names = demo_names(handle, file)
+        obs = handle["data"][names[0]].get("obs") if names else None
+        views = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
+        size = tuple(map(int, obs[views[0]].shape[1:3])) if views and obs is not None else default.size
+    return RenderConfig(
+        tuple(map(str, header.get("cameras", default.cameras))),
+        (size[0], size[1]),
+        tuple(map(str, header.get("pictures", default.modalities))),
+        header.get("drawing", FAST if "generator" in header else None),
+    )
 
 
 class StateRenderer:
@@ -120,10 +115,40 @@ class StateRenderer:
             perturb=config.perturb,
         )
 
+    @classmethod
+    def of_file(
+        cls,
+        file: Path,
+        config: RenderConfig,
+        assets: Pack | str | Path | None = None,
+        *,
+        task: Task | None = None,
+    ) -> "StateRenderer":
+        """Return a renderer in the scene of a file's demonstrations.
+
+        Args:
+            file: Demonstration file.
+            config: What is rendered.
+            assets: Where models come from, as for `LiberoEnv`.
+            task: Task that was recorded; None for the one that the file names.
+
+        Raises:
+            DemoError: It is not a demonstration file, or names no task.
+        """
+        return cls(task or recorded_task(file), config, assets, robot=recorded_robot(file))
+
     @property
     def scene(self) -> Scene:
         """The compiled scene."""
         return self.env.world.scene
+
+    def prepare(self, episode: Episode, where: str) -> None:
+        """Put the fixtures at the poses of an episode, from the next state on; `where` is for error messages.
+
+        Raises:
+            DemoError: The states or the fixtures do not fit the scene.
+        """
+        self.place_fixtures(fixture_poses(episode, self.scene, where))
 
     def place_fixtures(self, fixtures: np.ndarray) -> None:
         """Put the fixtures at the given poses, (nfixtures, 7) pos and quat wxyz, from the next state on."""
@@ -195,8 +220,13 @@ def fixture_poses(episode: Episode, scene: Scene, where: str) -> np.ndarray:
         where: File and demonstration, for error messages.
 
     Raises:
-        DemoError: The poses do not fit the scene.
+        DemoError: The states or the poses do not fit the scene.
     """
+    length = 1 + scene.model.nq + scene.model.nv
+    if episode.states.shape[1] != length:
+        raise BrokenDemoError(
+            f"{where}/states is {episode.states.shape}; expected (T, {length}) for {scene.problem.language!r}"
+        )
     poses = scene.fixture_poses.copy()
     if episode.fixtures is not None:
         if episode.fixtures.shape != poses.shape:

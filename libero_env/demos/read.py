@@ -21,7 +21,7 @@ replayed; `expert_actions`, where present, are those that the expert chose, whic
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +34,7 @@ from libero_env.demos.contents import (
     Pairing,
     check_demo,
     count_steps,
+    demo_attributes,
     demo_names,
     is_image,
     reached_goal,
@@ -43,33 +44,100 @@ from libero_env.demos.contents import (
 from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file, read_attribute
 from libero_env.errors import DemoError
 
+Labels = Literal["expert", "executed"]
+NOOP_THRESHOLD = 1e-3  # [action units] largest entry of a motion that counts as none
+PUBLISHED_NOOP_NORM = (
+    1e-4  # [action units] Euclidean norm below which the published sets count a motion as none
+)
+_DERIVED = ("num_samples", "init_state", "success", "fixtures")  # attributes that follow from the fields
+
 
 @dataclass(frozen=True)
-class Demo:
-    """One demonstration, as it is learned from.
+class Episode:
+    """One demonstration.
 
     Attributes:
-        name: Its group in the file, such as `demo_3`.
-        actions: (T, 7) float64 in [-1, 1].
-        obs: Observations, name to (T, ...); images are upright.
-        states: (T, 1 + nq + nv), or None where the file has none.
-        rewards: (T,) uint8, or None where the file has none.
-        dones: (T,) uint8, or None where the file has none.
+        actions: Executed actions, (T, 7); from `read_demos` those to learn.
+        states: State before each action, (T, 1 + nq + nv) time, qpos, qvel; (T, 0) where the file has none.
+        robot_states: (T, 9).
+        obs: Observations, name to (T, ...); images are upright. Empty until the states are rendered.
+        expert_actions: Actions that the expert chose, (T, 7), where noise was added to the executed ones.
         success: Whether the goal was reached.
+        fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
+        attrs: Further attributes of the demonstration.
+        name: Its group in the file, such as `demo_3`.
         pairing: Which observation stands with an action.
     """
 
-    name: str
     actions: np.ndarray
-    obs: Mapping[str, np.ndarray] = field(repr=False)
-    states: np.ndarray | None = field(default=None, repr=False)
-    rewards: np.ndarray | None = field(default=None, repr=False)
-    dones: np.ndarray | None = field(default=None, repr=False)
+    states: np.ndarray
+    robot_states: np.ndarray | None = field(default=None, repr=False)
+    obs: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    expert_actions: np.ndarray | None = field(default=None, repr=False)
     success: bool = True
+    fixtures: np.ndarray | None = field(default=None, repr=False)
+    attrs: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    name: str = ""
     pairing: Pairing = "aligned"
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    @property
+    def labels(self) -> np.ndarray:
+        """Actions to learn, (T, 7): those of the expert where they differ from the executed ones."""
+        return self.actions if self.expert_actions is None else self.expert_actions
+
+    def aligned(self) -> "Episode":
+        """Return the episode with each action paired with the observation before it.
+
+        One of "libero" pairing loses its first action and its last observation.
+        """
+        if self.pairing == "aligned":
+            return self
+        return replace(self._selected(slice(1, None), slice(None, -1)), pairing="aligned")
+
+    def select(self, steps: Any) -> "Episode":
+        """Return the episode with some of its steps only, such as those of a mask (T,)."""
+        return self._selected(steps, steps)
+
+    def _selected(self, actions: Any, observations: Any) -> "Episode":
+        def pick(values: np.ndarray | None, steps: Any) -> np.ndarray | None:
+            return None if values is None else values[steps]
+
+        return replace(
+            self,
+            actions=self.actions[actions],
+            states=self.states[actions],
+            expert_actions=pick(self.expert_actions, actions),
+            robot_states=pick(self.robot_states, observations),
+            obs={key: values[observations] for key, values in self.obs.items()},
+        )
+
+
+def noop_steps(actions: np.ndarray, threshold: float = NOOP_THRESHOLD) -> np.ndarray:
+    """Return which actions (T, 7) do nothing, (T,) bool: no motion, and the gripper command as before.
+
+    Args:
+        actions: (T, 7).
+        threshold: Largest entry of a motion that counts as none.
+    """
+    still = (np.abs(actions[:, :6]) <= threshold).all(axis=1)
+    return still & _keeps_gripper(actions)
+
+
+def published_noop_steps(actions: np.ndarray) -> np.ndarray:
+    """Return which actions (T, 7) the makers of the published sets leave out as no-ops, (T,) bool.
+
+    The Euclidean norm of the motion decides, and whether the gripper command is that of the last action that is kept;
+    before the first motion no action is kept, whatever the gripper does.
+    """
+    still = np.linalg.norm(actions[:, :6], axis=1) < PUBLISHED_NOOP_NORM
+    return still & (_keeps_gripper(actions) | np.logical_and.accumulate(still))
+
+
+def _keeps_gripper(actions: np.ndarray) -> np.ndarray:
+    return np.concatenate([[True], actions[1:, 6] == actions[:-1, 6]])
 
 
 def read_demos(
@@ -77,17 +145,17 @@ def read_demos(
     obs_keys: Sequence[str] | None = None,
     limit: int | None = None,
     *,
-    labels: Literal["expert", "executed"] = "expert",
+    labels: Labels = "expert",
     pairing: Literal["stored", "aligned"] = "stored",
-) -> list[Demo]:
-    """Read demonstrations, after all requested ones have been checked.
+) -> list[Episode]:
+    """Read demonstrations to learn from, after all requested ones have been checked.
 
     Args:
         path: A demonstration file, of this package or the original, or the folder of parts that an interrupted
             recording left.
         obs_keys: Observations to load; None for all known ones that the file has.
         limit: Largest number of demonstrations to read; None for all.
-        labels: "expert" puts `expert_actions` into `Demo.actions` where the file has them, "executed" never does.
+        labels: "expert" puts `expert_actions` into `actions` where the file has them, "executed" never does.
         pairing: "aligned" shifts demonstrations of "libero" pairing by one step; they lose their first action.
 
     Raises:
@@ -106,9 +174,9 @@ def iter_demos(
     obs_keys: Sequence[str] | None = None,
     limit: int | None = None,
     *,
-    labels: Literal["expert", "executed"] = "expert",
+    labels: Labels = "expert",
     pairing: Literal["stored", "aligned"] = "stored",
-) -> Iterator[Demo]:
+) -> Iterator[Episode]:
     """Read demonstrations one at a time, for files that do not fit into memory; see `read_demos`.
 
     Raises:
@@ -120,6 +188,38 @@ def iter_demos(
         max(plan.sizes), f"the longest demonstration of {path}", "record shorter ones or smaller images"
     )
     yield from _read(plan, labels, pairing)
+
+
+def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[Episode]:
+    """Read demonstrations one at a time with all that is recorded of them.
+
+    Args:
+        file: Demonstration file.
+        check_values: Whether numbers that are not finite or absurd are refused.
+
+    Raises:
+        DemoError: A demonstration is broken, or has no states; those before it have been returned.
+    """
+    with open_demo_file(file) as handle:
+        names, pairing = demo_names(handle, file), read_pairing(handle, file)
+        for name in names:
+            group, where = handle["data"][name], f"{file}: {name}"
+            obs = group.get("obs") if isinstance(group, h5py.Group) else None
+            stored = obs if isinstance(obs, h5py.Group) else ()
+            keys = [key for key in stored if is_image(key) or key in LOW_DIM_KEYS]
+            size = check_demo(group, where, keys)
+            check_memory(size, where, "record shorter ones or smaller images")
+            if "states" not in group:
+                raise BrokenDemoError(f"{where}/states is missing; expected (T, 1 + nq + nv)")
+            attrs = demo_attributes(group, where)
+            yield replace(
+                _load(group, where, keys, check=check_values),
+                robot_states=read_values(group, "robot_states", where, check=check_values),
+                fixtures=attrs.get("fixtures"),
+                attrs={key: value for key, value in attrs.items() if key not in _DERIVED},
+                name=name,
+                pairing=pairing,
+            )
 
 
 def demo_lengths(
@@ -135,7 +235,7 @@ def demo_lengths(
         with open_demo_file(file) as handle:
             names = demo_names(handle, file)[: None if limit is None else max(limit - len(lengths), 0)]
             shifted = pairing == "aligned" and read_pairing(handle, file) == "libero"
-            lengths += [count_steps(handle["data"][name], file, name) - shifted for name in names]
+            lengths += [count_steps(handle["data"][name], f"{file}: {name}") - shifted for name in names]
     return lengths
 
 
@@ -166,7 +266,7 @@ def demo_origin(path: str | Path, limit: int | None = None) -> DemoOrigin:
             generators.add(str(read_attribute(handle["data"], "generator", f"{file}: data", "")))
             for name in names:
                 for key in ("actions", "expert_actions", "states"):
-                    values = read_values(handle["data"][name], key, file, name)
+                    values = read_values(handle["data"][name], key, f"{file}: {name}")
                     if values is not None:
                         digest.update(f"{key} {values.shape}".encode())
                         digest.update(values.astype("<f8").tobytes())
@@ -177,61 +277,68 @@ def demo_origin(path: str | Path, limit: int | None = None) -> DemoOrigin:
 class _Plan:
     """What is read: the names of the demonstrations of each file, their observations, and their bytes in memory."""
 
-    files: list[tuple[Path, list[str], list[str]]]
-    sizes: list[int]
+    files: list[tuple[Path, list[str], list[str]]] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
 
 
 def _plan(path: str | Path, obs_keys: Sequence[str] | None, limit: int | None) -> _Plan:
     """Return what is read, after everything but the values has been checked."""
-    plan, shapes = _Plan([], []), None
+    plan, first = _Plan(), None
     for file in demo_files(path):
         with open_demo_file(file) as handle:
             names = demo_names(handle, file)[: None if limit is None else max(limit - len(plan.sizes), 0)]
-            keys = _requested_keys(handle, file, names, obs_keys)
+            keys = list(obs_keys or ())
+            if obs_keys is None and names:
+                keys = _stored_keys(handle["data"][names[0]], f"{file}: {names[0]}")
             read_pairing(handle, file)
             for name in names:
-                plan.sizes.append(check_demo(handle["data"][name], file, name, keys))
-                shapes = _check_same_shapes(handle["data"][name], keys, path, name, shapes)
+                group = handle["data"][name]
+                plan.sizes.append(check_demo(group, f"{file}: {name}", keys))
+                shapes = {key: group[f"obs/{key}"].shape[1:] for key in keys}
+                first = first or (name, shapes)
+                for key, shape in first[1].items():
+                    if shapes.get(key) != shape:
+                        raise DemoError(
+                            f"{path}: {name}/obs/{key} holds {shapes.get(key, 'nothing')}; expected {shape} as in "
+                            f"{first[0]}"
+                        )
         plan.files.append((file, names, keys))
     if not plan.sizes:
         raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0. Record them again")
     return plan
 
 
-def _read(plan: _Plan, labels: str, pairing: str) -> Iterator[Demo]:
+def _read(plan: _Plan, labels: Labels, pairing: str) -> Iterator[Episode]:
     for file, names, keys in plan.files:
         with open_demo_file(file) as handle:
             stored = read_pairing(handle, file)
             for name in names:
-                demo = _load(handle["data"][name], file, name, keys, labels, stored)
-                yield align(demo) if pairing == "aligned" else demo
+                episode = _load(handle["data"][name], f"{file}: {name}", keys, labels)
+                episode = replace(episode, name=name, pairing=stored)
+                yield episode.aligned() if pairing == "aligned" else episode
 
 
-def _check_same_shapes(
-    group: h5py.Group, keys: list[str], path: str | Path, name: str, first: tuple[str, dict] | None
-) -> tuple[str, dict]:
-    """Return the name and the observations' shapes of the first demonstration; raise DemoError if this one differs."""
-    found = {key: group[f"obs/{key}"].shape[1:] for key in keys}
-    if first is None:
-        return name, found
-    for key, shape in first[1].items():
-        if found.get(key) != shape:
-            raise DemoError(
-                f"{path}: {name}/obs/{key} holds {found.get(key, 'nothing')}; expected {shape} as in {first[0]}"
-            )
-    return first
+def _load(
+    group: h5py.Group, where: str, keys: Sequence[str], labels: Labels | None = None, *, check: bool = True
+) -> Episode:
+    """Read the arrays of a demonstration; with `labels`, its actions are those to learn."""
 
+    def read(key: str) -> Any:
+        return read_values(group, key, where, check=check)
 
-def align(demo: Demo) -> Demo:
-    """Return the demonstration with each action paired with the observation before it.
-
-    A demonstration of "libero" pairing loses its first action and its last observation.
-    """
-    if demo.pairing == "aligned":
-        return demo
-    states, rewards, dones = (None if x is None else x[1:] for x in (demo.states, demo.rewards, demo.dones))
-    obs = {key: value[:-1] for key, value in demo.obs.items()}
-    return Demo(demo.name, demo.actions[1:], obs, states, rewards, dones, demo.success, "aligned")
+    expert = None if labels == "executed" else read("expert_actions")
+    if labels == "expert" and expert is not None:
+        actions, expert = expert, None
+    else:
+        actions = read("actions")
+    states = read("states")
+    return Episode(
+        actions.astype(np.float64),
+        np.zeros((len(actions), 0)) if states is None else states,
+        obs={key: read(f"obs/{key}") for key in keys},
+        expert_actions=expert,
+        success=reached_goal(group, where, (read("rewards"), read("dones"))),
+    )
 
 
 def demo_files(path: str | Path) -> list[Path]:
@@ -248,29 +355,10 @@ def demo_files(path: str | Path) -> list[Path]:
     return [path]
 
 
-def _requested_keys(
-    handle: h5py.File, file: Path, names: list[str], obs_keys: Sequence[str] | None
-) -> list[str]:
-    if obs_keys is not None:
-        return list(obs_keys)
-    for name in names:
-        obs = handle["data"][name].get("obs") if isinstance(handle["data"][name], h5py.Group) else None
-        if not isinstance(obs, h5py.Group):
-            raise BrokenDemoError(
-                f"{file}: {name}/obs is missing; expected a group with {', '.join(IMAGE_KEYS)}, ..."
-            )
-        known = dict.fromkeys((*IMAGE_KEYS, *filter(is_image, sorted(obs)), *LOW_DIM_KEYS))
-        return [key for key in known if key in obs]
-    return []
-
-
-def _load(group: h5py.Group, file: Path, name: str, keys: list[str], labels: str, pairing: Pairing) -> Demo:
-    def read(key: str) -> Any:
-        return read_values(group, key, file, name)
-
-    obs = {key: read(f"obs/{key}") for key in keys}
-    actions = read("expert_actions") if labels == "expert" else None
-    actions = (read("actions") if actions is None else actions).astype(np.float64)
-    states, rewards, dones = (read(key) for key in ("states", "rewards", "dones"))
-    success = reached_goal(group, f"{file}: {name}", (rewards, dones))
-    return Demo(name, actions, obs, states, rewards, dones, success, pairing)
+def _stored_keys(group: h5py.Group, where: str) -> list[str]:
+    """Return the known observations of a demonstration, images first."""
+    obs = group.get("obs") if isinstance(group, h5py.Group) else None
+    if not isinstance(obs, h5py.Group):
+        raise BrokenDemoError(f"{where}/obs is missing; expected a group with {', '.join(IMAGE_KEYS)}, ...")
+    ordered = dict.fromkeys((*IMAGE_KEYS, *filter(is_image, sorted(obs)), *LOW_DIM_KEYS))
+    return [key for key in ordered if key in obs]

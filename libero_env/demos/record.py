@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from libero_env.demos.config import DemoConfig, RecordingJob
+from libero_env.demos.config import DemoConfig
 from libero_env.demos.observe import StateRenderer
-from libero_env.demos.write import Episode
+from libero_env.demos.read import Episode
+from libero_env.demos.write import DemoWriter
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import PlacementError
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError
@@ -162,22 +163,24 @@ class RecorderCache:
             self._recorder = None
 
 
-def record_chunk(job: RecordingJob, numbers: list[int], recorders: RecorderCache) -> RecordingReport:
-    """Record some demonstrations of a job as parts of its file.
+recorders = RecorderCache()  # of this process
+
+
+def record_chunk(config: DemoConfig, writer: DemoWriter, numbers: list[int]) -> RecordingReport:
+    """Record some demonstrations as parts of a file, with a recorder that stays open in `recorders`.
 
     Where the expert has no skill for the goal, or fails `MAX_ATTEMPTS` times on one demonstration, the report's
     `error` says so.
 
     Args:
-        job: File to record.
+        config: What the demonstrations depend on.
+        writer: Writer of the file.
         numbers: Demonstrations to record.
-        recorders: Where the recorder comes from.
 
     Raises:
         DemoError: A part cannot be written.
     """
-    writer, report = job.writer(), RecordingReport()
-    recorder = recorders.recorder(job.config)
+    report, recorder = RecordingReport(), recorders.recorder(config)
     failures = dict.fromkeys(numbers, 0)  # of the demonstrations still to be recorded
     while failures:
         try:
@@ -200,17 +203,3 @@ def record_chunk(job: RecordingJob, numbers: list[int], recorders: RecorderCache
                     f"reason of the last failure: {attempt.reason}"
                 )
     return report
-
-
-_worker_recorders: RecorderCache  # of a worker process; set by `initialize_worker`
-
-
-def initialize_worker() -> None:
-    """Prepare a worker process for `record_chunk_in_worker`."""
-    global _worker_recorders
-    _worker_recorders = RecorderCache()
-
-
-def record_chunk_in_worker(job: RecordingJob, numbers: list[int]) -> RecordingReport:
-    """Call `record_chunk` with the recorder that this worker process keeps open."""
-    return record_chunk(job, numbers, _worker_recorders)

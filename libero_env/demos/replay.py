@@ -1,31 +1,36 @@
-"""Replaying recorded demonstrations by their states or by their actions, and rendering them again."""
+"""Recorded demonstrations run again: by their states, by their actions, or as the published LIBERO sets were made.
 
-import json
+`experiments/robot/libero/regenerate_libero_dataset.py` of OpenVLA made the published sets of the human demonstrations:
+from the first recorded state the robot waits ten steps with its gripper open; the recorded actions are executed without
+those that do nothing; what is observed before an action is stored with it; an episode counts if the goal holds at its
+end. Images have 256 pixels and are turned by half a turn when they are converted: the original's first row is the
+bottom one, so they come out upright and mirrored left to right.
+
+Human demonstrations go on for a while when the goal has been reached; those of this package's expert end there. Run
+again they may be a step short, so the expert's last action is repeated a few times until the goal holds.
+"""
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import h5py
 import mujoco
 import numpy as np
 
-from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.contents import demo_names, demo_number
-from libero_env.demos.curate import read_episodes, recorded_robot, recorded_task
-from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
-from libero_env.demos.header import json_attribute, read_header
-from libero_env.demos.observe import PERTURBED_HEADER, RenderConfig, StateRenderer, fixture_poses
-from libero_env.demos.write import DemoWriter, Episode
+from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
+from libero_env.demos.config import RenderConfig
+from libero_env.demos.contents import EXPORTED_STATE, demo_number, read_header
+from libero_env.demos.observe import StateRenderer
+from libero_env.demos.read import PUBLISHED_NOOP_NORM, Episode, Labels, published_noop_steps, read_episodes
+from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
-from libero_env.perturbations.problem import reword_task
 from libero_env.sim.observations import image_name
-from libero_env.sim.scene import FAST, Scene, default_drawing
-from libero_env.tasks import Task
+from libero_env.sim.scene import Scene
 
 REPLAY_MODES = ("state", "action")
+_WAIT = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]])  # the action of the waiting steps
 
 
 @dataclass(frozen=True)
@@ -77,24 +82,22 @@ def replay(
     if by not in REPLAY_MODES:
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
     config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
-    renderer = _renderer(file, config, assets)
+    renderer = StateRenderer.of_file(file, config, assets)
     keys = [image_name(camera, "rgb") for camera in cameras]
-    found = set()
+    replayed = set()
     try:
-        for name, episode in read_episodes(file):
-            if demos is None or name in demos:
-                found.add(name)
-                renderer.place_fixtures(checked_fixtures(file, name, episode, renderer.scene))
-                yield _replay_episode(renderer, name, episode, by, keys)
+        for episode in read_episodes(file):
+            if demos is None or episode.name in demos:
+                replayed.add(episode.name)
+                renderer.prepare(episode, f"{file}: {episode.name}")
+                yield _replay_episode(renderer, episode, by, keys)
     finally:
         renderer.close()
-    if absent := set(demos or ()) - found:
+    if absent := set(demos or ()) - replayed:
         raise DemoError(f"{file}: no demonstration {', '.join(sorted(absent))}")
 
 
-def _replay_episode(
-    renderer: StateRenderer, name: str, episode: Episode, by: str, keys: list[str]
-) -> ReplayResult:
+def _replay_episode(renderer: StateRenderer, episode: Episode, by: str, keys: list[str]) -> ReplayResult:
     env, states, nq = renderer.env, episode.states, renderer.scene.model.nq
     objects = _object_positions(renderer.scene)
     obs = env.set_state(states[0])
@@ -112,7 +115,7 @@ def _replay_episode(
             if terminated:
                 break
     return ReplayResult(
-        name=name,
+        name=episode.name,
         recorded=episode.success,
         success=bool(terminated),
         steps=len(drift),
@@ -120,103 +123,6 @@ def _replay_episode(
         arm_drift=np.array(arm_drift),
         frames=np.stack(frames) if frames else None,
     )
-
-
-def rerender(
-    file: Path,
-    target: Path,
-    config: RenderConfig,
-    *,
-    assets: Pack | str | Path | None = None,
-    task: Task | None = None,
-    limit: int | None = None,
-    progress: bool | None = None,
-) -> Path:
-    """Write the demonstrations of a file with other observations: cameras, resolution, modalities, perturbations.
-
-    The observations are those of the recorded states, so the new file has "aligned" pairing, whatever the old one had.
-    Perturbations under which the file was rendered are not kept. Each demonstration has a draw of its own, named by its
-    name; actions and states stay as they are to the bit. An interrupted call can be repeated: it resumes where it
-    stopped.
-
-    Args:
-        file: File to read.
-        target: File to write.
-        config: What is rendered.
-        assets: Where models come from, as for `LiberoEnv`.
-        task: Task that was recorded, which names the draws of perturbations; by default the one that the file states.
-        limit: Largest number of demonstrations to write, the first of the file; None for all.
-        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
-
-    Returns:
-        The new file.
-
-    Raises:
-        DemoError: The file is broken or does not fit its task's scene, or the target was recorded with another
-            configuration, or made of another file.
-    """
-    if target.exists() and target.samefile(file):
-        raise DemoError(f"{target} is the file to read; choose another name")
-    pack = select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
-    config = replace(config, drawing=config.drawing or default_drawing(pack))
-    task = task or recorded_task(file)
-    writer = DemoWriter(target, rendered_header(file, config, task))
-    recorded = writer.recorded_states()
-    renderer = StateRenderer(task, config, assets, robot=recorded_robot(file))
-    try:
-        episodes = islice(read_episodes(file), limit)
-        for name, episode in progress_bar(episodes, desc="render", unit="demo", progress=progress):
-            if (index := demo_number(name)) in recorded:
-                if not np.array_equal(recorded[index], episode.states):
-                    raise DemoError(
-                        f"{target} has another {name} than {file}; choose another name or remove it"
-                    )
-            else:
-                fixtures = checked_fixtures(file, name, episode, renderer.scene)
-                obs, robot_states = renderer.render_states(episode.states, fixtures, name)
-                writer.write(index, replace(episode, obs=obs, robot_states=robot_states))
-    finally:
-        renderer.close()
-    return writer.finish()
-
-
-def recorded_rendering(file: Path) -> RenderConfig:
-    """Return how the images of a file were rendered, without the perturbations under which they may have been.
-
-    Raises:
-        DemoError: It is not a demonstration file.
-    """
-    header, default = read_header(file), RenderConfig()
-    with open_demo_file(file) as handle:
-        names = demo_names(handle, file)
-        obs = handle["data"][names[0]].get("obs") if names else None
-        views = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
-        size = tuple(map(int, obs[views[0]].shape[1:3])) if views and obs is not None else default.size
-    return RenderConfig(
-        tuple(map(str, header.get("cameras", default.cameras))),
-        (size[0], size[1]),
-        tuple(map(str, header.get("pictures", default.modalities))),
-        header.get("drawing", FAST if "generator" in header else None),
-    )
-
-
-def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, Any]:
-    """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it.
-
-    Args:
-        file: File that is read.
-        config: What is rendered; its drawing is named.
-        task: Task that was recorded.
-    """
-    before = read_header(file)
-    given_up = ("cameras", "pictures", "drawing", *PERTURBED_HEADER)
-    header = {k: v for k, v in before.items() if k not in given_up}
-    header |= {**config.header(), "pairing": "aligned"}
-    if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":
-        said = reword_task(task, config.perturbations).language
-        info = json_attribute(before, "problem_info", file)
-        header["problem_info"] = json.dumps({**info, "language_instruction": said})
-    return header
 
 
 def rerun_actions(file: Path, target: Path) -> Path:
@@ -234,36 +140,120 @@ def rerun_actions(file: Path, target: Path) -> Path:
     """
     if target.exists():
         raise DemoError(f"{target} exists; choose another name or remove it")
-    renderer = _renderer(file, RenderConfig(()))
+    renderer = StateRenderer.of_file(file, RenderConfig(()))
     writer, world = DemoWriter(target, read_header(file)), renderer.env.world
     writer.discard_parts()  # of an interrupted call, perhaps with another file
     try:
-        for name, episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
-            renderer.place_fixtures(checked_fixtures(file, name, episode, renderer.scene))
+        for episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
+            renderer.prepare(episode, f"{file}: {episode.name}")
             renderer.env.set_state(episode.states[0])
             states = []
             for action in episode.actions:
                 states.append(world.physics_state(0))
                 world.step([0], action[None])
             success = bool(world.check_goal(0)[0])
-            writer.write(demo_number(name), replace(episode, states=np.array(states), success=success))
+            writer.write(
+                demo_number(episode.name), replace(episode, states=np.array(states), success=success)
+            )
     finally:
         renderer.close()
     return writer.finish()
 
 
-def _renderer(file: Path, config: RenderConfig, assets: Pack | str | Path | None = None) -> StateRenderer:
-    return StateRenderer(recorded_task(file), config, assets, robot=recorded_robot(file))
+@dataclass(frozen=True)
+class Regeneration:
+    """How demonstrations are run again.
+
+    Attributes:
+        size: Height and width of the images, pixels.
+        settle_steps: Number of waiting steps before the first action.
+        extra_steps: Largest number of repetitions of the last action, in recordings of the expert only.
+        labels: Actions to store: those that were executed, or the expert's own where the file has them.
+        assets: Where models come from, as for `LiberoEnv`; None is the original's models where they are installed, as
+            in the facade.
+        drawing: How images are drawn, `faithful` or `fast`.
+    """
+
+    size: tuple[int, int] = (256, 256)
+    settle_steps: int = 10
+    extra_steps: int = 10
+    labels: Labels = "expert"
+    assets: Pack | str | Path | None = None
+    drawing: str = "faithful"
+
+    def pack(self) -> Pack:
+        """Return the pack of the models."""
+        return pack_of(facade_assets()) if self.assets is None else select_pack(self.assets)
+
+    def record(self) -> dict[str, Any]:
+        """Return what a data set states about how it was made."""
+        pack = self.pack()
+        return {
+            "models": {"pack": pack.name, "digest": pack.digest},
+            "drawing": self.drawing,
+            "settle_steps": self.settle_steps,
+            "extra_steps": f"at most {self.extra_steps}, of the expert's recordings",
+            "labels": self.labels,
+            "no_op": f"norm(action[:6]) < {PUBLISHED_NOOP_NORM} and the gripper as in the last kept action",
+        }
 
 
-def checked_fixtures(file: Path, name: str, episode: Episode, scene: Scene) -> np.ndarray:
-    """Return the poses of the fixtures, after a check that the states fit the scene."""
-    length = 1 + scene.model.nq + scene.model.nv
-    if episode.states.shape[1] != length:
-        raise BrokenDemoError(
-            f"{file}: {name}/states is {episode.states.shape}; expected (T, {length}) for {scene.problem.language!r}"
-        )
-    return fixture_poses(episode, scene, f"{file}: {name}")
+def regenerate(file: Path, config: Regeneration) -> Iterator[Episode]:
+    """Run the demonstrations of a file again; one that does not reach the goal is yielded with `success` False.
+
+    Args:
+        file: Demonstration file.
+        config: How they are run.
+
+    Raises:
+        DemoError: The file is broken or does not fit its task's scene.
+    """
+    if "generator" not in read_header(file):  # not of this package's expert
+        config = replace(config, extra_steps=0)
+    renderer = StateRenderer.of_file(
+        file, RenderConfig(size=config.size, drawing=config.drawing), config.pack()
+    )
+    try:
+        for episode in read_episodes(file):
+            renderer.prepare(episode, f"{file}: {episode.name}")
+            yield _regenerate_episode(renderer, episode, config)
+    finally:
+        renderer.close()
+
+
+def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regeneration) -> Episode:
+    world = renderer.env.world
+    labels = episode.labels if config.labels == "expert" else episode.actions
+    kept = np.flatnonzero(~published_noop_steps(episode.actions))
+    world.set_physics_state(0, episode.states[0])
+    for _ in range(config.settle_steps):
+        world.step([0], _WAIT)
+    images = world.empty_images()
+    stored: dict[str, list[np.ndarray]] = {key: [] for key in (*images, *EXPORTED_STATE)}
+    states, actions, success = [], [], False
+    recorded = list(zip(episode.actions[kept], labels[kept], strict=True))
+    extra = [(episode.labels[-1], episode.labels[-1])] * config.extra_steps
+    for i, (executed, label) in enumerate([*recorded, *extra]):
+        if success and i >= len(recorded):
+            break
+        world.render_cameras([0], images)
+        for key, rows in images.items():
+            stored[key].append(rows[0, :, ::-1].copy())  # here images are upright: mirrored is half a turn
+        obs = world.proprioception()
+        for key in EXPORTED_STATE:
+            stored[key].append(obs[key][0].copy())
+        states.append(world.physics_state(0))
+        actions.append(label)
+        world.step([0], executed[None])
+        success = i + 1 >= len(recorded) and bool(world.check_goal(0)[0])
+    return Episode(
+        np.array(actions).reshape(-1, 7),
+        np.array(states),
+        obs={key: np.array(values) for key, values in stored.items()},
+        success=success,
+        fixtures=world.simulations.fixtures[0].copy(),
+        name=episode.name,
+    )
 
 
 def _object_positions(scene: Scene) -> np.ndarray:

@@ -8,7 +8,6 @@ any other: `read_demos` reads it, or the whole folder.
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -21,13 +20,13 @@ from libero_env.demos.contents import (
     check_demo,
     demo_names,
     demo_number,
+    file_attributes,
     is_image,
     read_values,
     value_fault,
 )
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
-from libero_env.demos.header import file_attributes
-from libero_env.demos.read import demo_files
+from libero_env.demos.read import Episode, demo_files
 from libero_env.errors import DemoError
 from libero_env.storage import atomic_path
 
@@ -51,39 +50,6 @@ _CONFIG_KEYS = (
     "perturb",
     "perturb_draws",
 )
-
-
-@dataclass(frozen=True)
-class Episode:
-    """What happened in one episode, as it is recorded; `libero_env.demos.read` explains the arrays.
-
-    Attributes:
-        actions: Executed actions, (T, 7).
-        states: State before each action, (T, 1 + nq + nv) time, qpos, qvel.
-        robot_states: (T, 9).
-        obs: Observations, name to (T, ...); images are upright. Empty until the states are rendered.
-        expert_actions: Actions that the expert chose, (T, 7), where noise was added to the executed ones.
-        success: Whether the goal was reached.
-        fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
-        attrs: Further attributes of the demonstration.
-    """
-
-    actions: np.ndarray
-    states: np.ndarray
-    robot_states: np.ndarray | None = None
-    obs: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
-    expert_actions: np.ndarray | None = None
-    success: bool = True
-    fixtures: np.ndarray | None = None
-    attrs: Mapping[str, Any] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.actions)
-
-    @property
-    def labels(self) -> np.ndarray:
-        """Actions to learn, (T, 7): those of the expert where they differ from the executed ones."""
-        return self.actions if self.expert_actions is None else self.expert_actions
 
 
 class OtherRecordingError(DemoError):
@@ -118,7 +84,7 @@ class DemoWriter:
         found = {}
         for file, name in list(self._sources()):
             with open_demo_file(file) as handle:
-                states = read_values(handle["data"][name], "states", file, name)
+                states = read_values(handle["data"][name], "states", f"{file}: {name}")
             found[demo_number(name)] = np.zeros(0) if states is None else states
         return found
 
@@ -194,7 +160,9 @@ class DemoWriter:
             names = demo_names(handle, file)
             for name in names:
                 group = handle["data"][name]
-                check_demo(group, file, name, group.get("obs", ()) if isinstance(group, h5py.Group) else ())
+                check_demo(
+                    group, f"{file}: {name}", group.get("obs", ()) if isinstance(group, h5py.Group) else ()
+                )
             self._check_header(file, file_attributes(handle, file))
         for name in names:
             if name not in seen:

@@ -13,7 +13,8 @@ import numpy as np
 
 from libero_env.demos.config import DemoConfig
 from libero_env.demos.observe import StateRenderer
-from libero_env.demos.write import DemoWriter, Episode
+from libero_env.demos.read import Episode
+from libero_env.demos.write import DemoWriter
 from libero_env.envs.world import World
 from libero_env.tasks import Task
 from libero_env.teleop.devices import QUIT, Device

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from libero_env.demos.read import Demo
+from libero_env.demos.read import Episode
 from lifelong.data.frame_file import FrameFile
 from lifelong.data.source import (
     DemoSource,
@@ -102,7 +102,7 @@ class SequenceVLDataset:
     @classmethod
     def from_demos(
         cls,
-        demos: Sequence[Demo],
+        demos: Sequence[Episode],
         *,
         spec: PolicySpec,
         language: Tensor,
@@ -128,7 +128,7 @@ class SequenceVLDataset:
 
     @classmethod
     def _filled(
-        cls, demos: Iterable[Demo], lengths: list[int], spec: PolicySpec, language: Tensor, task_id: int
+        cls, demos: Iterable[Episode], lengths: list[int], spec: PolicySpec, language: Tensor, task_id: int
     ) -> "SequenceVLDataset":
         """Return a dataset whose tensors are filled one demonstration after the other."""
         frames, end, rows = sum(lengths), 0, slice(0, 0)

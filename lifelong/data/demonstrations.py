@@ -8,10 +8,10 @@ from weakref import WeakValueDictionary
 
 import torch
 
+from libero_env.demos.config import RenderConfig
 from libero_env.demos.generate import ensure_demos
-from libero_env.demos.observe import RenderConfig
-from libero_env.demos.perturbed import RenderJob, ensure_rendered
 from libero_env.demos.read import demo_lengths
+from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import Perturbation, replace_perturbations
 from libero_env.tasks import Task
 from lifelong.data import DemoSource, open_windows

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from libero_env.demos.observe import rendered_perturbations
+from libero_env.demos.config import rendered_perturbations
 from libero_env.errors import LiberoError
 from libero_env.perturbations import Perturbation, parse_perturbations
 from lifelong.errors import ConfigError

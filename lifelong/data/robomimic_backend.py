@@ -91,7 +91,7 @@ class RobomimicWindows:
             )
         for name in names:
             group = file["data"][name]
-            check_demo(group, path, name, [*self.source.spec.views, *self.source.spec.proprio])
+            check_demo(group, f"{path}: {name}", [*self.source.spec.views, *self.source.spec.proprio])
             stated, steps = read_attribute(group, "num_samples", f"{path}: {name}"), len(group["actions"])
             if stated != steps:
                 raise DataError(

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from libero_env.demos.read import Demo, demo_lengths, iter_demos
+from libero_env.demos.read import Episode, demo_lengths, iter_demos
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
@@ -53,7 +53,7 @@ class DemoSource:
         height, width = self.spec.image_size
         return sum(self.lengths()) * len(self.spec.views) * height * width * 3
 
-    def demos(self) -> Iterator[Demo]:
+    def demos(self) -> Iterator[Episode]:
         """Yield the demonstrations, with one in memory at a time.
 
         Raises:
@@ -66,7 +66,7 @@ class DemoSource:
             yield demo
 
 
-def demo_tensors(demo: Demo, spec: PolicySpec) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+def demo_tensors(demo: Episode, spec: PolicySpec) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Return the tensors of a demonstration that fits the spec.
 
     Returns:
@@ -82,7 +82,7 @@ def last_frames(lengths: list[int]) -> Tensor:
     return (counts.cumsum(0) - 1).repeat_interleave(counts)
 
 
-def check_fits(demo: Demo, spec: PolicySpec, source: str) -> None:
+def check_fits(demo: Episode, spec: PolicySpec, source: str) -> None:
     """Check that a demonstration fits the spec.
 
     Raises:

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from libero_env.demos.write import DemoWriter, Episode, make_header
+from libero_env.demos.read import Episode
+from libero_env.demos.write import DemoWriter, make_header
 from libero_env.expert.rollout import Attempt
 
 STEPS = 12  # of an episode by `wander`

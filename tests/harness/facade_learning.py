@@ -8,7 +8,8 @@ import torch
 from libero._adapters.lifelong.config import Config, load_config
 from libero.libero.benchmark import Benchmark, get_benchmark
 from libero.lifelong.datasets import SequenceVLDataset, get_dataset
-from libero_env.demos.write import DemoWriter, Episode
+from libero_env.demos.read import Episode
+from libero_env.demos.write import DemoWriter
 
 SIZE, LANGUAGE = 32, 16
 TINY = (

@@ -16,7 +16,7 @@ import pytest
 
 from libero_env.demos.generate import generate
 from libero_env.demos.lerobot import export_lerobot, export_published
-from libero_env.demos.regenerate import Regeneration
+from libero_env.demos.replay import Regeneration
 from tests.harness.peers import lerobot
 
 pytest.importorskip("av")

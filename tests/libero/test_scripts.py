@@ -27,8 +27,8 @@ from libero.scripts import (
     render_single_task,
     shasum_files,
 )
-from libero_env.demos.read import read_demos
-from libero_env.demos.write import DemoWriter, Episode, make_header
+from libero_env.demos.read import Episode, read_demos
+from libero_env.demos.write import DemoWriter, make_header
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import bddl, get_task
 from libero_env.teleop import screens as teleop_screens

@@ -10,18 +10,12 @@ import numpy as np
 import pytest
 
 from libero_env.demos import hdf5
-from libero_env.demos.curate import (
-    describe,
-    examine,
-    filter_demos,
-    read_episodes,
-    recorded_robot,
-    recorded_task,
-)
+from libero_env.demos.contents import read_header
+from libero_env.demos.curate import describe, examine, filter_demos
 from libero_env.demos.generate import generate, make_demos
-from libero_env.demos.header import read_header
 from libero_env.demos.lerobot import export_lerobot
-from libero_env.demos.read import demo_lengths, iter_demos, read_demos
+from libero_env.demos.observe import recorded_robot, recorded_task
+from libero_env.demos.read import demo_lengths, iter_demos, read_demos, read_episodes
 from libero_env.demos.replay import rerun_actions
 from libero_env.demos.stored_model import read_fixture_poses
 from libero_env.demos.video import check_video_path, write_video

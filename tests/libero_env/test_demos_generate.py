@@ -12,11 +12,10 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.config import DemoConfig, RecordingJob, Variation
-from libero_env.demos.contents import demo_number
-from libero_env.demos.curate import read_episodes, read_header
-from libero_env.demos.generate import demo_path, ensure_demos, generate, make_demos
-from libero_env.demos.read import read_demos
+from libero_env.demos.config import GENERATOR, DemoConfig, Variation
+from libero_env.demos.contents import demo_number, read_header
+from libero_env.demos.generate import RecordingJob, demo_path, ensure_demos, generate, make_demos
+from libero_env.demos.read import read_demos, read_episodes
 from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv
@@ -154,35 +153,24 @@ def test_a_faithful_drawing_is_recorded(whole, tmp_path):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    ("config", "folder"),
-    [
-        (DemoConfig("libero_object/0", (64, 64)), "64x64-seed0-scripted-expert-14"),
-        (DemoConfig("libero_object/0", (64, 64), drawing="fast"), "64x64-seed0-scripted-expert-14"),
-        (DemoConfig("libero_object/0", (64, 64), 3, "libero"), "64x64-seed3-scripted-expert-14-d9a2a37b"),
-        (
-            DemoConfig(
-                "libero_goal/3",
-                (128, 128),
-                variation=Variation(style=False, noise=0.2, reserved=True),
-                cameras=("agentview",),
-                modalities=("rgb", "depth"),
-            ),
-            "128x128-seed0-scripted-expert-14-800fa04f",
-        ),
-        (DemoConfig("libero_object/0", (64, 64), disturb=False), "64x64-seed0-scripted-expert-14-bf1e44b3"),
-    ],
-)
-def test_folders_of_earlier_versions_are_found(config, folder, tmp_path):
-    path = demo_path(tmp_path, config)
-    assert path == tmp_path / config.task.suite / folder / f"{config.task.name}_demo.hdf5"
+def test_the_folder_names_every_option_that_is_not_the_default(tmp_path):
+    def folder(**options):
+        return demo_path(tmp_path, DemoConfig("libero_object/0", (64, 64), **options)).parent.name
+
+    assert folder() == folder(drawing="fast") == f"64x64-seed0-{GENERATOR}"
+    options = [
+        *({"seed": 3}, {"pairing": "libero"}, {"disturb": False}, {"cameras": ("agentview",)}),
+        *({"modalities": ("rgb", "depth")}, {"drawing": "faithful"}, {"robot": "robosuite-1.4.1"}),
+        *({"variation": Variation(style=False)}, {"variation": Variation(noise=0.2)}),
+    ]
+    assert len({folder(), *(folder(**one) for one in options)}) == 1 + len(options)
 
 
 def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_path):
     path = tmp_path / "unjoined.hdf5"
     writer = RecordingJob(DemoConfig(get_task(TASK), SIZE), path).writer()
-    for name, episode in read_episodes(whole):
-        writer.write(demo_number(name), episode)
+    for episode in read_episodes(whole):
+        writer.write(demo_number(episode.name), episode)
     assert not path.exists()
     check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 

@@ -7,11 +7,12 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.curate import describe, examine, read_episodes
+from libero_env.demos.config import RenderConfig, rendered_perturbations
+from libero_env.demos.curate import describe, examine
 from libero_env.demos.generate import generate
-from libero_env.demos.observe import RenderConfig, rendered_perturbations
-from libero_env.demos.read import read_demos
-from libero_env.demos.replay import recorded_rendering, rerender
+from libero_env.demos.observe import recorded_rendering
+from libero_env.demos.read import read_demos, read_episodes
+from libero_env.demos.rendering import rerender
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.perturbations import parse_perturbations
@@ -69,11 +70,11 @@ def test_severity_0_is_the_file_to_the_bit(path, tmp_path):
 @pytest.mark.sim
 def test_what_happened_stays_and_what_is_seen_and_said_changes(path, other):
     text, target = MIXED, other
-    for (name, old), (_, new) in zip(read_episodes(path), read_episodes(target), strict=True):
+    for old, new in zip(read_episodes(path), read_episodes(target), strict=True):
         for key in KEPT:
-            np.testing.assert_array_equal(getattr(old, key), getattr(new, key), err_msg=f"{name} {key}")
+            np.testing.assert_array_equal(getattr(old, key), getattr(new, key), err_msg=f"{old.name} {key}")
         for key in ("agentview_rgb", "eye_in_hand_rgb", "joint_states", "ee_ori"):
-            assert (old.obs[key] != new.obs[key]).mean() > 0.5, (name, key)
+            assert (old.obs[key] != new.obs[key]).mean() > 0.5, (old.name, key)
     with h5py.File(path) as old, h5py.File(target) as new:
         assert new["data"].attrs["perturb"] == text
         said = [json.loads(f["data"].attrs["problem_info"])["language_instruction"] for f in (old, new)]
@@ -91,18 +92,18 @@ def test_each_demonstration_has_a_draw_of_its_own(path, tmp_path):
     part = perturbed(path, tmp_path / "part.hdf5", "light=0.8,dropped_frames=0.5", limit=1)
     assert len(read_demos(part)) == 1
     assert_same(whole, perturbed(path, part, "light=0.8,dropped_frames=0.5"))
-    means = [[e.obs["agentview_rgb"][0].mean() for _, e in read_episodes(file)] for file in (path, whole)]
+    means = [[e.obs["agentview_rgb"][0].mean() for e in read_episodes(file)] for file in (path, whole)]
     ratios = np.divide(*means)
     assert abs(ratios[1] - ratios[0]) > 0.05  # each has its own light
     seeded = perturbed(path, tmp_path / "seeded.hdf5", parse_perturbations("light=0.8", seed=1))
-    for (_, one), (_, two) in zip(read_episodes(whole), read_episodes(seeded), strict=True):
+    for one, two in zip(read_episodes(whole), read_episodes(seeded), strict=True):
         assert (one.obs["agentview_rgb"][0] != two.obs["agentview_rgb"][0]).any()
 
 
 @pytest.mark.sim
 def test_filters_with_a_memory_act_along_each_demonstration(path, tmp_path):
     late = perturbed(path, tmp_path / "late.hdf5", "latency=0.3")  # 3 steps
-    for (_, old), (_, new) in zip(read_episodes(path), read_episodes(late), strict=True):
+    for old, new in zip(read_episodes(path), read_episodes(late), strict=True):
         for key in ("agentview_rgb", "eye_in_hand_rgb"):
             shown = old.obs[key][np.maximum(np.arange(STEPS) - 3, 0)]
             np.testing.assert_array_equal(new.obs[key], shown)

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from libero_env.demos.curate import read_episodes, read_header, recorded_task
+from libero_env.demos.config import RenderConfig
+from libero_env.demos.contents import read_header
 from libero_env.demos.generate import generate
 from libero_env.demos.lerobot import ORIGIN, export_lerobot, export_published
-from libero_env.demos.observe import RenderConfig, StateRenderer
-from libero_env.demos.regenerate import Regeneration, noop_mask, regenerate
+from libero_env.demos.observe import StateRenderer, recorded_task
+from libero_env.demos.read import published_noop_steps, read_episodes
+from libero_env.demos.replay import Regeneration, regenerate
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, UnknownNameError
 
@@ -81,7 +83,7 @@ def file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def episode(file):
-    return next(read_episodes(file))[1]
+    return next(read_episodes(file))
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +107,7 @@ def exported(file, tmp_path_factory):
 
 def _rewrite(file, target, change):
     writer = DemoWriter(target, read_header(file))
-    for i, (_, one) in enumerate(read_episodes(file)):
+    for i, one in enumerate(read_episodes(file)):
         writer.write(i, change(one))
     return writer.finish()
 
@@ -210,7 +212,7 @@ def test_the_rule_of_no_ops():
     motions = np.zeros((7, 6))
     motions[4], motions[5] = 5e-5, 3e-5  # norms 1.2e-4 and 7e-5
     gripper = np.array([[-1.0], [-1.0], [1.0], [1.0], [1.0], [1.0], [-1.0]])
-    dropped = noop_mask(np.concatenate([motions, gripper], axis=1))
+    dropped = published_noop_steps(np.concatenate([motions, gripper], axis=1))
     # Before the first motion nothing is kept, closing neither: there is no action to compare its gripper with.
     assert dropped.tolist() == [True, True, True, True, False, True, False]
 
@@ -252,15 +254,15 @@ def test_a_recording_that_ends_too_early_is_continued(file, episode, tmp_path):
 
     short, small = _rewrite(file, tmp_path / "short.hdf5", cut), replace(HOW, size=(16, 16))
     (continued,) = regenerate(short, small)
-    assert continued.success and expected_frames - 3 < len(continued.action) <= expected_frames + 7
+    assert continued.success and expected_frames - 3 < len(continued.actions) <= expected_frames + 7
     (stopped,) = regenerate(short, replace(small, extra_steps=0))
-    assert not stopped.success and len(stopped.action) == expected_frames - 3
+    assert not stopped.success and len(stopped.actions) == expected_frames - 3
     human = DemoWriter(
         tmp_path / "human.hdf5", {k: v for k, v in read_header(short).items() if k != "generator"}
     )
-    human.write(0, next(read_episodes(short))[1])
+    human.write(0, next(read_episodes(short)))
     (left,) = regenerate(human.finish(), small)
-    assert not left.success and len(left.action) == expected_frames - 3
+    assert not left.success and len(left.actions) == expected_frames - 3
 
 
 def test_an_unknown_set_is_named(file, tmp_path):

@@ -7,14 +7,14 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.config import DemoConfig, RecordingJob, Variation
-from libero_env.demos.curate import examine, read_episodes, recorded_task
-from libero_env.demos.generate import generate, make_demos
+from libero_env.demos.config import DemoConfig, RenderConfig, Variation
+from libero_env.demos.curate import examine
+from libero_env.demos.generate import RecordingJob, generate, make_demos
 from libero_env.demos.lerobot import export_lerobot
-from libero_env.demos.observe import RenderConfig, StateRenderer, fixture_poses
-from libero_env.demos.read import read_demos
-from libero_env.demos.replay import replay, rerender
-from libero_env.demos.write import Episode
+from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
+from libero_env.demos.read import Episode, read_demos, read_episodes
+from libero_env.demos.rendering import rerender
+from libero_env.demos.replay import replay
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
@@ -37,7 +37,7 @@ def path(tmp_path_factory):
 
 def test_poses_of_fixtures_are_recorded(path):
     scene = LiberoEnv(TASK, cameras=()).world.scene
-    episodes = [episode for _, episode in read_episodes(path)]
+    episodes = list(read_episodes(path))
     poses = [episode.fixtures for episode in episodes]
     assert not np.allclose(poses[0], poses[1], atol=1e-6)  # they differ from start to start
     for episode, pose in zip(episodes, poses, strict=True):
@@ -66,7 +66,7 @@ def test_actions_replay_to_the_same_states(path):
 def test_images_depend_on_the_poses_of_fixtures(path, tmp_path):
     """So the other tests would fail if the poses were ignored."""
     renderer = StateRenderer(get_task(TASK), RenderConfig(("agentview",), SIZE))
-    _, episode = next(read_episodes(path))
+    episode = next(read_episodes(path))
     seen, _ = renderer.render_states(episode.states[:1], episode.fixtures)
     moved, _ = renderer.render_states(episode.states[:1], episode.fixtures + [0.1, 0, 0, 0, 0, 0, 0])
     renderer.close()
@@ -105,7 +105,7 @@ def test_rendering_again_with_other_cameras_depth_and_segmentation(path, tmp_pat
     )
     assert len(np.unique(demo.obs["agentview_segmentation"])) > 3
     renderer = StateRenderer(get_task(TASK), config)
-    _, episode = next(read_episodes(path))
+    episode = next(read_episodes(path))
     seen, _ = renderer.render_states(episode.states[:1], episode.fixtures)
     renderer.close()
     for key in ("frontview_depth", "agentview_segmentation"):
@@ -139,7 +139,7 @@ def original(source, out):
         data.attrs["bddl_file_content"] = task.bddl_text
         data.attrs["macros_image_convention"], data.attrs["tag"] = "opengl", "libero-v1"
         data.attrs["num_demos"], data.attrs["total"] = 1, STEPS - 1
-        episode: Episode = next(read_episodes(source))[1]
+        episode: Episode = next(read_episodes(source))
         model, fixtures = renderer.scene.model, episode.fixtures
         obs, robot = renderer.render_states(episode.states[1:], fixtures)
         demo = data.create_group("demo_0")
@@ -179,7 +179,7 @@ def test_files_of_the_original_work_with_every_tool(path, tmp_path):
 
 
 def test_recorded_models_have_the_joints_of_the_states(path):
-    _, episode = next(read_episodes(path))
+    episode = next(read_episodes(path))
     model = LiberoEnv(TASK, cameras=()).world.scene.model
     assert all(f'name="{model.joint(j).name}"' in episode.attrs["model_file"] for j in range(model.njnt))
 
@@ -222,7 +222,7 @@ def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
     config = DemoConfig(TASK, (8, 8), variation=Variation(reserved=True))
     make_demos([RecordingJob(config, tmp_path / "a.hdf5")], 2, workers=1, progress=False)
     env = LiberoEnv(TASK, cameras=())
-    for i, (_, episode) in enumerate(read_episodes(tmp_path / "a.hdf5")):
+    for i, episode in enumerate(read_episodes(tmp_path / "a.hdf5")):
         env.reset(options={"init_state": i})
         np.testing.assert_array_equal(episode.states[0], env.world.physics_state(0))
         np.testing.assert_array_equal(episode.fixtures, env.world.simulations.fixtures[0])

@@ -6,9 +6,10 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.curate import examine, filter_demos, noop_steps, read_episodes, recorded_task
-from libero_env.demos.read import read_demos
-from libero_env.demos.statistics import QUANTILES, ImageStatistics, NumberStatistics
+from libero_env.demos.curate import examine, filter_demos
+from libero_env.demos.lerobot_writers import QUANTILES, ImageStatistics, NumberStatistics
+from libero_env.demos.observe import recorded_task
+from libero_env.demos.read import noop_steps, read_demos, read_episodes
 from libero_env.errors import DemoError
 from libero_env.tasks import get_task
 from tests.harness.demos import episode, write
@@ -76,9 +77,9 @@ def test_filtering_keeps_the_chosen_steps_unchanged(path, tmp_path):
 
 def test_filtering_nothing_changes_nothing(path, tmp_path):
     filter_demos(path, tmp_path / "b.hdf5")
-    for (name, a), (_, b) in zip(read_episodes(path), read_episodes(tmp_path / "b.hdf5"), strict=True):
+    for a, b in zip(read_episodes(path), read_episodes(tmp_path / "b.hdf5"), strict=True):
         for key in ("actions", "states", "robot_states", "expert_actions"):
-            np.testing.assert_array_equal(getattr(a, key), getattr(b, key), err_msg=name)
+            np.testing.assert_array_equal(getattr(a, key), getattr(b, key), err_msg=a.name)
         assert a.obs.keys() == b.obs.keys() and a.success == b.success
         assert all(np.array_equal(a.obs[key], b.obs[key]) for key in a.obs)
 

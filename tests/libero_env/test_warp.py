@@ -5,9 +5,9 @@ import os
 import numpy as np
 import pytest
 
-from libero_env.demos.config import DemoConfig, RecordingJob
-from libero_env.demos.generate import demo_path, make_demos
-from libero_env.demos.header import read_header
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.contents import read_header
+from libero_env.demos.generate import RecordingJob, demo_path, make_demos
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.world import World
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError

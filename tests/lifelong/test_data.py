@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from libero_env.demos.read import Demo
+from libero_env.demos.read import Episode
 from libero_env.errors import DemoError
 from lifelong.data import ReplayMemory, SequenceVLDataset, batches, fake_batch
 from lifelong.errors import DataError
@@ -18,10 +18,11 @@ SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
 LENGTHS = (7, 1, 4, 12)
 
 
-def make_demo(name: str, steps: int, rng: np.random.Generator, spec: PolicySpec = SPEC) -> Demo:
+def make_demo(name: str, steps: int, rng: np.random.Generator, spec: PolicySpec = SPEC) -> Episode:
     obs = {v: rng.integers(0, 256, (steps, *spec.image_size, 3), dtype=np.uint8) for v in spec.views}
     obs |= {k: rng.normal(size=(steps, d)) for k, d in spec.proprio.items()}
-    return Demo(name, rng.uniform(-1, 1, (steps, spec.action_dim)), obs)
+    actions = rng.uniform(-1, 1, (steps, spec.action_dim))
+    return Episode(actions, np.zeros((steps, 0)), obs=obs, name=name)
 
 
 def make_dataset(task_id: int = 0, lengths: tuple[int, ...] = LENGTHS, seed: int = 0) -> SequenceVLDataset:
@@ -30,7 +31,7 @@ def make_dataset(task_id: int = 0, lengths: tuple[int, ...] = LENGTHS, seed: int
     return SequenceVLDataset.from_demos(demos, spec=SPEC, language=torch.arange(4.0), task_id=task_id)
 
 
-def write_hdf5(path: Path, demos: list[Demo]) -> Path:
+def write_hdf5(path: Path, demos: list[Episode]) -> Path:
     """Write a file in the original's layout: images upside down, each action with the observation after it."""
     with h5py.File(path, "w") as file:
         for demo in demos:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from libero_env.demos.read import Demo, demo_lengths, read_demos
+from libero_env.demos.read import Episode, demo_lengths, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import DemoSource, ReplayMemory, SequenceVLDataset, frame_cache, loading, open_windows
 from lifelong.data.frame_cache import cache_root
@@ -381,7 +381,7 @@ def test_replay_memory_accepts_windows_held_on_disk(path: Path) -> None:
 def test_lengths_are_those_of_the_demonstrations(path: Path) -> None:
     for pairing in ("stored", "aligned"):
         for limit in (None, 2):
-            found: list[Demo] = read_demos(path, [], limit, pairing=pairing)
+            found: list[Episode] = read_demos(path, [], limit, pairing=pairing)
             assert demo_lengths(path, limit, pairing=pairing) == [len(demo) for demo in found]
 
 

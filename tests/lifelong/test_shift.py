@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from libero_env.demos import perturbed as rendering
-from libero_env.demos.curate import read_episodes
+from libero_env.demos import generate as recording
+from libero_env.demos import rendering
+from libero_env.demos.config import RenderConfig
 from libero_env.demos.generate import generate
-from libero_env.demos.observe import RenderConfig
-from libero_env.demos.perturbed import RenderJob, ensure_rendered
+from libero_env.demos.read import read_episodes
+from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
 from libero_env.tasks import get_suite
 from libero_eval import relearning
@@ -85,7 +86,7 @@ def quick(monkeypatch):
         return torch.stack([torch.randn(384, generator=torch.Generator().manual_seed(s)) for s in seeds])
 
     monkeypatch.setattr(encoder, "_minilm", embeddings)
-    monkeypatch.setattr(rendering, "cpu_count", lambda: 1)
+    monkeypatch.setattr(recording, "cpu_count", lambda: 1)
 
 
 def run(folder: Path, home: Path, *overrides: str) -> Path:
@@ -178,15 +179,15 @@ def test_rendered_demonstrations_are_made_once_and_again_when_they_are_outdated(
     )
 
     ensure_rendered([RenderJob(own, task, 2, config)], workers=1, progress=False)  # goes on
-    whole = {name: episode.obs["agentview_rgb"] for name, episode in read_episodes(path)}
+    whole = {episode.name: episode.obs["agentview_rgb"] for episode in read_episodes(path)}
     (fresh,) = ensure_rendered([RenderJob(source, task, 2, config)], workers=2, progress=False)
-    for name, episode in read_episodes(fresh):
-        np.testing.assert_array_equal(whole[name], episode.obs["agentview_rgb"])
+    for episode in read_episodes(fresh):
+        np.testing.assert_array_equal(whole[episode.name], episode.obs["agentview_rgb"])
     with h5py.File(own, "r+") as file:  # recorded again, with other states
         file["data/demo_0/states"][0, 1] += 0.01
-    assert not RenderJob(own, task, 2, config).is_complete()
+    assert not RenderJob(own, task, 2, config).is_complete(2)
     ensure_rendered([RenderJob(own, task, 2, config)], workers=1, progress=False)
-    (_, new), (_, same) = read_episodes(path)
+    new, same = read_episodes(path)
     assert (new.obs["agentview_rgb"][0] != whole["demo_0"][0]).any()
     np.testing.assert_array_equal(same.obs["agentview_rgb"], whole["demo_1"])
 
@@ -211,9 +212,9 @@ def test_who_needs_a_file_that_is_being_rendered_waits_for_it(folder, monkeypatc
     monkeypatch.setattr(rendering, "rerender", slow)
     found: list[Path] = []
     second = threading.Thread(target=lambda: found.extend(ensure_rendered([job], workers=1, progress=False)))
-    assert ensure_rendered([job], workers=1, progress=False) == [job.target]
+    assert ensure_rendered([job], workers=1, progress=False) == [job.path]
     second.join(60)
-    assert len(calls) == 1 and found == [job.target]
+    assert len(calls) == 1 and found == [job.path]
 
 
 @pytest.mark.sim
@@ -255,7 +256,7 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
     settings, config = RelearnSettings(held_out=1), read_config(path / "config.yaml", ())
     training, held_out = relearning._windows(loaded, 1, settings, config)
     shifted = next(folder.rglob(f"under-instruction=0.6*/{TASKS[1].name}_demo.hdf5"))
-    (_, first), (_, other) = read_episodes(shifted)  # learned from, and held out
+    first, other = read_episodes(shifted)  # learned from, and held out
     assert len(training) == len(first) and len(held_out) == len(other)
     np.testing.assert_array_equal(held_out.observation.images[0, 0, 0], other.obs["agentview_rgb"][0])
     assert torch.equal(held_out.observation.language[0], embedded[1])

@@ -10,7 +10,8 @@ from libero.libero.envs import base_object
 from libero.libero.utils import mu_utils, object_utils, task_generation_utils
 from libero.lifelong.algos import REGISTERED_ALGOS
 from libero_env.demos.generate import generate
-from libero_env.demos.write import DemoWriter, Episode
+from libero_env.demos.read import Episode
+from libero_env.demos.write import DemoWriter
 from libero_env.objects import catalog
 from tests.walkthroughs.blocks import Block, load_blocks
 

@@ -26,12 +26,7 @@ from libero.libero.envs.robots.single_arm import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero.libero.utils.utils import postprocess_model_xml
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, ROBOTS
-from libero_env.demos.stored_model import (
-    compile_stored,
-    model_xml,
-    read_fixture_poses,
-    spec_without_textures,
-)
+from libero_env.demos.stored_model import compile_stored, model_xml, read_fixture_poses, spec_without_textures
 from libero_env.envs.checks import real_array
 from libero_env.errors import (
     ClosedEnvironmentError,

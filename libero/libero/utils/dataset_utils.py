@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.demos.contents import check_demo, demo_names, read_values, subset_names
+from libero_env.demos.contents import check_demo, demo_names, file_attributes, read_values, subset_names
 from libero_env.demos.hdf5 import check_memory, open_demo_file
-from libero_env.demos.header import file_attributes
 from libero_env.errors import DemoError
 
 
@@ -33,9 +32,11 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
         if not names:
             raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0")
         check_memory(
-            sum(check_demo(data[name], path, name, ()) for name in names), str(path), "choose a subset"
+            sum(check_demo(data[name], f"{path}: {name}", ()) for name in names), str(path), "choose a subset"
         )
-        rows = [np.asarray(read_values(data[name], "actions", path, name, check=False)) for name in names]
+        rows = [
+            np.asarray(read_values(data[name], "actions", f"{path}: {name}", check=False)) for name in names
+        ]
         lengths, actions = np.array([len(row) for row in rows]), np.concatenate(rows)
         structure = {name: _shapes(data[name]) for name in names}
         found, first = file_attributes(file, path), structure[names[0]]

@@ -1,0 +1,206 @@
+"""Recorded states rendered again: with other cameras, or under perturbations, once and kept beside the recording."""
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from libero_env.assets.pack import Pack, select_pack
+from libero_env.demos.config import PERTURBED_HEADER, RenderConfig
+from libero_env.demos.contents import demo_names, demo_number, json_attribute, read_header, read_values
+from libero_env.demos.generate import DemoJob, claim_incomplete, number_of_processes, run_each
+from libero_env.demos.hdf5 import open_demo_file
+from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
+from libero_env.demos.read import read_episodes
+from libero_env.demos.write import DemoWriter
+from libero_env.errors import DemoError
+from libero_env.parallel import progress_bar
+from libero_env.perturbations.problem import reword_task
+from libero_env.perturbations.value import format_perturbations
+from libero_env.sim.scene import default_drawing
+from libero_env.tasks import Task
+
+_LONGEST = 120  # [characters] of the text of perturbations in the name of a folder
+
+
+@dataclass(frozen=True)
+class RenderJob(DemoJob):
+    """Demonstrations to be rendered under perturbations.
+
+    Attributes:
+        file: File of the recorded demonstrations.
+        task: Task that was recorded; its id names the draws.
+        n: Number of demonstrations, the first of the file.
+        config: What is rendered.
+        path: File to write: the recorded one where nothing is perturbed, or one in a folder named by the perturbations.
+    """
+
+    file: Path
+    task: Task
+    n: int
+    config: RenderConfig
+    path: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        drawing = self.config.drawing or default_drawing(select_pack())
+        object.__setattr__(self, "config", replace(self.config, drawing=drawing))
+        text, (height, width) = format_perturbations(self.config.perturbations), self.config.size
+        if len(text) > _LONGEST:
+            text = f"{text[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+        folder = self.file.parent / f"under-{text}-{height}x{width}-{drawing}"
+        object.__setattr__(self, "path", folder / self.file.name if text else self.file)
+
+    def writer(self) -> DemoWriter:
+        """Return a writer of the file."""
+        return DemoWriter(self.path, rendered_header(self.file, self.config, self.task))
+
+    def missing(self, n: int) -> set[int]:
+        """Return which of the first `n` recorded demonstrations are not rendered; see `DemoJob`.
+
+        Raises:
+            DemoError: What is there is broken, or of other demonstrations.
+        """
+        rendered, missing = self.writer().recorded_states(), set()
+        for number, states in self._recorded_states(n):
+            if number not in rendered:
+                missing.add(number)
+            elif not np.array_equal(rendered[number], states):
+                raise DemoError(f"{self.path} has another demo_{number} than {self.file}")
+        return missing
+
+    def render(self) -> None:
+        """Render what is missing; what is broken or was made of another file is removed before.
+
+        Raises:
+            DemoError: The recorded demonstrations are broken, or the file cannot be written.
+        """
+        try:
+            self.missing(self.n)
+        except DemoError as error:
+            self.discard(error)
+        rerender(self.file, self.path, self.config, task=self.task, limit=self.n, progress=False)
+
+    def _recorded_states(self, n: int) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the number of each of the first `n` recorded demonstrations with its states."""
+        with open_demo_file(self.file) as handle:
+            for name in demo_names(handle, self.file)[:n]:
+                states = read_values(handle["data"][name], "states", f"{self.file}: {name}")
+                yield demo_number(name), np.zeros(0) if states is None else states
+
+
+def ensure_rendered(
+    jobs: Sequence[RenderJob], *, workers: int = 0, progress: bool | None = None
+) -> list[Path]:
+    """Return files of demonstrations under perturbations; what is missing is rendered.
+
+    A job without perturbations has the recorded file. An interrupted call can be repeated, and several processes may
+    call this at the same time: each file is made once.
+
+    Args:
+        jobs: What is needed.
+        workers: Number of processes; 0 means one per core, 1 renders in this process.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal, and lines otherwise.
+
+    Raises:
+        DemoError: A recorded file is broken, or a file cannot be written.
+    """
+    workers = number_of_processes(workers)
+    largest: dict[Path, RenderJob] = {}  # each file once, with the most demonstrations that are asked for
+    for job in jobs:
+        if job.config.perturb and (job.path not in largest or largest[job.path].n < job.n):
+            largest[job.path] = job
+    with claim_incomplete((job, job.n) for job in largest.values()) as claimed:
+        if claimed:
+            _render([job for job, _ in claimed], min(workers, len(claimed)), progress)
+    return [job.path for job in jobs]
+
+
+def _render(jobs: Sequence[RenderJob], workers: int, progress: bool | None) -> None:
+    """Render jobs while no other process writes in their folders."""
+    if progress is not False:
+        folders = ", ".join(sorted({str(job.path.parent) for job in jobs}))
+        tqdm.write(f"rendering demonstrations of {len(jobs)} tasks in {folders}", file=sys.stderr)
+    with progress_bar(total=len(jobs), desc="render", unit="file", progress=progress) as bar:
+        for _ in run_each(RenderJob.render, [(job,) for job in jobs], workers):
+            bar.update(1)
+
+
+def rerender(
+    file: Path,
+    target: Path,
+    config: RenderConfig,
+    *,
+    assets: Pack | str | Path | None = None,
+    task: Task | None = None,
+    limit: int | None = None,
+    progress: bool | None = None,
+) -> Path:
+    """Write the demonstrations of a file with other observations: cameras, resolution, modalities, perturbations.
+
+    The observations are those of the recorded states, so the new file has "aligned" pairing, whatever the old one had.
+    Perturbations under which the file was rendered are not kept. Each demonstration has a draw of its own, named by its
+    name; actions and states stay as they are to the bit. An interrupted call can be repeated: it resumes where it
+    stopped.
+
+    Args:
+        file: File to read.
+        target: File to write.
+        config: What is rendered.
+        assets: Where models come from, as for `LiberoEnv`.
+        task: Task that was recorded, which names the draws of perturbations; by default the one that the file states.
+        limit: Largest number of demonstrations to write, the first of the file; None for all.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
+
+    Returns:
+        The new file.
+
+    Raises:
+        DemoError: The file is broken or does not fit its task's scene, or the target was recorded with another
+            configuration, or made of another file.
+    """
+    if target.exists() and target.samefile(file):
+        raise DemoError(f"{target} is the file to read; choose another name")
+    config = replace(config, drawing=config.drawing or default_drawing(select_pack(assets)))
+    task = task or recorded_task(file)
+    writer = DemoWriter(target, rendered_header(file, config, task))
+    recorded = writer.recorded_states()
+    renderer = StateRenderer.of_file(file, config, assets, task=task)
+    try:
+        episodes = islice(read_episodes(file), limit)
+        for episode in progress_bar(episodes, desc="render", unit="demo", progress=progress):
+            name, number = episode.name, demo_number(episode.name)
+            if number not in recorded:
+                poses = fixture_poses(episode, renderer.scene, f"{file}: {name}")
+                obs, robot_states = renderer.render_states(episode.states, poses, name)
+                writer.write(number, replace(episode, obs=obs, robot_states=robot_states))
+            elif not np.array_equal(recorded[number], episode.states):
+                raise DemoError(f"{target} has another {name} than {file}; choose another name or remove it")
+    finally:
+        renderer.close()
+    return writer.finish()
+
+
+def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, Any]:
+    """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it.
+
+    Args:
+        file: File that is read.
+        config: What is rendered; its drawing is named.
+        task: Task that was recorded.
+    """
+    before = read_header(file)
+    replaced = ("cameras", "pictures", "drawing", *PERTURBED_HEADER)
+    header = {k: v for k, v in before.items() if k not in replaced}
+    header |= {**config.header(), "pairing": "aligned"}
+    if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":
+        instruction = reword_task(task, config.perturbations).language
+        info = json_attribute(before, "problem_info", file)
+        header["problem_info"] = json.dumps({**info, "language_instruction": instruction})
+    return header
