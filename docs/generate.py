@@ -4,8 +4,9 @@ MkDocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A page a
 `<!-- generated: commands -->`. Links to files outside this folder become their paths, as the site has none of these.
 """
 
-import argparse
+import contextlib
 import inspect
+import io
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -13,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from libero_env.cli.main import ALL, bind
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs"
@@ -28,45 +31,19 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
     return OUTSIDE.sub(lambda m: f"`{m[2]}`" if m[1] in m[2] else f"{m[1]} (`{m[2]}`)", markdown)
 
 
-def commands(parser: argparse.ArgumentParser | None = None) -> Iterator[argparse.ArgumentParser]:
-    """Every subcommand of `libero` that runs something, in the order of its help."""
-    if parser is None:
-        from libero_eval.cli.main import build_parser
-
-        parser = build_parser()
-    groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-    for group in groups:
-        about = {action.dest: action.help for action in group._choices_actions}
-        for name, child in group.choices.items():
-            child.description = child.description or about.get(name)
-            yield from commands(child)
-    if not groups:
-        yield parser
-
-
 def command_reference() -> str:
-    """A section for each subcommand, with all its arguments."""
-    return "\n".join(_command(parser) for parser in commands())
+    """A section for each command of `libero`: what its help prints."""
+    return "\n".join(f"## libero {name}\n\n```text\n{command_help(name)}```\n" for name in ALL)
 
 
-def _command(parser: argparse.ArgumentParser) -> str:
-    about = (parser.description or "").strip()
-    lines = [f"## {parser.prog}", "", f"{about[:1].upper()}{about[1:]}.", ""]
-    rows = [_argument(a) for a in parser._actions if not isinstance(a, argparse._HelpAction)]
-    if rows:
-        lines += ["| argument | what |", "|---|---|", *rows, ""]
-    return "\n".join(lines)
-
-
-def _argument(action: argparse.Action) -> str:
-    value = action.metavar or (action.dest if not action.option_strings else action.dest.upper())
-    if action.choices:
-        value = ",".join(map(str, action.choices))
-    value = "" if action.nargs == 0 else str(value) + ("..." if action.nargs in ("+", "*") else "")
-    names = [f"{flag} {value}".strip() for flag in action.option_strings] or [value]
-    help_text = (action.help or "").replace("%(default)s", str(action.default))
-    needed = "required. " if action.option_strings and action.required else ""
-    return f"| {', '.join(f'`{n}`' for n in names)} | {needed}{_cell(help_text)} |"
+def command_help(name: str) -> str:
+    """What `libero NAME --help` prints, without the boxes round groups of options."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        bind(name, ["--help"])()
+    lines = [line for line in printed.getvalue().splitlines() if not line.startswith("╰")]
+    lines = [re.sub(r"^╭─ (.*?) ─*╮$", r"\1:", line) for line in lines]
+    return "".join(line.removeprefix("│").removesuffix("│").rstrip() + "\n" for line in lines)
 
 
 def groups() -> dict[str, list[Path]]:

@@ -8,9 +8,9 @@ import pytest
 
 from libero_env.cli import arguments
 from libero_env.cli import demos as cli_demos
+from libero_env.cli import main as cli
 from libero_env.demos.read import read_demos
 from libero_env.demos.record import RecordingReport
-from libero_eval.cli import main as cli
 from tests.harness.demos import wander
 
 pytestmark = pytest.mark.sim

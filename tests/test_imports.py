@@ -101,5 +101,5 @@ def test_the_environment_loads_nothing_of_learning(tmp_path):
 
 def test_the_command_line_starts_light(tmp_path):
     """`libero --help` must not wait for PyTorch or MuJoCo."""
-    loaded = import_in_fresh_process(["libero_eval.cli.main"], tmp_path)["loaded"]
+    loaded = import_in_fresh_process(["libero_env.cli.main"], tmp_path)["loaded"]
     assert not {"torch", "mujoco", "hydra", "transformers", "matplotlib", "numba"} & set(loaded)

@@ -258,7 +258,7 @@ def relearn(runs: Sequence[Planned], folder: Path, by: str) -> int:
         directory = _directory(run, folder)
         if directory is None or not run.is_done():
             continue
-        command = [sys.executable, "-m", "lifelong.cli", "relearn", str(directory), *RELEARN[by]]
+        command = [sys.executable, "-m", "libero_env.cli", "relearn", str(directory), *RELEARN[by]]
         print(run.name, flush=True)
         if subprocess.run(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode == 0:
             run.keep(directory)

@@ -115,7 +115,7 @@ def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:
     command = [
         sys.executable,
         "-m",
-        "lifelong.cli",
+        "libero_env.cli",
         "eval",
         args.policy,
         "--suite",

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from libero.scripts.command import option, script
-from libero_env.cli.teleop import add_device_options, run_teleop
+from libero_env.cli.teleop import TeleopRequest, teleop
 from libero_env.errors import LiberoError
 from libero_env.tasks import read_task
 
@@ -20,8 +20,13 @@ OPTIONS = (
     option("--size", type=int, default=128, help="size of the recorded pictures, pixels (default: 128)"),
     option("--seed", type=int, default=0, help="seed of the initial states (default: 0)"),
     option("--screen", default="auto", choices=("auto", "window", "terminal"), help="where it is shown"),
-    add_device_options,
+    option("--device", default="keyboard", choices=("keyboard", "spacemouse"), help="input device"),
+    option("--pos-sensitivity", type=float, default=1.0, help="factor on translations (default: 1)"),
+    option("--rot-sensitivity", type=float, default=1.0, help="factor on rotations (default: 1)"),
+    option("--vendor-id", type=int, default=9583, help="USB vendor of the 3D mouse (default: 9583)"),
+    option("--product-id", type=int, default=50741, help="USB product of the 3D mouse (default: 50741)"),
 )
+DEVICE = ("device", "pos_sensitivity", "rot_sensitivity", "vendor_id", "product_id")
 
 
 def collect(args: argparse.Namespace) -> int:
@@ -33,11 +38,20 @@ def collect(args: argparse.Namespace) -> int:
     if args.num_demonstration < 1:
         raise LiberoError(f"--num-demonstration {args.num_demonstration}: expected at least 1")
     task = read_task(args.bddl_file)
-    args.out = args.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.task, args.bddl, args.n = None, args.bddl_file, args.num_demonstration
-    args.size = (args.size, args.size)
-    return run_teleop(args)
+    out = args.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    return teleop(
+        TeleopRequest(
+            bddl=args.bddl_file,
+            out=out,
+            n=args.num_demonstration,
+            size=(args.size, args.size),
+            seed=args.seed,
+            camera=args.camera,
+            screen=args.screen,
+            **{name: getattr(args, name) for name in DEVICE},
+        )
+    )
 
 
 @script(*OPTIONS, option("--bddl-file", type=Path, required=True, help="task file"))

@@ -1,63 +1,45 @@
 """`libero assets`: install or download the original's models, report which models are used, check them."""
 
-import argparse
 from pathlib import Path
 
-from libero_env.cli import arguments
-from libero_env.cli.arguments import Subparsers
+from libero_env.cli.options import FilePath, Positional
 
 
-def register(subparsers: Subparsers) -> None:
-    """Add the command `libero assets`."""
-    parser = subparsers.add_parser("assets", help="install, download and check the original's models")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    install = commands.add_parser(
-        "install", help="install the original's models (340 MB) with pip, the pinned version, verified"
-    )
-    install.add_argument("--dest", type=arguments.path, help="folder (default: the running environment)")
-    install.set_defaults(run=run_install)
-    download = commands.add_parser(
-        "download", help="download the same from the Hugging Face Hub (420 MB); resumes where it was stopped"
-    )
-    download.add_argument("--dest", type=arguments.path, help="folder (default: assets in the cache)")
-    download.add_argument(
-        "--revision", help="commit, tag or branch of the data set (default: a pinned commit)"
-    )
-    download.set_defaults(run=run_download, go_on="what is downloaded is kept; the same command goes on")
-    info = commands.add_parser("info", help="print which models scenes are built from, and why")
-    info.set_defaults(run=run_info)
-    check = commands.add_parser("check", help="check that all files of the models exist and are unchanged")
-    check.add_argument(
-        "folder", nargs="?", type=arguments.path, help="folder to check (default: the models in use)"
-    )
-    check.set_defaults(run=run_check)
+def install(*, dest: FilePath | None = None) -> None:
+    """Install the original's models (340 MB) with pip, the pinned version, and verify them.
 
-
-def run_install(args: argparse.Namespace) -> None:
-    """Install the models and print how to use them."""
-    from libero_env.assets.installed import install
+    Args:
+        dest: Folder (default: the running environment).
+    """
+    from libero_env.assets.installed import install as install_models
     from libero_env.assets.pack import ORIGINAL
 
-    folder = install(args.dest)
+    folder = install_models(dest)
     print(f"{folder}: complete; all files are the published ones")
-    _print_use(ORIGINAL if args.dest is None else str(folder))
+    _print_use(ORIGINAL if dest is None else str(folder))
 
 
-def run_download(args: argparse.Namespace) -> None:
-    """Download the models and print how to use them."""
-    from libero_env.assets.download import REVISION, download
+def download(*, dest: FilePath | None = None, revision: str | None = None) -> None:
+    """Download the original's models from the Hugging Face Hub (420 MB); resumes where it was stopped.
 
-    folder = download(args.dest, args.revision or REVISION)
+    Args:
+        dest: Folder (default: assets in the cache).
+        revision: Commit, tag or branch of the data set (default: a pinned commit).
+    """
+    from libero_env.assets.download import REVISION
+    from libero_env.assets.download import download as download_models
+
+    folder = download_models(dest, revision or REVISION)
     print(f"{folder}: complete; all files have the digests that the server lists")
     _print_use(str(folder))
 
 
-def run_info(args: argparse.Namespace) -> None:
+def info() -> None:
     """Print the models in use, the setting that chose them, and what is installed."""
     from libero_env.assets.download import default_folder, read_manifest
     from libero_env.assets.installed import VERSION, installed_folder
     from libero_env.assets.pack import chosen_assets, facade_assets, pack_of
-    from libero_env.assets.published import ChangedAssetsError
+    from libero_env.assets.published import ChangedAssetsError, check_folder
 
     choice = chosen_assets()
     pack = pack_of(choice)
@@ -66,7 +48,7 @@ def run_info(args: argparse.Namespace) -> None:
     print(f"because: {choice.reason} is {choice.value}")
     if root is None and choice.value != pack.name:
         print("         which does not exist")
-    print(f"digest:  {pack.digest}" + (f", {_summary(root)}" if root else ""))
+    print(f"digest:  {pack.digest}" + (f", {check_folder(Path(root)).summary}" if root else ""))
     try:
         facade = facade_assets()
         print(f"facade:  {pack_of(facade).name}" + (f": {facade.reason}" if facade != choice else ""))
@@ -78,19 +60,23 @@ def run_info(args: argparse.Namespace) -> None:
         print(f"downloaded: {root or default_folder()}, revision {record[0]}")
 
 
-def run_check(args: argparse.Namespace) -> int:
-    """Print a line for each model that cannot be built and each changed file; return 1 if there are any."""
+def check(folder: Positional[FilePath | None] = None) -> int:
+    """Print a line for each model that cannot be built and each changed file; return 1 if there are any.
+
+    Args:
+        folder: Folder to check (default: the models in use).
+    """
     from libero_env.assets.check import problems
     from libero_env.assets.original import OriginalPack, is_original
     from libero_env.assets.pack import select_pack
 
-    named = args.folder is not None and is_original(args.folder)  # then damaged files are listed, not refused
-    pack = OriginalPack(str(args.folder.expanduser().absolute())) if named else select_pack(args.folder)
-    found = problems(pack)
-    for line in found:
+    named = folder is not None and is_original(folder)  # then damaged files are listed, not refused
+    pack = OriginalPack(str(folder.expanduser().absolute())) if folder and named else select_pack(folder)
+    lines = problems(pack)
+    for line in lines:
         print(f"FAIL  {line}")
-    print(f"{pack.name}: {len(pack.categories())} objects, {len(found)} problems")
-    return int(bool(found))
+    print(f"{pack.name}: {len(pack.categories())} objects, {len(lines)} problems")
+    return int(bool(lines))
 
 
 def _print_use(value: str) -> None:
@@ -99,9 +85,3 @@ def _print_use(value: str) -> None:
 
     print(f"use it:      export {VARIABLE}={value}")
     print(f"or for good: the line `assets: {value}` in {config_file()}")
-
-
-def _summary(root: str) -> str:
-    from libero_env.assets.published import check_folder
-
-    return check_folder(Path(root)).summary

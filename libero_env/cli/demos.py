@@ -1,190 +1,146 @@
-"""`libero demos`: record demonstrations, describe and check files."""
+"""`libero demos`: record demonstrations; describe, check, replay, render again, filter and convert files."""
 
-import argparse
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from libero_env.cli import arguments, demos_edit
-from libero_env.cli.arguments import Subparsers, modalities
-from libero_env.demos.curate import describe, find_demo_files
+from libero_env.cli.options import (
+    Field,
+    FilePath,
+    Natural,
+    Positional,
+    Positive,
+    ProcessesOrAll,
+    Seed,
+    Segmentation,
+    Size,
+    arg,
+    modalities,
+)
+from libero_env.errors import DemoError, InvalidInputError
 
 if TYPE_CHECKING:
     from libero_env.demos.config import DemoConfig, Variation
     from libero_env.demos.record import RecordingReport
 
-VARIATIONS = ("style", "noise", "pushes")
-CAMERAS = ("agentview", "robot0_eye_in_hand")
+Drawing = Literal["fast", "faithful"]
+Files = Positional[tuple[FilePath, ...]]
 SHOWN_REASONS = 3  # most frequent reasons of failure that are listed for a task
 
 
-def register(subparsers: Subparsers) -> None:
-    """Add `libero demos generate|download|info|check|replay|rerender|filter|export`."""
-    parser = subparsers.add_parser("demos", help="record demonstrations, look at them, convert them")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    _register_generate(commands)
-    _register_download(commands)
-    paths = "files or folders (default: where demonstrations are kept)"
-    info = commands.add_parser("info", help="list the demonstration files in a folder")
-    info.add_argument("paths", nargs="*", type=arguments.path, help=paths)
-    info.set_defaults(run=run_info)
-    check = commands.add_parser("check", help="read files completely and report what is in them or broken")
-    check.add_argument("paths", nargs="*", type=arguments.path, help=paths)
-    check.set_defaults(run=run_check)
-    demos_edit.register(commands)
+@dataclass(frozen=True, kw_only=True)
+class RecordingRequest:
+    """Record with the scripted expert; an interrupted recording can be resumed.
+
+    Attributes:
+        benchmark: All tasks of a suite, such as libero_object.
+        task: One task, such as libero_goal/3.
+        bddl: A user-defined task file.
+        n: Demonstrations of each task.
+        size: Size of the images, 128 or 120x160.
+        cameras: Cameras to render.
+        no_images: Record states, proprioception and actions only; `rerender` can add images later.
+        drawing: How images are drawn (default: that of the models).
+        depth: Record depth too, in metres.
+        segmentation: Record a segmentation too.
+        robot: Model of the arm, libero or robosuite-1.4.1.
+        backend: Physics, mujoco, or warp on a GPU, as in warp,device=cuda:1.
+        seed: Seed of starts, motion styles and action noise.
+        reserved: Start from the 50 stored states, which evaluation uses.
+        variation: What varies: the motion style, noise on the executed actions, pushes; or none.
+        noise: Standard deviation of the noise on actions (default: 0.12).
+        pairing: Store the observation before an action, or the one after it as the original does.
+        workers: Number of processes; 0: one per core.
+        folder: Where to keep the files (default: LIBERO_DEMOS, or in the cache).
+    """
+
+    benchmark: Annotated[str | None, arg(aliases=["--suite"])] = None
+    task: str | None = None
+    bddl: FilePath | None = None
+    n: Positive = 50
+    size: Size = (128, 128)
+    cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
+    no_images: bool = False
+    drawing: Drawing | None = None
+    depth: bool = False
+    segmentation: Segmentation | None = None
+    robot: str = "libero"
+    backend: str = "mujoco"
+    seed: Seed = 0
+    reserved: bool = False
+    variation: tuple[Literal["style", "noise", "pushes", "none"], ...] = ("style", "noise", "pushes")
+    noise: Annotated[float, Field(ge=0, le=10)] | None = None
+    pairing: Literal["aligned", "libero"] = "aligned"
+    workers: ProcessesOrAll = 0
+    folder: FilePath | None = None
 
 
-def _register_generate(commands: Subparsers) -> None:
-    generate = commands.add_parser(
-        "generate", help="record with the scripted expert; an interrupted recording can be resumed"
-    )
-    tasks = generate.add_mutually_exclusive_group(required=True)
-    tasks.add_argument("--benchmark", "--suite", help="all tasks of a suite, such as libero_object")
-    tasks.add_argument("--task", help="one task, such as libero_goal/3")
-    tasks.add_argument("--bddl", type=arguments.path, help="a user-defined task file")
-    add = generate.add_argument
-    add("--n", type=arguments.positive, default=50, help="demonstrations of each task (default: 50)")
-    add(
-        "--size",
-        type=arguments.size,
-        default=(128, 128),
-        help="size of the images, 128 or 120x160 (default: 128)",
-    )
-    add("--cameras", nargs="+", default=CAMERAS, help=f"cameras to render (default: {' '.join(CAMERAS)})")
-    add(
-        "--no-images",
-        action="store_true",
-        help="record states, proprioception and actions only; `rerender` can add images later",
-    )
-    add("--drawing", choices=("fast", "faithful"), help="how images are drawn (default: that of the models)")
-    add("--depth", action="store_true", help="record depth too, in metres")
-    add("--segmentation", choices=("instance", "class", "element"), help="record a segmentation too")
-    add("--robot", default="libero", help="model of the arm: libero, or robosuite-1.4.1 (default: libero)")
-    add(
-        "--backend",
-        metavar="NAME",
-        default="mujoco",
-        help="physics: mujoco, or warp on a GPU, as in warp,device=cuda:1 (default: mujoco)",
-    )
-    add(
-        "--seed",
-        type=arguments.seed,
-        default=0,
-        help="seed of starts, motion styles and action noise (default: 0)",
-    )
-    add("--reserved", action="store_true", help="start from the 50 stored states, which evaluation uses")
-    add(
-        "--variation",
-        nargs="+",
-        choices=(*VARIATIONS, "none"),
-        default=VARIATIONS,
-        help="what varies: the motion style, noise on the executed actions, pushes (default: all)",
-    )
-    add(
-        "--noise",
-        type=arguments.number(0, 10),
-        help="standard deviation of the noise on actions (default: 0.12)",
-    )
-    add(
-        "--pairing",
-        choices=("aligned", "libero"),
-        default="aligned",
-        help="store the observation before an action, or the one after it as the original does (default: aligned)",
-    )
-    add(
-        "--workers",
-        type=arguments.processes_or_all,
-        default=0,
-        help="number of processes (default: one per core)",
-    )
-    add(
-        "--folder",
-        type=arguments.path,
-        help="where to keep the files (default: LIBERO_DEMOS, or in the cache)",
-    )
-    generate.set_defaults(run=run_generate, go_on="what is recorded is kept; the same command goes on")
-
-
-def _register_download(commands: Subparsers) -> None:
-    download = commands.add_parser(
-        "download",
-        help="download the original's human demonstrations; an interrupted download can be resumed",
-    )
-    add = download.add_argument
-    add("names", nargs="+", help="suites such as libero_object, or tasks such as libero_object/3")
-    add("--dest", type=arguments.path, help="folder to write (default: where demonstrations are kept)")
-    add("--revision", help="commit, tag or branch of the data set (default: a pinned commit)")
-    add("--overwrite", action="store_true", help="replace existing files of other contents")
-    download.set_defaults(run=run_download, go_on="what is downloaded is kept; the same command goes on")
-
-
-def run_download(args: argparse.Namespace) -> None:
-    """Download, then list the files."""
-    from libero_env.demos.download import REVISION, download_demos
-
-    for path in download_demos(
-        args.names, args.dest, revision=args.revision or REVISION, overwrite=args.overwrite
-    ):
-        print(f"{path}: complete; it has the digest that the server lists")
-
-
-def run_generate(args: argparse.Namespace) -> int:
+def generate(request: RecordingRequest) -> int:
     """Record what is missing, then list the files and the failures; return 1 if a task is not complete."""
+    from libero_env.demos.curate import describe
     from libero_env.demos.generate import RecordingJob, demo_path, make_demos
     from libero_env.paths import demos_dir
 
-    root = args.folder or demos_dir()
-    jobs = [RecordingJob(config, demo_path(root, config)) for config in demo_configs(args)]
-    reports = make_demos(jobs, args.n, workers=args.workers, replace=True)
+    root = request.folder or demos_dir()
+    jobs = [RecordingJob(config, demo_path(root, config)) for config in demo_configs(request)]
+    reports = make_demos(jobs, request.n, workers=request.workers, replace=True)
     for path, report in reports.items():
         print(describe(path) if path.is_file() else f"{path}: not complete")
         for line in report_lines(report):
             print(f"    {line}")
     if len(reports) > 1:
-        print(summary(reports, args.n))
+        print(summary(reports, request.n))
     return int(any(report.error for report in reports.values()))
 
 
-def demo_configs(args: argparse.Namespace) -> "list[DemoConfig]":
-    """Return the configurations of the demonstrations that the options of `generate` ask for, one per task."""
+def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
+    """Return the configurations of the demonstrations that a request asks for, one per task.
+
+    Raises:
+        InvalidInputError: Not exactly one of suite, task and task file is given.
+    """
     from libero_env.demos.config import DemoConfig
     from libero_env.tasks import get_suite, get_task, read_task
 
-    if args.benchmark:
-        tasks = get_suite(args.benchmark).tasks
+    if sum(one is not None for one in (request.benchmark, request.task, request.bddl)) != 1:
+        raise InvalidInputError("give one of --suite SUITE, --task TASK and --bddl FILE")
+    if request.benchmark:
+        tasks = get_suite(request.benchmark).tasks
     else:
-        tasks = (read_task(args.bddl) if args.bddl else get_task(args.task),)
+        tasks = (read_task(request.bddl) if request.bddl else get_task(request.task),)
+    shown = () if request.no_images else modalities(depth=request.depth, segmentation=request.segmentation)
     return [
         DemoConfig(
             task,
-            args.size,
-            args.seed,
-            args.pairing,
-            disturb=bool({"noise", "pushes"} & set(args.variation)),
-            variation=variation(args),
-            cameras=() if args.no_images else tuple(args.cameras),
-            modalities=modalities(args),
-            drawing=args.drawing,
-            robot=args.robot,
-            backend=args.backend,
+            request.size,
+            request.seed,
+            request.pairing,
+            disturb=bool({"noise", "pushes"} & set(request.variation)),
+            variation=variation(request),
+            cameras=() if request.no_images else request.cameras,
+            modalities=shown,
+            drawing=request.drawing,
+            robot=request.robot,
+            backend=request.backend,
         )
         for task in tasks
     ]
 
 
-def variation(args: argparse.Namespace) -> "Variation":
-    """Return how the demonstrations differ from each other, by the options of `generate`."""
+def variation(request: RecordingRequest) -> "Variation":
+    """Return how the demonstrations differ from each other."""
     from libero_env.demos.config import Variation
 
     default = Variation()
-    noise = default.noise if args.noise is None else args.noise
+    noise = default.noise if request.noise is None else request.noise
     return Variation(
-        style="style" in args.variation,
-        noise=noise if "noise" in args.variation else 0.0,
-        push_rate=default.push_rate if "pushes" in args.variation else 0.0,
-        reserved=args.reserved,
+        style="style" in request.variation,
+        noise=noise if "noise" in request.variation else 0.0,
+        push_rate=default.push_rate if "pushes" in request.variation else 0.0,
+        reserved=request.reserved,
     )
 
 
@@ -211,12 +167,37 @@ def summary(reports: "Mapping[Path, RecordingReport]", n: int) -> str:
     return f"{done} of {len(reports)} tasks complete{share}"
 
 
-def run_info(args: argparse.Namespace) -> int:
-    """Print one line about each file; return 1 if one cannot be read."""
-    from libero_env.errors import DemoError
+def download(
+    names: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    *,
+    dest: FilePath | None = None,
+    revision: str | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Download the original's human demonstrations; an interrupted download can be resumed.
+
+    Args:
+        names: Suites such as libero_object, or tasks such as libero_object/3.
+        dest: Folder to write (default: where demonstrations are kept).
+        revision: Commit, tag or branch of the data set (default: a pinned commit).
+        overwrite: Replace existing files of other contents.
+    """
+    from libero_env.demos.download import REVISION, download_demos
+
+    for path in download_demos(names, dest, revision=revision or REVISION, overwrite=overwrite):
+        print(f"{path}: complete; it has the digest that the server lists")
+
+
+def info(paths: Files = ()) -> int:
+    """Print one line about each demonstration file; return 1 if one cannot be read.
+
+    Args:
+        paths: Files or folders (default: where demonstrations are kept).
+    """
+    from libero_env.demos.curate import describe
 
     broken = 0
-    for path in demo_files(args.paths):
+    for path in demo_files(paths):
         try:
             print(describe(path))
         except DemoError as error:
@@ -225,22 +206,26 @@ def run_info(args: argparse.Namespace) -> int:
     return int(broken > 0)
 
 
-def run_check(args: argparse.Namespace) -> int:
-    """Read every file completely; return 1 if one is broken."""
-    return int(check_files(demo_files(args.paths)) > 0)
+def check(paths: Files = ()) -> int:
+    """Read files completely and report what is in them or broken; return 1 if one is broken.
+
+    Args:
+        paths: Files or folders (default: where demonstrations are kept).
+    """
+    return int(check_files(demo_files(paths)) > 0)
 
 
-def demo_files(paths: list[Path]) -> list[Path]:
+def demo_files(paths: Sequence[Path]) -> list[Path]:
     """Return the demonstration files among the given paths and in the given folders; see `find_demo_files`.
 
     Raises:
         DemoError: A folder is missing, or there are no files.
     """
-    from libero_env.errors import DemoError
+    from libero_env.demos.curate import find_demo_files
 
     if missing := [path for path in paths if path.suffix != ".hdf5" and not path.exists()]:
         raise DemoError(f"{missing[0]} does not exist; give demonstration files, or folders that hold some")
-    return find_demo_files(paths)
+    return find_demo_files(list(paths))
 
 
 def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
@@ -251,7 +236,6 @@ def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
         num_demos: Number of demonstrations that each file must have; None for any.
     """
     from libero_env.demos.curate import examine
-    from libero_env.errors import DemoError
 
     broken = 0
     for path in files:
@@ -270,3 +254,158 @@ def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
         if not faults:
             print(f"ok    {path}: {len(stats.lengths)} demonstrations, {stats}")
     return broken
+
+
+def replay_file(
+    file: Positional[FilePath],
+    *,
+    by: Literal["action", "state"] = "action",
+    demo: tuple[Natural, ...] = (),
+    video: FilePath | None = None,
+    cameras: tuple[str, ...] = ("agentview",),
+    size: Size = (256, 256),
+    assets: str | None = None,
+) -> int:
+    """Replay demonstrations and report success and drift; return 1 if one that succeeded does not any more.
+
+    Args:
+        file: Demonstration file.
+        by: What is replayed.
+        demo: Numbers of demonstrations (default: all).
+        video: Video to write, .mp4, .webp or .gif.
+        cameras: Cameras of the video.
+        size: Size of the video, 128 or 120x160.
+        assets: Where models come from: builtin, original, or a folder with the original's.
+    """
+    from libero_env.demos.replay import replay
+    from libero_env.demos.video import check_video_path, write_video
+    from libero_env.timing import CONTROL_HZ
+
+    if video:
+        check_video_path(video)
+    demos = [f"demo_{number}" for number in demo] if demo else None
+    results, lost = [], 0
+    for result in replay(
+        file, by=by, demos=demos, cameras=cameras if video else (), size=size, assets=assets
+    ):
+        lost += result.recorded and not result.success
+        outcome = "success" if result.success else "no success"
+        drift = f"objects {1000 * result.drift.max():.2f} mm, arm {1000 * result.arm_drift.max():.2f} mrad"
+        print(f"{result.name}: {outcome} after {result.steps} steps, largest drift: {drift}")
+        results.append(result)
+    print(f"{sum(result.success for result in results)} of {len(results)} successful by {by}")
+    if video and results:
+        import numpy as np
+
+        frames = [result.frames for result in results if result.frames is not None]
+        print(write_video(video, np.concatenate(frames), CONTROL_HZ))
+    return int(lost > 0)
+
+
+def rerender_file(
+    file: Positional[FilePath],
+    out: Positional[FilePath],
+    *,
+    perturb: Annotated[str | None, arg(metavar="KIND=SEVERITY,...")] = None,
+    perturb_seed: Seed = 0,
+    size: Size | None = None,
+    cameras: tuple[str, ...] | None = None,
+    drawing: Drawing | None = None,
+    depth: bool = False,
+    segmentation: Segmentation | None = None,
+    assets: str | None = None,
+) -> None:
+    """Render the recorded states again, with other cameras or under perturbations, and describe the new file.
+
+    Args:
+        file: Demonstration file.
+        out: The new file.
+        perturb: Perturbations that change what is seen or said, such as camera=0.3,light=0.5, sampled for each
+            demonstration. Size, cameras and drawing are then by default those of the file.
+        perturb_seed: Seed of the samples.
+        size: Size of the images, 128 or 120x160 (default: 128).
+        cameras: Cameras to render (default: agentview robot0_eye_in_hand).
+        drawing: How images are drawn (default: that of the models).
+        depth: Render depth too, in metres.
+        segmentation: Render a segmentation too.
+        assets: Where models come from: builtin, original, or a folder with the original's.
+    """
+    from libero_env.demos.curate import describe
+    from libero_env.demos.config import RenderConfig
+    from libero_env.demos.observe import recorded_rendering
+    from libero_env.demos.rendering import rerender
+    from libero_env.perturbations import parse_perturbations
+
+    config = RenderConfig(drawing=drawing)
+    if perturb is not None:
+        config = replace(recorded_rendering(file), perturb=parse_perturbations(perturb, perturb_seed))
+    chosen = {"cameras": cameras, "size": size, "drawing": drawing}
+    if depth or segmentation or perturb is None:
+        chosen["modalities"] = modalities(depth=depth, segmentation=segmentation)
+    config = replace(config, **{key: value for key, value in chosen.items() if value is not None})
+    print(describe(rerender(file, out, config, assets=assets)))
+
+
+def filter_file(
+    file: Positional[FilePath],
+    out: Positional[FilePath],
+    *,
+    success: bool = False,
+    no_ops: bool = False,
+    threshold: Annotated[float, Field(ge=0, le=1)] = 1e-3,
+) -> None:
+    """Write some of the demonstrations or steps of a file, and print the contents of both.
+
+    Args:
+        file: Demonstration file.
+        out: The new file.
+        success: Keep only demonstrations that reached the goal.
+        no_ops: Leave out steps in which the action does nothing.
+        threshold: Largest motion of a no-op.
+    """
+    from libero_env.demos.curate import examine, filter_demos
+
+    print(f"{file}: {examine(file, threshold=threshold)}")
+    stats = filter_demos(file, out, success_only=success, without_noops=no_ops, threshold=threshold)
+    print(f"{out}: {stats}")
+
+
+def export(
+    files: Positional[Annotated[tuple[FilePath, ...], Field(min_length=1)]],
+    *,
+    out: FilePath,
+    format: Literal["lerobot"] = "lerobot",
+    labels: Literal["expert", "executed"] = "expert",
+    published: Annotated[str | None, arg(name="as", metavar="SET")] = None,
+    settle: Annotated[int, Field(ge=0, le=1000)] = 10,
+    assets: str | None = None,
+    drawing: Drawing = "faithful",
+) -> None:
+    """Write files as one data set in another format, and print its size.
+
+    Args:
+        files: Files or folders.
+        out: A new folder.
+        format: LeRobotDataset v3.0.
+        labels: Actions that the expert asked for, or those that were executed.
+        published: Write what this published set is, lerobot/libero or physical-intelligence/libero: demonstrations
+            are run again without no-ops, successes kept, images of 256 pixels turned as there.
+        settle: With --as: waiting steps before the first action.
+        assets: With --as: where models come from (default: the original's where they are installed).
+        drawing: With --as: how images are drawn.
+    """
+    from libero_env.demos.curate import find_demo_files
+    from libero_env.demos.lerobot import export_lerobot, export_published
+    from libero_env.demos.replay import Regeneration
+
+    found = find_demo_files(list(files))
+    if published is None:
+        episodes, frames = export_lerobot(found, out, labels=labels)
+        print(f"{out}: {episodes} episodes, {frames} frames")
+        return
+    config = Regeneration(settle_steps=settle, labels=labels, assets=assets, drawing=drawing)
+    written = export_published(found, out, published, config)
+    print(f"{out}: {written.episodes} episodes, {written.frames} frames, as {published}")
+    print(f"models: {config.pack().name}, drawing: {config.drawing}")
+    for where in written.failed:
+        print(f"left out, does not reach the goal when it is run again: {where}")

@@ -1,5 +1,6 @@
 """Check of this machine for `libero doctor`: each finding states how to fix it, and no check raises an error."""
 
+import importlib
 import importlib.metadata
 import importlib.util
 import json
@@ -253,3 +254,17 @@ def findings_json(findings: Sequence[Finding]) -> str:
 def is_broken(findings: Iterable[Finding]) -> bool:
     """Return whether an essential check failed."""
     return any(finding.essential and not finding.ok for finding in findings)
+
+
+def doctor(*, gl: bool = False, json: bool = False) -> int:
+    """Say what this machine has and lacks, and how to fix it; return 1 where something essential is broken.
+
+    Args:
+        gl: Only draw a frame.
+        json: Print the findings as JSON.
+    """
+    findings = examine(gl_only=gl)
+    if not gl and importlib.util.find_spec("lifelong"):
+        findings += importlib.import_module("lifelong.cli.doctor").examine()
+    print(findings_json(findings) if json else render_findings(findings))
+    return int(is_broken(findings))

@@ -1,108 +1,28 @@
 """`libero tasks`: list, show, certify, lint, create and preview tasks; make their initial states."""
 
-import argparse
-import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from libero_env.cli import arguments, tasks_new
-from libero_env.cli.arguments import Subparsers
+from libero_env.cli.options import (
+    Field,
+    FilePath,
+    Natural,
+    Positional,
+    Processes,
+    ProcessesOrAll,
+    Share,
+    Side,
+)
+from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.parallel import cpu_count
 
 if TYPE_CHECKING:
     from libero_env.design.lint.report import Finding
     from libero_env.tasks import Task
 
 LEVELS = ("error", "warning", "info")
-
-
-def register(subparsers: Subparsers) -> None:
-    """Add the command `libero tasks`."""
-    parser = subparsers.add_parser("tasks", help="the tasks of the benchmark")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    listing = commands.add_parser("list", help="the tasks of one suite, or of all")
-    listing.add_argument("suite", nargs="?", help="such as libero_object")
-    listing.add_argument(
-        "--order", type=arguments.whole(0), default=0, help="one of the published sequences (0 to 20)"
-    )
-    listing.set_defaults(run=run_tasks_list)
-    show = commands.add_parser("show", help="the BDDL of a task")
-    show.add_argument("task", help="such as libero_object/3, the task's name, or a task file")
-    show.set_defaults(run=run_tasks_show)
-    states = commands.add_parser(
-        "init-states", help="generate the 50 stored initial states of a suite or task file again"
-    )
-    states.add_argument("suite", help="such as libero_object, or a file that ends in .yaml or .bddl")
-    states.add_argument(
-        "--out",
-        type=arguments.path,
-        help="folder for the .npz files (default: those in the package; for a file, the cache)",
-    )
-    states.add_argument(
-        "--jobs",
-        type=arguments.processes,
-        default=os.cpu_count() or 1,
-        help="number of processes (default: one per core)",
-    )
-    states.set_defaults(run=run_tasks_init_states)
-    _register_checks(commands)
-    tasks_new.register(commands)
-
-
-def _register_checks(commands: Subparsers) -> None:
-    """Add the commands `libero tasks certify` and `libero tasks lint`."""
-    certify = commands.add_parser(
-        "certify", help="measure the success of the expert; resumes where it was stopped"
-    )
-    _add_tasks(certify)
-    certify.add_argument(
-        "--states",
-        type=arguments.whole(1, 50),
-        default=50,
-        help="initial states of each task, 1 to 50 (default: 50)",
-    )
-    certify.add_argument(
-        "--jobs",
-        type=arguments.processes_or_all,
-        default=0,
-        help="number of processes (default: one per core)",
-    )
-    certify.add_argument(
-        "--out", type=arguments.path, default=Path("certificates"), help="folder (default: certificates)"
-    )
-    certify.add_argument(
-        "--require",
-        type=arguments.share,
-        default=0.8,
-        help="success rate that each task must reach (default: 0.8)",
-    )
-    certify.add_argument(
-        "--disturb", action="store_true", help="add noise to the actions, as demonstrations do"
-    )
-    certify.add_argument("--again", action="store_true", help="run again what is in the folder")
-    certify.set_defaults(run=run_certify, go_on="what is measured is kept; the same command goes on")
-    lint = commands.add_parser("lint", help="report what is wrong or doubtful in tasks, and how to fix it")
-    _add_tasks(lint)
-    lint.add_argument(
-        "--level", choices=LEVELS, default="warning", help="lowest level that is printed (default: warning)"
-    )
-    lint.add_argument(
-        "--starts",
-        type=arguments.whole(0, 1000),
-        default=5,
-        help="initial states to check; 0 simulates nothing (default: 5)",
-    )
-    lint.set_defaults(run=run_lint)
-
-
-def _add_tasks(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "tasks",
-        nargs="+",
-        metavar="TASK",
-        help="such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml",
-    )
-    parser.add_argument("--assets", help="`builtin`, `original`, or the folder of the original's models")
 
 
 def find_tasks(names: Sequence[str]) -> list["Task"]:
@@ -114,120 +34,249 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
     from libero_env.tasks import get_suite, get_task, is_suite
     from libero_env.tasks.files import read_yaml_tasks
 
-    found: dict[tuple[str, str], Task] = {}
+    tasks: dict[tuple[str, str], Task] = {}
     for name in names:
         if name.endswith((".yaml", ".yml")):
-            tasks: Sequence[Task] = read_yaml_tasks(name)
+            named: Sequence[Task] = read_yaml_tasks(name)
         else:
-            tasks = get_suite(name).tasks if is_suite(name) else (get_task(name),)
-        found |= {(name if task.suite == "file" else task.suite, task.name): task for task in tasks}
-    return list(found.values())
+            named = get_suite(name).tasks if is_suite(name) else (get_task(name),)
+        tasks |= {(name if task.suite == "file" else task.suite, task.name): task for task in named}
+    return list(tasks.values())
 
 
-def run_certify(args: argparse.Namespace) -> int:
-    """Run missing attempts, write the results and print tasks below the required success; return 1 if there are any."""
-    from libero_env.design.certify import certify
-    from libero_env.design.certify_figure import write_results
-    from libero_env.parallel import cpu_count
+def list_tasks(suite: Positional[str | None] = None, *, order: Natural = 0) -> None:
+    """Print a line for each task; of the variants that others have published, one for each suite unless it is named.
 
-    jobs = args.jobs or cpu_count()
-    found = certify(
-        find_tasks(args.tasks),
-        args.states,
-        jobs=jobs,
-        out=args.out,
-        assets=args.assets,
-        disturb=args.disturb,
-        again=args.again,
-    )
-    write_results(found, args.out, assets=args.assets, disturb=args.disturb)
-    short = [certificate for certificate in found if certificate.rate < args.require]
-    for certificate in short:
-        reason = next((o.reason for o in certificate.outcomes if not o.success), "")
-        print(
-            f"FAIL  {certificate.task} {certificate.name}: {100 * certificate.rate:.0f} %, such as: {reason}"
-        )
-    good, total = sum(len(c.lengths) for c in found), sum(len(c.outcomes) for c in found)
-    print(
-        f"{good}/{total} = {100 * good / total:.1f} %; {len(short)} of {len(found)} tasks under {args.require:.0%}"
-    )
-    return int(bool(short))
-
-
-def run_lint(args: argparse.Namespace) -> int:
-    """Print a line for each finding and their numbers; return 1 if one is an error."""
-    from collections import Counter
-
-    counts, number = Counter[str](), 0
-    for findings in _lint(args):
-        number += 1
-        counts.update(finding.level for finding in findings)
-        for finding in findings:
-            if LEVELS.index(finding.level) <= LEVELS.index(args.level):
-                print(finding, flush=True)
-    print(f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes")
-    return int(counts["error"] > 0)
-
-
-def _lint(args: argparse.Namespace) -> "Iterator[list[Finding]]":
-    """Yield the findings of each task."""
-    from libero_env.assets.pack import select_pack
-    from libero_env.design.lint.checks import lint_file, lint_task, lint_text
-
-    pack = select_pack(args.assets)
-    for name in dict.fromkeys(args.tasks):
-        if name.endswith(".bddl"):
-            yield lint_file(name, pack, starts=args.starts)
-            continue
-        for task in find_tasks([name]):
-            if task.suite == "file":  # line numbers refer to the text that `libero tasks show` prints
-                yield lint_text(task.bddl_text, name, task, pack, starts=args.starts)
-            else:
-                yield lint_task(task, pack, starts=args.starts)
-
-
-def run_tasks_list(args: argparse.Namespace) -> None:
-    """Print a line for each task; of the variants that others have published, one for each suite unless it is named."""
+    Args:
+        suite: Such as libero_object.
+        order: One of the published sequences, 0 to 20.
+    """
     from libero_env.tasks import get_suite, suite_names
     from libero_env.tasks.published import PublishedTask, published_sizes
 
-    names = [args.suite] if args.suite else suite_names()
-    tasks = {task.id: task for name in names for task in get_suite(name).order(args.order)}
+    names = [suite] if suite else suite_names()
+    tasks = {task.id: task for name in names for task in get_suite(name).order(order)}
     for task in tasks.values():
         if isinstance(task, PublishedTask):
             print(f"{task.id:24} {task.kind:10} {task.language}  ({task.name})")
         else:
             print(f"{task.id:18} {task.language}")
-    for name, size in {} if args.suite else published_sizes().items():
+    for name, size in {} if suite else published_sizes().items():
         print(f"{name:28} {size} variants: libero tasks list {name}")
 
 
-def run_tasks_show(args: argparse.Namespace) -> None:
-    """Print the generated task file."""
+def show(task: Positional[str]) -> None:
+    """Print the BDDL of a task.
+
+    Args:
+        task: Such as libero_object/3, the task's name, or a task file.
+    """
     from libero_env.tasks import get_task
 
-    print(get_task(args.task).bddl_text, end="")
+    print(get_task(task).bddl_text, end="")
 
 
-def run_tasks_init_states(args: argparse.Namespace) -> None:
-    """Write the files, one for each suite of the tasks, and print their paths."""
-    from libero_env.errors import InvalidInputError
+def init_states(
+    suite: Positional[str], *, out: FilePath | None = None, jobs: Processes | None = None
+) -> None:
+    """Generate the 50 stored initial states of a suite or task file again, and print the paths of the files.
+
+    Args:
+        suite: Such as libero_object, or a file that ends in .yaml or .bddl.
+        out: Folder for the .npz files (default: those in the package; for a file, the cache).
+        jobs: Number of processes (default: one per core).
+    """
     from libero_env.init_states.store import cache_init_states, shipped_path, write_suite
     from libero_env.tasks import get_suite
     from libero_env.tasks.files import ENDINGS
     from libero_env.tasks.published import is_published
 
-    if args.suite.endswith(ENDINGS) and not args.out:
-        for task in find_tasks([args.suite]):
+    if suite.endswith(ENDINGS) and not out:
+        for task in find_tasks([suite]):
             print(cache_init_states(task))
         return
-    if is_published(args.suite):
+    if is_published(suite):
         raise InvalidInputError(
-            f"{args.suite} starts from the states of the tasks that it varies, or from its own, made when they "
-            "are needed; there is nothing to generate"
+            f"{suite} starts from the states of the tasks that it varies, or from its own, made when they are needed; "
+            "there is nothing to generate"
         )
-    tasks = find_tasks([args.suite]) if args.suite.endswith(ENDINGS) else get_suite(args.suite).tasks
-    for suite in dict.fromkeys(task.suite for task in tasks):
-        path = args.out / f"{suite}.npz" if args.out else shipped_path(suite)
-        write_suite(path, [task for task in tasks if task.suite == suite], args.jobs)
+    tasks = find_tasks([suite]) if suite.endswith(ENDINGS) else get_suite(suite).tasks
+    for name in dict.fromkeys(task.suite for task in tasks):
+        path = out / f"{name}.npz" if out else shipped_path(name)
+        write_suite(path, [task for task in tasks if task.suite == name], jobs or cpu_count())
         print(path)
+
+
+def certify_tasks(
+    tasks: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    *,
+    assets: str | None = None,
+    states: Annotated[int, Field(ge=1, le=50)] = 50,
+    jobs: ProcessesOrAll = 0,
+    out: FilePath = Path("certificates"),
+    require: Share = 0.8,
+    disturb: bool = False,
+    again: bool = False,
+) -> int:
+    """Measure the success of the expert, and print the tasks below the required rate; return 1 if there are any.
+
+    What was measured before is not run again.
+
+    Args:
+        tasks: Such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml.
+        assets: builtin, original, or the folder of the original's models.
+        states: Initial states of each task, 1 to 50.
+        jobs: Number of processes; 0: one per core.
+        out: Folder of the results.
+        require: Success rate that each task must reach.
+        disturb: Add noise to the actions, as demonstrations do.
+        again: Run again what is in the folder.
+    """
+    from libero_env.design.certify import certify
+    from libero_env.design.certify_figure import write_results
+
+    certificates = certify(
+        find_tasks(tasks),
+        states,
+        jobs=jobs or cpu_count(),
+        out=out,
+        assets=assets,
+        disturb=disturb,
+        again=again,
+    )
+    write_results(certificates, out, assets=assets, disturb=disturb)
+    short = [certificate for certificate in certificates if certificate.rate < require]
+    for one in short:
+        reason = next((o.reason for o in one.outcomes if not o.success), "")
+        print(f"FAIL  {one.task} {one.name}: {100 * one.rate:.0f} %, such as: {reason}")
+    good, total = sum(len(c.lengths) for c in certificates), sum(len(c.outcomes) for c in certificates)
+    print(
+        f"{good}/{total} = {100 * good / total:.1f} %; {len(short)} of {len(certificates)} tasks under {require:.0%}"
+    )
+    return int(bool(short))
+
+
+def lint(
+    tasks: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    *,
+    assets: str | None = None,
+    level: Literal["error", "warning", "info"] = "warning",
+    starts: Annotated[int, Field(ge=0, le=1000)] = 5,
+) -> int:
+    """Report what is wrong or doubtful in tasks, and how to fix it; return 1 if one has an error.
+
+    Args:
+        tasks: Such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml.
+        assets: builtin, original, or the folder of the original's models.
+        level: Lowest level that is printed.
+        starts: Initial states to check; 0 simulates nothing.
+    """
+    counts, number = Counter[str](), 0
+    for findings in _lint(tasks, assets, starts):
+        number += 1
+        counts.update(finding.level for finding in findings)
+        for finding in findings:
+            if LEVELS.index(finding.level) <= LEVELS.index(level):
+                print(finding, flush=True)
+    print(f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes")
+    return int(counts["error"] > 0)
+
+
+def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[list[Finding]]":
+    """Yield the findings of each task."""
+    from libero_env.assets.pack import select_pack
+    from libero_env.design.lint.checks import lint_file, lint_task, lint_text
+
+    pack = select_pack(assets)
+    for name in dict.fromkeys(names):
+        if name.endswith(".bddl"):
+            yield lint_file(name, pack, starts=starts)
+            continue
+        for task in find_tasks([name]):
+            if task.suite == "file":  # line numbers refer to the text that `libero tasks show` prints
+                yield lint_text(task.bddl_text, name, task, pack, starts=starts)
+            else:
+                yield lint_task(task, pack, starts=starts)
+
+
+def new(
+    name: Positional[str],
+    *,
+    scene: str = "kitchen",
+    objects: tuple[str, ...] = (),
+    furniture: tuple[str, ...] = (),
+    goal: tuple[str, ...] = (),
+    language: str | None = None,
+    out: FilePath = Path(),
+    bddl: bool = False,
+) -> None:
+    """Write a template of a user-defined task, and print commands for the next steps.
+
+    Args:
+        name: Name of the task; the file is NAME.yaml.
+        scene: kitchen, living_room, study, coffee, table, floor, or kitchen_scene1, ...
+        objects: Categories, such as red_coffee_mug plate (default: bowl, plate).
+        furniture: Categories, such as wooden_cabinet.
+        goal: Atoms, such as 'On red_coffee_mug_1 plate_1' (default: first on last).
+        language: The instruction (default: it describes the goal).
+        out: Folder.
+        bddl: Also write the BDDL file.
+    """
+    from libero_env.design.template import task_template
+    from libero_env.tasks import read_task
+    from libero_env.tasks.files import write_task
+    from libero_env.tasks.task import check_name
+
+    if name.startswith(".") or Path(name).name != name:
+        raise LiberoError(f"{name!r} is not the name of a task, such as my_task; --out is the folder")
+    check_name(name)
+    path = out / f"{name}.yaml"
+    if path.exists():
+        raise LiberoError(f"{path} exists already; choose another name, or remove it")
+    text, _ = task_template(scene, objects, furniture, goal, language)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    task = read_task(path)
+    print(f"{path}: {task.language}")
+    if bddl:
+        print(write_task(task, path.with_suffix(".bddl")))
+    for command in (
+        f"libero tasks preview {path} --video",
+        f"libero tasks lint {path}",
+        f"libero demos generate --task {path} --n 10",
+        f"python train.py benchmark=own benchmark.files='[{path}]' language=onehot",
+    ):
+        print(f"  {command}")
+
+
+def preview(
+    task: Positional[str],
+    *,
+    starts: Annotated[int, Field(ge=1, le=50)] = 3,
+    cameras: tuple[str, ...] = (),
+    size: Side = 256,
+    video: Annotated[tuple[Literal["webp", "gif", "mp4"], ...] | None, Field(max_length=1)] = None,
+    out: FilePath | None = None,
+) -> int:
+    """Render a task's initial states, and a video of the expert; return 1 if the expert does not reach the goal.
+
+    Args:
+        task: A file that ends in .yaml or .bddl, or such as libero_goal/3.
+        starts: Number of initial states, one per row.
+        cameras: One per column (default: agentview robot0_eye_in_hand birdview).
+        size: Side of a picture, pixels.
+        video: Also write a video of the expert, by default as webp.
+        out: File of the pictures (default: TASK.png here); the video is written beside it.
+    """
+    from libero_env.design.preview import CAMERAS, contact_sheet, expert_video
+    from libero_env.tasks import get_task
+
+    chosen = get_task(task)
+    path = out or Path(f"{chosen.name}.png")
+    print(contact_sheet(chosen, path, starts=starts, cameras=cameras or CAMERAS, size=size))
+    if video is None:
+        return 0
+    file = path.with_suffix(f".{(*video, 'webp')[0]}")
+    done, reason = expert_video(chosen, file, size=size)
+    print(f"{file}: the expert {'reaches the goal' if done else f'does not reach the goal: {reason}'}")
+    return int(not done)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from libero_env.cli import arguments, ending
 from libero_env.memory import require_memory
 from libero_env.parallel import cpu_count
+from libero_eval.cli import options
 from libero_eval.cli.plan import plan_eval
-from lifelong.cli import options
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import argparse
 
 from libero_env.cli import arguments
 from libero_env.cli.arguments import Subparsers
-from lifelong.cli import options
+from libero_eval.cli import options
 
 
 def register(subparsers: Subparsers) -> None:

@@ -5,7 +5,7 @@ import asyncio
 import contextlib
 
 from libero_env.cli import arguments
-from lifelong.cli import options
+from libero_eval.cli import options
 
 
 def register(subparsers: "argparse._SubParsersAction") -> None:

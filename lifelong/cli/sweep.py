@@ -1,36 +1,22 @@
 """`libero sweep status`: how far a sweep is."""
 
-import argparse
 from pathlib import Path
 
-from libero_env.cli import arguments
-from libero_env.cli.arguments import Subparsers
+from libero_env.cli.options import FilePath, Positional
 from lifelong.errors import ConfigError
 
 
-def register(subparsers: Subparsers) -> None:
-    """Add the command `libero sweep`."""
-    parser = subparsers.add_parser("sweep", help="sweeps of runs (libero train -m)")
-    actions = parser.add_subparsers(required=True, metavar="ACTION")
-    status = actions.add_parser("status", help="what runs, what failed, and what is left")
-    status.add_argument(
-        "folders",
-        nargs="*",
-        type=arguments.path,
-        default=[Path("runs")],
-        metavar="DIR",
-        help="the folder of a sweep, or of runs, for all of its sweeps (default: runs)",
-    )
-    status.set_defaults(run=run_status)
+def status(folders: Positional[tuple[FilePath, ...]] = (Path("runs"),)) -> None:
+    """Print what runs, what failed, and what is left of each sweep.
 
-
-def run_status(args: argparse.Namespace) -> None:
-    """Print the status of each sweep."""
+    Args:
+        folders: Folders of sweeps, or of runs, for all of their sweeps.
+    """
     from lifelong.sweeps import find_sweeps, read_sweep, status_lines
 
-    for folder in args.folders:
-        found = find_sweeps(folder)
-        if not found:
+    for folder in folders:
+        sweeps = find_sweeps(folder)
+        if not sweeps:
             raise ConfigError(f"{folder} holds no sweep; `libero train -m KEY=A,B` starts one")
-        for one in found:
+        for one in sweeps:
             print(*status_lines(read_sweep(one)), sep="\n")

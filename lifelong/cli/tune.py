@@ -1,100 +1,91 @@
 """The command `libero tune`: choose a setting by what it keeps and what it lets learn."""
 
-import argparse
 import itertools
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from libero_env.cli import arguments
-from libero_env.cli.arguments import Subparsers
+import tyro
+
+from libero_env.cli.options import MAX_SEED, Field, FilePath, Positional, Probability
+from libero_env.errors import InvalidInputError
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_env.tasks import Task
     from lifelong.tuning.sweep import Candidate
 
-DESCRIPTION = """\
-Choose a setting without rollouts: short streams of tasks outside of the evaluated suites are learned with each value,
-and errors on held-out demonstrations take the place of success. Prints the frontier of retention and plasticity, keeps
-a picture and a JSON file, and names the value with the least error on all tasks at the end. A sweep that was stopped
-goes on with the same command.
-
-examples:
-  libero tune algo=ewc                                     the values that the algorithm suggests
-  libero tune algo=lwf algo.strength=0.1,0.3,1,3           these values
-  libero tune algo=ewc policy/head=gmm_small               with another head
-  libero tune algo=er train.lr=5e-4,1e-3,2e-3              any key of the configuration
-  libero tune algo=ewc --write my_configs                  write the chosen value, for libero train
-                                                           --config-dir my_configs algo=ewc tuned@algo=HEAD/ewc"""
-SUITE, STEPS, HELD_OUT, BESIDE = "libero_90", 160, 0.25, ["er"]  # the defaults
+SUITE, STEPS, HELD_OUT = "libero_90", 160, 0.25  # the defaults
 MEASUREMENT = (
     "for each value, the geometric mean over the streams of the factor on the error that fine-tuning leaves on a task "
     "it has just learned"
 )
 
 
-def register(subparsers: Subparsers) -> None:
-    """Add the command `libero tune`."""
-    parser = subparsers.add_parser(
-        "tune",
-        help="choose a setting by what it keeps and what it lets learn",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = parser.add_argument
-    add("overrides", nargs="+", metavar="OVERRIDE", help="as of `libero train`; KEY=V1,V2,... is swept")
-    add("--suite", default=SUITE, help="suite of the streams' tasks (default: libero_90)")
-    add(
-        "--stream",
-        action="append",
-        metavar="TASKS",
-        help="tasks of a stream in learning order, numbers or names, such as 61,62; give it once for each stream "
-        "(default: five of libero_90, in one scene)",
-    )
-    add("--seeds", type=_numbers, default=(1,), help="seeds with which each stream is learned (default: 1)")
-    add(
-        "--steps",
-        type=arguments.whole(1, 1_000_000),
-        default=STEPS,
-        help="optimiser steps a task (default: 160)",
-    )
-    add(
-        "--held-out",
-        type=arguments.number(0, 1, open_ends=True),
-        default=HELD_OUT,
-        help="share of the demonstrations that is measured on (default: 0.25)",
-    )
-    add(
-        "--beside", nargs="*", default=BESIDE, metavar="ALGO", help="algorithms to compare with (default: er)"
-    )
-    add(
-        "--out",
-        type=arguments.path,
-        default=Path("runs/tuning"),
-        metavar="DIR",
-        help="folder of table, picture and measurements (default: runs/tuning)",
-    )
-    add(
-        "--config-dir", type=arguments.path, metavar="DIR", help="a folder of configuration files to be added"
-    )
-    add(
-        "--write",
-        type=arguments.path,
-        metavar="DIR",
-        help="folder of configuration files in which tuned/HEAD/ALGO.yaml gets the chosen value",
-    )
-    parser.set_defaults(run=run_tune, go_on="the same command goes on from there")
+@dataclass(frozen=True, kw_only=True)
+class TuneRequest:
+    """Choose a setting without rollouts.
+
+    Short streams of tasks outside of the evaluated suites are learned with each value, and errors on held-out
+    demonstrations take the place of success. Prints the frontier of retention and plasticity, keeps a picture and a
+    JSON file, and names the value with the least error on all tasks at the end. A sweep that was stopped goes on with
+    the same command. Examples:
+
+    libero tune algo=ewc: the values that the algorithm suggests
+
+    libero tune algo=lwf algo.strength=0.1,0.3,1,3: these values
+
+    libero tune algo=ewc policy/head=gmm_small: with another head
+
+    libero tune algo=er train.lr=5e-4,1e-3,2e-3: any key of the configuration
+
+    libero tune algo=ewc --write my_configs: write the chosen value, for
+    libero train --config-dir my_configs algo=ewc tuned@algo=HEAD/ewc
+
+    Attributes:
+        overrides: As of `libero train`; KEY=V1,V2,... is swept.
+        suite: Suite of the streams' tasks.
+        stream: Tasks of a stream in learning order, numbers or names, such as 61,62; give it once for each stream
+            (default: five of libero_90, in one scene).
+        seeds: Seeds with which each stream is learned, such as 1,2.
+        steps: Optimiser steps a task.
+        held_out: Share of the demonstrations that is measured on.
+        beside: Algorithms to compare with.
+        out: Folder of table, picture and measurements.
+        config_dir: A folder of configuration files to be added.
+        write: Folder of configuration files in which tuned/HEAD/ALGO.yaml gets the chosen value.
+    """
+
+    overrides: Positional[Annotated[tuple[str, ...], Field(min_length=1)]]
+    suite: str = SUITE
+    stream: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    seeds: str = "1"
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = STEPS
+    held_out: Probability = HELD_OUT
+    beside: tuple[str, ...] = ("er",)
+    out: FilePath = Path("runs/tuning")
+    config_dir: FilePath | None = None
+    write: FilePath | None = None
+
+    @property
+    def seed_numbers(self) -> tuple[int, ...]:
+        """The seeds as numbers.
+
+        Raises:
+            InvalidInputError: One is not a seed.
+        """
+        parts = self.seeds.split(",")
+        if not all(part.isdecimal() and int(part) <= MAX_SEED for part in parts):
+            raise InvalidInputError(
+                f"--seeds {self.seeds}: expected whole numbers of at least 0, such as 1,2"
+            )
+        return tuple(map(int, parts))
 
 
-def _numbers(text: str) -> tuple[int, ...]:
-    read = arguments.whole(0, arguments.MAX_SEED)
-    return tuple(read(part) for part in text.split(","))
-
-
-def run_tune(args: argparse.Namespace) -> None:
+def tune(request: TuneRequest) -> None:
     """Measure all values and write table, picture, JSON file and the chosen value."""
     import torch
 
@@ -105,21 +96,21 @@ def run_tune(args: argparse.Namespace) -> None:
     from lifelong.tuning.proxy import ProxySettings
     from lifelong.tuning.sweep import measure_frontier, write_frontier, write_tuned
 
-    candidates, plain_words, default = _candidates(args.overrides, args.config_dir)
+    candidates, plain_words, default = _candidates(request.overrides, request.config_dir)
     without = [word for word in plain_words if not word.startswith(("algo", "tuned@algo"))]
 
     def other(algo: str) -> "Candidate":
-        return _candidate(algo, {}, [*without, f"algo={algo}"], args.config_dir)
+        return _candidate(algo, {}, [*without, f"algo={algo}"], request.config_dir)
 
-    config, choices = compose_run(plain_words, args.config_dir)
+    config, choices = compose_run(plain_words, request.config_dir)
     plain = plain_data(config)
     checked = Configuration(plain)
     checked.check()
     if threads := checked.settings().threads:
         torch.set_num_threads(threads)
-    beside = [other(algo) for algo in args.beside if algo != choices["algo"]]
-    proxy = ProxySettings(_streams(args), args.seeds, args.steps, args.held_out)
-    frontier = measure_frontier(candidates, beside, other("sequential"), proxy, args.out)
+    beside = [other(algo) for algo in request.beside if algo != choices["algo"]]
+    proxy = ProxySettings(_streams(request), request.seed_numbers, request.steps, request.held_out)
+    frontier = measure_frontier(candidates, beside, other("sequential"), proxy, request.out)
 
     algo, head = choices["algo"], choices.get("policy/head", choices["policy"])
     keys = ", ".join(candidates[0].settings)
@@ -128,13 +119,13 @@ def run_tune(args: argparse.Namespace) -> None:
     print("chosen: " + " ".join(f"{key}={value}" for key, value in best.settings.items()))
     if frontier.at_edge():
         print("the chosen value is the first or the last one: try values beyond it", file=sys.stderr)
-    about = _about(args, proxy.streams, choices, plain)
-    stem = args.out / f"{algo}-{head}-{'-'.join(key.rpartition('.')[2] for key in best.settings)}"
+    about = _about(request, proxy.streams, choices, plain)
+    stem = request.out / f"{algo}-{head}-{'-'.join(key.rpartition('.')[2] for key in best.settings)}"
     write_frontier(frontier, stem.with_suffix(".json"), about)
     draw_frontier(frontier, f"{algo}: {keys}", stem)
     print(f"picture: {stem}.png")
-    if args.write:
-        path = args.write / "tuned" / head / f"{algo}.yaml"
+    if request.write:
+        path = request.write / "tuned" / head / f"{algo}.yaml"
         write_tuned(best, path, _comment(about, best.score.value))
         print(f"written: {path}")
 
@@ -199,7 +190,7 @@ def _value_at(config: Any, key: str) -> Any:
     return config
 
 
-def _streams(args: argparse.Namespace) -> "tuple[tuple[Task, ...], ...]":
+def _streams(request: TuneRequest) -> "tuple[tuple[Task, ...], ...]":
     """Return the tasks of the streams.
 
     Raises:
@@ -208,15 +199,15 @@ def _streams(args: argparse.Namespace) -> "tuple[tuple[Task, ...], ...]":
     from lifelong.settings import BenchmarkSettings
     from lifelong.tuning.proxy import STREAMS
 
-    chosen = [text.split(",") for text in args.stream] if args.stream else STREAMS
+    chosen = [text.split(",") for text in request.stream] if request.stream else STREAMS
     return tuple(
-        BenchmarkSettings(args.suite, tasks=[int(t) if str(t).isdigit() else t for t in tasks]).sequence()
+        BenchmarkSettings(request.suite, tasks=[int(t) if str(t).isdigit() else t for t in tasks]).sequence()
         for tasks in chosen
     )
 
 
 def _about(
-    args: argparse.Namespace,
+    request: TuneRequest,
     streams: "Sequence[Sequence[Task]]",
     choices: dict[str, str],
     plain: dict[str, Any],
@@ -229,15 +220,15 @@ def _about(
     from libero_env.demos.config import GENERATOR
 
     return {
-        "command": shlex.join(["libero", "tune", *args.overrides, *_options(args)]),
+        "command": shlex.join(["libero", "tune", *request.overrides, *_options(request)]),
         "preset": choices.get("preset"),
         "policy": choices["policy"],
         "head": choices.get("policy/head"),
         "streams": [[task.id for task in stream] for stream in streams],
-        "seeds": list(args.seeds),
-        "steps": args.steps,
+        "seeds": list(request.seed_numbers),
+        "steps": request.steps,
         "batch_size": plain["train"].get("batch_size"),
-        "held_out": args.held_out,
+        "held_out": request.held_out,
         "versions": {
             "libero-lifelong": importlib.metadata.version("libero-lifelong"),
             "torch": torch.__version__,
@@ -246,15 +237,14 @@ def _about(
     }
 
 
-def _options(args: argparse.Namespace) -> list[str]:
+def _options(request: TuneRequest) -> list[str]:
     """Return the options that results depend on and that are not the default ones."""
-    seeds = ",".join(map(str, args.seeds))
-    options = {"--suite": args.suite, "--seeds": seeds, "--steps": str(args.steps)}
-    options |= {"--held-out": f"{args.held_out:g}"}
+    options = {"--suite": request.suite, "--seeds": request.seeds, "--steps": str(request.steps)}
+    options |= {"--held-out": f"{request.held_out:g}"}
     defaults = {"--suite": SUITE, "--seeds": "1", "--steps": str(STEPS), "--held-out": f"{HELD_OUT:g}"}
     chosen = [(name, value) for name, value in options.items() if value != defaults[name]]
-    chosen += [("--stream", tasks) for tasks in args.stream or ()]
-    beside = [] if args.beside == BESIDE else ["--beside", *args.beside]
+    chosen += [("--stream", tasks) for tasks in request.stream]
+    beside = [] if request.beside == ("er",) else ["--beside", *request.beside]
     return [*(word for pair in chosen for word in pair), *beside]
 
 

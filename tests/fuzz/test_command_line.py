@@ -1,15 +1,17 @@
 """Words of the command line, and texts of others in figures and pages."""
 
-import argparse
 import contextlib
 import io
+import re
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from libero_eval.cli.main import build_parser, main
+from libero_env.cli.main import ALL, load, main
+from libero_env.cli.options import options_of
 from lifelong.errors import ConfigError
 from lifelong.report.figures import Line, Panel, as_svg, forgetting_figure, heatmap_figure
 from lifelong.report.templates import page_template
@@ -164,11 +166,11 @@ def test_any_text_is_drawn_and_written(texts):
     survive("texts in reports", attempt)
 
 
-def test_every_number_of_an_option_has_a_range():
-    """No option takes any number: argparse's `int` and `float` have no ends."""
-    parsers = [build_parser()]
-    for parser in parsers:
-        for action in parser._actions:
-            assert action.type not in (int, float), f"{parser.prog} {action.option_strings or action.dest}"
-            if isinstance(action, argparse._SubParsersAction):
-                parsers += action.choices.values()
+@pytest.mark.parametrize("name", [name for name, command in ALL.items() if not command.reads_words])
+def test_every_number_of_an_option_has_a_range(name):
+    """No option takes any number: `int` and `float` alone have no ends."""
+    hints = get_type_hints(options_of(load(ALL[name])))  # without the bounds in Annotated
+    bounded = get_type_hints(options_of(load(ALL[name])), include_extras=True)
+    for option, hint in hints.items():
+        if re.search(r"\b(int|float)\b", str(hint)) and option != "return":
+            assert "FieldInfo" in str(bounded[option]), option

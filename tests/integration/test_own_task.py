@@ -13,9 +13,9 @@ import trimesh
 import yaml
 from PIL import Image
 
+from libero_env.cli.main import main
 from libero_env.envs.env import LiberoEnv
 from libero_env.tasks import read_task, write_task
-from libero_eval.cli.main import main
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

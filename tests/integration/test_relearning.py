@@ -32,7 +32,7 @@ def test_from_the_command_line(tmp_path):
     call("train.py", *TINY, f"runs_dir={tmp_path / 'runs'}")
     (config,) = (tmp_path / "runs" / "libero_object" / "lora").glob("*/config.yaml")
     run = config.parent
-    command = ("-m", "lifelong.cli", "relearn", str(run), "--steps", "4", "--every", "2", "--held-out", "1")
+    command = ("-m", "libero_env.cli", "relearn", str(run), "--steps", "4", "--every", "2", "--held-out", "1")
     said = call(*command)
     assert "savings" in said and "report.html" in said
     found = read_relearning(run)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from libero_eval.cli import main as cli
+from libero_env.cli import main as cli
 from libero_eval.servers.actor import RemoteActor
 from libero_eval.servers.codecs import OPENPI
 from libero_eval.servers.sessions import ServedPolicy

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from libero_eval.cli import main as cli
+from libero_env.cli import main as cli
 from tests.harness.peers import vla_eval
 from tests.harness.recorded import write_actions
 from tests.harness.runs import make_run

@@ -13,10 +13,10 @@ import pytest
 from libero.libero.utils import download_utils
 from libero_env.assets.http import fetch
 from libero_env.assets.hub import DownloadError
+from libero_env.cli.main import main
 from libero_env.demos import download as demos_download
 from libero_env.demos.download import REPO, REVISION, download_demos, remote_files
 from libero_env.errors import UnknownNameError
-from libero_eval.cli.main import main
 
 pytestmark = pytest.mark.unit
 

@@ -16,8 +16,8 @@ from libero_env.assets.download import REPO, REVISION, download, read_manifest
 from libero_env.assets.hub import DownloadError
 from libero_env.assets.original import FAMILIES, OriginalPack
 from libero_env.assets.pack import BuiltinPack, chosen_assets, select_pack
+from libero_env.cli.main import main
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_eval.cli.main import main
 
 pytestmark = pytest.mark.unit
 

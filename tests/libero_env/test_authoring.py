@@ -11,6 +11,7 @@ import yaml
 from PIL import Image
 
 from libero_env.assets.arena import WORKSPACES
+from libero_env.cli.main import main
 from libero_env.design.preview import contact_sheet
 from libero_env.design.template import task_template
 from libero_env.envs.env import LiberoEnv
@@ -30,7 +31,6 @@ from libero_env.tasks import (
 from libero_env.tasks.authoring import EMPTY, model_regions
 from libero_env.tasks.builder import load_data
 from libero_env.tasks.problem import Atom, Not, Or, differences
-from libero_eval.cli.main import main
 from lifelong.errors import ConfigError
 from lifelong.settings import BenchmarkSettings
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 
 from libero_env.assets.pack import BuiltinPack
+from libero_env.cli import main as cli
 from libero_env.design import certify as module
 from libero_env.design.certify import Certificate, Outcome, certify, markdown_table, results
 from libero_env.errors import LiberoError
 from libero_env.tasks import get_suite, get_task, read_task
 from libero_env.tasks.problem import And, Atom
-from libero_eval.cli import main as cli
 
 TASKS = get_suite("libero_object").tasks[:2]
 

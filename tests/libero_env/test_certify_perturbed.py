@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from libero_env import LiberoEnv
+from libero_env.cli.main import main
 from libero_env.design import certify_perturbed
 from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
 from libero_env.errors import LiberoError
 from libero_env.perturbations import Perturbation, draws
 from libero_env.tasks import get_suite, get_task
-from libero_eval.cli.main import main
 
 TASK = get_task("libero_goal/3")
 ROBOT = Perturbation("robot", 0.4)

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.cli.main import main
 from libero_env.demos.config import RenderConfig, rendered_perturbations
 from libero_env.demos.curate import describe, examine
 from libero_env.demos.generate import generate
@@ -17,7 +18,6 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.perturbations import parse_perturbations
 from libero_env.tasks import get_task
-from libero_eval.cli.main import main
 from tests.harness.demos import STEPS, wander
 
 TASK, SIZE = "libero_goal/3", (24, 32)

@@ -16,8 +16,8 @@ from libero_env.assets.published import (
     published_files,
 )
 from libero_env.cli.doctor import check_models
+from libero_env.cli.main import main
 from libero_env.errors import MissingPackageError
-from libero_eval.cli.main import main
 from lifelong.results.provenance import installed_versions
 
 pytestmark = pytest.mark.unit

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.cli import main as cli
 from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text
 from libero_env.design.lint.scene import furthest_reach, reach
 from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
 from libero_env.tasks.signatures import KINDS
-from libero_eval.cli import main as cli
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
 GOAL = "(And (In akita_black_bowl_1 wooden_cabinet_1_top_region))"

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from libero_env.cli.main import main
 from libero_env.design.objects import add_object, register_object_file
 from libero_env.design.objects.add import DENSITY, Options
 from libero_env.design.objects.collision import (
@@ -25,7 +26,6 @@ from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
 from libero_env.tasks.authoring import model_regions
-from libero_eval.cli.main import main
 
 pytestmark = pytest.mark.sim
 

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.cli import main as cli
 from libero_env.demos.read import read_demos
 from libero_env.demos.replay import replay
 from libero_env.errors import LiberoError, RenderError
@@ -17,7 +18,6 @@ from libero_env.teleop import screens as teleop_screens
 from libero_env.teleop.devices import GRIPPER, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
 from libero_env.teleop.screens import MouseReader, as_text, key_name, open_screen, press_typed
 from libero_env.teleop.session import Status, Teleop, record_session
-from libero_eval.cli import main as cli
 
 TASK = "libero_90/0"  # KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet
 # (x, y, z) for the gripper, m: before the open drawer, down to its front, and against it

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
+from libero_env.cli import main as cli
 from libero_env.tasks import get_task
-from libero_eval.cli import main as cli
 from libero_eval.protocols.adapter import CardAdapter, axis_angle, axis_angle_float32, axis_angle_positive
 from libero_eval.protocols.checks import SUITES
 from libero_eval.protocols.files import card_names, load_card, parse_card

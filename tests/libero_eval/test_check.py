@@ -6,8 +6,8 @@ import shutil
 import pytest
 import yaml
 
+from libero_env.cli.main import main
 from libero_eval.check import examine
-from libero_eval.cli.main import main
 from lifelong.results.provenance import start_record
 from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, from_line
 from lifelong.results.run_directory import RunDirectory

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from libero_env.cli.main import main
 from libero_env.perturbations import KINDS
 from libero_env.tasks import get_task
-from libero_eval.cli.main import main
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.judging.comparability import Side, check_comparable, match
 from libero_eval.protocols.environment import ProtocolEnv, make_env

@@ -2,10 +2,10 @@
 
 import pytest
 
+from libero_env.cli.main import main
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite
-from libero_eval.cli.main import main
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.protocols.files import load_card
 from tests.harness.published import REWORDED, base_task, write_plus, write_pro

@@ -7,8 +7,8 @@ import pickle
 import numpy as np
 import pytest
 
+from libero_env.cli.main import main
 from libero_eval.cli import robustness
-from libero_eval.cli.main import main
 from libero_eval.evaluation_file import EvaluationResult
 
 pytestmark = pytest.mark.sim

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from libero_env import memory
+from libero_env.cli import main as cli
 from libero_eval.candidates import UserPolicy, load_callable
-from libero_eval.cli import main as cli
 from libero_eval.cli.evaluate import plan_eval
 from libero_eval.evaluation_file import EvaluationResult, overall
 from libero_eval.protocols.packaged import PROTOCOLS, choose_init_states

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from libero_eval.cli.main import main
+from libero_env.cli.main import main
 from libero_eval.judging.comparability import Side, back_end_of, check_comparable, check_same_back_end
 from libero_eval.judging.comparison import judge
 from libero_eval.protocols.files import load_card

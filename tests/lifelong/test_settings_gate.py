@@ -10,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from libero_eval.cli.main import main
+from libero_env.cli.main import main
 from lifelong import experiment
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.settings import DataSettings

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from libero_env.cli.main import main
 from libero_env.demos import generate as recording
 from libero_env.demos import rendering
 from libero_env.demos.config import RenderConfig
@@ -20,7 +21,6 @@ from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
 from libero_env.tasks import get_suite
 from libero_eval import relearning
-from libero_eval.cli.main import main
 from libero_eval.relearning import RelearnSettings
 from lifelong import experiment
 from lifelong.data import demonstrations

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from libero_eval.cli.main import main
+from libero_env.cli.main import main
 from lifelong import sweeps
 from lifelong.composition import check_choices, config_folder
 from lifelong.errors import ConfigError, MissingPackageError, ResultsError, RunLockedError

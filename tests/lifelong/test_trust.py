@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from libero_eval.cli.main import main
+from libero_env.cli.main import main
 from libero_eval.repeat import repeated
 from lifelong.errors import ConfigError
 from lifelong.evaluation.restore import restore
@@ -36,8 +36,8 @@ HOSTILE = [
     ),
     *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.source.Path"),
     *(
-        "libero_eval.cli.main.main",
-        "lifelong.cli.__main__.main",
+        "libero_env.cli.main.main",
+        "libero_env.cli.__main__.main",
         "lifelong.algorithms.er.ER.__init__",
         "lifelong",
     ),

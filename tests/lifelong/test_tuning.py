@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from libero_eval.cli.main import main
+from libero_env.cli.main import main
 from lifelong import algorithms
 from lifelong.composition import compose_run, swept
 from lifelong.errors import LiberoError

@@ -1,0 +1,176 @@
+"""From the words of a command line to the call of a function, by tyro; and the types of options that commands share.
+
+The parameters of a command's function are its options, with their types, defaults and bounds; their help is its
+docstring. A function whose only parameter is a dataclass has the fields of that as options.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import inspect
+import io
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn, get_type_hints
+
+import tyro
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from tyro.conf import Positional, arg
+from tyro.constructors import PrimitiveConstructorSpec
+
+__all__ = ["Positional", "arg"]
+
+MISTAKE = 2  # exit status, as in `libero_env.cli.ending`
+MAX_SIDE = 1024  # pixels, as in libero_env.sim.render, which is slow to import
+MAX_PROCESSES = 1024  # also of threads
+MAX_STEPS = 1_000_000  # of an episode; 14 hours
+MAX_SEED = 2**63 - 1  # what HDF5 and JSON readers keep
+
+Natural = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+Processes = Annotated[int, Field(ge=1, le=MAX_PROCESSES)]
+ProcessesOrAll = Annotated[int, Field(ge=0, le=MAX_PROCESSES)]  # 0: one for each core
+Horizon = Annotated[int, Field(ge=1, le=MAX_STEPS)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Probability = Annotated[float, Field(gt=0, lt=1)]
+Seconds = Annotated[float, Field(gt=0, lt=1e6)]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|xpu|cuda(:\d{1,3})?)$")]
+
+
+def _check_path(path: Path) -> Path:
+    if not str(path).strip():
+        raise ValueError("a path is needed, not an empty text; this folder is .")
+    return path
+
+
+def _read_size(words: list[str]) -> tuple[int, int]:
+    sides = words[0].split("x")
+    if not all(side.isdecimal() for side in sides) or len(sides) > 2:
+        raise ValueError(f"{words[0]} is neither N nor HEIGHTxWIDTH")
+    return int(sides[0]), int(sides[-1])
+
+
+FilePath = Annotated[Path, AfterValidator(_check_path)]
+Size = Annotated[  # height, width
+    tuple[Side, Side],
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="N|HEIGHTxWIDTH",
+        instance_from_str=_read_size,
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda size: ["x".join(map(str, size if size[0] != size[1] else size[:1]))],
+    ),
+]
+Segmentation = Literal["instance", "class", "element"]
+
+
+def modalities(*, depth: bool, segmentation: str | None) -> tuple[str, ...]:
+    """Return the kinds of image that the options ask for, as `RenderConfig` names them."""
+    return (
+        "rgb",
+        *(("depth",) if depth else ()),
+        *((f"segmentation_{segmentation}",) if segmentation else ()),
+    )
+
+
+def parse(function: Callable[..., Any], words: Sequence[str], prog: str) -> Callable[[], Any]:
+    """Read words as arguments of a function.
+
+    Args:
+        function: Function of a command.
+        words: Words of the command line after the command's name.
+        prog: The command, such as `libero demos generate`.
+
+    Returns:
+        The call, to be made without arguments. After `--help`, or after an error told in one line, the process ends.
+    """
+    target = options_of(function)
+    wants_help = bool({"-h", "--help"} & set(words))
+    printed = io.StringIO()
+    try:
+        with contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed):
+            arguments = tyro.cli(_capture(target), prog=prog, args=list(words), config=_CONFIG)
+    except SystemExit as ended:
+        if ended.code:
+            _fail(_unboxed(printed.getvalue()), prog)
+        raise
+    values = _checked(target, arguments, prog)
+    if target is function:
+        return functools.partial(function, **values)
+    return functools.partial(function, target(**values))
+
+
+def options_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what holds the options of a command: its function, or the dataclass that is its only parameter."""
+    hints = [hint for name, hint in get_type_hints(function).items() if name != "return"]
+    return hints[0] if len(hints) == 1 and dataclasses.is_dataclass(hints[0]) else function  # type: ignore[return-value]
+
+
+_CONFIG = (
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.DisallowNone,
+    tyro.conf.HelptextFromCommentsOff,
+    tyro.conf.PositionalMetavarFromFieldName,
+)
+
+
+def _capture(target: Callable[..., Any]) -> Callable[..., dict[str, Any]]:
+    """Return a function with the options of another that returns its arguments, for tyro."""
+
+    def captured(**arguments: Any) -> dict[str, Any]:
+        return arguments
+
+    hints = get_type_hints(target, include_extras=True)
+    fields = dataclasses.fields(target) if dataclasses.is_dataclass(target) else ()
+    made = {f.name: f.default_factory() for f in fields if f.default_factory is not dataclasses.MISSING}
+    parameters = [
+        inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_quiet(hints[name], default)
+        )
+        for name, p in inspect.signature(target).parameters.items()
+        for default in [made.get(name, p.default)]
+    ]
+    captured.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    captured.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": dict[str, Any]}
+    captured.__doc__ = re.sub(r"(?m)^(\s*)Attributes:$", r"\1Args:", inspect.getdoc(target) or "")
+    return captured
+
+
+def _quiet(hint: Any, default: Any) -> Any:
+    """Return a type whose help does not show a default that says nothing: None, False, nothing."""
+    return (
+        Annotated[hint, arg(help_behavior_hint="")]
+        if default is None or default is False or default == ()
+        else hint
+    )
+
+
+def _checked(target: Callable[..., Any], arguments: dict[str, Any], prog: str) -> dict[str, Any]:
+    """Return the arguments within the bounds of their types; end with one line where one is not."""
+    hints = get_type_hints(target, include_extras=True)
+    values = {}
+    for name, value in arguments.items():
+        try:
+            values[name] = TypeAdapter(hints[name]).validate_python(value)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            text = first["msg"].removeprefix("Value error, ")
+            shown = "" if text.startswith(str(first["input"])) else f" {first['input']}"
+            _fail(f"--{name.replace('_', '-')}{shown}: {text[0].lower()}{text[1:]}", prog)
+    return values
+
+
+def _unboxed(text: str) -> str:
+    """Return what tyro says in the first paragraph of its box."""
+    lines = [line.strip("│ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
+    rule = next((i for i, line in enumerate(lines) if line.startswith("───")), len(lines))
+    return " ".join(" ".join(lines[:rule]).split()).removesuffix(".")
+
+
+def _fail(message: str, prog: str) -> NoReturn:
+    print(f"error: {message}; see {prog} --help", file=sys.stderr)
+    raise SystemExit(MISTAKE)

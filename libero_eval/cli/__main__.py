@@ -1,8 +1,0 @@
-"""`python -m lifelong.cli`."""
-
-import sys
-
-from libero_eval.cli.main import main
-
-if __name__ == "__main__":
-    sys.exit(main())
