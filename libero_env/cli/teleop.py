@@ -1,8 +1,9 @@
 """`libero teleop`: record demonstrations with a keyboard or a 3D mouse."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
+
+from pydantic.dataclasses import dataclass
 
 from libero_env.cli.options import Field, FilePath, Positional, Positive, Seed, Size
 from libero_env.errors import InvalidInputError

@@ -237,7 +237,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(monkeypatch, capfd):
 
     with open(os.devnull, "w") as sink:
         monkeypatch.setattr(sys, "stdout", sink)
-        monkeypatch.setattr("libero_env.cli.tasks.show", write)
+        monkeypatch.setattr("libero_env.tasks.get_task", write)
         assert main(["tasks", "show", "libero_goal/0"]) == 141
     assert capfd.readouterr().err == ""
 
