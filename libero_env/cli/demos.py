@@ -332,8 +332,8 @@ def rerender_file(
         segmentation: Render a segmentation too.
         assets: Where models come from: builtin, original, or a folder with the original's.
     """
-    from libero_env.demos.curate import describe
     from libero_env.demos.config import RenderConfig
+    from libero_env.demos.curate import describe
     from libero_env.demos.observe import recorded_rendering
     from libero_env.demos.rendering import rerender
     from libero_env.perturbations import parse_perturbations
