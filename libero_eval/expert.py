@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from libero_env.demos.config import GENERATOR
-from libero_env.envs.world import World
+from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert, Shapes
 from libero_env.tasks import Task
 from libero_eval.candidates import PolicyUnderTest
@@ -35,12 +35,10 @@ class ExpertActor:
         self.seeds, self.views = seeds, views
         self._over = np.zeros(len(seeds), bool)
 
-    def watch(self, world: World) -> None:
+    def watch(self, env: BatchEnv) -> None:
         """Receive the simulations; see `WatchesWorld`."""
-        self._world, shapes = world, Shapes(world.scene)
-        self._experts = [
-            Expert(world.task, np.random.default_rng(seed), shapes=shapes) for seed in self.seeds
-        ]
+        self._env, shapes = env, Shapes(env.scene)
+        self._experts = [Expert(env.task, np.random.default_rng(seed), shapes=shapes) for seed in self.seeds]
 
     def reset(self, num_envs: int) -> None:
         """Take all episodes as running; see `Actor`."""
@@ -55,7 +53,7 @@ class ExpertActor:
         actions = np.zeros((len(self._experts), ACTION_DIM))
         for i, expert in enumerate(self._experts):
             if not self._over[i] and not expert.failure_reason:
-                actions[i] = expert.act(self._world.views[i])
+                actions[i] = expert.act(self._env.views[i])
         return actions
 
 

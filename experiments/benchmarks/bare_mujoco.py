@@ -25,7 +25,7 @@ class BareMujoco:
     """MuJoCo alone on the model of an environment: no controller, no observations, no copies."""
 
     def __init__(self, env: LiberoEnv):
-        self.model, size = env.world.scene.model, env.config.camera_size
+        self.model, size = env.scene.model, env.config.camera_size
         self.data = mujoco.MjData(self.model)
         self.cameras = [self.model.camera(name).id for name in env.config.cameras]
         _, self.gl = open_context(*size)
@@ -42,7 +42,7 @@ class BareMujoco:
 
     def step(self, env: LiberoEnv) -> float:
         """Seconds of as many steps as a control step has, from the state that `env` is in."""
-        data, model = env.world.simulations.data(0), env.world.simulations.model
+        data, model = env.simulations.data(0), env.simulations.model
         self.data.qpos[:], self.data.qvel[:], self.data.ctrl[:] = data.qpos, data.qvel, data.ctrl
         self.data.qacc_warmstart[:] = data.qacc_warmstart
         mujoco.mj_forward(model, self.data)
@@ -53,8 +53,8 @@ class BareMujoco:
 
     def draw(self, env: LiberoEnv) -> tuple[float, float]:
         """Seconds of drawing all cameras of the state that `env` is in: as such, and with the pixels read."""
-        model, camera = env.world.simulations.model, mujoco.MjvCamera()
-        self.data.qpos[:] = env.world.simulations.data(0).qpos
+        model, camera = env.simulations.model, mujoco.MjvCamera()
+        self.data.qpos[:] = env.simulations.data(0).qpos
         mujoco.mj_forward(model, self.data)
         camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         for scene, camera.fixedcamid in zip(self.scenes, self.cameras, strict=True):

@@ -79,7 +79,7 @@ class Comparison:
             "simplified camera step": select_pack(self.about["assets"], lod),
         }
         env = self.env(cameras=())
-        scene, name = env.world.scene, f"{env.task.suite}/{env.task.name}"
+        scene, name = env.scene, f"{env.task.suite}/{env.task.name}"
         self.poses = scene.fixture_poses
         self.fixtures = {f"{n}_main": p.tolist() for n, p in zip(scene.fixtures, self.poses, strict=True)}
         self.file = f"{self.about['bddl_files']}/{name}.bddl"
@@ -93,7 +93,7 @@ class Comparison:
 
     def start(self, env: LiberoEnv, i: int = 0) -> None:
         """Begin an episode from the original's i-th state, fixtures where the other side has them."""
-        env.world.simulations.fixtures[0] = self.poses
+        env.simulations.fixtures[0] = self.poses
         env.set_state(self.states[i])
 
     def start_all(self, batch: BatchEnv, env: LiberoEnv) -> None:
@@ -125,7 +125,7 @@ class Comparison:
                 found = self.theirs("physics", actions)
                 other.append(found["s"])
                 one.append(self.ours(env, actions))
-            contacts = env.world.simulations.data(0).ncon
+            contacts = env.simulations.data(0).ncon
             self.start_all(batch, env)
             many.append(step_times(batch, np.repeat(actions[:, None], BATCH, axis=1)))
         self.notes["contacts at the end"] = {"original": found["contacts"], "ours": int(contacts)}
@@ -205,7 +205,7 @@ class Comparison:
         """What MuJoCo itself takes, from the same states: 25 steps, and drawing."""
         steps, frames = [], []
         physics, env = self.env(cameras=()), self.env()
-        bare, images = BareMujoco(env), env.world.empty_images()
+        bare, images = BareMujoco(env), env.observer.empty_images()
         env.render_images = False
         for _ in range(self.rounds):
             self.start(physics)
@@ -217,8 +217,8 @@ class Comparison:
             frames.append([])
             for action in smooth_actions(CAMERA_STEPS // 2):
                 env.step(action)
-                env.world.render_cameras([0], images)  # from here on its context is the current one
-                mine = best(lambda: env.world.render_cameras([0], images), 2)
+                env.observer.render_cameras([0], images)  # from here on its context is the current one
+                mine = best(lambda: env.observer.render_cameras([0], images), 2)
                 frames[-1].append((mine, *bare.draw(env)))
         for made in (bare, physics, env):
             made.close()
@@ -252,7 +252,7 @@ class Comparison:
         """How far our grip site is from theirs after the same actions, with their pack in both, m."""
         env = self.env(self.packs["simplified camera step"], cameras=())
         self.ours(env, actions)
-        found = env.world.proprioception()["ee_pos"][0]
+        found = env.observer.state()["ee_pos"][0]
         env.close()
         return float(np.linalg.norm(found - grip))
 

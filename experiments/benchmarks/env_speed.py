@@ -37,17 +37,17 @@ def step_ratio(repeats: int) -> dict[str, float]:
     env = LiberoEnv(TASK, cameras=())
     env.reset(options={"init_state": 0})
     rng = np.random.default_rng(0)
-    bare = mujoco.MjData(env.world.scene.model)
+    bare = mujoco.MjData(env.scene.model)
     ours, theirs = [], []
     for _ in range(repeats):
         action = rng.uniform(-1, 1, 7)
-        data = env.world.simulations.data(0)
+        data = env.simulations.data(0)
         bare.qpos[:], bare.qvel[:], bare.ctrl[:] = data.qpos, data.qvel, data.ctrl
         bare.qacc_warmstart[:] = data.qacc_warmstart
-        mujoco.mj_forward(env.world.scene.model, bare)
+        mujoco.mj_forward(env.scene.model, bare)
         start = time.perf_counter()
         for _ in range(SUBSTEPS):
-            mujoco.mj_step(env.world.scene.model, bare)
+            mujoco.mj_step(env.scene.model, bare)
         middle = time.perf_counter()
         env.step(action)
         ours.append(time.perf_counter() - middle)
@@ -72,7 +72,7 @@ def camera_rate(size: int, repeats: int) -> dict[str, float]:
         for _ in range(25):
             env.step(rng.uniform(-0.5, 0.5, 7))
         rates.append(25 / (time.perf_counter() - start))
-    drawing = best(lambda: env.world.render_cameras([0], env.world.empty_images()), 5 * repeats)
+    drawing = best(lambda: env.observer.render_cameras([0], env.observer.empty_images()), 5 * repeats)
     env.close()
     median = float(np.median(rates))
     return {"steps_per_s_best": max(rates), "steps_per_s_median": median, "draw_both_ms": 1e3 * drawing}

@@ -73,7 +73,7 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
         camera_size=(args.size, args.size),
         horizon=10**6,
     )
-    device, ids = env.world.simulations.device, np.arange(worlds)
+    device, ids = env.simulations.device, np.arange(worlds)
     starts = {"init_state": ids % 50}
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (worlds, 7))
     # of the processor one thread works, beside others
@@ -82,7 +82,7 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
     env.reset(options=starts)
     env.step(actions)  # compiles, and captures the graph
     first, free = clock() - begin, device.free_memory if device.is_cuda else 0
-    simulations, world = env.world.simulations, env.world
+    simulations = env.simulations
 
     def physics() -> None:
         simulations.step(ids, actions)
@@ -90,16 +90,18 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
 
     def observe() -> None:
         simulations._copies.forget()
-        world.proprioception()
+        env.proprioception()
 
-    images = world.empty_images()
+    images = env.observer.empty_images()
     return Measurement(
         worlds=worlds,
         pictures=pictures,
         physics=timed(physics, args.steps, clock),
-        goals=timed(lambda: world.goals.check(ids), args.steps, clock),
+        goals=timed(lambda: env.goals.check(ids), args.steps, clock),
         observing=timed(observe, args.steps, clock),
-        drawing=timed(lambda: world.render_cameras(ids, images), args.steps, clock) if pictures else 0.0,
+        drawing=timed(lambda: env.observer.render_cameras(ids, images), args.steps, clock)
+        if pictures
+        else 0.0,
         whole=timed(lambda: env.step(actions), args.steps, clock),
         reset=timed(lambda: env.reset(options=starts), 1, clock),
         first=first,

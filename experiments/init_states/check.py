@@ -13,7 +13,7 @@ import numpy as np
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import start_faults
-from libero_env.init_states.store import load_init_states, split_row
+from libero_env.init_states.store import load_init_states
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene
@@ -73,7 +73,7 @@ def original_rows(folder: Path, task: Task) -> np.ndarray:
 
 def check(scene: Scene, rows: np.ndarray, *, own: bool, threads: int) -> tuple[dict[str, float], list[str]]:
     """How far each object moves at most, m, and what is wrong with the states before and after."""
-    qpos, qvel, fixtures = split_row(scene.model, rows)
+    qpos, qvel, fixtures = scene.split_states(rows)
     ids = range(len(rows))
     simulations = make_simulations(scene.model, len(rows), threads, scene.fixture_bodies.tolist())
     simulations.reset(ids, qpos, qvel, fixtures=fixtures if fixtures.shape[1] else None)

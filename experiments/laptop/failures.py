@@ -60,7 +60,7 @@ class Watched:
 
     def __init__(self, env: BatchEnv):
         self._env = env
-        scene = env.world.scene
+        scene = env.scene
         self._owner = {int(b): name for name, bodies in scene.bodies.items() for b in bodies}
         words = {word for atom in env.atoms for word in atom.replace("(", " ").replace(",", " ").split()}
         self._objects = [name for name in scene.objects if name in words]
@@ -77,8 +77,8 @@ class Watched:
         running = np.flatnonzero(self._env.running)
         found = self._env.step(actions)
         for i in running.tolist():
-            self._note(self._env.world.views[i], i)
-        self.hands.append(np.array([view.eef_pos for view in self._env.world.views]))
+            self._note(self._env.views[i], i)
+        self.hands.append(np.array([view.eef_pos for view in self._env.views]))
         return found
 
     def _note(self, view: StateView, i: int) -> None:
@@ -107,7 +107,7 @@ class Watched:
         """Return where the hand of a simulation is after a number of steps, and whether it stands."""
         path = np.array(self.hands)[max(0, length - LAST) : length, i]
         way = float(np.linalg.norm(path - path[-1], axis=1).max())
-        view = self._env.world.views[i]
+        view = self._env.views[i]
         entities = {
             name: float(np.linalg.norm(view.body_pos(name) - path[-1])) for name in view.scene.entities
         }

@@ -51,7 +51,7 @@ class Grasps:
         self._env = env
         self.closings: dict[int, list[float]] = {}
         words = [word for atom in env.atoms for word in re.split(r"[^\w]+", atom)]
-        self._object = next((word for word in words if word in env.world.scene.objects), None)
+        self._object = next((word for word in words if word in env.scene.objects), None)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
@@ -59,7 +59,7 @@ class Grasps:
     def step(self, actions: np.ndarray) -> tuple:
         """Step all simulations; see `BatchEnv`."""
         for i in np.flatnonzero(self._env.running & (actions[:, 6] > 0)).tolist() if self._object else ():
-            view = self._env.world.views[i]
+            view = self._env.views[i]
             self.closings.setdefault(i, (view.body_pos(self._object) - view.eef_pos).round(4).tolist())
         return self._env.step(actions)
 

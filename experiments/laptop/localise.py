@@ -27,8 +27,8 @@ LOW = 0.10  # [m] of the hand above the object
 def positions(task: Task, demos: Sequence[Episode]) -> Tensor:
     """Return the position of the goal's first object from the grip site in every frame, (F, 3), [m]."""
     env = LiberoEnv(task, cameras=())
-    view, found = env.world.views[0], []
-    name = env.world.atoms[0].args[0]
+    view, found = env.batch.views[0], []
+    name = env.batch.goals.atoms[0].args[0]
     for demo in demos:
         for state in demo.states:
             env.set_state(state)

@@ -15,8 +15,8 @@ import numpy as np
 from page import object_file, task_file, write_page
 from PIL import Image, ImageDraw, ImageFont
 
-from libero_env.envs.world import World
-from libero_env.init_states.store import generate_init_states, shipped_path, split_row
+from libero_env.envs.batch import BatchEnv
+from libero_env.init_states.store import generate_init_states, shipped_path
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.tasks import Task, get_suite, suite_names
 
@@ -91,16 +91,15 @@ def draw_tasks(docs: Path, suite: str) -> None:
 
 def first_view(task: Task, size: int = 256) -> np.ndarray:
     """The first initial state of a task as `agentview` sees it, (size, size, 3) uint8."""
-    world = World(task, camera_size=(2 * size, 2 * size))  # and shrunk, as the portraits are
+    env = BatchEnv(task, 1, camera_size=(2 * size, 2 * size))  # and shrunk, as the portraits are
     try:
         if shipped_path(task.suite).exists():
-            world.reset_to_init([0], [0])
+            env.reset(options={"init_state": 0})
         else:  # the same state, without the other 49
-            qpos, qvel, fixtures = split_row(world.scene.model, generate_init_states(task, world.scene, 1))
-            world.simulations.reset([0], qpos, qvel, fixtures=fixtures)
-        picture = world.render(0, "agentview")
+            env.reset(options={"start": generate_init_states(task, env.scene, 1)})
+        picture = env.observer.render(0, "agentview")
     finally:
-        world.close()
+        env.close()
     return shrunk(picture, size)
 
 

@@ -23,7 +23,7 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_90", "libero
 def record(task: Task, seed: int, assets: str, robot: str) -> dict[str, np.ndarray]:
     """Return the arrays of the expert's attempt from a placement of a task's objects."""
     env = BatchEnv(task, 1, cameras=(), horizon=MAX_STEPS, assets=assets, robot=robot)
-    scene = env.world.scene
+    scene = env.scene
     env.reset(seed=seed)
     rng = np.random.default_rng([task.index, seed])
     attempt = run_experts(env, [Expert(task, rng, shapes=Shapes(scene))])[0]

@@ -16,7 +16,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from libero_env.envs.world import World
+from libero_env.envs.batch import BatchEnv
+from libero_env.sim.scene import Scene
 
 ROBOT_OF = {"1.4.0": "libero", "1.4.1": "robosuite-1.4.1"}
 TOUCHES = ("self", "link7", "table", "objects")  # bits of `touches`, as in record.py
@@ -77,10 +78,10 @@ def replay(
     with np.load(path, allow_pickle=False) as stored:
         recording = {key: stored[key] for key in stored.files}
     task = f"{recording['suite']}/{int(recording['task_id'])}"
-    world = World(task, assets=assets, cameras=(), robot=robot or ROBOT_OF[str(recording["robosuite"])])
+    env = BatchEnv(task, 1, assets=assets, cameras=(), robot=robot or ROBOT_OF[str(recording["robosuite"])])
     actions, recorded = recording["actions"][:steps] / 64.0, recording["robot_qpos"][:steps]
-    moments = _states(world, recording)
-    nq, simulations = world.scene.model.nq, world.simulations
+    moments = _states(env.scene, recording)
+    nq, simulations = env.scene.model.nq, env.simulations
     others = []
 
     def run(restart: bool) -> np.ndarray:
@@ -93,20 +94,20 @@ def replay(
                         np.abs(found - moments[t // STRIDE][1 : 1 + nq])[NUM_ROBOT:].max(initial=0.0)
                     )
                 simulations.set_state(0, moments[t // STRIDE])
-            world.step([0], action[None])
+            simulations.step([0], action[None])
             off.append(np.abs(simulations.fields["qpos"][0][:NUM_ROBOT] - recorded[t]).max())
         return np.array(off)
 
     deviation = Deviation(run(False), run(True), np.array(others), recording["touches"][:steps])
-    world.close()
+    env.close()
     return deviation
 
 
-def _states(world: World, recording: dict[str, np.ndarray]) -> np.ndarray:
+def _states(scene: Scene, recording: dict[str, np.ndarray]) -> np.ndarray:
     """Return the recorded moments as states of this project's simulations, which also hold the fixtures' poses."""
-    model, moments = world.scene.model, recording["moments"]
+    model, moments = scene.model, recording["moments"]
     stored = json.loads(str(recording["fixtures"]))
-    fixtures = np.array([stored[name] for name in world.scene.fixtures]).ravel()
+    fixtures = np.array([stored[name] for name in scene.fixtures]).ravel()
     before = 1 + model.nq + model.nv
     rows = np.tile(fixtures, (len(moments), 1))
     return np.concatenate([moments[:, :before], rows, moments[:, before:]], axis=1)

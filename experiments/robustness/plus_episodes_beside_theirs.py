@@ -72,8 +72,8 @@ def their_arm(task: PublishedTask, moves: np.ndarray) -> tuple[np.ndarray, dict,
 
 def start_row(env: BatchEnv, state: np.ndarray, fixtures: dict) -> np.ndarray:
     """Return a state with the poses of fixtures as a start of an environment of this package, (1, n)."""
-    model = env.world.scene.model
-    poses = [fixtures[name] for name in env.world.scene.fixtures]
+    model = env.scene.model
+    poses = [fixtures[name] for name in env.scene.fixtures]
     return np.concatenate([state[: 1 + model.nq + model.nv], np.ravel(poses)])[None]
 
 
@@ -120,7 +120,7 @@ def our_arm(task, state: np.ndarray, fixtures: dict, moves: np.ndarray, assets: 
     joints = []
     for move in moves:
         env.step(move[None])
-        joints.append(env.world.physics_state(0)[1:8])
+        joints.append(env.simulations.physics_state(0)[1:8])
     env.close()
     return np.array(joints)
 

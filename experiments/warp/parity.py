@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from libero_env.envs.world import World
+from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert, Shapes
 from libero_env.sim.back_ends import make_simulations
 from libero_env.sim.engine import BackEnd
@@ -34,11 +34,11 @@ STEPS, MAX_STEPS, BATCH = 50, 600, 50
 
 def motion(task: str, warp: BackEnd) -> dict[str, object]:
     """Largest differences of positions [m, rad] over `STEPS` control steps in which the arm touches nothing."""
-    world = World(task, 2, cameras=(), observations=(), threads=1)
-    seed, actions = next((seed, a) for seed in range(100) if (a := free_actions(world, seed)) is not None)
-    ours = make_simulations(world.scene.model, 2, fixture_bodies=world.scene.fixture_bodies, back_end=warp)
-    theirs = world.simulations
-    world.reset_to_init([0, 1], [0, 1])
+    env = BatchEnv(task, 2, cameras=(), observations=(), num_threads=1)
+    seed, actions = next((seed, a) for seed in range(100) if (a := free_actions(env, seed)) is not None)
+    ours = make_simulations(env.scene.model, 2, fixture_bodies=env.scene.fixture_bodies, back_end=warp)
+    theirs = env.simulations
+    env.reset(options={"init_state": [0, 1]})
     ours.reset([0, 1], theirs.fields["qpos"], theirs.fields["qvel"], fixtures=theirs.fixtures)
     largest = {"arm": 0.0, "fingers": 0.0, "objects": 0.0, "grip_site": 0.0}
     for action in actions:
@@ -51,17 +51,17 @@ def motion(task: str, warp: BackEnd) -> dict[str, object]:
     return {"steps": STEPS, "seed": seed, **largest}
 
 
-def free_actions(world: World, seed: int) -> list[np.ndarray] | None:
+def free_actions(env: BatchEnv, seed: int) -> list[np.ndarray] | None:
     """Smooth motions of two simulations, upwards in the mean; None where the robot touches something."""
-    rng, robot, found = np.random.default_rng(seed), world.scene.bodies["robot"], []
-    world.reset_to_init([0, 1], [0, 1])
+    rng, robot, found = np.random.default_rng(seed), env.scene.bodies["robot"], []
+    env.reset(options={"init_state": [0, 1]})
     for step in range(STEPS):
         if step % 10 == 0:
             action = rng.uniform(-0.5, 0.5, (2, 7))
             action[:, 2], action[:, 6] = 0.3 * np.abs(action[:, 2]), np.sign(action[:, 6])
-        world.step([0, 1], action)
-        pairs = np.concatenate([world.simulations.contact_geoms(i) for i in (0, 1)])
-        if (np.isin(world.scene.model.geom_bodyid[pairs], robot).sum(1) == 1).any():
+        env.simulations.step([0, 1], action)
+        pairs = np.concatenate([env.simulations.contact_geoms(i) for i in (0, 1)])
+        if (np.isin(env.scene.model.geom_bodyid[pairs], robot).sum(1) == 1).any():
             return None
         found.append(action)
     return found
@@ -115,23 +115,23 @@ def expert(task: str, warp: BackEnd, starts: Sequence[int]) -> dict[str, object]
     """Success of the expert from stored starts on both back ends."""
     found: dict[str, object] = {"starts": list(starts)}
     for name, back_end in (("mujoco", BackEnd()), ("warp", warp)):
-        world = World(task, len(starts), cameras=(), observations=(), threads=1, backend=back_end)
-        world.reset_to_init(range(len(starts)), starts)
-        shapes, begin = Shapes(world.scene), time.perf_counter()
-        experts = [Expert(world.task, np.random.default_rng([0, start]), shapes=shapes) for start in starts]
+        env = BatchEnv(task, len(starts), cameras=(), observations=(), num_threads=1, backend=back_end)
+        env.reset(options={"init_state": list(starts)})
+        shapes, begin = Shapes(env.scene), time.perf_counter()
+        experts = [Expert(env.task, np.random.default_rng([0, start]), shapes=shapes) for start in starts]
         won, over, steps = np.zeros(len(starts), bool), np.zeros(len(starts), bool), 0
         while steps < MAX_STEPS and not over.all():
             ids, actions = np.flatnonzero(~over), np.zeros((len(starts), 7))
             for i in ids:
-                actions[i] = experts[i].act(world.views[i])
-            world.step(ids, actions)
-            won[ids] = world.goals.check(ids)[0]
+                actions[i] = experts[i].act(env.views[i])
+            env.simulations.step(ids, actions)
+            won[ids] = env.goals.check(ids)[0]
             over |= won | np.array([bool(one.failure_reason) for one in experts])
             steps += 1
         found[name] = won.tolist()
         found[f"{name}_seconds"] = round(time.perf_counter() - begin, 1)
         found[f"{name}_steps"] = steps
-        world.close()
+        env.close()
     return found
 
 

@@ -23,7 +23,7 @@ from libero._adapters.lifelong.observations import image_tensor
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.pickles import read_states
-from libero_env.init_states.store import NUM_INIT_STATES, check_width, split_row
+from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, read_task, suite_names
 from lifelong.evaluation.actors import Obs
 from lifelong.evaluation.rollout import Episode, run_episodes
@@ -229,22 +229,22 @@ class _EvalEnv(BatchEnv):
         is_users = folder and folder != generated_paths()["init_states"] and path.is_file()
         self.rows = read_states(path) if is_users else None
         if self.rows is not None:
-            check_width(self.world.scene.model, self.rows, path)
+            self.scene.check_states(self.rows, path)
         self.sim_states, self.on_step = sim_states, on_step
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         obs, info = super().reset(seed=seed, options=options)
         if self.rows is not None and options is not None:
             rows = self.rows[np.asarray(options["init_state"]) % len(self.rows)]
-            qpos, qvel, fixtures = split_row(self.world.scene.model, rows)
+            qpos, qvel, fixtures = self.scene.split_states(rows)
             poses = fixtures if fixtures.size else None
-            self.world.simulations.reset(range(self.num_envs), qpos, qvel, fixtures=poses)
+            self.simulations.reset(range(self.num_envs), qpos, qvel, fixtures=poses)
         return obs, info
 
     def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
         running = self.running
         result = super().step(actions)
-        simulations, fields = self.world.simulations, self.world.simulations.fields
+        simulations, fields = self.simulations, self.simulations.fields
         if self.sim_states is not None:
             for i in np.flatnonzero(running).tolist():
                 self.sim_states[i].append(np.r_[simulations.time(i), fields["qpos"][i], fields["qvel"][i]])

@@ -140,7 +140,7 @@ class StateRenderer:
     @property
     def scene(self) -> Scene:
         """The compiled scene."""
-        return self.env.world.scene
+        return self.env.scene
 
     def prepare(self, episode: Episode, where: str) -> None:
         """Put the fixtures at the poses of an episode, from the next state on; `where` is for error messages.
@@ -152,7 +152,7 @@ class StateRenderer:
 
     def place_fixtures(self, fixtures: np.ndarray) -> None:
         """Put the fixtures at the given poses, (nfixtures, 7) pos and quat wxyz, from the next state on."""
-        self.env.world.simulations.fixtures[0] = fixtures
+        self.env.simulations.fixtures[0] = fixtures
 
     def render_states(
         self, states: np.ndarray, fixtures: np.ndarray, name: str = ""
@@ -171,7 +171,7 @@ class StateRenderer:
         frames, robot_states = [], []
         for frame in self._frames(states, name):
             frames.append(frame)
-            true = {key: rows[0] for key, rows in self.env.world.observer.state().items()}
+            true = {key: rows[0] for key, rows in self.env.observer.state().items()}
             quat_xyzw = true["ee_quat"][[1, 2, 3, 0]]
             robot_states.append(np.concatenate([true["gripper_states"], true["ee_pos"], quat_xyzw]))
         obs = {key: np.stack([frame[key] for frame in frames]) for key in frames[0] if key != "ee_quat"}
@@ -179,16 +179,16 @@ class StateRenderer:
 
     def _frames(self, states: np.ndarray, name: str) -> Iterator[dict[str, np.ndarray]]:
         """Yield the observation of each state; filters with a memory see them in this order."""
-        world = self.env.world
-        if (perturbed := world.perturbed) is None:
+        batch = self.env.batch
+        if (perturbed := batch.perturbed) is None:
             yield from map(self.env.set_state, states)
             return
         perturbed.open(0, name)
-        world.observer.set_look(0, perturbed.look(name))
+        batch.observer.set_look(0, perturbed.look(name))
         for step, state in enumerate(states):
-            world.set_physics_state(0, world.checked_state(state))
+            self.env.simulations.set_physics_state(0, state)
             perturbed.steps[0] = step
-            yield {**self.env.render_cameras(), **{k: rows[0] for k, rows in world.proprioception().items()}}
+            yield {**self.env.render_cameras(), **{k: rows[0] for k, rows in batch.proprioception().items()}}
 
     def model_xml(self, fixtures: np.ndarray) -> str:
         """Return the scene as MJCF, complete but for its textures; the robot's meshes are named by their path.

@@ -59,7 +59,7 @@ class DemoRecorder:
             backend=config.backend,
         )
         self.renderer = StateRenderer(self.task, config.render_config, robot=config.robot)
-        self.shapes = Shapes(self.env.world.scene)
+        self.shapes = Shapes(self.env.scene)
 
     def attempt(self, numbers: list[tuple[int, int]]) -> list[tuple[int, Attempt]]:
         """Attempt the first of the given demonstrations, as many as are simulated together.

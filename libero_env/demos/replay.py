@@ -105,7 +105,7 @@ def _replay_episode(renderer: StateRenderer, episode: Episode, by: str, keys: li
     for t, action in enumerate(episode.actions):
         if by == "state" and t:
             obs = env.set_state(states[t])
-        qpos, recorded_qpos = env.world.simulations.fields["qpos"][0], states[t, 1 : 1 + nq]
+        qpos, recorded_qpos = env.simulations.fields["qpos"][0], states[t, 1 : 1 + nq]
         offsets = qpos[objects] - recorded_qpos[objects]  # (n, 3)
         drift.append(np.linalg.norm(offsets, axis=1).max(initial=0.0))
         arm_drift.append(np.abs(qpos[:7] - recorded_qpos[:7]).max())
@@ -141,7 +141,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     if target.exists():
         raise DemoError(f"{target} exists; choose another name or remove it")
     renderer = StateRenderer.of_file(file, RenderConfig(()))
-    writer, world = DemoWriter(target, read_header(file)), renderer.env.world
+    writer, env = DemoWriter(target, read_header(file)), renderer.env.batch
     writer.discard_parts()  # of an interrupted call, perhaps with another file
     try:
         for episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
@@ -149,9 +149,9 @@ def rerun_actions(file: Path, target: Path) -> Path:
             renderer.env.set_state(episode.states[0])
             states = []
             for action in episode.actions:
-                states.append(world.physics_state(0))
-                world.step([0], action[None])
-            success = bool(world.check_goal(0)[0])
+                states.append(env.simulations.physics_state(0))
+                env.simulations.step([0], action[None])
+            success = bool(env.check_goal(0)[0])
             writer.write(
                 demo_number(episode.name), replace(episode, states=np.array(states), success=success)
             )
@@ -222,36 +222,36 @@ def regenerate(file: Path, config: Regeneration) -> Iterator[Episode]:
 
 
 def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regeneration) -> Episode:
-    world = renderer.env.world
+    env = renderer.env.batch
     labels = episode.labels if config.labels == "expert" else episode.actions
     kept = np.flatnonzero(~published_noop_steps(episode.actions))
-    world.set_physics_state(0, episode.states[0])
+    env.simulations.set_physics_state(0, episode.states[0])
     for _ in range(config.settle_steps):
-        world.step([0], _WAIT)
-    images = world.empty_images()
-    stored: dict[str, list[np.ndarray]] = {key: [] for key in (*images, *EXPORTED_STATE)}
+        env.simulations.step([0], _WAIT)
+    stored: dict[str, list[np.ndarray]] = {
+        key: [] for key in (*env.observer.empty_images(0), *EXPORTED_STATE)
+    }
     states, actions, success = [], [], False
     recorded = list(zip(episode.actions[kept], labels[kept], strict=True))
     extra = [(episode.labels[-1], episode.labels[-1])] * config.extra_steps
     for i, (executed, label) in enumerate([*recorded, *extra]):
         if success and i >= len(recorded):
             break
-        world.render_cameras([0], images)
-        for key, rows in images.items():
+        for key, rows in env.render_cameras().items():
             stored[key].append(rows[0, :, ::-1].copy())  # here images are upright: mirrored is half a turn
-        obs = world.proprioception()
+        obs = env.proprioception()
         for key in EXPORTED_STATE:
             stored[key].append(obs[key][0].copy())
-        states.append(world.physics_state(0))
+        states.append(env.simulations.physics_state(0))
         actions.append(label)
-        world.step([0], executed[None])
-        success = i + 1 >= len(recorded) and bool(world.check_goal(0)[0])
+        env.simulations.step([0], executed[None])
+        success = i + 1 >= len(recorded) and bool(env.check_goal(0)[0])
     return Episode(
         np.array(actions).reshape(-1, 7),
         np.array(states),
         obs={key: np.array(values) for key, values in stored.items()},
         success=success,
-        fixtures=world.simulations.fixtures[0].copy(),
+        fixtures=env.simulations.fixtures[0].copy(),
         name=episode.name,
     )
 

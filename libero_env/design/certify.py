@@ -234,7 +234,7 @@ def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> lis
 @lru_cache(maxsize=1)
 def _environment(task: Task, pack: Pack) -> tuple[BatchEnv, Shapes]:
     env = BatchEnv(task, BATCH, num_threads=1, cameras=(), horizon=NO_HORIZON, assets=pack)
-    return env, Shapes(env.world.scene)
+    return env, Shapes(env.scene)
 
 
 def _digest(task: Task, pack: Pack, disturb: bool) -> str:

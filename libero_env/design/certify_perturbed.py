@@ -170,7 +170,7 @@ def _outcomes(
             try:
                 env.reset(options={"init_state": list(starts)})
                 seeds = [np.random.default_rng([task.index, start]) for start in starts]
-                shapes = Shapes(env.world.scene)
+                shapes = Shapes(env.scene)
                 found = run_experts(env, [Expert(env.task, seed, shapes=shapes) for seed in seeds])
             finally:
                 env.close()

@@ -1,24 +1,74 @@
 """Simulations of one task in one process, as a `gymnasium.vector.VectorEnv`."""
 
 from collections.abc import Sequence
-from typing import Any, Unpack
+from functools import cached_property
+from typing import Annotated, Any, NoReturn, Self
 
+import gymnasium
+import mujoco
 import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from pydantic import Field
 
 from libero_env.envs.checks import (
+    ClosedGymEnvironmentError,
     ResetRequest,
     checked_actions,
     checked_index,
     checked_indices,
-    checked_options,
-    checked_truth,
+    checked_numbers,
 )
-from libero_env.envs.config import EnvConfig, EnvOptions, show_options
-from libero_env.envs.vector import LiberoVectorEnv
-from libero_env.envs.world import World
+from libero_env.envs.config import AFTER, EnvConfig, show_options
+from libero_env.envs.scenes import open_scenes, sample_states
+from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.init_states.store import load_init_states
+from libero_env.memory import require_memory
+from libero_env.perturbations.drawing import start_name
+from libero_env.perturbations.episodes import TRIES
+from libero_env.sim.back_ends import make_simulations
+from libero_env.sim.goals import make_goals
+from libero_env.sim.observations import is_of_joints, make_observer
 from libero_env.sim.rewards import Reward
+from libero_env.sim.scene import InitialStates
+from libero_env.sim.simulation import WATCHED, Indices
 from libero_env.tasks import Task
+from libero_env.timing import CONTROL_HZ
+from libero_env.validation import validate
+
+Count = Annotated[int, Field(ge=1)]
+Threads = Annotated[int, Field(ge=0, le=4096)]
+Images = dict[str, np.ndarray]  # (num_envs, height, width, ...) by name
+
+
+class LiberoVectorEnv(gymnasium.vector.VectorEnv):
+    """A vector environment without autoreset, which `with` closes; after `close` every use is an error."""
+
+    metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
+
+    def render(self) -> NoReturn:
+        """Raise: `render_cameras` or `call` return images of vector environments."""
+        self.require_open()
+        raise InvalidInputError("a vector environment has no render(); its observations have the images")
+
+    def require_open(self) -> None:
+        """Raise a `ClosedEnvironmentError` after `close`."""
+        if self.closed:
+            raise ClosedGymEnvironmentError("this environment is closed; make another")
+
+    def __enter__(self) -> Self:
+        """Return the environments; they are closed at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise InvalidInputError(
+            "an environment cannot be copied or pickled: it holds simulations, processes or an OpenGL context. Make "
+            "another with the same task and config=, and pass it the state: set_state(get_state())"
+        )
 
 
 class BatchEnv(LiberoVectorEnv):
@@ -36,9 +86,18 @@ class BatchEnv(LiberoVectorEnv):
 
     Attributes:
         config: Configuration of all simulations.
-        task: Task of the simulations.
-        world: Simulations, scene and observer.
-        render_images: As in `LiberoEnv`.
+        task: Task of the simulations, as the perturbations of the configuration change it.
+        scene: Compiled scene of the task.
+        base_task: The task without perturbations, to which initial states belong.
+        base_scene: Compiled scene of that task.
+        perturbed: Samples and filters of the perturbations; None without any.
+        simulations: Physics and controllers.
+        views: State view of each simulation.
+        observer: Observer of the simulations.
+        goals: The goal and its atoms in the simulations.
+        generators: Random generator of each simulation.
+        render_images: Whether images are rendered in each step. If False, observations have the images that were
+            rendered last (black before the first); `render_cameras` renders those of the current state.
 
     Raises:
         UnknownNameError: The task, a camera, an option or a value of an option does not exist.
@@ -64,33 +123,58 @@ class BatchEnv(LiberoVectorEnv):
         *,
         num_threads: int = 0,
         config: EnvConfig | None = None,
-        **options: Unpack[EnvOptions],
+        **options: Any,
     ):
-        self.config = EnvConfig.from_options(config, options)
-        self.reward = Reward(self.config.reward, self.config.reward_scale)
-        self.world = World(task, num_envs, threads=num_threads, config=self.config)
-        self.task, self.num_envs, self.render_mode = self.world.task, self.world.num, None
-        self.single_observation_space = self.world.observation_space()
-        self.single_action_space = self.world.action_space()
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.render_images = True
-        self._generators = [np.random.default_rng() for _ in range(self.num_envs)]
-        self._images = self.world.empty_images()
-        self._steps = np.zeros(self.num_envs, np.int64)
-        self._running = np.zeros(self.num_envs, bool)
-        self._success = np.zeros(self.num_envs, bool)
-        self._progress = np.zeros((self.num_envs, len(self.world.atoms)), bool)
+        self.config = config = EnvConfig.from_options(config, options)
+        self.num_envs = num = validate(Count, num_envs, prefix=("num_envs",))
+        threads = validate(Threads, num_threads, prefix=("num_threads",))
+        self.render_mode, self.render_images = None, True
+        self.reward = Reward(config.reward, config.reward_scale)
+        scenes = open_scenes(task, config, num)
+        self.task, self.scene, self.perturbed = scenes.task, scenes.scene, scenes.perturbed
+        self.base_task, self.base_scene = scenes.base_task, scenes.base_scene
+        self._check_memory()
+        self.simulations = make_simulations(
+            self.scene.model, num, threads, self.scene.fixture_bodies, config.backend
+        )
+        self.simulations.set_controller(config.controller, config.control_delta, scenes.rest)
+        self.observer = make_observer(
+            self.scene,
+            self.simulations,
+            observations=config.observations,
+            cameras=config.cameras,
+            camera_size=config.camera_size,
+        )
+        self.views = self.observer.views
+        goal = self.scene.problem.goal
+        self.goals = make_goals(goal, self.scene.goal_atoms, self.views, config.semantics, self.simulations)
+        controller = self.simulations.controller_state.controller
+        self.single_observation_space = self.observer.space()
+        self.single_action_space = spaces.Box(
+            controller.low.astype(np.float32), controller.high.astype(np.float32)
+        )
+        self.observation_space = batch_space(self.single_observation_space, num)
+        self.action_space = batch_space(self.single_action_space, num)
+        self.generators = [np.random.default_rng() for _ in range(num)]
+        self._images = self.observer.empty_images()
+        self._steps = np.zeros(num, np.int64)
+        self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
+        self._progress = np.zeros((num, len(self.atoms)), bool)
 
     @property
     def atoms(self) -> tuple[str, ...]:
         """Atoms of the goal, in the order of `progress` in infos, such as `(On plate_1 stove_1)`."""
-        return self.world.atom_names
+        return tuple(map(str, self.goals.atoms))
 
     @property
     def running(self) -> np.ndarray:
         """Whether each simulation is in an episode, (num_envs,) bool."""
         return self._running.copy()
+
+    @cached_property
+    def init_states(self) -> InitialStates:
+        """Stored initial states of `base_task`."""
+        return load_init_states(self.base_task, self.base_scene)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -101,7 +185,7 @@ class BatchEnv(LiberoVectorEnv):
             seed: One seed for each simulation, or one number from which they count up.
             options: `init_state`: index of one stored state, or of one for each simulation, (num_envs,).
                 `start`: instead of it, a state for each simulation, [time, qpos, qvel, poses of the fixtures], of the
-                task without perturbations; where both are given, the index only names what perturbations draw.
+                task without perturbations; where both are given, the index only names what perturbations sample.
                 `outdated_controller`: whether the controller takes the arm to be in its rest pose at first, as that of
                 the original, see `libero_env.sim.simulation.Simulations.outdate_controller`.
                 `reset_mask`: which simulations to reset, (num_envs,) bool; by default all.
@@ -112,33 +196,26 @@ class BatchEnv(LiberoVectorEnv):
                 another kind; nothing has changed.
             PlacementError: The objects do not fit; none of these simulations is in an episode.
         """
-        self._check_open()
-        options = checked_options(options, valid=("init_state", "start", "outdated_controller", "reset_mask"))
-        request, outdated = (
-            ResetRequest.from_arguments(self.num_envs, seed, options),
-            checked_truth(options, "outdated_controller"),
-        )
-        ids, rows = request.ids, None
+        self.require_open()
+        request = ResetRequest.from_arguments(self.num_envs, seed, options)
+        ids, states = request.ids, None
         if request.starts is not None:
-            rows = self.world.checked_starts(request.starts[ids])
+            states = self._checked_starts(request.starts[ids])
         elif request.init_states is not None:
-            rows = self.world.init_rows(request.init_states[ids])
-        if not ids.size:
-            return self._observe(ids), self._info()
-        self._running[ids] = False  # until it is done: an error or an interruption ends the episodes
-        for i in ids:
-            if (new_seed := request.seeds[i]) is not None:
-                self._generators[i] = np.random.Generator(np.random.PCG64(new_seed))
-        if rows is not None:
-            named = request.init_states
-            self.world.reset_to(ids, rows, None if named is None else named[ids])
-        else:
-            self.world.reset_random(ids, [self._generators[i] for i in ids])
-        if outdated:
-            self.world.simulations.outdate_controller(ids)
-        self._steps[ids], self._running[ids], self._success[ids] = 0, True, False
-        self._check_goals(ids)
-        return self._observe(ids), self._info()
+            states = self._stored_states(request.init_states[ids])
+        if ids.size:
+            self._running[ids] = False  # until it is done: an error or an interruption ends the episodes
+            for i in ids:
+                if (new_seed := request.seeds[i]) is not None:
+                    self.generators[i] = np.random.Generator(np.random.PCG64(new_seed))
+            if states is None:
+                states = sample_states(self.base_scene, [self.generators[i] for i in ids])
+            self._start(ids, states, None if request.init_states is None else request.init_states[ids])
+            if request.outdated_controller:
+                self.simulations.outdate_controller(ids)
+            self._steps[ids], self._running[ids] = 0, True
+            self._success[ids] = self._check_goals(ids)[0]
+        return self._with_images(self._observe(ids)), self._info()
 
     def step(
         self, actions: np.ndarray
@@ -150,33 +227,38 @@ class BatchEnv(LiberoVectorEnv):
 
         Returns:
             Observations, rewards (num_envs,), terminations, truncations, and infos: `success` (num_envs,) bool and
-            `progress` (num_envs, natoms) bool, the truth of each of the goal's `atoms`. Both keep the outcome of
-            episodes that are over. With perturbations also `attempts` (num_envs, n): how many draws of each were not
+            `progress` (num_envs, natoms) bool, whether each of the goal's `atoms` holds. Both keep the outcome of
+            episodes that are over. With perturbations also `attempts` (num_envs, n): how many samples of each were not
             valid at the reset.
 
         Raises:
-            ActionError: The shape is wrong, or a value is no finite number; no state has changed.
+            ActionError: The shape is wrong, or a value is not a finite number; no state has changed.
         """
-        self._check_open()
-        actions = checked_actions(actions, self.num_envs, self.world.controller.action_dim)
+        self.require_open()
+        return self.advance(checked_actions(actions, self.action_space.shape))
+
+    def advance(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step with actions that have been checked, (num_envs, action_dim) float64; see `step`."""
         running, ids = self._running.copy(), np.flatnonzero(self._running)
         self._running[:] = False  # until it is done: a step that is interrupted has moved some substeps
         reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
-        state = None
+        entries = None
         if ids.size:
-            state = self.world.step_and_observe(ids, actions, self._images if self.render_images else None)
+            entries = self._step_and_observe(ids, actions)
             reached[ids], rewards[ids] = self._check_goals(ids)
             self._steps[ids] += 1
         truncated = running & ~reached & (self._steps >= self.config.horizon)
-        self._success |= reached
+        self._success[ids] = reached[ids]
         self._running = running & ~(reached | truncated)
-        return self._observation(state), rewards, reached, truncated, self._info()
+        return self._with_images(entries), rewards, reached, truncated, self._info()
 
     def get_state(self, i: int) -> np.ndarray:
-        """Return the state of simulation i, as `LiberoEnv.get_state`."""
-        self._check_open()
+        """Return all that the rest of the episode in simulation i depends on, see `LiberoEnv.get_state`."""
+        self.require_open()
         i = checked_index(i, self.num_envs)
-        return np.append(self.world.simulations.get_state(i), float(self._steps[i]))
+        return np.append(self.simulations.get_state(i), float(self._steps[i]))
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state in simulation i; see `LiberoEnv.set_state`.
@@ -184,48 +266,199 @@ class BatchEnv(LiberoVectorEnv):
         Raises:
             InvalidInputError: There is no such simulation, or the state is not valid; nothing has changed.
         """
-        self._check_open()
-        i, state = checked_index(i, self.num_envs), self.world.checked_state(state)
+        self.require_open()
+        i, state = checked_index(i, self.num_envs), self._checked_state(state)
         self._running[i] = False
-        self._steps[i] = self.world.restore(i, state)
+        if state.size == self.simulations.state_size + 1:
+            self.simulations.set_state(i, state[:-1])
+            self._steps[i] = int(state[-1])
+        else:
+            self.simulations.set_physics_state(i, state)
+            self._steps[i] = 0
+        if self.perturbed is not None:
+            self.perturbed.resume(i, int(self._steps[i]))
         self._running[i], self._success[i] = True, False
 
-    def render_cameras(self, ids: Sequence[int] | None = None) -> dict[str, np.ndarray]:
+    def observe(self, i: int) -> dict[str, np.ndarray]:
+        """Return the observation of simulation i in its present state, with a leading axis of one."""
+        self.require_open()
+        return {name: rows[[i]] for name, rows in self._with_images(self._observe([i])).items()}
+
+    def proprioception(self) -> dict[str, np.ndarray]:
+        """Return all observations except images: name -> (num_envs, length) float64."""
+        entries = self.observer.state()
+        return entries if self.perturbed is None else self.perturbed.see_state(entries)
+
+    def render_cameras(self, ids: Sequence[int] | None = None) -> Images:
         """Render the observed images of the current states: name -> (n, H, W, ...).
 
         Args:
             ids: Indices of the simulations; by default all.
         """
-        self._check_open()
+        self.require_open()
         rows = checked_indices(ids, self.num_envs)
-        self.world.render_cameras(rows, self._images)
+        self._render(rows, self._images)
         return {key: images[rows] for key, images in self._images.items()}
+
+    def check_goal(self, i: int) -> tuple[bool, dict[str, bool]]:
+        """Return whether the goal is reached in simulation i, and whether each of its atoms holds, by its text."""
+        reached, held = self.goals.check([i])
+        return bool(reached[0]), dict(zip(self.atoms, map(bool, held[0]), strict=True))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulations and the OpenGL context."""
-        self.world.close()
+        self.observer.close()
+        self.simulations.close()
+
+    def _start(self, ids: np.ndarray, states: InitialStates, init_states: np.ndarray | None) -> None:
+        """Start simulations from states of `base_task`, or from those that the perturbations make of them.
+
+        Args:
+            ids: Indices of the simulations, (k,).
+            states: State of each.
+            init_states: Indices of the states, (k,), which name the samples of perturbations; by default the states
+                themselves do.
+
+        Raises:
+            PlacementError: Perturbations make no valid start of a state.
+        """
+        if self.perturbed is None:
+            qpos, qvel, fixtures = self.scene.split_states(states)
+            self.simulations.reset(ids, qpos, qvel, fixtures=fixtures)
+            return
+        names = map(start_name, states) if init_states is None else map(int, init_states)
+        for i, name, state in zip(ids, names, states, strict=True):
+            self._start_perturbed(int(i), name, state)
+
+    def _start_perturbed(self, i: int, name: object, state: np.ndarray) -> None:
+        """Start a simulation from what the perturbations make of a state; the goal does not hold there."""
+        perturbed = self.perturbed
+        assert perturbed is not None
+        paired, again = perturbed.paired(i, name, state), 0
+        while True:
+            start = perturbed.begin(i, name, paired, again)
+            qpos, qvel, fixtures = self.scene.split_states(start[None])
+            self.simulations.reset([i], qpos, qvel, fixtures=fixtures)
+            if not perturbed.is_physical or not self.goals.check([i])[0][0]:
+                break
+            again += 1
+            if not perturbed.draws_starts or again == TRIES:
+                raise PlacementError(
+                    f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
+                )
+        self.observer.set_look(i, perturbed.look(name))
+
+    def _stored_states(self, indices: np.ndarray) -> InitialStates:
+        """Return stored initial states by index, (k,)."""
+        stored = self.init_states
+        if ((indices < 0) | (indices >= len(stored))).any():
+            raise InvalidInputError(
+                f"init_state {indices.tolist()}: {self.task.id} has 0 to {len(stored) - 1}"
+            )
+        return stored[indices]
+
+    def _checked_starts(self, states: np.ndarray) -> InitialStates:
+        size, fixtures = self.base_scene.state_size, len(self.base_scene.fixtures)
+        if states.shape[1] != size:
+            raise InvalidInputError(
+                f"{self.task.id}: a start has {size} numbers, [time, qpos, qvel] and the poses of {fixtures} fixtures; "
+                f"got {states.shape[1]}. Is it one of another task?"
+            )
+        _check_range(states, self.task)
+        return states
+
+    def _checked_state(self, state: object) -> np.ndarray:
+        """Return a vector of `get_state`, or [time, qpos, qvel], as float64."""
+        model, size = self.scene.model, self.simulations.state_size + 1
+        name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
+        array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
+        _check_range(array, self.task)
+        if array.size == size and not (array[-1] >= 0 and array[-1].is_integer()):
+            raise InvalidInputError(
+                f"a state ends with its number of steps, a whole number; got {array[-1]:g}"
+            )
+        return array
+
+    def _check_memory(self) -> None:
+        """Raise if the simulations and their images do not fit into memory."""
+        if self.num_envs == 1:
+            return
+        height, width = self.config.camera_size
+        images = 16 * height * width * len(self.config.cameras)
+        model = self.scene.model
+        state = 0 if self.config.backend.is_warp else model.narena + model.nbuffer // 8  # on the device
+        require_memory(
+            self.num_envs * (state + images),
+            f"num_envs={self.num_envs}",
+            "take fewer simulations or smaller images",
+        )
 
     def _check_goals(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether the goal is reached in each of the simulations, and its reward; note the truth of atoms."""
-        reached, truths = self.world.goals.check(ids)
-        self._progress[ids] = truths
+        """Return whether the goal is reached in each of the simulations, and its reward; note which atoms hold."""
+        reached, held = self.goals.check(ids)
+        self._progress[ids] = held
         rewards = [
-            self.reward(self.world.views[i], bool(won), self.world.atoms, list(row))
-            for i, won, row in zip(ids, reached, truths, strict=True)
+            self.reward(self.views[i], bool(won), self.goals.atoms, list(row))
+            for i, won, row in zip(ids, reached, held, strict=True)
         ]
         return reached, np.array(rewards, np.float64)
 
-    def _observe(self, ids: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the observations of all simulations, with images rendered of the given ones."""
-        return self._observation(self.world.observe(ids, self._images if self.render_images else None))
+    def _step_and_observe(self, ids: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+        """Advance simulations by one control period, and observe them when `config.observed` says."""
+        if self.perturbed is not None:
+            actions = self.perturbed.act(ids, actions)
+        if self.config.observed == AFTER:
+            self.simulations.step(ids, actions)
+            return self._observe(ids)
+        seen = self.proprioception()
 
-    def _observation(self, state: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+        def watch(done: int, rows: np.ndarray) -> None:
+            now = self.proprioception()
+            if done == WATCHED[0]:
+                self._render_observed(rows)
+            for name, values in now.items():
+                if (done == WATCHED[1]) == is_of_joints(name):
+                    seen[name][rows] = values[rows]
+
+        self.simulations.step(ids, actions, watch=watch)
+        return seen
+
+    def _observe(self, ids: Indices) -> dict[str, np.ndarray]:
+        """Render the images of simulations, and return all observations except images."""
+        self._render_observed(ids)
+        return self.proprioception()
+
+    def _render_observed(self, ids: Indices) -> None:
+        """Render images where they are observed; unseen ones where a perturbation remembers them."""
+        if self.render_images:
+            self._render(ids, self._images)
+        elif self.perturbed is not None and self.perturbed.has_memory:
+            self._render(ids, self._unseen)
+
+    @cached_property
+    def _unseen(self) -> Images:
+        return self.observer.empty_images()
+
+    def _render(self, ids: Indices, images: Images) -> None:
+        self.observer.render_cameras(ids, images)
+        if self.perturbed is not None:
+            self.perturbed.see_images(ids, images)
+
+    def _with_images(self, entries: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
         """Return copies of the images, with the given observations of the state or those of the present one."""
         images = {name: values.copy() for name, values in self._images.items()}
-        return {**images, **(self.world.proprioception() if state is None else state)}
+        return {**images, **(self.proprioception() if entries is None else entries)}
 
     def _info(self) -> dict[str, Any]:
-        found = {"success": self._success.copy(), "progress": self._progress.copy()}
-        if (perturbed := self.world.perturbed) is not None:
-            found["attempts"] = perturbed.attempts.copy()
-        return found
+        info = {"success": self._success.copy(), "progress": self._progress.copy()}
+        if self.perturbed is not None:
+            info["attempts"] = self.perturbed.attempts.copy()
+        return info
+
+
+def _check_range(states: np.ndarray, task: Task) -> None:
+    """Raise unless MuJoCo takes the numbers: it resets a simulation with larger ones, without an error."""
+    if not (np.abs(states) <= mujoco.mjMAXVAL).all():
+        raise InvalidInputError(
+            f"{task.id}: a state has a number beyond {mujoco.mjMAXVAL:g}, or not a number"
+        )

@@ -1,13 +1,13 @@
 """Checks of what callers pass to environments; nothing has changed when one of them fails."""
 
-import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
+from pydantic import Field
 
 from libero_env.errors import (
     ActionError,
@@ -16,29 +16,29 @@ from libero_env.errors import (
     LiberoError,
     UnknownNameError,
 )
-from libero_env.sim.osc import ACTION_DIM
 from libero_env.text import shown
+from libero_env.validation import validate
 
+RESET_OPTIONS = ("init_state", "start", "outdated_controller", "reset_mask")
 Shape = tuple[int, ...]
-_MAX_SEED_BITS = 4096
+Whole = Annotated[int, Field(ge=0)]
 
 
 class ClosedGymEnvironmentError(ClosedEnvironmentError, gymnasium.error.ClosedEnvironmentError):
     """An environment is used after `close`; the error is Gymnasium's and the package's."""
 
 
-def checked_actions(actions: object, num: int | None = None, size: int = ACTION_DIM) -> np.ndarray:
+def checked_actions(actions: object, shape: Shape | None) -> np.ndarray:
     """Return actions as float64. Values outside the action space are left to the controller, which clips them.
 
     Args:
         actions: Action (size,), or actions (num, size).
-        num: Number of environments; None for a single action.
-        size: Length of an action.
+        shape: Shape that they must have.
 
     Raises:
-        ActionError: The shape is wrong, or a value is no finite real number.
+        ActionError: The shape is wrong, or a value is not a finite real number.
     """
-    return checked_numbers(actions, "actions", ((size,) if num is None else (num, size),), ActionError)
+    return checked_numbers(actions, "actions", (shape or (),), ActionError)
 
 
 def checked_numbers(
@@ -53,7 +53,7 @@ def checked_numbers(
         error: Type of the error.
 
     Raises:
-        InvalidInputError: The shape is wrong, or a value is no finite real number; or `error`.
+        InvalidInputError: The shape is wrong, or a value is not a finite real number; or `error`.
     """
     expected = f"{name}: expected finite numbers of shape {' or '.join(map(str, shapes))}"
     try:
@@ -70,7 +70,7 @@ def checked_numbers(
 
 
 def real_array(value: object) -> np.ndarray:
-    """Return an array as float64; raise a TypeError for what is no real number, such as a text or a masked entry."""
+    """Return an array as float64; raise a TypeError for what is not a real number, such as a text or a masked entry."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise TypeError("some of its entries are masked")
     array = np.asarray(value)
@@ -78,30 +78,26 @@ def real_array(value: object) -> np.ndarray:
         return array
     if array.dtype.kind == "O":
         if odd := [one for one in array.ravel() if not isinstance(one, Real)]:
-            raise TypeError(f"{type(odd[0]).__name__} is no real number")
+            raise TypeError(f"{type(odd[0]).__name__} is not a real number")
     elif array.dtype.kind not in "biuf":
-        raise TypeError(f"{array.dtype} is no real number")
+        raise TypeError(f"{array.dtype} is not a real number")
     with np.errstate(over="ignore"):  # what is too large becomes infinite
         return array.astype(np.float64)
 
 
-def checked_index(i: object, count: int, name: str = "index") -> int:
+def checked_index(i: object, count: int) -> int:
     """Return an index from 0 to `count - 1` as int.
 
     Raises:
         InvalidInputError: It is another value.
     """
-    if not isinstance(i, bool | np.bool_):
-        try:
-            index = operator.index(i)  # type: ignore[arg-type]
-        except TypeError:
-            index = -1
-        if 0 <= index < count:
-            return index
-    raise InvalidInputError(f"{name} {shown(i)}: expected a whole number from 0 to {count - 1}")
+    index: int = validate(Whole, i, prefix=("index",))
+    if index >= count:
+        raise InvalidInputError(f"index is {shown(i)}; expected a whole number from 0 to {count - 1}")
+    return index
 
 
-def checked_indices(ids: object, count: int) -> np.ndarray:
+def checked_indices(ids: Sequence[int] | None, count: int) -> np.ndarray:
     """Return indices from 0 to `count - 1`, (k,); None stands for all.
 
     Raises:
@@ -109,27 +105,18 @@ def checked_indices(ids: object, count: int) -> np.ndarray:
     """
     if ids is None:
         return np.arange(count)
-    if isinstance(ids, str) or not isinstance(ids, Iterable) or not getattr(ids, "ndim", 1):
-        raise InvalidInputError(f"ids={shown(ids)}: expected a list of indices from 0 to {count - 1}")
-    return np.array([checked_index(i, count) for i in ids], np.int64)
+    indices = validate(list[Whole], ids, prefix=("indices",))
+    return np.array([checked_index(i, count) for i in indices], np.int64)
 
 
 def checked_seed(seed: object) -> int | None:
     """Return a seed as int; None stands for none.
 
     Raises:
-        InvalidInputError: It is no whole number from 0.
+        InvalidInputError: It is not a whole number from 0.
     """
-    if seed is None:
-        return None
-    if not isinstance(seed, bool | np.bool_ | str | bytes):
-        try:
-            number = operator.index(seed)  # type: ignore[arg-type]
-        except TypeError:
-            number = -1
-        if number >= 0 and number.bit_length() <= _MAX_SEED_BITS:
-            return number
-    raise InvalidInputError(f"seed={shown(seed)}: expected a whole number from 0, or None")
+    value: int | None = validate(Whole | None, seed, prefix=("seed",))
+    return value
 
 
 def checked_options(options: object, valid: Sequence[str] | None = None) -> dict[str, Any]:
@@ -140,7 +127,7 @@ def checked_options(options: object, valid: Sequence[str] | None = None) -> dict
         valid: Names of options; None for any.
 
     Raises:
-        InvalidInputError: They are no dictionary.
+        InvalidInputError: They are not a dictionary.
         UnknownNameError: An option does not exist.
     """
     if options is None:
@@ -153,18 +140,6 @@ def checked_options(options: object, valid: Sequence[str] | None = None) -> dict
     return dict(options)
 
 
-def checked_truth(options: Mapping[str, Any], name: str) -> bool:
-    """Return a reset option that is true or false; false where it is not given.
-
-    Raises:
-        InvalidInputError: It is another value.
-    """
-    value = options.get(name, False)
-    if not isinstance(value, bool | np.bool_):
-        raise InvalidInputError(f"{name}={shown(value)}: expected true or false")
-    return bool(value)
-
-
 @dataclass(frozen=True)
 class ResetRequest:
     """Arguments of `reset` of a vector environment, checked.
@@ -174,48 +149,54 @@ class ResetRequest:
         seeds: Seed of each environment, (num_envs,); None continues its generator.
         init_states: Index of the initial state of each environment, (num_envs,); None for new placements.
         starts: State that each environment starts in, (num_envs, size); None for stored states or new placements.
+        outdated_controller: See `BatchEnv.reset`.
     """
 
     ids: np.ndarray
     seeds: list[int | None]
     init_states: np.ndarray | None
-    starts: np.ndarray | None = None
+    starts: np.ndarray | None
+    outdated_controller: bool
 
     @classmethod
     def from_arguments(
-        cls, num_envs: int, seed: int | Sequence[int | None] | None, options: Mapping[str, Any]
+        cls, num_envs: int, seed: object, options: object, valid: Sequence[str] | None = RESET_OPTIONS
     ) -> "ResetRequest":
         """Check the arguments of `reset`.
 
         Args:
             num_envs: Number of environments.
             seed: One seed for each environment, or one number from which they count up.
-            options: Reset options `init_state`, `start` and `reset_mask`; others are ignored.
+            options: Reset options.
+            valid: Names of options; None for any.
 
         Raises:
             InvalidInputError: Seeds, mask, initial states or starts have the wrong length or are of another kind.
+            UnknownNameError: An option does not exist.
         """
+        values = checked_options(options, valid)
         mask = np.ones(num_envs, bool)
-        if "reset_mask" in options:
-            mask = checked_numbers(options["reset_mask"], "reset_mask", ((num_envs,),)) != 0
+        if "reset_mask" in values:
+            mask = checked_numbers(values["reset_mask"], "reset_mask", ((num_envs,),)) != 0
         init_states = starts = None
-        if "init_state" in options:
-            init_states = whole_numbers(options["init_state"], "init_state", ((), (1,), (num_envs,)))
+        if "init_state" in values:
+            init_states = whole_numbers(values["init_state"], "init_state", ((), (1,), (num_envs,)))
             init_states = np.broadcast_to(init_states, (num_envs,))
-        if "start" in options:
-            starts = checked_numbers(options["start"], "start", (f"({num_envs}, n)",))
+        if "start" in values:
+            starts = checked_numbers(values["start"], "start", (f"({num_envs}, n)",))
             if starts.ndim != 2 or len(starts) != num_envs:
                 raise InvalidInputError(
                     f"start: expected {num_envs} rows of numbers, got shape {starts.shape}"
                 )
-        return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts)
+        outdated = validate(bool, values.get("outdated_controller", False), prefix=("outdated_controller",))
+        return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts, outdated)
 
 
 def whole_numbers(value: object, name: str, shapes: Sequence[Shape]) -> np.ndarray:
     """Return an array of whole numbers, int64.
 
     Raises:
-        InvalidInputError: The shape is wrong, or a value is no whole number.
+        InvalidInputError: The shape is wrong, or a value is not a whole number.
     """
     array = checked_numbers(value, name, shapes)
     if np.asarray(value).dtype.kind not in "iu":

@@ -7,7 +7,7 @@ itself. Observations are passed in shared memory. A worker that dies, or does no
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -15,15 +15,14 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from pydantic import Field
 
+from libero_env.envs.batch import LiberoVectorEnv
 from libero_env.envs.checks import (
     ResetRequest,
     checked_actions,
     checked_index,
     checked_indices,
-    checked_options,
 )
-from libero_env.envs.config import EnvConfig, EnvOptions, show_options
-from libero_env.envs.vector import LiberoVectorEnv
+from libero_env.envs.config import EnvConfig, show_options
 from libero_env.envs.worker import Failure, Worker, checked_space, shut_down, wait_for
 from libero_env.envs.worker_host import open_libero
 from libero_env.errors import InvalidInputError, LiberoError
@@ -105,7 +104,7 @@ class SubprocEnv(LiberoVectorEnv):
         start_timeout: float = 300.0,
         gl_devices: Sequence[int] = (),
         config: EnvConfig | None = None,
-        **options: Unpack[EnvOptions],
+        **options: Any,
     ):
         self.timeout = validate(Seconds, timeout, prefix=("timeout",))
         self.start_timeout = validate(Seconds, start_timeout, prefix=("start_timeout",))
@@ -156,10 +155,11 @@ class SubprocEnv(LiberoVectorEnv):
             InvalidInputError: Seeds, mask or initial states have the wrong length or are of another kind; nothing has
                 changed.
         """
-        self._check_open()
-        options = checked_options(options)
-        request = ResetRequest.from_arguments(self.num_envs, seed, options)
-        others = {key: value for key, value in options.items() if key not in ("reset_mask", "init_state")}
+        self.require_open()
+        request = ResetRequest.from_arguments(self.num_envs, seed, options, valid=None)
+        others = {
+            key: value for key, value in (options or {}).items() if key not in ("reset_mask", "init_state")
+        }
         ids = [int(i) for i in request.ids]
         failed = self._reopen([i for i in ids if not self._workers[i].opened])
         ids = [i for i in ids if i not in failed]
@@ -182,8 +182,8 @@ class SubprocEnv(LiberoVectorEnv):
             ActionError: The shape is wrong, or a value is not finite; no state has changed.
             WorkerError: Some workers failed; the others have stepped, see `WorkerError.outcome`.
         """
-        self._check_open()
-        actions = checked_actions(actions, self.num_envs, self._action_size)
+        self.require_open()
+        actions = checked_actions(actions, self.action_space.shape)
         ids = [int(i) for i in np.flatnonzero(self._running)]
         for i in ids:
             self._workers[i].send("step", actions[i])
@@ -210,7 +210,7 @@ class SubprocEnv(LiberoVectorEnv):
         Raises:
             WorkerError: Some workers failed; `outcome` has None for them.
         """
-        self._check_open()
+        self.require_open()
         indices = [int(i) for i in checked_indices(indices, self.num_envs)]
         failed = self._reopen([i for i in indices if not self._workers[i].opened])
         called = [i for i in indices if i not in failed]
@@ -249,7 +249,7 @@ class SubprocEnv(LiberoVectorEnv):
         self._attached(range(self.num_envs))
         self._common = [k for k, box in observed[0].items() if all(o.spaces.get(k) == box for o in observed)]
         self.single_observation_space = spaces.Dict({key: observed[0][key] for key in self._common})
-        self.single_action_space, self._action_size = first, first.shape[0]
+        self.single_action_space = first
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(first, self.num_envs)
         return observed

@@ -60,7 +60,7 @@ def run_experts(
         One attempt for each expert, in order.
     """
     noise = noise or [None] * len(experts)
-    world, recordings = env.world, [_Recording() for _ in experts]
+    recordings = [_Recording() for _ in experts]
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
         running = map(int, np.flatnonzero(env.running[: len(experts)]))
@@ -69,15 +69,15 @@ def run_experts(
             break
         actions = np.zeros((env.num_envs, 7))
         for i in live:
-            action, own_noise = experts[i].act(world.views[i]), noise[i]
+            action, own_noise = experts[i].act(env.views[i]), noise[i]
             actions[i] = action if own_noise is None else own_noise.apply(action, experts[i].noise_scale)
-            recordings[i].states.append(world.physics_state(i))
+            recordings[i].states.append(env.simulations.physics_state(i))
             recordings[i].actions.append(actions[i].copy())
             recordings[i].expert_actions.append(action)
         success = env.step(actions)[-1]["success"][: len(experts)]
     for i, recording in enumerate(recordings):
-        recording.states.append(world.physics_state(i))
-    fixtures = world.simulations.fixtures
+        recording.states.append(env.simulations.physics_state(i))
+    fixtures = env.simulations.fixtures
     return [
         recordings[i].attempt(expert, bool(success[i]), fixtures[i].copy())
         for i, expert in enumerate(experts)

@@ -5,7 +5,6 @@ from .store import (
     generate_init_states,
     load_init_states,
     shipped_path,
-    split_row,
     write_suite,
 )
 
@@ -17,7 +16,6 @@ __all__ = [
     "sample_settled",
     "settle",
     "shipped_path",
-    "split_row",
     "start_faults",
     "write_suite",
 ]

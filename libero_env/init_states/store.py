@@ -6,7 +6,6 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.pack import BUILTIN
@@ -18,7 +17,7 @@ from libero_env.init_states.settle import sample_settled
 from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.back_ends import LoopSimulations
-from libero_env.sim.scene import Scene, build_scene
+from libero_env.sim.scene import InitialStates, Scene, build_scene
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
 from libero_env.tasks.published.task import PublishedTask
 from libero_env.tasks.task import Task
@@ -28,7 +27,7 @@ _FIXTURE_SEED = 0  # of the poses of fixtures beside published states
 _SEED = 0x1B3E0  # keeps the seeds of these states apart from those of `reset(seed=...)`
 
 
-def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -> np.ndarray:
+def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -> InitialStates:
     """Generate the initial states of a task.
 
     Args:
@@ -37,8 +36,7 @@ def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -
         num: Number of states.
 
     Returns:
-        Rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture], (num, 1 + nq + nv + 7 nfixtures). Row i
-        depends on the task's name and i alone.
+        The states, of which the i-th depends on the task's name and i alone.
     """
     simulations, nv = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies), scene.model.nv
     name = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
@@ -49,40 +47,7 @@ def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -
     return np.array(rows)
 
 
-def split_row(model: mujoco.MjModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split rows (k, n) of initial states into qpos (k, nq), qvel (k, nv) and fixtures (k, nfixtures, 7).
-
-    Raises:
-        LiberoError: The rows have another length.
-    """
-    check_width(model, rows)
-    if (rows.shape[1] - 1 - model.nq - model.nv) % 7:
-        raise LiberoError(f"a state of {rows.shape[1]} numbers; the poses at its end have 7 each")
-    _, qpos, qvel, fixtures = np.split(rows, np.cumsum([1, model.nq, model.nv]), axis=1)
-    return qpos, qvel, fixtures.reshape(len(rows), -1, 7)
-
-
-def check_width(model: mujoco.MjModel, rows: np.ndarray, source: object = "") -> None:
-    """Check that rows (k, n) can begin with [time, qpos, qvel] of a model.
-
-    Args:
-        model: Model of the task.
-        rows: States.
-        source: Where they come from, for the message.
-
-    Raises:
-        LiberoError: The rows are too short.
-    """
-    size = 1 + model.nq + model.nv
-    if rows.ndim != 2 or rows.shape[1] < size:
-        where = f"{source}: " if source else ""
-        raise LiberoError(
-            f"{where}states of {rows.shape[-1]} numbers; this task's begin with {size} of [time, qpos, qvel]. "
-            "Are they of another task, or of other models?"
-        )
-
-
-def load_init_states(task: Task, scene: Scene) -> np.ndarray:
+def load_init_states(task: Task, scene: Scene) -> InitialStates:
     """Return the initial states of a task: those of the package, or else of the cache, where they are generated once.
 
     Args:
@@ -90,7 +55,7 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
         scene: Compiled scene of the task.
 
     Returns:
-        Rows as of `generate_init_states`, (50, ...); of a variant that leaves objects in place, those of its base task.
+        The 50 states; of a variant that leaves objects in place, those of its base task.
 
     Raises:
         LiberoError: The states of the package were made for another model, or their file is damaged.
@@ -104,11 +69,12 @@ def load_init_states(task: Task, scene: Scene) -> np.ndarray:
                 f"generate them again: libero tasks init-states {task.suite}"
             )
         return packaged[1]
-    width = 1 + scene.model.nq + scene.model.nv + 7 * len(scene.fixtures)
     return cached_arrays(
         _cached_path(task, digest),
         lambda: {"states": _own_states(task, scene)},
-        lambda stored: set(stored) == {"states"} and stored["states"].shape == (task.num_starts, width),
+        lambda stored: (
+            set(stored) == {"states"} and stored["states"].shape == (task.num_starts, scene.state_size)
+        ),
     )["states"]
 
 
@@ -146,7 +112,7 @@ def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray |
         return None
     states = _read_npz(path) if path.suffix == ".npz" else read_states(path)
     if scene is not None:
-        check_width(scene.model, states, path)
+        scene.check_states(states, path)
     return states
 
 

@@ -1,4 +1,4 @@
-"""Perturbed episodes of a world's simulations: what is drawn at a reset, and what acts until the next."""
+"""Perturbed episodes of simulations: what is drawn at a reset, and what acts until the next."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

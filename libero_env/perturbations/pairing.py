@@ -12,7 +12,6 @@ import numpy as np
 from libero_env.errors import PlacementError
 from libero_env.init_states.placement import collision_boxes, lowest_point
 from libero_env.init_states.settle import settle
-from libero_env.init_states.store import split_row
 from libero_env.perturbations.drawing import DrawKey
 from libero_env.perturbations.starts import contacts, posed
 from libero_env.sim.back_ends import LoopSimulations
@@ -78,7 +77,7 @@ class Pairing:
     def _paired(self, row: np.ndarray) -> np.ndarray:
         """Return the start with everything that both scenes have; what is new is at its model's origin."""
         base, model = self.base, self.scene.model
-        qpos, qvel, fixtures = (part[0].copy() for part in split_row(base.model, row[None]))
+        qpos, qvel, fixtures = (part[0].copy() for part in base.split_states(row[None]))
         now, speed = model.qpos0.copy(), np.zeros(model.nv)
         for j in range(base.model.njnt):
             name = base.model.joint(j).name
@@ -157,7 +156,7 @@ class Pairing:
         scene, model = self.scene, self.scene.model
         if self._simulations is None:
             self._simulations = LoopSimulations(model, fixture_bodies=scene.fixture_bodies)
-        qpos, _, fixtures = split_row(model, row[None])
+        qpos, _, fixtures = scene.split_states(row[None])
         rest, settled = settle(self._simulations, 0, qpos[0], scene.nq_robot, fixtures[0]), row.copy()
         new = [*self.added, *self.exchanged]
         for name in new:

@@ -11,7 +11,6 @@ import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
-from libero_env.init_states.store import split_row
 from libero_env.perturbations.drawing import direction, sign
 from libero_env.perturbations.kind import Kind
 from libero_env.sim.scene import Scene
@@ -160,7 +159,7 @@ def posed(scene: Scene, row: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]
         model = copy(scene.model) if scene.fixtures else scene.model
         _geometry[scene.model] = model, mujoco.MjData(model)
     model, data = _geometry[scene.model]
-    qpos, _, fixtures = split_row(model, row[None])
+    qpos, _, fixtures = scene.split_states(row[None])
     if scene.fixtures:
         model.body_pos[scene.fixture_bodies] = fixtures[0, :, :3]
         model.body_quat[scene.fixture_bodies] = fixtures[0, :, 3:]

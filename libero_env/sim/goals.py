@@ -12,7 +12,13 @@ from libero_env.tasks.problem import And, Atom, Expression
 
 
 class Goals(Protocol):
-    """The truth of one goal in simulations of its scene."""
+    """The truth of one goal in simulations of its scene.
+
+    Attributes:
+        atoms: Atoms whose truth `check` returns.
+    """
+
+    atoms: tuple[Atom, ...]
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in simulations, (k,) bool, and the truth of its atoms, (k, natoms)."""
@@ -29,16 +35,16 @@ class ViewedGoals:
     """
 
     def __init__(self, goal: Expression, atoms: Sequence[Atom], views: Sequence[StateView], semantics: str):
-        self._goal, self._atoms, self._views, self._semantics = goal, tuple(atoms), views, semantics
+        self._goal, self.atoms, self._views, self._semantics = goal, tuple(atoms), views, semantics
         parts = goal.parts if isinstance(goal, And) else (goal,)
-        self._is_conjunction = all(part in self._atoms for part in parts)  # no atom is evaluated twice then
+        self._is_conjunction = all(part in self.atoms for part in parts)  # no atom is evaluated twice then
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in simulations, (k,) bool, and the truth of its atoms, (k, natoms)."""
-        reached, truths = np.zeros(len(ids), bool), np.zeros((len(ids), len(self._atoms)), bool)
+        reached, truths = np.zeros(len(ids), bool), np.zeros((len(ids), len(self.atoms)), bool)
         for k, i in enumerate(ids):
             view = self._views[i]
-            truths[k] = [evaluate(atom, view, self._semantics) for atom in self._atoms]
+            truths[k] = [evaluate(atom, view, self._semantics) for atom in self.atoms]
             if self._is_conjunction:
                 reached[k] = truths[k].all()
             else:
@@ -57,7 +63,7 @@ def make_goals(
 
     Args:
         goal: The goal.
-        atoms: Atoms whose truth is told.
+        atoms: Atoms whose truth `check` returns, such as `Scene.goal_atoms`.
         views: State view of each simulation.
         semantics: Semantics of the predicates, `original` or `strict`.
         simulations: The simulations.

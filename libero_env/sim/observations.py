@@ -74,10 +74,12 @@ class Observer:
     Args:
         scene: Scene that is simulated.
         simulations: Simulations to observe.
-        views: State view of each simulation.
         observations: Names of the table above.
         cameras: Names of the cameras to render; empty for none.
         camera_size: Height and width of the images, pixels.
+
+    Attributes:
+        views: State view of each simulation.
 
     Raises:
         UnknownNameError: An observation or a camera does not exist.
@@ -88,7 +90,6 @@ class Observer:
         self,
         scene: Scene,
         simulations: Simulations,
-        views: Sequence[StateView],
         *,
         observations: Sequence[str] = DEFAULT_OBSERVATIONS,
         cameras: Sequence[str] = DEFAULT_CAMERAS,
@@ -100,7 +101,8 @@ class Observer:
         kinds = [kind for kind in SEGMENTATIONS if f"segmentation_{kind}" in observations]
         if len(kinds) > 1:
             raise LiberoError(f"observations: one kind of segmentation at a time, got {', '.join(kinds)}")
-        self.scene, self.simulations, self.views = scene, simulations, views
+        self.scene, self.simulations = scene, simulations
+        self.views = [StateView(scene, simulations, i) for i in range(simulations.num)]
         self.camera_size = (int(camera_size[0]), int(camera_size[1]))
         self.renderer = Renderer(scene.model, *self.camera_size, faithful=scene.drawing == FAITHFUL)
         self.segmentation = kinds[0] if kinds else None
@@ -316,7 +318,6 @@ class _EntityObserver:
 def make_observer(
     scene: Scene,
     simulations: Simulations,
-    views: Sequence[StateView],
     *,
     observations: Sequence[str],
     cameras: Sequence[str],
@@ -331,9 +332,7 @@ def make_observer(
     kind = Observer
     if simulations.back_end.is_warp:
         from libero_env.sim.mjwarp.pictures import WarpObserver as kind  # with the extra `warp` only
-    return kind(
-        scene, simulations, views, observations=observations, cameras=cameras, camera_size=camera_size
-    )
+    return kind(scene, simulations, observations=observations, cameras=cameras, camera_size=camera_size)
 
 
 def image_name(camera: str, kind: str) -> str:

@@ -24,9 +24,12 @@ from libero_env.mujoco_compat import log_warnings, set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.sim.model_checks import check_models
 from libero_env.tasks.checks import check_problem
-from libero_env.tasks.problem import Problem, Region
+from libero_env.tasks.problem import Atom, Problem, Region
 from libero_env.timing import TIMESTEP
 
+InitialStates = (
+    np.ndarray
+)  # (k, state_size) rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture]
 FAST, FAITHFUL = DRAWINGS = ("fast", "faithful")
 ROBOT = "robot"  # name of arm and gripper in contacts
 _MAX_IMAGE = 1024  # [pixels] largest edge of an image; size of the offscreen buffer
@@ -123,6 +126,47 @@ class Scene:
                         parts.append((name, int(model.geom_type[g]), *(f"{value:.5f}" for value in values)))
                 parts.append((name, f"{model.body_mass[body]:.6f}"))
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    @cached_property
+    def goal_atoms(self) -> tuple[Atom, ...]:
+        """Atoms of the goal, except those with variables of quantifiers."""
+        names = {*self.entities, *(region.address for region in self.problem.regions)}
+        return tuple(atom for atom in self.problem.goal.atoms() if names.issuperset(atom.args))
+
+    @property
+    def state_size(self) -> int:
+        """Length of an initial state."""
+        return 1 + self.model.nq + self.model.nv + 7 * len(self.fixtures)
+
+    def check_states(self, states: np.ndarray, source: object = "") -> None:
+        """Check that rows (k, n) begin with [time, qpos, qvel] of this scene, as those of the original do.
+
+        Args:
+            states: States.
+            source: Where they come from, for the message.
+
+        Raises:
+            LiberoError: They are too short.
+        """
+        size = 1 + self.model.nq + self.model.nv
+        if states.ndim != 2 or states.shape[1] < size:
+            where = f"{source}: " if source else ""
+            raise LiberoError(
+                f"{where}states of {states.shape[-1]} numbers; this task's begin with {size} of [time, qpos, qvel]. "
+                "Are they of another task, or of other models?"
+            )
+
+    def split_states(self, states: InitialStates) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Split states into qpos (k, nq), qvel (k, nv) and fixtures (k, nfixtures, 7), none where they have no poses.
+
+        Raises:
+            LiberoError: They have another length.
+        """
+        self.check_states(states)
+        _, qpos, qvel, fixtures = np.split(states, np.cumsum([1, self.model.nq, self.model.nv]), axis=1)
+        if fixtures.shape[1] % 7:
+            raise LiberoError(f"a state of {states.shape[1]} numbers; the poses at its end have 7 each")
+        return qpos, qvel, fixtures.reshape(len(states), -1, 7)
 
     def owner(self, address: str) -> str | None:
         """Return the object or fixture of a name or of a region's address; None if it belongs to neither."""

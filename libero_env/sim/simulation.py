@@ -15,7 +15,7 @@ import numpy as np
 
 from libero_env.errors import ClosedEnvironmentError
 from libero_env.mujoco_compat import MASS_FIELD, log_warnings
-from libero_env.sim.controller import Controller, ControllerState
+from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.engine import BackEnd
 from libero_env.sim.osc import REST, ArmIndex
 from libero_env.timing import SUBSTEPS
@@ -123,9 +123,18 @@ class Simulations(ABC):
         """Return the back end and what of it the numbers depend on, as plain data."""
         return {"backend": self.back_end.name}
 
-    def has_controller(self, controller: Controller) -> bool:
-        """Return whether a controller can run here."""
-        return True
+    def set_controller(self, name: str, control_delta: bool = True, rest: np.ndarray = REST) -> None:
+        """Choose the controller, before the first reset.
+
+        Args:
+            name: Name in the table of `libero_env.sim.controller`.
+            control_delta: Whether actions are relative.
+            rest: Joints that the controller takes for the arm's rest pose, (7,) [rad].
+        """
+        self.controller_state, self.rest = (
+            ControllerState(self.num, get_controller(name, control_delta)),
+            rest,
+        )
 
     def close(self) -> None:
         """Free the simulations. Idempotent."""
@@ -240,6 +249,15 @@ class Simulations(ABC):
         self.reset([i], qpos[None], qvel[None], float(time[0]), fixtures.reshape(1, nfixtures, 7))
         self._set_warm_start(i, warm_start)
         self.controller_state.unpack(i, controller)
+
+    def physics_state(self, i: int) -> np.ndarray:
+        """Return [time, qpos, qvel] of simulation i, the original's layout."""
+        return np.concatenate([[self.time(i)], self.fields["qpos"][i], self.fields["qvel"][i]])
+
+    def set_physics_state(self, i: int, state: np.ndarray) -> None:
+        """Restore [time, qpos, qvel] of simulation i; the controller is reset and holds the pose."""
+        nq = self.model.nq
+        self.reset([i], state[None, 1 : 1 + nq], state[None, 1 + nq :], float(state[0]))
 
     @property
     def state_size(self) -> int:

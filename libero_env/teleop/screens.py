@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from libero_env.envs.world import World
+from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, RenderError
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.predicates import glowing_sites
@@ -136,7 +136,7 @@ class Window:
         self.glfw.set_key_callback(self.window, self._on_key)
         self.context: mujoco.MjrContext | None = None
 
-    def poll(self, world: World) -> None:
+    def poll(self, env: BatchEnv) -> None:
         """See `Screen`."""
         self.glfw.poll_events()
         if self.reader is not None:
@@ -144,15 +144,15 @@ class Window:
         if self.glfw.window_should_close(self.window):
             self.keyboard.press(QUIT)
 
-    def show(self, world: World, status: Status) -> None:
+    def show(self, env: BatchEnv, status: Status) -> None:
         """See `Screen`."""
-        model, data = world.simulations.model, world.simulations.data(0)
+        model, data = env.simulations.model, env.simulations.data(0)
         self.glfw.make_context_current(self.window)
         if self.context is None:
             self.context = self._make_context(model)
         area = mujoco.MjrRect(0, 0, *self.glfw.get_framebuffer_size(self.window))
         mujoco.mj_camlight(model, data)
-        self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(world.views[0]))  # glows while a stove is on
+        self.option.sitegroup[GLOW_GROUP] = bool(glowing_sites(env.views[0]))  # glows while a stove is on
         mujoco.mjv_updateScene(
             model, data, self.option, None, self.view, mujoco.mjtCatBit.mjCAT_ALL, self.scene
         )
@@ -222,19 +222,19 @@ class Terminal:
         self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
         print(f"\x1b[2J{HELP}")
 
-    def poll(self, world: World) -> None:
+    def poll(self, env: BatchEnv) -> None:
         """See `Screen`."""
         while select.select([sys.stdin], [], [], 0.0)[0]:
             press_typed(self.keyboard, os.read(sys.stdin.fileno(), 64).decode(errors="ignore"))
         if self.reader is not None:
             self.reader.poll()
 
-    def show(self, world: World, status: Status) -> None:
+    def show(self, env: BatchEnv, status: Status) -> None:
         """See `Screen`; every fourth state is shown."""
         if status.step % _STEPS_PER_IMAGE == 1:
             columns, lines = shutil.get_terminal_size()
             edge = max(min(columns, 2 * (lines - 6)) // 2 * 2, 8)
-            image = Image.fromarray(world.render(0, self.camera)).resize((edge, edge))
+            image = Image.fromarray(env.observer.render(0, self.camera)).resize((edge, edge))
             print(f"\x1b[4;1H{as_text(np.asarray(image))}\n\x1b[K{status}", flush=True)
         self.clock.wait()
 

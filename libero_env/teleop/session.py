@@ -15,7 +15,7 @@ from libero_env.demos.config import DemoConfig
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter
-from libero_env.envs.world import World
+from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
 from libero_env.teleop.devices import QUIT, Device
 
@@ -50,11 +50,11 @@ class Status:
 class Screen(Protocol):
     """What the user looks at and types into."""
 
-    def poll(self, world: World) -> None:
+    def poll(self, env: BatchEnv) -> None:
         """Pass the user's input to the device; called once per control step."""
         ...
 
-    def show(self, world: World, status: Status) -> None:
+    def show(self, env: BatchEnv, status: Status) -> None:
         """Show the state, and wait until the control step has lasted 50 ms."""
         ...
 
@@ -75,7 +75,7 @@ class Teleop:
     ):
         self.task, self.device, self.screen = task, device, screen
         self.seed, self.hold_steps = seed, hold_steps
-        self.world = World(task, 1, cameras=(), camera_size=VIEW_SIZE)
+        self.env = BatchEnv(task, 1, cameras=(), camera_size=VIEW_SIZE)
         self.rng = np.random.default_rng(seed)
 
     def episode(self, recorded: int = 0, target: int = 1) -> Episode | None:
@@ -96,31 +96,32 @@ class Teleop:
         while self.device.command != QUIT:
             self.device.command = None
             self.device.restart()
-            self.world.reset_random([0], [self.rng])
+            self.env.generators[0] = self.rng
+            self.env.reset()
             if (episode := self._attempt(recorded, target)) is not None:
                 return episode
         return None
 
     def _attempt(self, recorded: int, target: int) -> Episode | None:
         """Run an episode; return None when the user gives a command."""
-        world, actions, states, held = self.world, [], [], 0
-        fixtures = world.simulations.fixtures[0].copy()
+        env, actions, states, held = self.env, [], [], 0
+        fixtures = env.simulations.fixtures[0].copy()
         while held < self.hold_steps:
-            self.screen.poll(world)
+            self.screen.poll(env)
             if self.device.command is not None:
                 return None
             action = self.device.action()
-            states.append(world.physics_state(0))
+            states.append(env.simulations.physics_state(0))
             actions.append(action)
-            world.step([0], action[None])
-            success, progress = world.check_goal(0)
+            env.simulations.step([0], action[None])
+            success, progress = env.check_goal(0)
             held = held + 1 if success else 0
-            self.screen.show(world, Status(self.task.language, progress, len(actions), recorded, target))
+            self.screen.show(env, Status(self.task.language, progress, len(actions), recorded, target))
         return Episode(np.array(actions), np.array(states), fixtures=fixtures)
 
     def close(self) -> None:
         """Free the simulation."""
-        self.world.close()
+        self.env.close()
 
 
 def record_session(

@@ -9,7 +9,6 @@ from libero_env.assets.pack import BUILTIN, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.config import EnvConfig
-from libero_env.envs.world import World
 from libero_env.init_states.original_resets import OriginalResets, drawn_fixtures
 from libero_env.init_states.store import load_original_states
 from libero_env.sim.scene import Scene, default_drawing
@@ -31,15 +30,14 @@ class ProtocolEnv:
         env: The simulations.
         card: The protocol.
         num_envs: Number of simulations.
+        scene: Compiled scene of the task.
+        simulations: Physics and controllers.
+        views: State view of each simulation.
     """
 
     def __init__(self, env: BatchEnv, card: Card):
         self.env, self.card, self.num_envs = env, card, env.num_envs
-
-    @property
-    def world(self) -> World:
-        """Simulations, scene and observer."""
-        return self.env.world
+        self.scene, self.simulations, self.views = env.scene, env.simulations, env.views
 
     @property
     def task(self) -> Task:
@@ -78,8 +76,7 @@ class ProtocolEnv:
         if self.card.world.fixture_poses == "stored":
             return self.env.reset(seed=seed, options=options)
         starts = np.broadcast_to(options["init_state"], (self.num_envs,)).tolist()
-        world = self.env.world
-        rows = start_rows(world.base_task, world.base_scene, self.card, starts, self._stored())
+        rows = start_rows(self.env.base_task, self.env.base_scene, self.card, starts, self._stored())
         return self.env.reset(seed=seed, options={**options, "start": rows})
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -93,9 +90,8 @@ class ProtocolEnv:
     def _stored(self) -> np.ndarray:
         """Return the initial states of the task that the protocol names, rows that begin with [time, qpos, qvel]."""
         if self.card.world.init_states == "builtin":
-            return self.env.world.init_states
-        world = self.env.world
-        states = load_original_states(world.base_task, world.base_scene)
+            return self.env.init_states
+        states = load_original_states(self.env.base_task, self.env.base_scene)
         if states is None:
             raise ConfigError(
                 f"{self.env.task.id}: protocol {self.card.name} starts from the states that LIBERO publishes, which "

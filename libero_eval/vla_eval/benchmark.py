@@ -246,7 +246,7 @@ class LiberoBenchmark(StepBenchmark):
 
     def render(self) -> np.ndarray | None:
         """Return the present image of the agent's camera, (H, W, 3) uint8."""
-        return None if self._env is None else self._env.world.render(0, "agentview")
+        return None if self._env is None else self._env.env.observer.render(0, "agentview")
 
     def _open(self, task: Task) -> ProtocolEnv:
         """Return the simulation of a task; it is kept for all of the task's episodes."""
@@ -271,7 +271,7 @@ class LiberoBenchmark(StepBenchmark):
         from vla_eval.rotation import matrix_to_quat, quat_to_axisangle
 
         assert self._env is not None
-        view = self._env.world.views[0]
+        view = self._env.views[0]
         rotation = quat_to_axisangle(matrix_to_quat(np.asarray(view.eef_mat, np.float32)))
         parts = [
             np.asarray(view.eef_pos, np.float32),

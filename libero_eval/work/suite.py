@@ -197,7 +197,7 @@ class SuiteEvaluation:
         filmed = [i for i, start in enumerate(unit.starts) if start in self.init_states[: self.videos]]
         with self.actor(_acted_task(env, unit), unit.starts) as actor:
             if isinstance(actor, WatchesWorld):
-                actor.watch(env.world)  # type: ignore[attr-defined]  # of every environment of this package
+                actor.watch(env)  # type: ignore[arg-type]  # of every environment of this package
             return run_episodes(
                 actor,
                 env,

@@ -17,7 +17,7 @@ from lifelong.training.precision import autocast
 from lifelong.types import Observation, PolicySpec
 
 if TYPE_CHECKING:
-    from libero_env.envs.world import World
+    from libero_env.envs.batch import BatchEnv
 
 ACTION_DIM = 7
 
@@ -52,7 +52,7 @@ class TakesNote(Protocol):
 class WatchesWorld(Protocol):
     """An actor that sees the whole state, as no policy does; it is given the simulations before the episodes."""
 
-    def watch(self, world: "World") -> None:
+    def watch(self, env: "BatchEnv") -> None:
         """Receive the simulations of the next episodes."""
 
 

@@ -17,20 +17,16 @@ def describe_environment(env: VectorEnv) -> dict[str, Any]:
         env: Environment; one that is not a `libero_env.envs.batch.BatchEnv` contributes nothing.
     """
     found: dict[str, Any] = {}
-    if (world := getattr(env, "world", None)) is not None:
-        scene = world.scene
+    scene, simulations = getattr(env, "scene", None), getattr(env, "simulations", None)
+    if scene is not None and simulations is not None:
         found |= {
             "models": scene.pack.name,
             "models_digest": getattr(scene.pack, "digest", None),
             "robot": scene.robot,
             "drawing": scene.drawing,
-            **world.simulations.record(),
+            **simulations.record(),
         }
-    if (
-        (config := getattr(env, "config", None)) is not None
-        and config.cameras
-        and not config.back_end.is_warp
-    ):
+    if (config := getattr(env, "config", None)) is not None and config.cameras and not config.backend.is_warp:
         backend, renderer = renderer_name()
         found |= {"gl": backend, "renderer": renderer}
     return found | {

@@ -44,12 +44,12 @@ def wander(env, experts, noise, max_steps):
     for _ in range(STEPS):
         action = rng.uniform(-1, 1, (env.num_envs, 7))
         for i in range(len(experts)):
-            states[i].append(env.world.physics_state(i))
+            states[i].append(env.simulations.physics_state(i))
             actions[i].append(action[i])
         env.step(action)
     for i, rows in enumerate(states):
-        rows.append(env.world.physics_state(i))
+        rows.append(env.simulations.physics_state(i))
     return [
-        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "", env.world.simulations.fixtures[i].copy())
+        Attempt(True, np.array(s), np.array(a), np.array(a), 0, "", env.simulations.fixtures[i].copy())
         for i, (s, a) in enumerate(zip(states, actions, strict=True))
     ]

@@ -76,7 +76,7 @@ def test_native_environments_draw_the_same(original, shared):
     recorded = np.load(shared / "pixels" / "libero_goal-00.npz")
     env = LiberoEnv(f"{recorded['suite']}/{recorded['task_id']}", camera_size=(128, 128))
     poses = json.loads(str(recorded["fixtures"]))
-    env.world.simulations.fixtures[0] = [poses[name] for name in env.world.scene.fixtures]
+    env.simulations.fixtures[0] = [poses[name] for name in env.scene.fixtures]
     observed = env.set_state(recorded["state"])
     env.close()
     for camera in CAMERAS:  # both drawn in one call

@@ -45,11 +45,11 @@ def collected(tmp_path_factory):
     path, task = tmp_path_factory.mktemp("collected") / "demo.hdf5", get_task(TASK)
     env = BatchEnv(task, 2, num_threads=1, cameras=())
     env.reset(seed=0)
-    fixtures, rng = env.world.simulations.fixtures.copy(), np.random.default_rng(0)
+    fixtures, rng = env.simulations.fixtures.copy(), np.random.default_rng(0)
     states, actions = [[], []], rng.uniform(-1, 1, (6, 2, 7))
     for action in actions:
         for i in range(2):
-            states[i].append(env.world.physics_state(i))
+            states[i].append(env.simulations.physics_state(i))
         env.step(action)
     env.close()
     header = make_header(
@@ -310,10 +310,10 @@ class Leaver:
     def __init__(self, keyboard):
         self.keyboard = keyboard
 
-    def poll(self, world):
+    def poll(self, env):
         self.keyboard.press(QUIT)
 
-    def show(self, world, status):
+    def show(self, env, status):
         """Nothing."""
 
     def close(self):

@@ -8,7 +8,7 @@ import pytest
 from libero_env.assets.pack import select_pack
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.settle import start_faults
-from libero_env.init_states.store import load_init_states, split_row
+from libero_env.init_states.store import load_init_states
 from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import build_scene
@@ -72,7 +72,7 @@ def test_init_states_are_at_rest_in_the_regions_of_the_task(key):
     scene = build_scene(task.problem)
     rows = load_init_states(task, scene)
     assert len(rows) == 50 and len(np.unique(rows, axis=0)) == 50
-    qpos, qvel, fixtures = split_row(scene.model, rows)
+    qpos, qvel, fixtures = scene.split_states(rows)
     simulations = LoopSimulations(scene.model, 1, scene.fixture_bodies)
     view = StateView(scene, simulations)
     for i in np.random.default_rng(TASKS.index(key)).choice(50, 2, replace=False):
@@ -91,7 +91,7 @@ def test_states_of_the_original_fit(shared, settling, key):
     suite, record = task.suite, settling[key]
     assert 1 + scene.model.nq + scene.model.nv == record["state_size"]
     rows = read_states(shared / "official" / "init_files" / suite / f"{task.name}.pruned_init")
-    qpos, qvel, _ = split_row(scene.model, rows)
+    qpos, qvel, _ = scene.split_states(rows)
     simulations = LoopSimulations(scene.model, 1, scene.fixture_bodies)
     view = StateView(scene, simulations)
     for i in (0, 20):
@@ -155,6 +155,6 @@ def test_starts_of_a_file_follow_its_regions(tmp_path, monkeypatch):
         file.write_text(text.replace(region, where))
         task = read_task(file)
         scene = build_scene(task.problem)
-        qpos, _, _ = split_row(scene.model, load_init_states(task, scene))
+        qpos, _, _ = scene.split_states(load_init_states(task, scene))
         found.append(qpos[0, scene.model.joint("plate_1_joint0").qposadr[0]])
     assert found[1] - found[0] > 0.07

@@ -25,7 +25,7 @@ def expert(monkeypatch):
     seen = SimpleNamespace(solves=lambda row: True, joints=[])
 
     def run(env, experts):
-        rows = env.world.simulations.fields["qpos"][: len(experts), :7]
+        rows = env.simulations.fields["qpos"][: len(experts), :7]
         seen.joints.append(rows.copy())
         return [SimpleNamespace(success=bool(seen.solves(row)), reason="too far") for row in rows]
 

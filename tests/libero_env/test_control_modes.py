@@ -28,14 +28,14 @@ def make(mode, cls=LiberoEnv, *args, **kwargs):
 
 def commands(env, steps, num, seed=0):
     """Return actions that move the arm a little with any controller."""
-    rng, controller = np.random.default_rng(seed), env.world.controller
+    rng, controller = np.random.default_rng(seed), env.simulations.controller_state.controller
     small = rng.uniform(-1, 1, (steps, num, controller.action_dim))
     if controller.control_delta:
         return small
     here = {
         "osc_pose": np.append(env.view.eef_pos, [np.pi, 0, 0]),
         "osc_position": env.view.eef_pos,
-        "joint_position": env.world.simulations.fields["qpos"][0, :7],
+        "joint_position": env.simulations.fields["qpos"][0, :7],
     }[controller.name]
     return np.append(here, 0.0) + small * np.append(np.full(here.size, 0.05), 1.0)
 
@@ -65,7 +65,7 @@ def test_batch_and_states_give_the_same_bits(mode):
 @pytest.mark.parametrize("mode", MODES, ids=str)
 def test_the_action_space_is_that_of_the_controller(mode):
     env = make(mode)
-    assert env.action_space.shape == (env.world.controller.action_dim,)
+    assert env.action_space.shape == (env.simulations.controller_state.controller.action_dim,)
     env.reset(options={"init_state": 0})
     env.action_space.seed(0)
     env.step(env.action_space.sample())
@@ -81,7 +81,7 @@ def test_starts_do_not_depend_on_the_controller(mode):
     np.testing.assert_array_equal(
         env.reset(seed=4)[0]["joint_states"], usual.reset(seed=4)[0]["joint_states"]
     )
-    np.testing.assert_array_equal(env.world.physics_state(0), usual.world.physics_state(0))
+    np.testing.assert_array_equal(env.simulations.physics_state(0), usual.simulations.physics_state(0))
     env.close()
     usual.close()
 
@@ -105,13 +105,13 @@ def test_absolute_joints_are_reached_and_deltas_are_relative_to_the_present():
     for delta in (True, False):
         env = make(("joint_position", delta))
         env.reset(options={"init_state": 0})
-        start = env.world.simulations.fields["qpos"][0, :7].copy()
+        start = env.simulations.fields["qpos"][0, :7].copy()
         goal = start + [0.2, -0.1, 0.1, 0.15, -0.1, 0.1, 0.2]
         for _ in range(80):
-            now = env.world.simulations.fields["qpos"][0, :7]
+            now = env.simulations.fields["qpos"][0, :7]
             move = np.clip((goal - now) / JOINT_SCALE, -1, 1) if delta else goal
             env.step(np.append(move, 0.0))
-        np.testing.assert_allclose(env.world.simulations.fields["qpos"][0, :7], goal, atol=0.02)
+        np.testing.assert_allclose(env.simulations.fields["qpos"][0, :7], goal, atol=0.02)
         env.close()
 
 

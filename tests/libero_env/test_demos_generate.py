@@ -51,7 +51,7 @@ def test_observations_are_those_of_the_environment(whole):
     env = LiberoEnv(TASK, camera_size=SIZE)
     obs = env.set_state(demo.states[0])
     for t, action in enumerate(demo.actions):
-        np.testing.assert_allclose(env.world.physics_state(0)[1:], demo.states[t][1:], atol=1e-6)
+        np.testing.assert_allclose(env.simulations.physics_state(0)[1:], demo.states[t][1:], atol=1e-6)
         for key in ("joint_states", "gripper_states", "ee_pos", "ee_ori"):
             np.testing.assert_allclose(obs[key], demo.obs[key][t], atol=1e-6)
         for key in ("agentview_rgb", "eye_in_hand_rgb"):

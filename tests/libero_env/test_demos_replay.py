@@ -36,7 +36,7 @@ def path(tmp_path_factory):
 
 
 def test_poses_of_fixtures_are_recorded(path):
-    scene = LiberoEnv(TASK, cameras=()).world.scene
+    scene = LiberoEnv(TASK, cameras=()).scene
     episodes = list(read_episodes(path))
     poses = [episode.fixtures for episode in episodes]
     assert not np.allclose(poses[0], poses[1], atol=1e-6)  # they differ from start to start
@@ -180,7 +180,7 @@ def test_files_of_the_original_work_with_every_tool(path, tmp_path):
 
 def test_recorded_models_have_the_joints_of_the_states(path):
     episode = next(read_episodes(path))
-    model = LiberoEnv(TASK, cameras=()).world.scene.model
+    model = LiberoEnv(TASK, cameras=()).scene.model
     assert all(f'name="{model.joint(j).name}"' in episode.attrs["model_file"] for j in range(model.njnt))
 
 
@@ -224,8 +224,8 @@ def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
     env = LiberoEnv(TASK, cameras=())
     for i, episode in enumerate(read_episodes(tmp_path / "a.hdf5")):
         env.reset(options={"init_state": i})
-        np.testing.assert_array_equal(episode.states[0], env.world.physics_state(0))
-        np.testing.assert_array_equal(episode.fixtures, env.world.simulations.fixtures[0])
+        np.testing.assert_array_equal(episode.states[0], env.simulations.physics_state(0))
+        np.testing.assert_array_equal(episode.fixtures, env.simulations.fixtures[0])
 
 
 def test_a_header_is_computed_once_per_job(tmp_path, monkeypatch):

@@ -86,7 +86,7 @@ def test_states_of_the_original_are_accepted(env, shared):
         state = z["states"][0]
     env0 = LiberoEnv("libero_object/0", cameras=())
     env0.set_state(state)
-    np.testing.assert_array_equal(env0.world.physics_state(0), state)
+    np.testing.assert_array_equal(env0.simulations.physics_state(0), state)
     with pytest.raises(LiberoError, match="finite numbers"):
         env0.set_state(state[:-1])
 
@@ -104,7 +104,7 @@ def test_the_horizon_truncates():
 def test_reaching_the_goal_terminates(env):
     """With the target moved into the basket, the goal is true and the episode ends."""
     env.reset(options={"init_state": 0})
-    state, scene = env.world.physics_state(0), env.world.scene
+    state, scene = env.simulations.physics_state(0), env.scene
     target = env.task.problem.goal.parts[0].args[0] if hasattr(env.task.problem.goal, "parts") else None
     target = target or env.task.problem.goal.args[0]
     address = 1 + scene.model.joint(f"{target}_joint0").qposadr[0]
@@ -195,9 +195,8 @@ def test_a_batch_is_a_gymnasium_vector_environment():
 @pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.id)
 def test_initial_states_are_at_rest_in_their_regions(task):
     env = LiberoEnv(task, cameras=())
-    world, nq = env.world, env.world.scene.model.nq
-    states = world.init_states
-    assert states.shape == (50, 1 + nq + world.scene.model.nv)
+    states = env.batch.init_states
+    assert states.shape == (50, env.scene.state_size)
     assert len(np.unique(states[:, 1:], axis=0)) == 50
     for i in range(0, 50, 7):
         env.reset(options={"init_state": i})
@@ -205,10 +204,10 @@ def test_initial_states_are_at_rest_in_their_regions(task):
             (x0, y0, x1, y1), *_ = task.problem.region(atom.args[1]).ranges
             x, y, _ = env.view.body_pos(atom.args[0])
             assert x0 - 2e-3 < x < x1 + 2e-3 and y0 - 2e-3 < y < y1 + 2e-3
-        before = world.simulations.fields["qpos"][0].copy()
+        before = env.simulations.fields["qpos"][0].copy()
         for _ in range(10):
             assert not env.step(np.zeros(7))[4]["success"]
-        moved = np.abs(world.simulations.fields["qpos"][0] - before)[world.scene.nq_robot :]
+        moved = np.abs(env.simulations.fields["qpos"][0] - before)[env.scene.nq_robot :]
         assert moved.max() < 5e-3
     env.close()
 
@@ -244,7 +243,7 @@ def test_a_batch_reports_the_progress_of_each_atom():
     assert env.atoms == (f"(Close {drawer})", f"(In akita_black_bowl_1 {drawer})")
     np.testing.assert_array_equal(info["progress"], [[False, False], [False, False]])
     state = env.get_state(0)
-    qpos = env.world.scene.model.joint("white_cabinet_1_bottom_level").qposadr[0]
+    qpos = env.scene.model.joint("white_cabinet_1_bottom_level").qposadr[0]
     state[1 + qpos] = 0.0015  # pushed in, empty
     env.set_state(0, state)
     info = env.step(np.zeros((2, 7)))[-1]

@@ -2,23 +2,15 @@
 
 import dataclasses
 import inspect
-from typing import get_type_hints
 
 import pytest
 
 from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv, SubprocEnv
-from libero_env.envs.config import EnvOptions
-from libero_env.envs.world import World
 from libero_env.errors import UnknownNameError
 
 TASK = "libero_object/0"
 FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
-ENVIRONMENTS = [LiberoEnv, BatchEnv, SubprocEnv, World]
-
-
-@pytest.mark.unit
-def test_options_have_the_names_and_types_of_the_fields():
-    assert get_type_hints(EnvOptions) == get_type_hints(EnvConfig)
+ENVIRONMENTS = [LiberoEnv, BatchEnv, SubprocEnv]
 
 
 @pytest.mark.unit
@@ -42,11 +34,10 @@ def test_the_signature_shows_the_options_with_their_default_values(environment):
     [
         lambda **options: LiberoEnv(TASK, **options),
         lambda **options: BatchEnv(TASK, 2, **options),
-        lambda **options: World(TASK, **options),
         lambda **options: SubprocEnv([{"task": TASK}], **options),
         lambda **options: SubprocEnv([{"task": TASK, **options}]),
     ],
-    ids=["LiberoEnv", "BatchEnv", "World", "SubprocEnv", "specs of SubprocEnv"],
+    ids=["LiberoEnv", "BatchEnv", "SubprocEnv", "specs of SubprocEnv"],
 )
 def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
     with pytest.raises(UnknownNameError, match="camera_siz'.*'camera_size'.*control_delta"):

@@ -278,8 +278,8 @@ def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped():
     task = get_task("libero_goal/1")
     env = BatchEnv(task, 6, cameras=())
     env.reset(options={"init_state": range(6)})
-    shapes = Shapes(env.world.scene)
-    for view in env.world.views:
+    shapes = Shapes(env.scene)
+    for view in env.views:
         (step,) = plan_goal(task.problem.goal, view)
         plan = plan_pick(view, shapes, step.atom)
         bowl = view.body_pos("akita_black_bowl_1")
@@ -499,8 +499,8 @@ def test_every_task_is_reached_and_stays_reached(task):
     assert np.abs(attempt.actions).max() <= 1.0 and len(attempt) < 160
     hold = np.array([[0.0] * 6 + [-1.0]])
     for _ in range(12):  # let go of, it comes to rest in the basket
-        env.world.step([0], hold)
-    assert env.world.check_goal(0)[0]
+        env.simulations.step([0], hold)
+    assert env.check_goal(0)[0]
     env.close()
 
 
@@ -511,7 +511,7 @@ def test_what_one_simulation_does_depends_on_no_other():
     def run(starts, slot):
         env = BatchEnv(task, len(starts), num_threads=2, cameras=())
         env.reset(seed=starts)
-        shapes = Shapes(env.world.scene)
+        shapes = Shapes(env.scene)
         experts = [Expert(task, np.random.default_rng(s), shapes=shapes) for s in starts]
         noise = [ActionNoise(np.random.default_rng(s)) for s in starts]
         attempt = run_experts(env, experts, noise, max_steps=60)[slot]

@@ -88,14 +88,14 @@ def make_task(tmp_path, category, region, state, begin, place, yaw):
 def run(env, skills, steps=STEPS):
     """Let each skill act in its simulation; return the actions (steps, num, 7) and which goals were reached (num,)."""
     reached = np.zeros(len(skills), bool)
-    views, rest, taken = env.world.views, np.array([0.0] * 6 + [-1.0]), []
+    views, rest, taken = env.views, np.array([0.0] * 6 + [-1.0]), []
     for _ in range(steps):
         done = [skill.done(view) for skill, view in zip(skills, views, strict=True)]
         if all(done):
             break
         actions = [rest if d else s.act(v) for d, s, v in zip(done, skills, views, strict=True)]
-        env.world.step(np.arange(len(skills)), np.array(actions))
-        reached |= [env.world.check_goal(i)[0] for i in range(len(skills))]
+        env.simulations.step(np.arange(len(skills)), np.array(actions))
+        reached |= [env.check_goal(i)[0] for i in range(len(skills))]
         taken.append(actions)
     return np.array(taken), reached
 
@@ -106,7 +106,7 @@ def test_a_joint_is_moved_and_stays(tmp_path, case):
     env = BatchEnv(task, SEEDS, num_threads=1, cameras=())
     env.reset(seed=0)
     atom = Atom(case[2].capitalize(), (address,))
-    assert not any(evaluate(atom, view) for view in env.world.views)
+    assert not any(evaluate(atom, view) for view in env.views)
     skills = [
         MoveJoint(address, case[2], style=MotionStyle.sample(np.random.default_rng(i))) for i in range(SEEDS)
     ]
@@ -114,8 +114,8 @@ def test_a_joint_is_moved_and_stays(tmp_path, case):
     assert np.abs(actions).max() <= 1.0
     rest = np.tile([0.0] * 6 + [-1.0], (SEEDS, 1))
     for _ in range(10):
-        env.world.step(np.arange(SEEDS), rest)
-    held = sum(evaluate(atom, view) for view in env.world.views)
+        env.simulations.step(np.arange(SEEDS), rest)
+    held = sum(evaluate(atom, view) for view in env.views)
     env.close()
     # its bars are 2 cm long and taper, and its door is closed only while it is pressed against its stop
     least = 0.8 if case[0].startswith("short") else 0.9
@@ -141,7 +141,7 @@ def test_a_reached_state_needs_no_motion(tmp_path):
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
     skill = MoveJoint(address, "open")
-    assert skill.done(env.world.views[0]) and skill.retries == 0
+    assert skill.done(env.views[0]) and skill.retries == 0
     env.close()
 
 
@@ -150,7 +150,7 @@ def test_a_fixture_without_the_joint_is_reported(tmp_path):
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
     skill = MoveJoint("fixture_1_top_side", "open")
-    np.testing.assert_array_equal(skill.act(env.world.views[0])[:6], 0.0)
+    np.testing.assert_array_equal(skill.act(env.views[0])[:6], 0.0)
     assert "fixture_1_top_side" in skill.failure_reason
     env.close()
 
@@ -160,7 +160,7 @@ def test_the_handle_is_found_in_front(tmp_path, case):
     task, address = make_task(tmp_path, *case)
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
-    view = env.world.views[0]
+    view = env.views[0]
     part = Part.from_joint(view.scene.model, view.scene.joints[address][0])
     handle = find_handle(view, part, -1.0)
     assert np.linalg.norm(handle.out) == pytest.approx(1.0) and abs(handle.out @ handle.along) < 1e-6
@@ -186,7 +186,7 @@ def poses(number, seed=0):
 
 def test_the_wrist_bends_as_inverse_kinematics_says():
     env = BatchEnv("libero_goal/7", 1, num_threads=1, cameras=())
-    arm, base = ArmKinematics(env.world.scene.model), np.array(env.world.scene.workspace.robot_base_pos)
+    arm, base = ArmKinematics(env.scene.model), np.array(env.scene.workspace.robot_base_pos)
     env.close()
     pos, mat = poses(60)
     expected = wrist_bend(pos, mat, base)
@@ -225,7 +225,7 @@ def test_the_collision_depth_of_the_hand():
 def test_the_hand_leans_over_a_knob_close_to_the_base():
     env = BatchEnv(get_task("libero_goal/7"), 1, num_threads=1, cameras=())
     env.reset(options={"init_state": 8})
-    view = env.world.views[0]
+    view = env.views[0]
     part = Part.from_joint(view.scene.model, view.scene.joints["flat_stove_1"][0])
     hold, base = grasp_knob(view, part, 0.8), np.array(view.scene.workspace.robot_base_pos)
     ends = [hold.contact, part.pose_after(view, hold.contact, 0.8)]
@@ -240,7 +240,7 @@ def test_a_door_may_rotate_under_the_hand(tmp_path):
     task, address = make_task(tmp_path, *next(c for c in CASES if c[0] == "short_fridge" and c[2] == "close"))
     env = BatchEnv(task, 1, num_threads=1, cameras=())
     env.reset(seed=0)
-    view = env.world.views[0]
+    view = env.views[0]
     part = Part.from_joint(view.scene.model, view.scene.joints[address][0])
     delta = -part.value(view)
     hold = grasp_handle(view, part, find_handle(view, part, 1.0), delta, False)

@@ -31,7 +31,7 @@ def kitchen():
 
 def world_points(env, camera, depth):
     """Return the world position of each pixel's surface, (H, W, 3), from depth and camera parameters."""
-    observer = env.world.observer
+    observer = env.observer
     rows, cols = np.indices(depth.shape)
     rays = (
         np.stack([cols + 0.5, rows + 0.5, np.ones(depth.shape)], -1)
@@ -42,7 +42,7 @@ def world_points(env, camera, depth):
 
 
 def turned_on(env):
-    state, model = env.get_state(), env.world.scene.model
+    state, model = env.get_state(), env.scene.model
     state[1 + model.joint("flat_stove_1_button").qposadr[0]] = 1.5
     return state
 
@@ -67,7 +67,7 @@ def test_default_observations_are_images_and_proprioception():
 
 def test_depth_and_segmentation_agree_with_object_positions(kitchen):
     seen = kitchen.render_cameras()
-    labels = kitchen.world.observer.labels()
+    labels = kitchen.observer.labels()
     points = world_points(kitchen, "agentview", seen["agentview_depth"])
     found = 0
     for number, name in labels.items():
@@ -82,9 +82,9 @@ def test_depth_and_segmentation_agree_with_object_positions(kitchen):
 
 
 def test_the_hands_camera_moves_with_the_hand(kitchen):
-    data = kitchen.world.simulations.data(0)
-    camera = kitchen.world.scene.model.camera("robot0_eye_in_hand").id
-    pose = kitchen.world.observer.camera_to_world(0, "robot0_eye_in_hand")
+    data = kitchen.simulations.data(0)
+    camera = kitchen.scene.model.camera("robot0_eye_in_hand").id
+    pose = kitchen.observer.camera_to_world(0, "robot0_eye_in_hand")
     np.testing.assert_allclose(pose[:3, 3], data.cam_xpos[camera], atol=1e-9)
     np.testing.assert_allclose(pose[:3, 2], -data.cam_xmat[camera].reshape(3, 3)[:, 2], atol=1e-9)
 
@@ -102,13 +102,12 @@ def test_each_camera_has_its_own_headlight():
 
 
 def test_kinds_of_segmentation_agree(kitchen):
-    world = kitchen.world
     of = {
-        kind: world.render(0, "agentview", f"segmentation_{kind}")
+        kind: kitchen.observer.render(0, "agentview", f"segmentation_{kind}")
         for kind in ("instance", "class", "element")
     }
-    names = {kind: world.observer.labels(kind) for kind in of}
-    scene = world.scene
+    names = {kind: kitchen.observer.labels(kind) for kind in of}
+    scene = kitchen.scene
     for instance, category, element in {*zip(*(of[kind].ravel().tolist() for kind in of), strict=True)}:
         name = names["instance"][instance]
         expected = scene.entities[name].category if name in scene.entities else name
@@ -121,7 +120,7 @@ def test_kinds_of_segmentation_agree(kitchen):
 
 def test_poses_in_the_hand_frame_transform_back_to_the_world(kitchen):
     seen = kitchen.set_state(kitchen.get_state())
-    for name in kitchen.world.scene.entities:
+    for name in kitchen.scene.entities:
         back = quat_rotate(seen["ee_quat"][None], seen[f"{name}_to_ee_pos"][None])[0] + seen["ee_pos"]
         np.testing.assert_allclose(back, seen[f"{name}_pos"], atol=1e-9)
         quat = quat_multiply(seen["ee_quat"][None], seen[f"{name}_to_ee_quat"][None])[0]
@@ -136,8 +135,8 @@ def test_a_glowing_site_is_visible_only_while_turned_on(kitchen):
     assert glowing_sites(kitchen.view)
     redder = on["agentview_rgb"].astype(int)[..., 0] - off["agentview_rgb"].astype(int)[..., 0]
     assert (redder > 100).sum() > 5
-    element = kitchen.world.render(0, "agentview", "segmentation_element")
-    site = 1 + kitchen.world.scene.model.ngeom + next(iter(glowing_sites(kitchen.view)))
+    element = kitchen.observer.render(0, "agentview", "segmentation_element")
+    site = 1 + kitchen.scene.model.ngeom + next(iter(glowing_sites(kitchen.view)))
     assert (element == site).any()
     again = kitchen.set_state(before)
     np.testing.assert_array_equal(again["agentview_rgb"], off["agentview_rgb"])
@@ -167,7 +166,7 @@ def test_one_simulation_and_many_have_the_same_observations():
 def test_images_are_rendered_only_on_request(make, monkeypatch):
     env = make(TASK, camera_size=(16, 16))
     drawn = []
-    renderer = env.world.observer.renderer
+    renderer = env.observer.renderer
     render = renderer.render
     monkeypatch.setattr(renderer, "render", lambda *args: drawn.append(1) or render(*args))
     env.render_images = False
@@ -201,7 +200,7 @@ def test_staged_rewards_increase_towards_the_goal_and_only_success_gives_one(kit
     env.reset(seed=0)
     _, reward, *_ = env.step(np.zeros(7))
     assert 0 < reward < 2
-    atom, address = env.world.atoms[0], 1 + env.world.scene.model.joint("flat_stove_1_button").qposadr[0]
+    atom, address = env.batch.goals.atoms[0], 1 + env.scene.model.joint("flat_stove_1_button").qposadr[0]
     state, shares = env.get_state(), []
     for angle in (0.0, 0.1, 0.3, 0.45):
         state[address] = angle
@@ -221,11 +220,11 @@ def test_staged_rewards_increase_towards_the_goal_and_only_success_gives_one(kit
 def test_every_goal_has_a_staged_reward(suite):
     for task in get_suite(suite).tasks[:: max(1, len(get_suite(suite)) // 3)]:
         env = LiberoEnv(task, cameras=(), reward="staged", observations=["ee_pos"])
-        scene = env.world.scene
-        env.world.simulations.reset([0], scene.model.qpos0[None], np.zeros((1, scene.model.nv)))
-        for atom in env.world.atoms:
+        scene = env.scene
+        env.simulations.reset([0], scene.model.qpos0[None], np.zeros((1, scene.model.nv)))
+        for atom in env.batch.goals.atoms:
             assert 0 < atom_progress(env.view, atom) <= 0.9, (task.name, atom)
-        assert len(env.world.atoms) == len(env.world.progress(0)) > 0
+        assert len(env.batch.goals.atoms) == len(env.batch.check_goal(0)[1]) > 0
         env.close()
 
 
@@ -252,6 +251,6 @@ def test_wrong_names_list_the_valid_ones(kitchen):
     with pytest.raises(UnknownNameError, match="depth"):
         LiberoEnv(TASK, observations=["deph"])
     with pytest.raises(UnknownNameError, match="segmentation_class"):
-        kitchen.world.render(0, "agentview", "segmentation")
+        kitchen.observer.render(0, "agentview", "segmentation")
     with pytest.raises(UnknownNameError, match="agentview"):
-        kitchen.world.observer.camera_to_world(0, "agentveiw")
+        kitchen.observer.camera_to_world(0, "agentveiw")

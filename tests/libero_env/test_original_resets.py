@@ -68,17 +68,17 @@ def test_the_first_steps_are_those_of_the_original(num_envs):
         actions, qpos, start = recorded["actions"], recorded["qpos"], recorded["start"]
     task = "libero_goal/3"
     env = BatchEnv(task, num_envs, cameras=())
-    (fixtures,) = drawn_fixtures(env.world.scene, 7, 1)
+    (fixtures,) = drawn_fixtures(env.scene, 7, 1)
     rows = np.tile(np.concatenate([start, fixtures.ravel()]), (num_envs, 1))
     env.reset(options={"start": rows, "outdated_controller": True})
-    far = env.world.simulations.fields["qpos"][-1, :9].copy()
+    far = env.simulations.fields["qpos"][-1, :9].copy()
     for action, expected in zip(actions, qpos[1:], strict=True):
         env.step(np.tile(action, (num_envs, 1)))
-        np.testing.assert_allclose(env.world.simulations.fields["qpos"][-1, :9], expected, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(env.simulations.fields["qpos"][-1, :9], expected, rtol=0, atol=1e-7)
     env.reset(options={"start": rows})
-    np.testing.assert_array_equal(env.world.simulations.fields["qpos"][-1, :9], far)
+    np.testing.assert_array_equal(env.simulations.fields["qpos"][-1, :9], far)
     env.step(np.tile(actions[0], (num_envs, 1)))
-    other = np.abs(env.world.simulations.fields["qpos"][-1, :9] - qpos[1]).max()
+    other = np.abs(env.simulations.fields["qpos"][-1, :9] - qpos[1]).max()
     assert other > 1e-3, "a controller that knows the arm's pose starts otherwise"
     env.close()
 

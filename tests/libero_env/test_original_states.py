@@ -5,13 +5,13 @@ import pickle
 import tracemalloc
 import zipfile
 
-import mujoco
 import numpy as np
 import pytest
 
 from libero_env.errors import LiberoError
 from libero_env.init_states.pickles import StateFileError, read_states, write_states
-from libero_env.init_states.store import check_width, split_row
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.unit
 
@@ -114,15 +114,16 @@ def test_states_are_finite_numbers(tmp_path, value):
 
 
 def test_states_of_another_model_are_one_line(tmp_path):
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
-    )
-    check_width(model, np.zeros((2, 14)))
-    with pytest.raises(LiberoError, match=r"^file: states of 13 numbers; .* begin with 14 "):
-        check_width(model, np.zeros((2, 13)), "file")
-    with pytest.raises(LiberoError, match="15 numbers"):
-        split_row(model, np.zeros((2, 15)))
-    assert [part.shape for part in split_row(model, np.zeros((2, 21)))] == [(2, 7), (2, 6), (2, 1, 7)]
+    scene = build_scene(get_task("libero_goal/0").problem)
+    nq, nv, fixtures = scene.model.nq, scene.model.nv, len(scene.fixtures)
+    size = 1 + nq + nv
+    scene.check_states(np.zeros((2, size)))
+    with pytest.raises(LiberoError, match=rf"^file: states of {size - 1} numbers; .* begin with {size} "):
+        scene.check_states(np.zeros((2, size - 1)), "file")
+    with pytest.raises(LiberoError, match=f"{size + 1} numbers"):
+        scene.split_states(np.zeros((2, size + 1)))
+    parts = scene.split_states(np.zeros((2, scene.state_size)))
+    assert [part.shape for part in parts] == [(2, nq), (2, nv), (2, fixtures, 7)]
 
 
 def test_what_is_no_file_is_not_read(tmp_path):

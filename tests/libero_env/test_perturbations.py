@@ -98,14 +98,14 @@ def test_every_kind_does_something(kind, plain):
 
 def in_sight(env):
     """Return the objects and where they are."""
-    return {name: env.view.body_pos(name).tolist() for name in env.world.scene.objects}
+    return {name: env.view.body_pos(name).tolist() for name in env.scene.objects}
 
 
 def test_severity_0_changes_no_bit(plain):
     _, seen = plain
     nothing = ",".join(f"{kind}=0" for kind, definition in KINDS.items() if not definition.exclusive)
     env = LiberoEnv(TASK, perturb=nothing, **SMALL)
-    assert same(episode(env), seen) and env.config.perturb == () and env.world.perturbed is None
+    assert same(episode(env), seen) and env.config.perturb == () and env.batch.perturbed is None
     env.close()
     empty = LiberoEnv(TASK, perturb=[Look()], **SMALL)
     assert same(episode(empty), seen)
@@ -145,9 +145,9 @@ def test_absolute_changes_can_be_given_as_they_are():
     view = CameraView(pos=(1.0, 0.1, 1.5), quat=(0.6, 0.35, 0.35, 0.63), fovy=50.0)
     env, observation, _ = world_of([RobotJoints(qpos), Look(cameras={CAMERA: view})])
     assert np.array_equal(observation["joint_states"], qpos)
-    pose = env.world.observer.camera_to_world(0, CAMERA)
+    pose = env.observer.camera_to_world(0, CAMERA)
     assert np.array_equal(pose[:3, 3], view.pos)
-    assert env.world.observer.intrinsics(CAMERA)[0, 0] == pytest.approx(16 / np.tan(np.deg2rad(25)))
+    assert env.observer.intrinsics(CAMERA)[0, 0] == pytest.approx(16 / np.tan(np.deg2rad(25)))
     env.close()
     env, moved, _ = world_of([RobotJoints(qpos), Perturbation("robot", 0.4)], cameras=())  # starts from there
     assert np.linalg.norm(moved["joint_states"] - qpos) == pytest.approx(KINDS["robot"].amount(0.4))
@@ -160,8 +160,8 @@ def test_absolute_changes_can_be_given_as_they_are():
 def test_the_camera_orbits_by_degrees(severity, plain):
     base, _ = plain
     env, _, _ = world_of(f"camera={severity}", start=3)
-    before, after = (e.world.observer.camera_to_world(0, CAMERA) for e in (base, env))
-    pivot = pivot_of(env.world.scene)
+    before, after = (e.observer.camera_to_world(0, CAMERA) for e in (base, env))
+    pivot = pivot_of(env.scene)
     rays = [pose[:3, 3] - pivot for pose in (before, after)]
     cosine = rays[0] @ rays[1] / np.linalg.norm(rays[0]) / np.linalg.norm(rays[1])
     assert np.rad2deg(np.arccos(cosine)) == pytest.approx(KINDS["camera"].at_one * severity, abs=1e-6)
@@ -173,7 +173,7 @@ def test_the_camera_orbits_by_degrees(severity, plain):
 def test_light_is_a_ratio_of_all_lights_and_the_field_of_view_is_in_degrees(plain):
     base, _ = plain
     env, _, _ = world_of("light=0.5,fov=0.5")
-    drawn = [e.world.observer.renderer._scene for e in (base, env)]
+    drawn = [e.observer.renderer._scene for e in (base, env)]
     ratios = [
         np.asarray(getattr(b, name)).sum() / max(np.asarray(getattr(a, name)).sum(), 1e-9)
         for a, b in zip(*(list(s.lights[: s.nlight]) for s in drawn), strict=True)
@@ -181,7 +181,7 @@ def test_light_is_a_ratio_of_all_lights_and_the_field_of_view_is_in_degrees(plai
     ]
     ratio = KINDS["light"].amount(0.5)
     assert np.allclose(ratios, ratio) or np.allclose(ratios, 1 / ratio)
-    fovy = [np.rad2deg(2 * np.arctan2(16, e.world.observer.intrinsics(CAMERA)[0, 0])) for e in (base, env)]
+    fovy = [np.rad2deg(2 * np.arctan2(16, e.observer.intrinsics(CAMERA)[0, 0])) for e in (base, env)]
     assert abs(fovy[1] - fovy[0]) == pytest.approx(KINDS["fov"].amount(0.5))
     eye = drawn[1].camera[0]
     assert np.rad2deg(2 * np.arctan(eye.frustum_top / eye.frustum_near)) == pytest.approx(fovy[1], rel=1e-5)
@@ -194,12 +194,12 @@ def test_the_robot_is_at_an_exact_distance_within_limits_and_touches_nothing(sev
     env, moved, info = world_of(f"robot={severity}", start=1, cameras=())
     offset = moved["joint_states"] - observation["joint_states"]
     assert np.linalg.norm(offset) == pytest.approx(KINDS["robot"].at_one * severity, rel=1e-12)
-    low, high = env.world.scene.model.jnt_range[:7].T
+    low, high = env.scene.model.jnt_range[:7].T
     assert ((moved["joint_states"] > low) & (moved["joint_states"] < high)).all()
-    assert not any(env.view.in_contact("robot", name) for name in env.world.scene.entities)
+    assert not any(env.view.in_contact("robot", name) for name in env.scene.entities)
     assert info["attempts"].shape == (1,) and not info["success"]
-    nq = env.world.scene.nq_robot
-    rest = [e.world.simulations.fields["qpos"][0, nq:] for e in (base, env)]
+    nq = env.scene.nq_robot
+    rest = [e.simulations.fields["qpos"][0, nq:] for e in (base, env)]
     assert np.array_equal(*rest)
     base.close()
     env.close()
@@ -233,7 +233,7 @@ def test_actions_are_delayed_by_steps():
 def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are():
     base, _, _ = world_of("", start=4, cameras=())
     env, _, info = world_of("distractors=0.5", start=4, cameras=())
-    scene, old = env.world.scene, env.world.base_scene
+    scene, old = env.scene, env.batch.base_scene
     added = [name for name in scene.objects if name not in old.objects]
     assert len(added) == KINDS["distractors"].amount(0.5) == 3 and not info["success"]
     assert env.task.id == base.task.id and env.task.problem.goal == base.task.problem.goal
@@ -282,7 +282,7 @@ def test_an_episode_from_a_seed_is_paired_with_the_same_placement():
     )
     plain.reset(seed=5)
     first = perturbed.reset(seed=5)[0]
-    for name in plain.world.scene.entities:
+    for name in plain.scene.entities:
         assert np.array_equal(plain.view.body_pos(name), perturbed.view.body_pos(name))
     assert same([first], [perturbed.reset(seed=5)[0]])
     plain.close()
@@ -292,9 +292,9 @@ def test_an_episode_from_a_seed_is_paired_with_the_same_placement():
 def test_another_goal_of_the_scene_comes_with_its_instruction():
     goals = {task.language: task.problem.goal for task in get_suite("libero_goal").tasks}
     env, _, info = world_of("goal=1", cameras=())
-    assert env.task.language != env.world.base_task.language
+    assert env.task.language != env.batch.base_task.language
     assert env.task.problem.goal == goals[env.task.language] and not info["success"]
-    assert env.task.id == TASK and env.world.scene.problem.objects == env.world.base_scene.problem.objects
+    assert env.task.id == TASK and env.scene.problem.objects == env.batch.base_scene.problem.objects
     env.close()
     env, _, _ = world_of("goal=1", task="libero_object/0", cameras=())  # where no task begins in the same way
     carried = env.task.problem.goal.parts[0].args[0]
@@ -308,7 +308,7 @@ def test_another_goal_of_the_scene_comes_with_its_instruction():
 def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(severity):
     base, _, _ = world_of("", task="libero_object/3", start=9, cameras=())
     env, _, info = world_of(f"layout={severity}", task="libero_object/3", start=9, cameras=())
-    before, after = ({n: e.view.body_pos(n) for n in e.world.scene.objects} for e in (base, env))
+    before, after = ({n: e.view.body_pos(n) for n in e.scene.objects} for e in (base, env))
     moved = {
         n: np.linalg.norm(after[n] - before[n]) for n in before if not np.array_equal(after[n], before[n])
     }
@@ -316,7 +316,7 @@ def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(s
     assert np.allclose(list(moved.values()), KINDS["layout"].amount(severity), atol=1e-9)
     for name, region in ((a.args[0], env.task.problem.region(a.args[1])) for a in env.task.problem.init):
         x0, y0, x1, y1 = region.ranges[0]
-        x, y, _ = after[name] - env.world.scene.workspace.offset
+        x, y, _ = after[name] - env.scene.workspace.offset
         assert x0 - 0.02 < x < x1 + 0.02 and y0 - 0.02 < y < y1 + 0.02  # the task says where they are
     base.close()
     env.close()
@@ -325,7 +325,7 @@ def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(s
 def test_objects_that_places_tell_apart_move_together():
     base, _, _ = world_of("", task="libero_spatial/1", cameras=())
     env, _, _ = world_of("layout=0.5", task="libero_spatial/1", cameras=())
-    steps = [env.view.body_pos(n) - base.view.body_pos(n) for n in env.world.scene.objects]
+    steps = [env.view.body_pos(n) - base.view.body_pos(n) for n in env.scene.objects]
     assert np.allclose(steps, steps[0], atol=1e-9) and np.linalg.norm(steps[0]) == pytest.approx(0.05)
     base.close()
     env.close()
@@ -350,7 +350,7 @@ def test_objects_start_at_a_distance_from_their_places_and_carry_what_stands_on_
     task, start = "libero_spatial/3", 2  # the bowl stands on the cookie box
     base, _, _ = world_of("", task=task, start=start, cameras=())
     env, _, _ = world_of("object_pose=0.6", task=task, start=start, cameras=())
-    steps = {n: (env.view.body_pos(n) - base.view.body_pos(n))[:2] for n in env.world.scene.objects}
+    steps = {n: (env.view.body_pos(n) - base.view.body_pos(n))[:2] for n in env.scene.objects}
     lengths = {n: np.linalg.norm(step) for n, step in steps.items()}
     assert lengths["cookies_1"] == pytest.approx(KINDS["object_pose"].amount(0.6))
     assert env.view.in_contact("akita_black_bowl_1", "cookies_1")

@@ -172,12 +172,11 @@ def test_both_readings_of_the_arms_pose(plus):
     for task in (base_task(), overwritten, skipped):
         with LiberoEnvClosing(task, cameras=()) as env:
             env.reset(options={"init_state": 3})
-            world = env.world
-            rows[task.id] = world.physics_state(0)
+            rows[task.id] = env.simulations.physics_state(0)
             at_rest = joint_pose(0 if task is base_task() else 451)
-            np.testing.assert_array_equal(world.simulations.rest, at_rest)
+            np.testing.assert_array_equal(env.simulations.rest, at_rest)
             env.step(np.zeros(7))
-            rows[task.id, "later"] = world.physics_state(0)
+            rows[task.id, "later"] = env.simulations.physics_state(0)
     base, first, second = (rows[task.id] for task in (base_task(), overwritten, skipped))
     np.testing.assert_array_equal(base, first)
     assert (

@@ -67,8 +67,8 @@ def test_environments_have_the_robot_that_they_name():
     task = get_task("libero_object/0")
     assert build_scene(task.problem).robot == DEFAULT_ROBOT
     env = BatchEnv(task, 2, cameras=(), robot="robosuite-1.4.1")
-    assert env.world.scene.robot == "robosuite-1.4.1"
-    assert "robot0_link7_collision" in colliders(env.world.scene.model)
+    assert env.scene.robot == "robosuite-1.4.1"
+    assert "robot0_link7_collision" in colliders(env.scene.model)
     env.reset(options={"init_state": np.array([0, 1])})  # initial states are valid for both
     env.close()
     with pytest.raises(UnknownNameError, match=r"robosuite-1\.4\.1"):

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from libero_env.envs.checks import checked_actions
-from libero_env.errors import ActionError
 from libero_env.sim.back_ends import Batch, BatchSimulations, LoopSimulations
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.scene import build_scene
@@ -144,11 +142,3 @@ def test_the_block_of_the_mass_matrix_agrees_with_mujoco(scene):
     np.testing.assert_allclose(
         data.M[ArmIndex.from_model(scene.model).mass_address], full[:7, :7], atol=1e-12
     )
-
-
-@pytest.mark.parametrize(
-    "bad", [np.zeros(6), np.zeros((1, 7)), [0, 0, 0, np.nan, 0, 0, 0], [0, 0, 0, 0, 0, 0, np.inf], "up", None]
-)
-def test_invalid_actions_are_errors(bad):
-    with pytest.raises(ActionError):
-        checked_actions(bad)

@@ -143,7 +143,7 @@ class User:
         self.keyboard, self.way, self.goals, self.clock = keyboard, way, list(way), 0
         self.give_up_after, self.resets_at, self.shown = give_up_after, resets_at, []
 
-    def poll(self, world):
+    def poll(self, env):
         self.clock += 1
         if self.clock > self.give_up_after:
             return self.keyboard.press(QUIT)
@@ -153,14 +153,14 @@ class User:
         if not self.keyboard.closed:
             self.goals = list(self.way)  # a new episode
             return self.keyboard.press(GRIPPER)
-        away = np.subtract(self.goals[0], world.proprioception()["ee_pos"][0])
+        away = np.subtract(self.goals[0], env.proprioception()["ee_pos"][0])
         if np.abs(away).max() < 0.02 and len(self.goals) > 1:
             self.goals.pop(0)
         axis = int(np.abs(away).argmax())
         self.keyboard.press(("ws", "ad", "fr")[axis][int(away[axis] > 0)])
         return None
 
-    def show(self, world, status):
+    def show(self, env, status):
         self.shown.append(status)
 
     def close(self):

@@ -9,7 +9,6 @@ from libero_env.demos.config import DemoConfig
 from libero_env.demos.contents import read_header
 from libero_env.demos.generate import RecordingJob, demo_path, make_demos
 from libero_env.envs.batch import BatchEnv
-from libero_env.envs.world import World
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.rollout import MAX_STEPS
@@ -79,7 +78,7 @@ def test_a_reset_gives_the_same_observations_and_contacts(pair):
     assert pair[1].action_space == pair[0].action_space
     assert_close(ours, theirs, 1e-6)
     assert {k: v.tolist() for k, v in our_info.items()} == {k: v.tolist() for k, v in their_info.items()}
-    mujoco_sims, warp_sims = (env.world.simulations for env in pair)
+    mujoco_sims, warp_sims = (env.simulations for env in pair)
     for i in range(NUM):  # fixtures are elsewhere in each, and their geoms with them
         assert sorted(map(tuple, warp_sims.contact_geoms(i))) == sorted(
             map(tuple, mujoco_sims.contact_geoms(i))
@@ -106,12 +105,12 @@ def test_a_simulation_does_not_move_while_another_does(pair):
     env = pair[1]
     before, _ = reset(pair)[1]
     actions = smooth_actions(1)[0]
-    env.world.step([1], actions)
-    after = env.world.proprioception()
+    env.simulations.step([1], actions)
+    after = env.proprioception()
     for name, values in before.items():
         assert (after[name][[0, 2]] == values[[0, 2]]).all()
     assert (after["ee_pos"][1] != before["ee_pos"][1]).any()
-    assert env.world.simulations.time(1) > env.world.simulations.time(0) == 0.0
+    assert env.simulations.time(1) > env.simulations.time(0) == 0.0
 
 
 def test_what_a_simulation_does_depends_on_itself_alone(pair):
@@ -130,12 +129,12 @@ def test_a_graph_does_what_its_kernels_do(pair, outdated):
     """Warp captures and replays graphs on the processor too, which is how what GPUs run is tested."""
     env, action, found = pair[1], smooth_actions(1)[0], []
     for uses_graphs in (False, True):
-        env.world.simulations.uses_graphs = uses_graphs
+        env.simulations.uses_graphs = uses_graphs
         env.reset(options={"init_state": [0, 1, 2], "outdated_controller": outdated})
-        env.world.step([0, 2], action)
-        found.append(env.world.simulations.fields["qpos"].copy())
-        found.append(env.world.simulations.fields["qvel"].copy())
-    env.world.simulations.uses_graphs = False
+        env.simulations.step([0, 2], action)
+        found.append(env.simulations.fields["qpos"].copy())
+        found.append(env.simulations.fields["qvel"].copy())
+    env.simulations.uses_graphs = False
     assert (found[0] == found[2]).all() and (found[1] == found[3]).all()
 
 
@@ -183,8 +182,7 @@ def test_it_is_observed_within_a_step_as_mujoco():
 
 
 def test_truths_are_those_of_the_predicates(pair):
-    worlds = [env.world for env in pair]
-    scene, rng = worlds[0].scene, np.random.default_rng(0)
+    scene, rng = pair[0].scene, np.random.default_rng(0)
     names, regions = list(scene.entities), [r.address for r in scene.problem.regions]
     sites = [name for name in scene.joints if name not in names and name in regions and scene.joints[name]]
     atoms = [Atom(p, (a, b)) for p in ("On", "In", "Stack") for a in scene.objects for b in regions]
@@ -196,7 +194,7 @@ def test_truths_are_those_of_the_predicates(pair):
     goal = Or(
         (And(tuple(atoms[:3])), Not(ForAll((("b", scene.objects[names[0]].category),), Atom("Up", ("b",)))))
     )
-    checkers = [make_goals(goal, atoms, world.views, "original", world.simulations) for world in worlds]
+    checkers = [make_goals(goal, atoms, env.views, "original", env.simulations) for env in pair]
     assert isinstance(checkers[0], ViewedGoals)
     assert checkers[1].on_host == (Atom("True", ()),)
     seen = []
@@ -205,12 +203,12 @@ def test_truths_are_those_of_the_predicates(pair):
         for joint in range(scene.model.njnt):
             address, low, high = scene.model.jnt_qposadr[joint], *scene.model.jnt_range[joint]
             if scene.model.jnt_type[joint] == 0:
-                near = worlds[0].simulations.fixtures[0, rng.integers(len(scene.fixtures)), :3]
+                near = pair[0].simulations.fixtures[0, rng.integers(len(scene.fixtures)), :3]
                 qpos[:, address : address + 3] = near + rng.uniform(-0.15, 0.25, (NUM, 3))
             else:
                 qpos[:, address] = rng.uniform(low, high, NUM)
-        for world in worlds:
-            world.simulations.reset(range(NUM), qpos, np.zeros((NUM, scene.model.nv)))
+        for env in pair:
+            env.simulations.reset(range(NUM), qpos, np.zeros((NUM, scene.model.nv)))
         (reached, truths), (our_reached, our_truths) = (one.check(range(NUM)) for one in checkers)
         assert (our_reached == reached).all()
         wrong = [atoms[k] for k in np.flatnonzero((our_truths != truths).any(axis=0))]
@@ -220,24 +218,24 @@ def test_truths_are_those_of_the_predicates(pair):
 
 
 def test_predicates_of_users_and_of_strict_semantics_are_evaluated_on_the_host(pair):
-    world = pair[1].world
+    env = pair[1]
     register_predicate("Leftof", lambda view, a, b: bool(view.body_pos(a)[1] < view.body_pos(b)[1]))
-    a, b = list(world.scene.entities)[:2]
+    a, b = list(env.scene.entities)[:2]
     atom, reset_ = Atom("Leftof", (a, b)), reset(pair)
     assert reset_
-    checker = make_goals(atom, [atom], world.views, "original", world.simulations)
+    checker = make_goals(atom, [atom], env.views, "original", env.simulations)
     assert checker.on_host == (atom,)
-    theirs = ViewedGoals(atom, [atom], pair[0].world.views, "original").check(range(NUM))[0]
+    theirs = ViewedGoals(atom, [atom], pair[0].views, "original").check(range(NUM))[0]
     assert (checker.check(range(NUM))[0] == theirs).all()
-    strict = make_goals(world.task.problem.goal, world.atoms, world.views, "strict", world.simulations)
+    strict = make_goals(env.task.problem.goal, env.goals.atoms, env.views, "strict", env.simulations)
     assert {one.predicate for one in strict.on_host} == {"In"}
 
 
 def test_too_many_contacts_are_an_error_that_says_what_to_set(pair):
-    full = World(TASK, 1, cameras=(), backend="warp,device=cpu,contacts=4")
+    full = BatchEnv(TASK, 1, cameras=(), backend="warp,device=cpu,contacts=4")
     with pytest.raises(LiberoError, match=r"set backend='warp,contacts=8' \(now 4\)"):
-        full.reset_to_init([0], [0])
-        full.step([0], np.zeros((1, 7)))
+        full.reset(options={"init_state": 0})
+        full.step(np.zeros((1, 7)))
     full.close()
 
 
@@ -247,20 +245,20 @@ def test_memory_that_does_not_suffice_is_said_in_one_line(monkeypatch):
 
     monkeypatch.setattr(warp_simulations.mjw, "make_data", fail)
     with pytest.raises(LiberoError, match=r"no room for 2 simulations .* fewer contacts than 192"):
-        World(TASK, 2, cameras=(), backend=WARP)
+        BatchEnv(TASK, 2, cameras=(), backend=WARP)
 
 
 def test_closed_simulations_say_so():
-    world = World(TASK, 1, cameras=(), backend=WARP)
-    world.close()
+    env = BatchEnv(TASK, 1, cameras=(), backend=WARP)
+    env.close()
     with pytest.raises(LiberoError, match="closed"):
-        world.step([0], np.zeros((1, 7)))
+        env.simulations.step([0], np.zeros((1, 7)))
     with pytest.raises(LiberoError, match="closed"):
-        world.proprioception()
+        env.proprioception()
 
 
 def test_results_name_it(pair):
-    theirs, ours = (env.world.simulations.record() for env in pair)
+    theirs, ours = (env.simulations.record() for env in pair)
     assert theirs == {"backend": "mujoco"}
     assert ours["backend"] == "warp" and ours["backend_device"] and ours["mujoco-warp"] and ours["warp-lang"]
 
@@ -275,12 +273,12 @@ def test_results_name_it(pair):
 )
 def test_what_it_does_not_offer_is_said_in_one_line(options, told):
     with pytest.raises(LiberoError, match=told) as caught:
-        World(TASK, 1, **options)
+        BatchEnv(TASK, 1, **options)
     assert "\n" not in str(caught.value)
 
 
 def test_looks_need_the_other_back_end(pair):
-    observer = pair[1].world.observer
+    observer = pair[1].observer
     observer.set_look(0, Look())
     with pytest.raises(LiberoError, match="need backend=mujoco"):
         observer.set_look(0, Look(materials={"wall": "floor"}))
@@ -355,22 +353,22 @@ def test_pictures_show_the_same():
             ]
             assert min(likeness) > 0.8, name
     assert (ours["agentview_rgb"][0] != ours["agentview_rgb"][1]).any()
-    assert (envs[1].world.render(2, "agentview") == ours["agentview_rgb"][2]).all()
+    assert (envs[1].observer.render(2, "agentview") == ours["agentview_rgb"][2]).all()
     for env in envs:
         env.close()
 
 
-def free_actions(world, seed):
+def free_actions(env, seed):
     """Actions of 50 control steps; None where the robot touches something."""
-    world.reset_to_init(range(NUM), range(NUM))
+    env.reset(options={"init_state": list(range(NUM))})
     actions, bodies, robot = (
         smooth_actions(50, seed),
-        world.scene.model.geom_bodyid,
-        world.scene.bodies["robot"],
+        env.scene.model.geom_bodyid,
+        env.scene.bodies["robot"],
     )
     for action in actions:
-        world.step(range(NUM), action)
-        pairs = np.concatenate([world.simulations.contact_geoms(i) for i in range(NUM)])
+        env.simulations.step(range(NUM), action)
+        pairs = np.concatenate([env.simulations.contact_geoms(i) for i in range(NUM)])
         if (np.isin(bodies[pairs], robot).sum(axis=1) == 1).any():
             return None
     return actions
@@ -380,11 +378,11 @@ def free_actions(world, seed):
 @pytest.mark.parametrize("task", TEN_TASKS if EVERYTHING else TEN_TASKS[:2])
 def test_free_motion_is_that_of_mujoco(task):
     """50 control steps within 1e-5 rad and m."""
-    world = World(task, NUM, cameras=(), threads=1)
-    fixtures = world.scene.fixture_bodies
-    ours = make_simulations(world.scene.model, NUM, fixture_bodies=fixtures, back_end=BackEnd.read(WARP))
-    theirs, actions = world.simulations, next(filter(None, (free_actions(world, seed) for seed in range(20))))
-    world.reset_to_init(range(NUM), range(NUM))
+    env = BatchEnv(task, NUM, cameras=(), num_threads=1)
+    fixtures = env.scene.fixture_bodies
+    ours = make_simulations(env.scene.model, NUM, fixture_bodies=fixtures, back_end=BackEnd.read(WARP))
+    theirs, actions = env.simulations, next(filter(None, (free_actions(env, seed) for seed in range(20))))
+    env.reset(options={"init_state": list(range(NUM))})
     ours.reset(range(NUM), theirs.fields["qpos"], theirs.fields["qvel"], fixtures=theirs.fixtures)
     for action in actions:
         for simulations in (ours, theirs):
@@ -394,21 +392,21 @@ def test_free_motion_is_that_of_mujoco(task):
 
 def won_by_the_expert(task, starts, backend):
     """Which of the starts the expert solves."""
-    world = World(task, starts, cameras=(), threads=1, backend=backend)
-    world.reset_to_init(range(starts), range(starts))
-    shapes = Shapes(world.scene)
-    experts = [Expert(world.task, np.random.default_rng([0, i]), shapes=shapes) for i in range(starts)]
+    env = BatchEnv(task, starts, cameras=(), num_threads=1, backend=backend)
+    env.reset(options={"init_state": list(range(starts))})
+    shapes = Shapes(env.scene)
+    experts = [Expert(env.task, np.random.default_rng([0, i]), shapes=shapes) for i in range(starts)]
     won, over = np.zeros(starts, bool), np.zeros(starts, bool)
     for _ in range(MAX_STEPS):
         ids, actions = np.flatnonzero(~over), np.zeros((starts, 7))
         for i in ids:
-            actions[i] = experts[i].act(world.views[i])
-        world.step(ids, actions)
-        won[ids] = world.goals.check(ids)[0]
+            actions[i] = experts[i].act(env.views[i])
+        env.simulations.step(ids, actions)
+        won[ids] = env.goals.check(ids)[0]
         over |= won | np.array([bool(expert.failure_reason) for expert in experts])
         if over.all():
             break
-    world.close()
+    env.close()
     return won
 
 

@@ -87,9 +87,7 @@ def test_a_units_episodes_do_not_depend_on_the_unit(tmp_path, monkeypatch):
 
 
 def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypatch):
-    monkeypatch.setattr(
-        ProtocolEnv, "_stored", lambda self: self.env.world.init_states
-    )  # LIBERO's may not be here
+    monkeypatch.setattr(ProtocolEnv, "_stored", lambda self: self.env.init_states)  # LIBERO's may not be here
     card = load_card("openpi").changed({"pixels.render_size": (32, 32)})
     found = []
     for perturb in ("", "layout=0.3,distractors=0.3,robot=0.4"):
@@ -97,9 +95,9 @@ def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypat
             get_task("libero_goal/3"), 2, card.changed({"world.perturb": perturb}), cameras=(), threads=1
         )
         env.reset(options={"init_state": np.array([3, 7])})
-        plate = [view.body_pos("plate_1") for view in env.world.views]
-        found.append((env.world.simulations.fixtures.copy(), np.array(plate)))
-        assert env.task.language == env.world.base_task.language and len(env.step(np.zeros((2, 7)))) == 5
+        plate = [view.body_pos("plate_1") for view in env.views]
+        found.append((env.simulations.fixtures.copy(), np.array(plate)))
+        assert env.task.language == env.env.base_task.language and len(env.step(np.zeros((2, 7)))) == 5
         env.close()
     assert np.array_equal(found[0][0], found[1][0])
     moved = np.linalg.norm(found[1][1] - found[0][1], axis=1)

@@ -107,6 +107,6 @@ def test_a_run_is_evaluated_with_the_drawing_that_it_was_trained_with(tmp_path, 
     policy = RunPolicy(args)
     env = policy.env(policy.run.tasks[0], 1, policy.protocol(load_card("libero")))
     try:
-        assert env.env.world.scene.drawing == drawing
+        assert env.env.scene.drawing == drawing
     finally:
         env.close()

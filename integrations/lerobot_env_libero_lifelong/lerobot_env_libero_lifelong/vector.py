@@ -149,7 +149,7 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         Each of them has loaded its model when it was made, at a first reset, and at each reset since.
         """
         assert isinstance(self._envs, BatchEnv), "there are no processes with these starts"
-        scene, states = self._envs.world.scene, load_original_states(self._task)
+        scene, states = self._envs.scene, load_original_states(self._task)
         size = 1 + scene.model.nq + scene.model.nv
         if states is None or len(states[0]) < size:
             raise LiberoError(
@@ -201,7 +201,7 @@ def _waiting(envs: BatchEnv | SubprocEnv) -> Iterator[None]:
     if not isinstance(envs, BatchEnv):
         yield
         return
-    state = envs.world.simulations.controller_state
+    state = envs.simulations.controller_state
     own, state.controller = state.controller, get_controller()
     try:
         yield

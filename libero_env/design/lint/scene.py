@@ -13,7 +13,7 @@ from libero_env.design.lint.report import Report
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.init_states.placement import sample_start
 from libero_env.init_states.settle import settle, start_faults
-from libero_env.init_states.store import load_init_states, split_row
+from libero_env.init_states.store import load_init_states
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
@@ -181,7 +181,7 @@ def _set_start(
     """
     stored, still = task.suite != FILE and scene.pack.name == BUILTIN, np.zeros((1, scene.model.nv))
     if stored:
-        qpos, _, (fixtures,) = split_row(scene.model, load_init_states(task, scene)[i : i + 1])
+        qpos, _, (fixtures,) = scene.split_states(load_init_states(task, scene)[i : i + 1])
     else:
         start = sample_start(scene, np.random.default_rng(i))
         qpos, fixtures = start.qpos[None], start.fixtures

@@ -57,7 +57,12 @@ class WarpGoals:
         simulations: WarpSimulations,
     ):
         scene = views[0].scene
-        self._goal, self._atoms, self._views, self._semantics = ground(goal, scene), atoms, views, semantics
+        self._goal, self.atoms, self._views, self._semantics = (
+            ground(goal, scene),
+            tuple(atoms),
+            views,
+            semantics,
+        )
         self._simulations, formulas = simulations, _Formulas(scene, semantics)
         needed = dict.fromkeys([*atoms, *self._goal.atoms()])
         self._formulas = {atom: formulas.make(atom) for atom in needed}
@@ -74,7 +79,7 @@ class WarpGoals:
                 found[atom] = np.array(on_host, bool)
             else:
                 found[atom] = formula(truths)
-        of_atoms = [found[atom] for atom in self._atoms]
+        of_atoms = [found[atom] for atom in self.atoms]
         reached = _combine(self._goal, found, len(ids))
         return reached, np.stack(of_atoms, axis=1) if of_atoms else np.zeros((len(ids), 0), bool)
 

@@ -9,12 +9,11 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from libero_env.errors import LiberoError
-from libero_env.sim.controller import Controller
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.sim.engine import BackEnd
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.mjwarp.device import DeviceFields, Freed, allocate, choose_device, room_for
-from libero_env.sim.osc import osc_torques
+from libero_env.sim.osc import REST, osc_torques
 from libero_env.sim.simulation import WATCHED, Indices, KinematicsHook, Simulations, Watch
 from libero_env.timing import SUBSTEPS
 
@@ -89,8 +88,12 @@ class WarpSimulations(Simulations):
         versions = {name: metadata.version(name) for name in ("mujoco-warp", "warp-lang")}
         return {"backend": self.back_end.name, "backend_device": self.device.name, **versions}
 
-    def has_controller(self, controller: Controller) -> bool:
-        return controller.kernel is osc_torques
+    def set_controller(self, name: str, control_delta: bool = True, rest: np.ndarray = REST) -> None:
+        super().set_controller(name, control_delta, rest)
+        if self.controller_state.controller.kernel is not osc_torques:
+            raise InvalidInputError(
+                f"backend=warp has no controller {name}, only osc_pose and osc_position; backend=mujoco has"
+            )
 
     def contact_geoms(self, i: int) -> np.ndarray:
         geoms, starts = self._contacts

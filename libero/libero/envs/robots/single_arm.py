@@ -179,4 +179,4 @@ class SingleArm:
         action = np.asarray(action)
         if self.action_dim == 4 and action.shape == (7,):
             action = action[[0, 1, 2, 6]]
-        return checked_actions(action, size=self.action_dim)
+        return checked_actions(action, (self.action_dim,))
