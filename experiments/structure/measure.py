@@ -1,4 +1,4 @@
-"""Measure the shape of the code: entries, levels and circles of imports, lines, long functions, exemptions.
+"""Measure the shape of the code: lines, files, functions, circles of imports, tests, documents, configurations.
 
     python experiments/structure/measure.py [CHECKOUT ...]
 
@@ -7,11 +7,14 @@ Imports are those of grimp (the library behind import-linter), inside functions 
 
 import argparse
 import ast
+import io
 import json
+import re
 import subprocess
 import sys
+import tokenize
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero")
@@ -28,7 +31,14 @@ print(json.dumps({m: sorted(graph.find_modules_directly_imported_by(m)) for m in
 
 def import_graph(checkout: Path) -> dict[str, list[str]]:
     """Return module -> modules it imports, read in a process of its own from this checkout."""
-    command = [sys.executable, "-P", "-c", _GRAPH, str(checkout), *PACKAGES]
+    command = [
+        sys.executable,
+        "-P",
+        "-c",
+        _GRAPH,
+        str(checkout),
+        *(p for p in PACKAGES if (checkout / p).is_dir()),
+    ]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True, cwd="/").stdout)
 
 
@@ -120,11 +130,40 @@ def _first(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return 0 if ast.get_docstring(function) else function.body[0].lineno - 1
 
 
-def docstring_lines(trees: Sequence[ast.Module]) -> int:
-    """Return how many lines are docstrings."""
+def code_lines(text: str, tree: ast.Module) -> int:
+    """Return how many lines hold code: neither blank nor only a comment or a docstring."""
+    silent = (
+        tokenize.COMMENT,
+        tokenize.NL,
+        tokenize.NEWLINE,
+        tokenize.INDENT,
+        tokenize.DEDENT,
+        tokenize.ENDMARKER,
+    )
+    lines: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in silent:
+            lines.update(range(token.start[0], token.end[0] + 1))
+    return len(lines - docstring_lines(tree))
+
+
+def docstring_lines(tree: ast.Module) -> set[int]:
+    """Return the numbers of the lines that are docstrings."""
     kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    owners = [n for tree in trees for n in ast.walk(tree) if isinstance(n, kinds) and ast.get_docstring(n)]
-    return sum(_end(n.body[0]) - n.body[0].lineno + 1 for n in owners)
+    owners = [
+        n for n in ast.walk(tree) if isinstance(n, kinds) and ast.get_docstring(n, clean=False) is not None
+    ]
+    return {line for n in owners for line in range(n.body[0].lineno, _end(n.body[0]) + 1)}
+
+
+def functions(tree: ast.Module) -> int:
+    """Return the number of functions and methods."""
+    return sum(isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef)) for n in ast.walk(tree))
+
+
+def words(files: Iterable[Path]) -> int:
+    """Return the number of words of text files."""
+    return sum(len(re.findall(r"\S+", file.read_text(encoding="utf-8"))) for file in files)
 
 
 def exempt_modules(checkout: Path) -> int:
@@ -136,7 +175,7 @@ def exempt_modules(checkout: Path) -> int:
 def measure(checkout: Path) -> dict[str, str]:
     """Return the figures of a checkout."""
     graph, figures = import_graph(checkout), {}
-    for package in (*PACKAGES, "libero_env.expert"):
+    for package in (*(p for p in PACKAGES if (checkout / p).is_dir()), "libero_env.expert"):
         own = entries(graph, package)
         inside = sum(
             len({*others} & circle) for circle in circles(own) for n, others in own.items() if n in circle
@@ -146,17 +185,29 @@ def measure(checkout: Path) -> dict[str, str]:
             f"{inside} of them in circles"
         )
     figures["circles of modules"] = str(len(circles(graph)))
-    read = {package: list(sources(checkout, package)) for package in PACKAGES}
-    lines = {package: sum(text.count("\n") for text, _ in files) for package, files in read.items()}
-    figures["lines"] = f"{sum(lines.values())}: " + ", ".join(f"{k} {v}" for k, v in lines.items())
+    present = [package for package in PACKAGES if (checkout / package).is_dir()]
+    read = {package: list(sources(checkout, package)) for package in present}
+    for name, count in {
+        "code lines": lambda text, tree: code_lines(text, tree),
+        "files": lambda text, tree: 1,
+        "functions": lambda text, tree: functions(tree),
+        "raw lines": lambda text, tree: text.count("\n"),
+        "lines of docstrings": lambda text, tree: len(docstring_lines(tree)),
+    }.items():
+        each = {package: sum(count(*file) for file in files) for package, files in read.items()}
+        figures[name] = f"{sum(each.values())}: " + ", ".join(f"{k} {v}" for k, v in each.items())
+    tests = list((checkout / "tests").rglob("*.py"))
+    figures["raw lines of tests"] = str(sum(f.read_text(encoding="utf-8").count("\n") for f in tests))
+    guide = [checkout / "README.md", checkout / "CONTRIBUTING.md", *(checkout / "docs").glob("*.md")]
+    figures["words of documents"] = str(words(guide))
+    figures["files of configuration"] = str(sum(f.is_file() for f in (checkout / "configs").rglob("*")))
     trees = [tree for files in read.values() for _, tree in files]
-    figures["lines"] += f"; {docstring_lines(trees)} of them docstrings"
     whole, bodies = long_functions(trees)
     figures[f"functions over {LONG} lines"] = f"{whole}, {bodies} of them without signature and docstring"
     figures["modules exempt from mypy"] = str(exempt_modules(checkout))
     skipped = sum(
         file.read_text(encoding="utf-8").count("# fmt: " + "skip")
-        for folder in (*PACKAGES, "tests", "experiments")
+        for folder in (*present, "tests", "experiments")
         for file in (checkout / folder).rglob("*.py")
     )
     figures["lines that the formatter skips"] = str(skipped)
