@@ -59,7 +59,7 @@ class M2Distill(Rehearsal):
             language: Weight of the instruction's features.
             proprio: Weight of the readings' features.
             policy: Weight of the divergence of actions. With a deterministic head stronger distillation (1, and 0.1 or
-                0.01 for the features) kept and learned less than replay alone (experiments/replay): it also keeps the
+                0.01 for the features) kept and learned less than replay alone (experiments/tuning): it also keeps the
                 teacher's errors. The divergence of mixtures has the unit of their loss, so that 1 weighs both alike;
                 this was not measured.
         """

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
-SCRIPT = Path(__file__).parents[2] / "experiments" / "evaluation" / "kills.py"
+SCRIPT = Path(__file__).parents[2] / "experiments" / "kills" / "evaluations.py"
 SMALL = ["--suite", "libero_goal/3", "libero_object/0", "--episodes", "8", "--unit-starts", "2"]
 SMALL += ["--horizon", "50", "--pause", "0.1"]  # the last units take longer than the pauses before the kills
 

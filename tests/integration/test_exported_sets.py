@@ -2,7 +2,7 @@
 
 They need environments of their own, which variables name. `LIBERO_LEROBOT`: a Python with lerobot 0.4 or newer, by
 default that of tests/harness/peers.py. `LIBERO_LEROBOT_V2`: one with lerobot 0.3, the last that reads version 2.0.
-`LIBERO_OPENPI`: openpi's file src/openpi/policies/libero_policy.py. experiments/data_sets/README.md states how they are
+`LIBERO_OPENPI`: openpi's file src/openpi/policies/libero_policy.py. experiments/lerobot/exports.md states how they are
 made and what came out.
 """
 
@@ -38,7 +38,7 @@ def file(tmp_path_factory):
 def _named(variable):
     value = os.environ.get(variable)
     if not value or not Path(value).exists():
-        pytest.skip(f"{variable} names nothing; see experiments/data_sets/README.md")
+        pytest.skip(f"{variable} names nothing; see experiments/lerobot/exports.md")
     return value
 
 

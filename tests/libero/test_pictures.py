@@ -118,7 +118,7 @@ def test_burners_glow_as_the_originals(whole):
 
 
 def element_names(model):
-    """Names of visual geoms and sites as in experiments/pixels/record.py: (kind, index) -> name."""
+    """Names of visual geoms and sites as in experiments/parity/record_pictures.py: (kind, index) -> name."""
     names, count = {}, Counter()
     for geom in range(model.ngeom):
         if model.geom_group[geom] == 1:

@@ -1,7 +1,7 @@
 """Processes that share an evaluation are killed at random moments: the result is that of one process, to the bit.
 
-    python experiments/evaluation/kills.py                                  # 20 kills of one of three processes
-    python experiments/evaluation/kills.py --policy RUN_DIR --suite libero_object/0 libero_object/1
+    python experiments/kills/evaluations.py                                  # 20 kills of one of three processes
+    python experiments/kills/evaluations.py --policy RUN_DIR --suite libero_object/0 libero_object/1
 
 It exits with status 1 where an episode, a bit of an action, or a unit differs.
 """

@@ -1,6 +1,6 @@
 """Measure what algorithms keep and learn on held-out demonstrations, with what they store and what a step costs.
 
-    python experiments/replay/measure.py "algo=er algo.memory.budget=1000" "algo=compressed_er algo.budget=950000"
+    python experiments/tuning/replay.py "algo=er algo.memory.budget=1000" "algo=compressed_er algo.budget=950000"
 
 Two tasks of LIBERO-Object are learned with 30 demonstrations each, in 160 steps of 64 windows, by the small ResNet-T on
 images of 64 pixels. Kept and learned are the mean absolute errors of the actions on ten other demonstrations of the

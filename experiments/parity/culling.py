@@ -1,6 +1,6 @@
 """Draw random states of many tasks with and without what cameras cannot show; no bit may differ.
 
-    python experiments/pixels/culling.py --states 5 --every 10
+    python experiments/parity/culling.py --states 5 --every 10
 
 Draws `--states` random states of every `--every`-th of the 130 tasks, both drawings, both cameras, 128² and 256²:
 pictures and depth. The arm, drawers and doors are anywhere in their range, objects anywhere around the table.

