@@ -1,6 +1,6 @@
 """Record depth, segmentation and a burner that is on, in the original's environments.
 
-    LIBERO_CONFIG_PATH=<the original's configuration> python experiments/parity/record_pictures.py STATE.npz... --out FOLDER
+    LIBERO_CONFIG_PATH=CONFIGURATION python experiments/parity/record_pictures.py STATE.npz... --out FOLDER
 
 Runs in the original's environment, see experiments/benchmarks/README.md. STATE.npz has `suite`, `task_id`, `state` and
 `fixtures` (JSON: name -> position and quaternion wxyz). `tests/libero/data` has what this wrote for two of them.
