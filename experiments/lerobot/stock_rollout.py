@@ -17,8 +17,7 @@ import yaml
 
 from libero_env import LiberoEnv
 from lifelong.language import embed
-from lifelong.policies.lerobot import EMBEDDING, FOLDER, IMAGES
-from lifelong.policies.lerobot_package import lerobot_module
+from lifelong.policies.lerobot import EMBEDDING, FOLDER, IMAGES, lerobot_module
 
 
 class ForLeRobot(gymnasium.Env[dict[str, Any], np.ndarray]):

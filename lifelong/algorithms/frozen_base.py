@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
 from lifelong.errors import ConfigError, PolicyError
-from lifelong.nn.adapters import freeze_statistics
-from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output
+from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output, freeze_statistics
 from lifelong.policies.base import Policy
 
 

@@ -11,8 +11,7 @@ from lifelong.algorithms.frozen_base import FrozenBase
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
-from lifelong.nn.adapters import check_matches, matches
-from lifelong.nn.experts import ExpertLibrary, Pair
+from lifelong.nn.experts import ExpertLibrary, Pair, check_matches, matches
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
 

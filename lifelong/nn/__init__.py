@@ -3,11 +3,9 @@
 from lifelong.nn.augmentation import Augmentation, ColorJitter, Compose, RandomShift
 from lifelong.nn.flow import FlowHead
 from lifelong.nn.heads import ActionHead, DeterministicHead, GMMHead
-from lifelong.nn.patches import PatchEncoder, SpatialTransformer
-from lifelong.nn.recurrent import TemporalLSTM
 from lifelong.nn.tokens import LanguageToken, ProprioScaling, ProprioTokens
-from lifelong.nn.transformer import TemporalTransformer
-from lifelong.nn.vision import FiLM, ResNetFiLMEncoder, SpatialSoftmax
+from lifelong.nn.transformer import SpatialTransformer, TemporalLSTM, TemporalTransformer
+from lifelong.nn.vision import FiLM, PatchEncoder, ResNetFiLMEncoder, SpatialSoftmax
 
 __all__ = [
     "ActionHead",

@@ -5,6 +5,7 @@ Shape legend: B batch, r rank.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from types import MethodType
 from typing import Any, ClassVar
 
@@ -14,12 +15,12 @@ from torch.nn import functional
 from torch.utils.hooks import RemovableHandle
 
 from lifelong.errors import CheckpointError, ConfigError, PolicyError
-from lifelong.nn.adapters import check_matches, initial_pair, matches
 
 Pair = Mapping[str, Tensor]  # a (r, inputs), b (out, r)
 Add = Callable[[str, nn.Module, Tensor], Tensor | None]  # name of a layer, layer, its input -> what is added
 Encode = Callable[[nn.Module, Callable[..., Tensor], Any], Tensor]  # policy, its own encode, observation
 
+_WITH_STATISTICS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._InstanceNorm)
 _MARK = "_has_experts"  # attribute of a policy with experts; copies of it have them too
 
 
@@ -75,7 +76,11 @@ class ExpertLibrary:
         self.pairs[task] = {}
         for name, weight in weights.items():
             out, inputs = weight.flatten(1).shape
-            a, b = initial_pair(out, inputs, count * min(rank, out, inputs), draws)
+            ranks = count * min(rank, out, inputs)
+            a = (
+                torch.rand(ranks, inputs, generator=draws) * 2 - 1
+            ) / inputs**0.5  # as PyTorch's linear layers
+            b = torch.zeros(out, ranks)  # so that B A is zero at first (Hu et al. 2022, section 4.1)
             self.pairs[task][name] = {k: nn.Parameter(t.to(weight.device)) for k, t in (("a", a), ("b", b))}
 
     def parameters(self, task: int) -> list[nn.Parameter]:
@@ -281,3 +286,28 @@ def rows_per_sample(x: Tensor, samples: int) -> int:
             f"a layer has {len(x)} rows for {samples} samples: rows cannot be assigned to samples"
         )
     return len(x) // samples
+
+
+def matches(name: str, patterns: Sequence[str]) -> bool:
+    """Return whether one of the patterns (`*`, `?`, `[...]`) matches the whole name."""
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def check_matches(found: Sequence[str], patterns: Sequence[str], names: Sequence[str], kind: str) -> None:
+    """Raise an error where patterns match nothing.
+
+    Raises:
+        ConfigError: `found` is empty; the message lists some of the names that exist.
+    """
+    if not found:
+        some = ", ".join(list(names)[:5])
+        raise ConfigError(
+            f"algo.adapted={list(patterns)} matches no {kind} of the policy, which has {some}, ..."
+        )
+
+
+def freeze_statistics(policy: nn.Module) -> None:
+    """Put layers with running statistics in evaluation mode, so that training does not change these."""
+    for module in policy.modules():
+        if isinstance(module, _WITH_STATISTICS):
+            module.eval()

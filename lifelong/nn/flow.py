@@ -43,7 +43,7 @@ class FlowHead(ActionHead):
         layers: Number of residual blocks of the network.
 
     Raises:
-        PolicyError: Not 1 <= execute <= chunk, or no step.
+        PolicyError: More actions are executed than a chunk has.
     """
 
     def __init__(
@@ -58,11 +58,8 @@ class FlowHead(ActionHead):
         layers: Depth = 2,
     ) -> None:
         super().__init__()
-        if not 1 <= execute <= chunk or steps < 1:
-            raise PolicyError(
-                f"a flow head with chunk {chunk}, execute {execute}, steps {steps}; valid: "
-                "1 <= execute <= chunk and steps >= 1"
-            )
+        if execute > chunk:
+            raise PolicyError(f"policy.head.execute is {execute}; it must be {chunk} (chunk) at most")
         self.chunk, self.execute, self.steps, self.action_dim = chunk, execute, steps, action_dim
         self.velocity = VelocityField(
             in_dim=in_dim, action_dim=action_dim, chunk=chunk, hidden=hidden, layers=layers

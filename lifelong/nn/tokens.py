@@ -1,4 +1,4 @@
-"""Tokens of the instruction and of proprioception.
+"""Tokens of the instruction and of proprioception, and features divided by modality.
 
 Shape legend: B batch, T time, L language embedding, D one modality's dimension, E token.
 """
@@ -51,14 +51,7 @@ class ProprioScaling(nn.Module):
 
 
 class ProprioTokens(nn.Module):
-    """One token per modality: a linear map of the scaled reading.
-
-    Args:
-        proprio: Name -> D, in order.
-        dim: E.
-        normalise: Whether to bring known modalities to order one, see `ProprioScaling`.
-        dropout: Chance that a modality is zeroed, see `ProprioScaling`.
-    """
+    """One token per modality: a linear map to E numbers (`dim`) of the reading, scaled by `ProprioScaling`."""
 
     def __init__(
         self, *, proprio: Mapping[str, int], dim: int, normalise: bool = True, dropout: float = 0.0
@@ -67,10 +60,10 @@ class ProprioTokens(nn.Module):
         self.scaling = ProprioScaling(proprio=proprio, normalise=normalise, dropout=dropout)
         self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
 
-    def forward(self, proprio: Mapping[str, Tensor]) -> Tensor:
-        """Map readings, name -> (B, T, D), to tokens (B, T, number of modalities, E)."""
+    def forward(self, proprio: Mapping[str, Tensor]) -> list[Tensor]:
+        """Map readings, name -> (B, T, D), to one token each, (B, T, E); in order."""
         scaled = self.scaling(proprio)
-        return torch.stack([linear(scaled[name]) for name, linear in self.linears.items()], dim=2)
+        return [linear(scaled[name]) for name, linear in self.linears.items()]
 
 
 class LanguageToken(nn.Module):
@@ -83,6 +76,12 @@ class LanguageToken(nn.Module):
     def forward(self, language: Tensor) -> Tensor:
         """Map embeddings (B, L) to tokens (B, E)."""
         return self.linear(language)
+
+
+def named_parts(features: Tensor, sizes: Mapping[str, int], dim: int) -> dict[str, Tensor]:
+    """Return the parts of features along an axis by name, given the size of each in order; without empty ones."""
+    parts = zip(sizes, features.split(list(sizes.values()), dim=dim), strict=True)
+    return {name: part for name, part in parts if part.shape[dim]}
 
 
 def standardise(language: Tensor) -> Tensor:

@@ -1,11 +1,14 @@
-"""The transformer over time.
+"""Networks over the tokens of a window: transformers over time and over a frame's patches, and an LSTM.
 
-Shape legend: B batch, T time, M tokens per time step, E token.
+Shape legend: B batch, T time, M tokens per time step, N frames, V views, P patches per view, E token, F features of a
+frame.
 """
 
 import math
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -136,18 +139,9 @@ class TemporalTransformer(nn.Module):
         max_length: int = 10,
     ) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(
-            TransformerLayer(
-                dim=dim,
-                heads=heads,
-                head_dim=head_dim,
-                mlp_dim=mlp_dim,
-                dropout=dropout,
-                attention_dropout=attention_dropout,
-                drop_path=drop_path,
-            )
-            for _ in range(layers)
-        )
+        sizes = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim, "dropout": dropout}
+        more = {"attention_dropout": attention_dropout, "drop_path": drop_path}
+        self.layers = nn.ModuleList(TransformerLayer(**sizes, **more) for _ in range(layers))
         self.register_buffer("positions", sinusoidal_positions(max_length, dim), persistent=False)
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -158,3 +152,93 @@ class TemporalTransformer(nn.Module):
         for layer in self.layers:
             x = layer(x, mask)
         return x.view(b, t, m, e)
+
+
+class SpatialTransformer(nn.Module):
+    """Transformer over the patches of a frame and its instruction: ViLT (Kim, Son and Kim, ICML 2021).
+
+    The patches of all views and the instruction's token attend to each other; the output is read from a learned
+    token. The defaults are LIBERO's sizes.
+
+    Args:
+        views: V.
+        patches: P of every view.
+        dim: E.
+        out_dim: Size of the output.
+        layers: Number of layers.
+        heads: Number of attention heads.
+        head_dim: Size of a head.
+        mlp_dim: Width of the feed-forward networks.
+        dropout: Dropout of attention weights, after attention and in the feed-forward networks.
+        attention_dropout: Dropout of attention weights alone, see `TransformerLayer`.
+        drop_path: Chance that a frame skips a feed-forward network, see `TransformerLayer`.
+    """
+
+    def __init__(
+        self,
+        *,
+        views: int,
+        patches: int,
+        dim: Width = 128,
+        out_dim: Width = 64,
+        layers: Depth = 7,
+        heads: Width = 8,
+        head_dim: Width = 120,
+        mlp_dim: Width = 256,
+        dropout: Share = 0.1,
+        attention_dropout: Share | None = None,
+        drop_path: Share = 0.0,
+    ) -> None:
+        super().__init__()
+        self.positions = nn.Parameter(torch.randn(views, patches, dim))
+        self.modalities = nn.Parameter(torch.randn(views + 1, dim))  # each view, then language
+        self.read = nn.Parameter(torch.randn(dim))
+        sizes = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim, "dropout": dropout}
+        more = {"attention_dropout": attention_dropout, "drop_path": drop_path}
+        self.layers = nn.ModuleList(TransformerLayer(**sizes, **more) for _ in range(layers))
+        self.project = nn.Linear(dim, out_dim)
+
+    def forward(self, patches: Tensor, language: Tensor) -> Tensor:
+        """Mix the patches of each frame with its instruction.
+
+        Args:
+            patches: Tokens of patches (N, V, P, E).
+            language: Tokens of instructions (B, E); N = B T with the T frames of a window adjacent.
+
+        Returns:
+            One vector per frame (N, out_dim).
+        """
+        n = len(patches)
+        seen = (patches + self.positions + self.modalities[:-1, None]).flatten(1, 2)
+        instruction = (language + self.modalities[-1]).repeat_interleave(n // len(language), dim=0)
+        x = torch.cat([self.read.expand(n, 1, -1), instruction[:, None], seen], dim=1)
+        for layer in self.layers:
+            x = layer(x)
+        return self.project(x[:, 0])
+
+
+class TemporalLSTM(nn.LSTM):
+    """LSTM over windows, (B, T, F) -> (B, T, hidden).
+
+    Args:
+        in_dim: F.
+        hidden: Size of the state.
+        layers: Number of layers.
+        dropout: Dropout between the layers; without effect where there is one.
+    """
+
+    def __init__(
+        self,
+        *,
+        in_dim: int,
+        hidden: Width = 1024,
+        layers: Annotated[int, Field(ge=1, le=1000)] = 2,
+        dropout: Share = 0.0,
+    ) -> None:
+        super().__init__(
+            input_size=in_dim,
+            hidden_size=hidden,
+            num_layers=layers,
+            dropout=dropout if layers > 1 else 0.0,
+            batch_first=True,
+        )

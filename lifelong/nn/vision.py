@@ -1,6 +1,6 @@
-"""Image encoder: a ResNet of basic blocks, each modulated by the instruction, read out as keypoints.
+"""Image encoders: a ResNet of basic blocks, each modulated by the instruction, read out as keypoints; and patches.
 
-Shape legend: N images, C channels, H W image, K keypoints, L language embedding, E latent.
+Shape legend: N images, C channels, H W image, K keypoints, P patches, L language embedding, E latent or token.
 """
 
 from collections.abc import Sequence
@@ -31,15 +31,11 @@ def to_network(images: Tensor, pixels: str) -> Tensor:
 
     Returns:
         Images (N, 3, H, W) float32, with channels last in memory.
-
-    Raises:
-        PolicyError: Another form of pixels.
     """
-    if pixels == "centred":
-        return images.movedim(-1, 1).to(torch.float32).mul_(2.0 / 255.0).sub_(1.0)
     if pixels == "libero":
         return images.flip(1).movedim(-1, 1).to(torch.float32).div_(255.0)
-    raise PolicyError(f"unknown form of pixels {pixels!r}. Valid: centred, libero")
+    assert pixels == "centred", pixels
+    return images.movedim(-1, 1).to(torch.float32).mul_(2.0 / 255.0).sub_(1.0)
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:
@@ -51,7 +47,7 @@ def make_norm(kind: str, channels: int) -> nn.Module:
         channels: C.
 
     Raises:
-        PolicyError: Another kind, or channels that cannot be divided into groups.
+        PolicyError: The channels cannot be divided into groups.
     """
     if kind == "group":
         groups = max(1, channels // 8)
@@ -60,11 +56,7 @@ def make_norm(kind: str, channels: int) -> nn.Module:
                 f"{channels} channels cannot be normalised in groups of 8; use a multiple of 8, or another norm"
             )
         return nn.GroupNorm(groups, channels)
-    if kind == "batch":
-        return nn.BatchNorm2d(channels)
-    if kind == "none":
-        return nn.Identity()
-    raise PolicyError(f"unknown norm {kind!r}. Valid: batch, group, none")
+    return {"batch": nn.BatchNorm2d, "none": nn.Identity}[kind](channels)
 
 
 class FiLM(nn.Module):
@@ -175,28 +167,6 @@ class FlatReadout(nn.Module):
         return functional.gelu(self.norm(self.read(self.reduce(h).flatten(1))))
 
 
-def make_readout(
-    kind: str, channels: int, size: tuple[int, int], keypoints: int, temperature: float
-) -> nn.Module:
-    """Build the readout of a feature map, (N, C, H, W) -> (N, 2 K).
-
-    Args:
-        kind: `keypoints` (`SpatialSoftmax`) or `flat` (`FlatReadout`).
-        channels: C.
-        size: H, W of the feature map.
-        keypoints: K.
-        temperature: Temperature of the keypoints' softmax.
-
-    Raises:
-        PolicyError: Another kind.
-    """
-    if kind == "keypoints":
-        return SpatialSoftmax(channels=channels, size=size, keypoints=keypoints, temperature=temperature)
-    if kind == "flat":
-        return FlatReadout(channels=channels, size=size, features=2 * keypoints)
-    raise PolicyError(f"unknown readout {kind!r}. Valid: flat, keypoints")
-
-
 class ResNetFiLMEncoder(nn.Module):
     """Image encoder of ResNet-T: ResNet-18's first stages, FiLM after every block, keypoints, one linear map.
 
@@ -224,7 +194,7 @@ class ResNetFiLMEncoder(nn.Module):
             torchvision's ResNet.
 
     Raises:
-        PolicyError: An unknown readout, or an image too small for the number of stages.
+        PolicyError: The image is too small for the number of stages.
     """
 
     def __init__(
@@ -264,11 +234,18 @@ class ResNetFiLMEncoder(nn.Module):
                 self.blocks.append(BasicBlock(in_channels=channels, channels=out, stride=stride, norm=norm))
                 self.films.append(film(channels=out))
                 channels = out
-        if init == "libero":
-            _init_as_torchvision(self)  # stem and blocks only: the rest is not built yet
+        for layer in self.modules() if init == "libero" else ():
+            if isinstance(layer, nn.Conv2d):  # of stem and blocks: the rest is not built yet
+                nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
         size = self._map_size(image_size)
         keypoints = keypoints or max(1, latent_dim // 2)
-        self.readout = make_readout(readout, channels, size, keypoints, temperature)
+        if readout == "flat":
+            self.readout: nn.Module = FlatReadout(channels=channels, size=size, features=2 * keypoints)
+        else:
+            assert readout == "keypoints", readout
+            self.readout = SpatialSoftmax(
+                channels=channels, size=size, keypoints=keypoints, temperature=temperature
+            )
         self.project = nn.Linear(2 * keypoints, latent_dim)
         self.to(memory_format=torch.channels_last)
 
@@ -307,8 +284,73 @@ class ResNetFiLMEncoder(nn.Module):
         return self.project(self.readout(h))
 
 
-def _init_as_torchvision(module: nn.Module) -> None:
-    """Draw the weights of all convolutions as torchvision's ResNet does (He et al., ICCV 2015, fan out)."""
-    for layer in module.modules():
-        if isinstance(layer, nn.Conv2d):
-            nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
+class PatchEncoder(nn.Module):
+    """Tokens of an image's patches: a strided convolution, then one linear map per patch of its output.
+
+    Args:
+        image_size: H, W in pixels.
+        dim: E.
+        width: Channels of the convolution.
+        stem_kernel: Side of the convolution's kernel.
+        stem_stride: Stride of the convolution.
+        patch: Side of a patch, in cells of the convolution's output.
+        norm: Normalisation, see `make_norm`.
+        pixels: Form in which images enter: `centred` or `libero`, see `to_network`.
+        rectify: Whether a ReLU follows the last normalisation; the original has none there.
+
+    Raises:
+        PolicyError: The patches do not tile the image.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: tuple[int, int],
+        dim: Width = 128,
+        width: Width = 64,
+        stem_kernel: Side = 7,
+        stem_stride: Side = 2,
+        patch: Side = 8,
+        norm: Norm = "group",
+        pixels: Pixels = "centred",
+        rectify: bool = True,
+    ) -> None:
+        super().__init__()
+        self.pixels, self.rectify = pixels, rectify
+        padding = stem_kernel // 2
+        cells = [(n + 2 * padding - stem_kernel) // stem_stride + 1 for n in image_size]
+        if any(n < patch or n % patch for n in cells):
+            raise PolicyError(
+                f"images of {tuple(image_size)} give {cells[0]} x {cells[1]} cells after the stem, which patches "
+                f"of {patch} x {patch} do not tile; change policy.encoder.patch or policy.encoder.stem_stride"
+            )
+        self.patches = (cells[0] // patch) * (cells[1] // patch)
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, width, stem_kernel, stem_stride, padding=padding, bias=norm == "none"),
+            make_norm(norm, width),
+            nn.ReLU(inplace=True),
+        )
+        self.project = nn.Conv2d(width, dim, patch, patch)
+        self.norm = make_norm(norm, dim)
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Encode images (N, H, W, 3) uint8 to tokens (N, P, E), row by row."""
+        h = self.norm(self.project(self.stem(to_network(images, self.pixels))))
+        if self.rectify:
+            h = functional.relu(h, inplace=True)
+        return h.flatten(2).transpose(1, 2)
+
+
+def encode_views(encoders: nn.ModuleDict, images: Tensor, language: Tensor) -> list[Tensor]:
+    """Return the latents of each view, (B, T, E), in order.
+
+    Args:
+        encoders: Image encoder of each view.
+        images: Images (B, T, V, H, W, 3) uint8.
+        language: Embeddings (B, L).
+    """
+    return [
+        encoder(images[:, :, view].flatten(0, 1), language).view(*images.shape[:2], -1)
+        for view, encoder in enumerate(encoders.values())
+    ]

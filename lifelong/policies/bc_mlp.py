@@ -3,16 +3,17 @@
 Shape legend: B batch, T time, F features of a frame.
 """
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from lifelong.nn.heads import DeterministicHead
-from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Head, ImageEncoder
-from lifelong.policies.joined import JoinedFeaturesPolicy
-from lifelong.types import PolicySpec, Share, Width
+from lifelong.nn.tokens import LanguageToken, ProprioScaling, named_parts
+from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
+from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder
+from lifelong.types import Observation, PolicySpec, Share, Width
 
 
-class BCMLP(JoinedFeaturesPolicy):
+class BCMLP(HistoryPolicy):
     """Behaviour cloning from one frame: an action head on all of its features, side by side.
 
     The cameras' latents, the instruction's latent and the proprioceptive readings are joined to one vector, which the
@@ -26,10 +27,10 @@ class BCMLP(JoinedFeaturesPolicy):
         encoder: Image encoder, one for each camera, see `ResNetFiLMEncoder`; completed with `image_size`,
             `language_dim` and `latent_dim`.
         head: Action head: `GMMHead`, `DeterministicHead` or `FlowHead`; completed with `in_dim` and `action_dim`.
-        stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
+        stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
-        standardise_language: Whether to bring embeddings to mean 0 and variance 1.
+        standardise_language: See `HistoryPolicy`.
 
     Raises:
         PolicyError: Components or sizes that do not work together.
@@ -48,17 +49,27 @@ class BCMLP(JoinedFeaturesPolicy):
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(
-            spec=spec,
-            image_embed=image_embed,
-            text_embed=text_embed,
-            encoder=encoder,
-            stochastic=stochastic,
-            normalise_proprio=normalise_proprio,
-            proprio_dropout=proprio_dropout,
-            standardise_language=standardise_language,
+        super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
+        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
+        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
+        self.proprio = ProprioScaling(
+            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
         )
-        self.head = self.build_head(head, in_dim=self.features)
+        readings = sum(spec.proprio.values())
+        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
+        self.head = self.build_head(head, in_dim=sum(self._sizes.values()))
+
+    def encode(self, observation: Observation) -> Tensor:
+        """Return one vector per frame, (B, T, F): the cameras' latents, the instruction's, and the readings."""
+        images, language = observation.images, self.instruction(observation)
+        seen = encode_views(self.encoders, images, language)
+        text = self.language(language)[:, None].expand(*images.shape[:2], -1)
+        return torch.cat([*seen, text, *self.proprio(observation.proprio).values()], dim=-1)
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the parts (B, T, n) of each camera, the instruction and the readings."""
+        return named_parts(features, self._sizes, dim=-1)
 
     def over_time(self, features: Tensor) -> Tensor:
         """Return the features (B, T, F) as they are: each frame is by itself."""

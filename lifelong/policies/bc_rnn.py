@@ -5,18 +5,18 @@ Shape legend: B batch, T time, F features of a frame, A action, L language embed
 
 from typing import Annotated, Literal
 
+import torch
 from torch import Tensor, nn
 
-from lifelong.errors import PolicyError
 from lifelong.nn.heads import GMMHead
-from lifelong.nn.recurrent import TemporalLSTM
-from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Component, Head, ImageEncoder
-from lifelong.policies.joined import JoinedFeaturesPolicy
-from lifelong.types import CompletedWith, PolicySpec, Share, Width
+from lifelong.nn.tokens import LanguageToken, ProprioScaling, named_parts
+from lifelong.nn.transformer import TemporalLSTM
+from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
+from lifelong.policies.history import Component, Head, HistoryPolicy, ImageEncoder
+from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
 
-class BCRNN(JoinedFeaturesPolicy):
+class BCRNN(HistoryPolicy):
     """Behaviour cloning with LIBERO's ResNet-RNN (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     The cameras' latents, the instruction's latent and the proprioceptive readings are joined to one vector per frame
@@ -35,13 +35,13 @@ class BCRNN(JoinedFeaturesPolicy):
             grow older than they are. `reset`: the state is carried on and emptied every `seq_len` steps; the steps
             after that hardly know the past. `window`: the LSTM reads the last `seq_len` frames again at every step.
             `none`: the state is empty at every step, as where the original acts; each action follows from one frame.
-        stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
+        stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
-        standardise_language: Whether to bring embeddings to mean 0 and variance 1.
+        standardise_language: See `HistoryPolicy`.
 
     Raises:
-        PolicyError: An unknown memory, or components or sizes that do not work together.
+        PolicyError: Components or sizes that do not work together.
     """
 
     uses_history = True
@@ -61,23 +61,31 @@ class BCRNN(JoinedFeaturesPolicy):
         proprio_dropout: Share = 0.0,
         standardise_language: bool = True,
     ) -> None:
-        super().__init__(
-            spec=spec,
-            image_embed=image_embed,
-            text_embed=text_embed,
-            encoder=encoder,
-            stochastic=stochastic,
-            normalise_proprio=normalise_proprio,
-            proprio_dropout=proprio_dropout,
-            standardise_language=standardise_language,
+        super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
+        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
+        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
+        self.proprio = ProprioScaling(
+            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
         )
-        if memory not in ("reset", "window", "none"):
-            raise PolicyError(f"unknown memory {memory!r}. Valid: none, reset, window")
+        readings = sum(spec.proprio.values())
+        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
         self.memory = memory
-        self.rnn: nn.LSTM = temporal(in_dim=self.features)
+        self.rnn: nn.LSTM = temporal(in_dim=sum(self._sizes.values()))
         self.head = self.build_head(head, in_dim=self.rnn.hidden_size)
         self._state: tuple[Tensor, Tensor] | None = None  # each (layers, B, hidden)
         self._age = 0  # steps that the state has seen
+
+    def encode(self, observation: Observation) -> Tensor:
+        """Return one vector per frame, (B, T, F): the cameras' latents, the instruction's, and the readings."""
+        images, language = observation.images, self.instruction(observation)
+        seen = encode_views(self.encoders, images, language)
+        text = self.language(language)[:, None].expand(*images.shape[:2], -1)
+        return torch.cat([*seen, text, *self.proprio(observation.proprio).values()], dim=-1)
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the parts (B, T, n) of each camera, the instruction and the readings."""
+        return named_parts(features, self._sizes, dim=-1)
 
     def over_time(self, features: Tensor) -> Tensor:
         """Map features (B, T, F) to the LSTM's outputs, (B, T, hidden), from an empty state."""

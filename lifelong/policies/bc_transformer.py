@@ -1,20 +1,20 @@
 """ResNet-T: ResNet with FiLM per camera, a transformer over time, an action head.
 
-Shape legend: B batch, T time, V views, M tokens per step, E token, A action, L language embedding.
+Shape legend: B batch, T time, M tokens per step, E token.
 """
 
 import torch
 from torch import Tensor, nn
 
 from lifelong.nn.heads import GMMHead
+from lifelong.nn.tokens import LanguageToken, ProprioTokens, named_parts
 from lifelong.nn.transformer import TemporalTransformer
-from lifelong.nn.vision import ResNetFiLMEncoder
-from lifelong.policies.history import Head, ImageEncoder, OverTime
-from lifelong.policies.tokens import TokenPolicy
+from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
+from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder, OverTime
 from lifelong.types import Observation, PolicySpec, Share, Width
 
 
-class BCTransformer(TokenPolicy):
+class BCTransformer(HistoryPolicy):
     """Behaviour cloning with LIBERO's ResNet-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, one per camera. All tokens of a
@@ -29,15 +29,16 @@ class BCTransformer(TokenPolicy):
             `language_dim` and `latent_dim`.
         temporal: Network over time, see `TemporalTransformer`; completed with `dim` and `max_length`.
         head: Action head: `GMMHead`, `DeterministicHead` or `FlowHead`; completed with `in_dim` and `action_dim`.
-        stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
+        stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
-        standardise_language: Whether to bring embeddings to mean 0 and variance 1, so that unit vectors of sentence
-            encoders weigh as much as BERT's outputs.
+        standardise_language: See `HistoryPolicy`.
 
     Raises:
         PolicyError: Components or sizes that do not work together.
     """
+
+    uses_history = True
 
     def __init__(
         self,
@@ -55,20 +56,25 @@ class BCTransformer(TokenPolicy):
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": embed_dim}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.build_rest(
-            seen=spec.views,
-            embed_dim=embed_dim,
-            temporal=temporal,
-            head=head,
-            normalise_proprio=normalise_proprio,
-            proprio_dropout=proprio_dropout,
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
+        self.proprio = ProprioTokens(
+            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
         )
+        self.transformer = temporal(dim=embed_dim, max_length=spec.seq_len)
+        self.head = self.build_head(head, in_dim=embed_dim)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
         images, language = observation.images, self.instruction(observation)
-        tokens = self.first_tokens(observation, language)
-        for view, encoder in enumerate(self.encoders.values()):
-            latent = encoder(images[:, :, view].flatten(0, 1), language)
-            tokens.append(latent.view(*images.shape[:2], 1, -1))
-        return torch.cat(tokens, dim=2)
+        seen = encode_views(self.encoders, images, language)
+        first = self.language(language)[:, None].expand(*images.shape[:2], -1)
+        return torch.stack([first, *self.proprio(observation.proprio), *seen], dim=2)
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the tokens of the instruction, the readings and each camera, each (B, T, n, E)."""
+        sizes = {"language": 1, "proprio": len(self.spec.proprio)} | dict.fromkeys(self.spec.views, 1)
+        return named_parts(features, sizes, dim=2)
+
+    def over_time(self, features: Tensor) -> Tensor:
+        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
+        return self.transformer(features)[:, :, 0]

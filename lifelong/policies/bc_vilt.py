@@ -1,6 +1,6 @@
 """ViT-T: a transformer over the patches of a frame, one over time, an action head.
 
-Shape legend: B batch, T time, V views, P patches, M tokens per step, S token of a patch, E token of a step.
+Shape legend: B batch, T time, M tokens per step, S token of a patch, E token of a step.
 """
 
 from typing import Annotated
@@ -10,15 +10,17 @@ from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import GMMHead
-from lifelong.nn.patches import PatchEncoder, SpatialTransformer
-from lifelong.nn.tokens import LanguageToken
-from lifelong.nn.transformer import TemporalTransformer
-from lifelong.policies.history import Component, Head, OverTime
-from lifelong.policies.tokens import TokenPolicy
+from lifelong.nn.tokens import LanguageToken, ProprioTokens, named_parts
+from lifelong.nn.transformer import SpatialTransformer, TemporalTransformer
+from lifelong.nn.vision import PatchEncoder
+from lifelong.policies.history import Component, Head, HistoryPolicy, OverTime
 from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
+Patches = Annotated[Component, CompletedWith(("image_size", "dim"))]
+OverPatches = Annotated[Component, CompletedWith(("views", "patches", "dim", "out_dim"))]
 
-class BCViLT(TokenPolicy):
+
+class BCViLT(HistoryPolicy):
     """Behaviour cloning with LIBERO's ViT-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, and one in which a transformer
@@ -36,14 +38,16 @@ class BCViLT(TokenPolicy):
             `dim` and `out_dim`.
         temporal: Network over time, see `TemporalTransformer`; completed with `dim` and `max_length`.
         head: Action head: `GMMHead`, `DeterministicHead` or `FlowHead`; completed with `in_dim` and `action_dim`.
-        stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
+        stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
-        standardise_language: Whether to bring embeddings to mean 0 and variance 1.
+        standardise_language: See `HistoryPolicy`.
 
     Raises:
-        PolicyError: Components or sizes that do not work together.
+        PolicyError: Components or sizes that do not work together, or no camera.
     """
+
+    uses_history = True
 
     def __init__(
         self,
@@ -51,10 +55,8 @@ class BCViLT(TokenPolicy):
         spec: PolicySpec,
         patch_embed: Width = 128,
         embed_dim: Width = 64,
-        encoder: Annotated[Component, CompletedWith(("image_size", "dim"))] = PatchEncoder,
-        spatial: Annotated[
-            Component, CompletedWith(("views", "patches", "dim", "out_dim"))
-        ] = SpatialTransformer,
+        encoder: Patches = PatchEncoder,
+        spatial: OverPatches = SpatialTransformer,
         temporal: OverTime = TemporalTransformer,
         head: Head = GMMHead,
         stochastic: bool = False,
@@ -63,21 +65,19 @@ class BCViLT(TokenPolicy):
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
+        if not spec.views:
+            raise PolicyError("data.views is []; this policy sees nothing without a camera")
         encoders = {view: encoder(image_size=spec.image_size, dim=patch_embed) for view in spec.views}
         self.encoders = nn.ModuleDict(encoders)
         self.spatial_language = LanguageToken(language_dim=spec.language_dim, dim=patch_embed)
-        if not encoders:
-            raise PolicyError("data.views is []; this policy sees nothing without a camera")
         patches = encoders[spec.views[0]].patches
         self.spatial = spatial(views=len(encoders), patches=patches, dim=patch_embed, out_dim=embed_dim)
-        self.build_rest(
-            seen=("images",),
-            embed_dim=embed_dim,
-            temporal=temporal,
-            head=head,
-            normalise_proprio=normalise_proprio,
-            proprio_dropout=proprio_dropout,
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
+        self.proprio = ProprioTokens(
+            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
         )
+        self.transformer = temporal(dim=embed_dim, max_length=spec.seq_len)
+        self.head = self.build_head(head, in_dim=embed_dim)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
@@ -86,5 +86,15 @@ class BCViLT(TokenPolicy):
             encoder(images[:, :, view].flatten(0, 1)) for view, encoder in enumerate(self.encoders.values())
         ]
         seen = self.spatial(torch.stack(patches, dim=1), self.spatial_language(language))
-        seen = seen.view(*images.shape[:2], 1, -1)
-        return torch.cat([*self.first_tokens(observation, language), seen], dim=2)
+        seen = seen.view(*images.shape[:2], -1)
+        first = self.language(language)[:, None].expand(*images.shape[:2], -1)
+        return torch.stack([first, *self.proprio(observation.proprio), seen], dim=2)
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the tokens of the instruction, the readings and the mixed images, each (B, T, n, E)."""
+        sizes = {"language": 1, "proprio": len(self.spec.proprio), "images": 1}
+        return named_parts(features, sizes, dim=2)
+
+    def over_time(self, features: Tensor) -> Tensor:
+        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
+        return self.transformer(features)[:, :, 0]

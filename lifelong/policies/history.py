@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead
+from lifelong.nn.tokens import standardise
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, CompletedWith, Observation, PolicySpec
 
@@ -25,20 +26,22 @@ OverTime = Annotated[Component, CompletedWith(("dim", "max_length"))]
 class HistoryPolicy(Policy):
     """Policy that acts on the last frames: encode each frame, mix the features over time, apply the head.
 
-    A subclass sets `head` and implements `encode` and `over_time`. When acting, the features of the last
-    `memory_steps` frames are kept and go through `over_time` again at every step, so that a step is computed as the
-    last one of a window.
+    A subclass builds its parts, the last of them `head` by `build_head`, and implements `encode`, `modalities` and
+    `over_time`. When acting, the features of the last `memory_steps` frames are stored and go through `over_time` again
+    at every step, so that a step is computed as the last one of a window.
 
     Args:
         spec: What the policy observes and does; `spec.seq_len` is the longest window.
         stochastic: Whether to sample actions instead of taking the most likely ones; sampling needs generators.
+        standardise_language: Whether to bring embeddings of instructions to mean 0 and variance 1, so that unit vectors
+            of sentence encoders weigh as much as BERT's outputs.
     """
 
     head: ActionHead
 
-    def __init__(self, spec: PolicySpec, *, stochastic: bool) -> None:
+    def __init__(self, spec: PolicySpec, *, stochastic: bool, standardise_language: bool) -> None:
         super().__init__(spec)
-        self.stochastic = stochastic
+        self.stochastic, self.standardise_language = stochastic, standardise_language
         self._history: Tensor | None = None  # (B, <= memory_steps, ...)
         self._num_envs: int | None = None
         self._planned: list[Tensor] = []  # actions (B, A) still to be executed
@@ -48,7 +51,7 @@ class HistoryPolicy(Policy):
         """Return the features of every frame by itself, (B, T, ...)."""
 
     def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the parts of `encode`'s features by what they tell of, each (B, T, ...); together they are all.
+        """Return the parts of `encode`'s features by modality, each (B, T, ...); together they are all.
 
         They are called `language`, `proprio` (where there is any), and after the views, or `images` where those are
         mixed; the view that is named first comes first.
@@ -67,6 +70,10 @@ class HistoryPolicy(Policy):
     @abstractmethod
     def over_time(self, features: Tensor) -> Tensor:
         """Map features (B, T, ...) to latents (B, T, E), each computed from its own frame and earlier ones."""
+
+    def instruction(self, observation: Observation) -> Tensor:
+        """Return the instruction's embedding (B, L), standardised if so chosen."""
+        return standardise(observation.language) if self.standardise_language else observation.language
 
     def build_head(self, head: Component, in_dim: int) -> ActionHead:
         """Build the head for latents of `in_dim` numbers.
@@ -113,8 +120,21 @@ class HistoryPolicy(Policy):
         """Forget the history and the planned actions; see `Policy`."""
         self._history, self._num_envs, self._planned = None, num_envs, []
 
+    def step(self, observation: Observation) -> dict[str, Tensor]:
+        """Add a frame to the history; return the parameters of the distribution of the next action.
+
+        Raises:
+            PolicyError: `reset` was called for another number of environments.
+        """
+        if self._num_envs != len(observation.images):
+            raise PolicyError(
+                f"reset was called for {self._num_envs} environments, the observation has "
+                f"{len(observation.images)}; call reset(num_envs) at the start of an episode"
+            )
+        return self.head(self._latest_latent(self.encode(observation)))
+
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
-        params = self._step(observation)
+        params = self.step(observation)
         if not self.stochastic:
             generators = None
         elif generators is None or len(generators) != self._num_envs:
@@ -124,15 +144,6 @@ class HistoryPolicy(Policy):
         if not self._planned:
             self._planned = list(self.head.plan(params, generators).unbind(1))
         return self._planned.pop(0)
-
-    def _step(self, observation: Observation) -> dict[str, Tensor]:
-        """Add a frame to the history; return the parameters of the distribution of the next action."""
-        if self._num_envs != len(observation.images):
-            raise PolicyError(
-                f"reset was called for {self._num_envs} environments, the observation has "
-                f"{len(observation.images)}; call reset(num_envs) at the start of an episode"
-            )
-        return self.head(self._latest_latent(self.encode(observation)))
 
     def _latest_latent(self, features: Tensor) -> Tensor:
         """Append the features (B, 1, ...) of a frame to the history; return the frame's latent (B, E)."""

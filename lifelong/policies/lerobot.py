@@ -6,6 +6,7 @@ with it, because it asks for other versions of some packages.
 Shape legend: B batch, T steps of a window, A action, D sizes of all readings, L language embedding.
 """
 
+import importlib
 import inspect
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,9 +18,8 @@ import torch
 from torch import Tensor
 
 from lifelong.data.windows import JoinedWindows, WindowDataset
-from lifelong.errors import ConfigError, PolicyError
+from lifelong.errors import ConfigError, MissingPackageError, PolicyError
 from lifelong.policies.base import Policy
-from lifelong.policies.lerobot_package import lerobot_module, settings_errors
 from lifelong.types import Batch, Count, Observation, PolicySpec
 
 # type -> its setting for the number of actions in a chunk, which is the length of a window
@@ -93,8 +93,11 @@ class LeRobotPolicy(Policy):
         super().__init__(spec)
         self.type, self.when = type, statistics
         self.language = language and type in WITH_EMBEDDING
-        with settings_errors(type):
+        try:
             self.inner = self._build(settings, act_steps, pretrained)
+        except (ValueError, NotImplementedError, TypeError) as error:
+            text = " ".join(str(error).split())
+            raise ConfigError(f"policy.type={type}: LeRobot refuses its settings: {text}") from error
         self._frames = list(self.inner.config.observation_delta_indices or [0])
         self._first = min(*self._frames, *self.inner.config.action_delta_indices)
         longest = max(*self._frames, *self.inner.config.action_delta_indices) - self._first + 1
@@ -346,3 +349,36 @@ def _frames_of(dataset: WindowDataset, readings: Iterable[str]) -> tuple[Tensor,
         proprio = {n: torch.cat([b.observation.proprio[n][:, 0] for b in batches]) for n in names}
         actions = torch.cat([b.actions[:, 0] for b in batches])
     return torch.cat([proprio[name] for name in names], dim=1).cpu(), actions.cpu()
+
+
+def lerobot_module(module: str) -> Any:
+    """Import a module of LeRobot, such as `policies.factory`.
+
+    Raises:
+        MissingPackageError: It is not installed, or does not fit the versions beside it.
+    """
+    try:
+        _declare_operators()
+        return importlib.import_module(f"lerobot.{module}")
+    except (ImportError, RuntimeError, TypeError) as error:
+        reason = f"LeRobot cannot be imported ({error})"
+        raise MissingPackageError(reason, "`make lerobot`, which makes an environment with it") from error
+
+
+def _declare_operators() -> None:
+    """Declare torchvision's operators where its build does not fit torch's, as of a CPU build; LeRobot calls none."""
+    try:
+        importlib.import_module("torchvision")
+    except RuntimeError as error:
+        if "torchvision::" not in str(error):
+            raise
+        library = torch.library.Library("torchvision", "FRAGMENT")
+        _KEPT.append(library)
+        for name in _OPERATORS:
+            library.define(f"{name}(Tensor x) -> Tensor")
+        importlib.import_module("torchvision")
+
+
+_KEPT: list[Any] = []  # operators are forgotten with their library
+_BACKWARD = ("roi_align", "roi_pool", "ps_roi_align", "ps_roi_pool", "deform_conv2d")
+_OPERATORS = ("nms", "qnms", *_BACKWARD, *(f"_{name}_backward" for name in _BACKWARD))

@@ -105,7 +105,7 @@ def acts(policy: Policy, episode: Batch) -> Found:
     """Return the distribution of the action at each frame, as the policy acts."""
     policy.eval().reset(len(episode))
     steps = episode.actions.shape[1]
-    params = [policy._step(original.episode_frame(episode, step)) for step in range(steps)]
+    params = [policy.step(original.episode_frame(episode, step)) for step in range(steps)]
     joined = {name: torch.stack([p[name] for p in params], 1) for name in params[0]}
     return {
         "act_means": joined["means"].flatten(0, 1).view(len(episode), -1, *joined["means"].shape[-2:]),

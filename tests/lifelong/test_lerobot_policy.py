@@ -11,8 +11,7 @@ pytest.importorskip("lerobot")
 from lifelong.data.dataset import SequenceVLDataset, last_frames
 from lifelong.data.fake import fake_observation
 from lifelong.errors import ConfigError, PolicyError
-from lifelong.policies.lerobot import FOLDER, LeRobotPolicy
-from lifelong.policies.lerobot_package import lerobot_module
+from lifelong.policies.lerobot import FOLDER, LeRobotPolicy, lerobot_module
 from lifelong.settings import build
 from lifelong.training.fit import _make_optimizer
 from lifelong.training.settings import FitSettings

@@ -84,12 +84,10 @@ def test_flat_readout_reads_every_place_of_the_map() -> None:
     assert (h.grad.abs().sum(1) > 0).all()
 
 
-def test_encoder_takes_either_readout_and_names_the_valid_ones() -> None:
+def test_encoder_takes_either_readout() -> None:
     images = torch.randint(0, 256, (2, 32, 32, 3), generator=generator(), dtype=torch.uint8)
     for readout in ("keypoints", "flat"):
         assert small_encoder(readout=readout)(images, randn(2, 6)).shape == (2, 8)
-    with pytest.raises(PolicyError, match="flat, keypoints"):
-        small_encoder(readout="pooled")
 
 
 @pytest.mark.parametrize("norm", ["group", "batch", "none"])
@@ -118,11 +116,9 @@ def test_the_instruction_modulates_a_stem_without_blocks_where_it_is_asked_to(st
     assert torch.equal(one, other) == (not stem_film)
 
 
-def test_encoder_refuses_invalid_sizes_and_norms() -> None:
+def test_encoder_refuses_images_that_are_too_small() -> None:
     with pytest.raises(PolicyError, match="too small to localise"):
         small_encoder(stage_blocks=(1, 1, 1, 1), stem_pool=True)
-    with pytest.raises(PolicyError, match="Valid: batch, group, none"):
-        small_encoder(norm="layer")
 
 
 def test_mask_lets_a_step_attend_to_itself_and_the_past() -> None:
@@ -190,8 +186,6 @@ def test_pixels_of_the_original_are_its_range_and_its_first_row() -> None:
     assert ours.shape == theirs.shape == (2, 3, 4, 5)
     torch.testing.assert_close(ours[0, 1], images[0, :, :, 1] / 127.5 - 1)
     torch.testing.assert_close(theirs[0, 1], images[0, :, :, 1].flipud() / 255)
-    with pytest.raises(PolicyError, match="Valid: centred, libero"):
-        to_network(images, "raw")
 
 
 def test_initial_weights_of_the_original_are_those_of_torchvisions_resnet() -> None:
@@ -326,10 +320,10 @@ def test_proprio_is_of_order_one_and_dropout_takes_whole_windows() -> None:
     nn.init.eye_(tokens.linears["gripper_states"].weight)
     nn.init.zeros_(tokens.linears["gripper_states"].bias)
     opened = torch.tensor([0.04, -0.04]).expand(64, 3, 2)
-    torch.testing.assert_close(tokens.eval()({"gripper_states": opened})[0, 0, 0], torch.tensor([1.0, -1.0]))
+    torch.testing.assert_close(tokens.eval()({"gripper_states": opened})[0][0, 0], torch.tensor([1.0, -1.0]))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        kept = tokens.train()({"gripper_states": opened}).abs().sum(-1).flatten(1) > 0
+        kept = tokens.train()({"gripper_states": opened})[0].abs().sum(-1) > 0
     assert (kept.all(1) | ~kept.any(1)).all()
     assert kept.any() and not kept.all()
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy import stats
 
-from lifelong.nn.shared_augmentation import SharedShift
+from lifelong.nn.augmentation import SharedShift
 from lifelong.seeding import generator
 from lifelong.settings import build
 from tests.harness import original, original_results

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from libero._adapters.lifelong.observations import uint8_image
 from lifelong.errors import PolicyError
-from lifelong.nn import patches, vision
+from lifelong.nn import vision
 
 
 class SpatialSoftmax(nn.Module):
@@ -89,7 +89,7 @@ class ResnetEncoder(nn.Module):
 
 
 class PatchEncoder(nn.Module):
-    """Strided convolution and one linear map for each patch of its output; see `lifelong.nn.patches.PatchEncoder`.
+    """Strided convolution and one linear map for each patch of its output; see `lifelong.nn.vision.PatchEncoder`.
 
     `patch_size` has two equal sides, in cells of the convolution's output. `more` are other arguments of the network.
     """
@@ -104,7 +104,7 @@ class PatchEncoder(nn.Module):
         super().__init__()
         _, height, width = input_shape
         sizes = {"image_size": (height, width), "dim": embed_size, "patch": square(patch_size)}
-        self.encoder = patches.PatchEncoder(**{**sizes, **more})
+        self.encoder = vision.PatchEncoder(**{**sizes, **more})
         self.patch_size, self.num_patches, self._aspect = patch_size, self.encoder.patches, width / height
 
     def forward(self, x: Tensor) -> Tensor:
