@@ -7,9 +7,17 @@ from typing import Any
 
 import mujoco
 
-from libero_env.assets.furniture import add_furniture, add_visual_mesh, furniture, solid_mesh
+from libero_env.assets.furnishing import (
+    add_furniture,
+    add_material,
+    add_visual_mesh,
+    furniture,
+    furniture_of,
+    load_styles,
+    solid_mesh,
+    styles_of,
+)
 from libero_env.assets.robot import load_robosuite, robosuite_assets
-from libero_env.assets.styles import add_material, furniture_of, load_styles, styles_of
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import delete
 from libero_env.objects.builtin.mesh import Mesh, merge

@@ -14,8 +14,7 @@ from typing import Any
 import mujoco
 
 from libero_env.assets.arena import Workspace, add_cameras_and_lights
-from libero_env.assets.original_arena import arena_spec, scene_file
-from libero_env.assets.original_drawing import restore_drawing
+from libero_env.assets.original_arena import arena_spec, restore_drawing, scene_file
 from libero_env.assets.original_mjcf import object_xml, read_spec
 from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import simplify_visuals
@@ -48,7 +47,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )  # fmt: skip
 # Category that LIBERO-PRO adds -> category that it recolours or enlarges, and by how much. Their files are in the
-# distributions of `libero_env.assets.installed`, and in no folder of the original.
+# distributions of `libero_env.assets.published`, and in no folder of the original.
 LIBERO_PRO: Mapping[str, tuple[str, float]] = MappingProxyType(
     {
         "bigger_akita_black_bowl": ("akita_black_bowl", 1.5),
@@ -170,7 +169,7 @@ class OriginalPack:
     def restore_drawing(
         self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
     ) -> None:
-        """Make a complete scene of this pack look as the original's own, see `libero_env.assets.original_drawing`.
+        """Make a complete scene of this pack look as the original's own, see `libero_env.assets.original_arena`.
 
         Raises:
             LiberoError: The pack is simplified, or a file is missing.

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -10,11 +10,18 @@ from typing import NamedTuple, Protocol
 
 import mujoco
 
-from libero_env.assets.arena import Workspace, add_arena
-from libero_env.assets.download import default_folder
-from libero_env.assets.installed import EXTRA, REMEDY, installed_folder
+from libero_env.assets.arena import WORKSPACES, Workspace, add_arena, load_workspace
+from libero_env.assets.downloads import broken_files, default_folder, read_manifest
 from libero_env.assets.original import LIBERO_PRO, OriginalPack, is_original
-from libero_env.assets.published import require_published, require_undamaged
+from libero_env.assets.published import (
+    EXTRA,
+    REMEDY,
+    check_folder,
+    installed_folder,
+    require_published,
+    require_undamaged,
+)
+from libero_env.assets.robot import robosuite_assets
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.paths import config_file, read_config
@@ -22,7 +29,7 @@ from libero_env.paths import config_file, read_config
 BUILTIN = "builtin"
 ORIGINAL = "original"  # the original's models, wherever they are installed
 VARIABLE = "LIBERO_ASSETS"
-_SOURCES = ("objects", "assets/arena.py", "assets/furniture.py", "assets/object_mjcf.py", "assets/styles.py")
+_SOURCES = ("objects", "assets/arena.py", "assets/furnishing.py")
 
 
 class Pack(Protocol):
@@ -138,13 +145,13 @@ def facade_assets() -> Choice:
     return choice
 
 
-def select_pack(assets: str | os.PathLike | None = None, lod: int | None = None) -> Pack:
+def select_pack(assets: Pack | str | os.PathLike | None = None, lod: int | None = None) -> Pack:
     """Return the pack to build scenes from.
 
     Args:
-        assets: `builtin`; `original` for the original's models where they are installed as packages or downloaded; or
-            the folder of the original's files. Default: `$LIBERO_ASSETS`, then the key `assets` of
-            `$LIBERO_CONFIG_PATH/config.yaml`, then `builtin`.
+        assets: A pack, which is returned as it is; `builtin`; `original` for the original's models where they are
+            installed as packages or downloaded; or the folder of the original's files. Default: `$LIBERO_ASSETS`, then
+            the key `assets` of `$LIBERO_CONFIG_PATH/config.yaml`, then `builtin`.
         lod: Largest number of triangles of a visual mesh of the original; None keeps all triangles.
 
     Raises:
@@ -152,7 +159,9 @@ def select_pack(assets: str | os.PathLike | None = None, lod: int | None = None)
         ChangedAssetsError: Files are missing or damaged.
         LiberoError: The folder does not hold the original's files.
     """
-    return pack_of(chosen_assets(assets), lod)
+    if assets is None or isinstance(assets, str | os.PathLike):
+        return pack_of(chosen_assets(assets), lod)
+    return assets
 
 
 def pack_of(choice: Choice, lod: int | None = None) -> Pack:
@@ -186,6 +195,40 @@ def original_folder() -> Path:
         require_undamaged(folder)
         return folder
     raise MissingPackageError("the original's models are not installed", f"{EXTRA}, or libero assets install")
+
+
+def problems(pack: Pack) -> list[str]:
+    """Return a line for each object or room that does not compile and each file that is missing or has changed."""
+    lines = []
+    try:
+        robosuite_assets()
+    except MissingPackageError as error:
+        lines.append(f"robot: {error}")
+    for category in pack.categories():
+        lines += _build_problems(category, lambda category=category: pack.build(category).spec)
+    for name in WORKSPACES:
+        lines += _build_problems(name, lambda name=name: _arena_alone(pack, name))
+    if not isinstance(pack, OriginalPack):
+        return lines
+    root = Path(pack.root)
+    if record := read_manifest(root):  # as the Hub listed the files
+        return lines + [f"{name}: missing or changed" for name in broken_files(root, record[1])]
+    check_folder.cache_clear()
+    return lines + list(check_folder(root).differences)
+
+
+def _build_problems(what: str, make: Callable[[], mujoco.MjSpec]) -> list[str]:
+    try:
+        make().compile()
+    except (LiberoError, ValueError) as error:  # MuJoCo raises ValueError for a broken mesh or texture
+        return [f"{what}: {error}"]
+    return []
+
+
+def _arena_alone(pack: Pack, workspace: str) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    pack.add_arena(spec, load_workspace(workspace), {})
+    return spec
 
 
 def _is_absent(value: str) -> bool:

@@ -11,8 +11,8 @@ def install(*, dest: FilePath | None = None) -> None:
     Args:
         dest: Folder (default: the running environment).
     """
-    from libero_env.assets.installed import install as install_models
     from libero_env.assets.pack import ORIGINAL
+    from libero_env.assets.published import install as install_models
 
     folder = install_models(dest)
     print(f"{folder}: complete; all files are the published ones")
@@ -26,8 +26,8 @@ def download(*, dest: FilePath | None = None, revision: str | None = None) -> No
         dest: Folder (default: assets in the cache).
         revision: Commit, tag or branch of the data set (default: a pinned commit).
     """
-    from libero_env.assets.download import REVISION
-    from libero_env.assets.download import download as download_models
+    from libero_env.assets.downloads import REVISION
+    from libero_env.assets.downloads import download as download_models
 
     folder = download_models(dest, revision or REVISION)
     print(f"{folder}: complete; all files have the digests that the server lists")
@@ -36,10 +36,9 @@ def download(*, dest: FilePath | None = None, revision: str | None = None) -> No
 
 def info() -> None:
     """Print the models in use, the setting that chose them, and what is installed."""
-    from libero_env.assets.download import default_folder, read_manifest
-    from libero_env.assets.installed import VERSION, installed_folder
+    from libero_env.assets.downloads import default_folder, read_manifest
     from libero_env.assets.pack import chosen_assets, facade_assets, pack_of
-    from libero_env.assets.published import ChangedAssetsError, check_folder
+    from libero_env.assets.published import VERSION, ChangedAssetsError, check_folder, installed_folder
 
     choice = chosen_assets()
     pack = pack_of(choice)
@@ -66,9 +65,8 @@ def check(folder: Positional[FilePath | None] = None) -> int:
     Args:
         folder: Folder to check (default: the models in use).
     """
-    from libero_env.assets.check import problems
     from libero_env.assets.original import OriginalPack, is_original
-    from libero_env.assets.pack import select_pack
+    from libero_env.assets.pack import problems, select_pack
 
     named = folder is not None and is_original(folder)  # then damaged files are listed, not refused
     pack = OriginalPack(str(folder.expanduser().absolute())) if folder and named else select_pack(folder)

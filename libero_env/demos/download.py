@@ -1,18 +1,14 @@
 """Download of the human demonstrations of the original benchmark: HDF5 files, pinned and verified."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from urllib.parse import quote
 
-from libero_env.assets.http import fetch, read_json
-from libero_env.assets.hub import DownloadError, Remote, check_free_space, listed_files
+from libero_env.assets.downloads import download_files
 from libero_env.paths import demos_dir
 from libero_env.tasks import get_suite, get_task
 
 REPO = "yifengzhu-hf/LIBERO-datasets"  # a data set on the Hugging Face Hub; CC BY 4.0
 REVISION = "e329580e402fb5f07ae3b1f18475fc3b63783b91"
-HUB = "https://huggingface.co"
 
 
 def remote_files(names: Sequence[str]) -> list[str]:
@@ -24,11 +20,11 @@ def remote_files(names: Sequence[str]) -> list[str]:
     Raises:
         UnknownNameError: A suite or task does not exist.
     """
-    found: dict[str, None] = {}
+    files: dict[str, None] = {}
     for name in names:
         tasks = [get_task(name)] if "/" in name else get_suite(name).tasks
-        found |= {f"{task.suite}/{task.name}_demo.hdf5": None for task in tasks}
-    return list(found)
+        files |= {f"{task.suite}/{task.name}_demo.hdf5": None for task in tasks}
+    return list(files)
 
 
 def download_demos(
@@ -37,7 +33,6 @@ def download_demos(
     *,
     revision: str = REVISION,
     overwrite: bool = False,
-    progress: bool | None = None,
 ) -> list[Path]:
     """Download demonstrations, or what is missing of them; `HF_ENDPOINT` names another server than the Hub.
 
@@ -48,48 +43,17 @@ def download_demos(
         dest: Folder to write; files go to `<dest>/<suite>/`. None for the folder where demonstrations are kept.
         revision: Commit, tag or branch of the data set.
         overwrite: Whether to replace existing files of other contents.
-        progress: Whether to show progress bars. None shows them if stderr is a terminal.
 
     Returns:
         The files, complete and verified.
 
     Raises:
-        DownloadError: There is no network or not enough space, a file of other contents exists, or a file arrives
-            different from what the server announces.
+        DownloadError: As for `libero_env.assets.downloads.download_files`.
         UnknownNameError: A suite or task does not exist.
+        MissingPackageError: huggingface_hub is not installed.
     """
     folder = (dest or demos_dir()).expanduser().absolute()
+    remedy = "perhaps recorded here: name another folder with --dest, or replace it with --overwrite"
     files = remote_files(names)
-    remote: dict[str, Remote] = {}
-    for suite in dict.fromkeys(file.partition("/")[0] for file in files):
-        remote |= _list_suite(suite, revision)
-    if absent := [file for file in files if file not in remote]:
-        raise DownloadError(f"{REPO} at revision {revision} has no {absent[0]}")
-    missing = [file for file in files if not remote[file].matches(folder / file)]
-    conflicting = [file for file in missing if (folder / file).exists()]
-    if conflicting and not overwrite:
-        raise DownloadError(
-            f"{folder / conflicting[0]} exists with other contents (perhaps recorded here); name another folder "
-            "with --dest, or replace it with --overwrite"
-        )
-    downloaded = sum(_partial_size(folder / file) for file in missing)
-    check_free_space(folder, sum(remote[file].size for file in missing) - downloaded)
-    for file in missing:
-        url = f"{_endpoint()}/datasets/{REPO}/resolve/{quote(revision, safe='')}/{quote(file)}"
-        fetch(url, folder / file, size=remote[file].size, is_valid=remote[file].matches, progress=progress)
+    download_files(REPO, revision, folder, files, replace=overwrite, remedy=remedy)
     return [folder / file for file in files]
-
-
-def _endpoint() -> str:
-    return os.environ.get("HF_ENDPOINT", HUB).rstrip("/")
-
-
-def _partial_size(path: Path) -> int:
-    partial = path.with_name(f"{path.name}.partial")
-    return partial.stat().st_size if partial.is_file() else 0
-
-
-def _list_suite(suite: str, revision: str) -> dict[str, Remote]:
-    """Return the files that the server has of a suite, with their sizes and digests."""
-    url = f"{_endpoint()}/api/datasets/{REPO}/tree/{quote(revision, safe='')}/{suite}?recursive=true"
-    return listed_files(read_json(url), url)

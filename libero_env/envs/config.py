@@ -110,8 +110,7 @@ class EnvConfig:
     @property
     def pack(self) -> Pack:
         """Asset pack of the models."""
-        assets = self.assets
-        return select_pack(assets) if assets is None or isinstance(assets, str | Path) else assets
+        return select_pack(self.assets)
 
     @classmethod
     def from_options(cls, config: "EnvConfig | None", options: Mapping[str, Any]) -> "EnvConfig":

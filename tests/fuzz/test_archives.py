@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from libero_env.assets.archive import unpack
-from libero_env.assets.http import check_url
-from libero_env.assets.hub import listed_files
+from libero._adapters.downloads import check_url, unpack
+from libero_env.assets.downloads import checked_listing
 from tests.harness.fuzz import examples, survive
 
 pytestmark = pytest.mark.unit
@@ -73,34 +72,17 @@ def test_archives_are_unpacked_within_their_folder_or_refused(place, entries, fl
         assert (place / "in" / "a" / "c.hdf5").read_text() == "recorded here"
 
 
-ENTRY = st.fixed_dictionaries(
-    {
-        "type": st.sampled_from(["file", "file", "directory"]),
-        "path": NAMES,
-        "size": st.integers(0, 10**9),
-        "oid": st.text(HEX, min_size=40, max_size=40),
-    },
-    optional={
-        "lfs": st.fixed_dictionaries(
-            {"oid": st.text(HEX, min_size=64, max_size=64), "size": st.integers(0, 9)}
-        ),
-        "other": ODD,
-    },
+FILE = st.tuples(
+    NAMES | ODD,
+    st.integers(0, 10**9) | ODD,
+    st.text(HEX, min_size=40, max_size=40) | st.text(HEX, min_size=64, max_size=64) | ODD,
 )
 
 
-@given(
-    st.lists(ENTRY, max_size=5), st.lists(st.tuples(st.integers(0, 20), st.text(max_size=5), ODD), max_size=3)
-)
+@given(st.lists(FILE, max_size=5))
 @examples(short=80, long=4000)
-def test_listings_name_files_of_one_folder_or_are_refused(entries, changes):
-    for where, key, value in changes:
-        if not entries:
-            entries.append(value)
-        elif isinstance(entry := entries[where % len(entries)], dict):
-            known = [*entry, key]
-            entry[known[where % len(known)]] = value
-    found = survive("archives", lambda: listed_files(entries, "here"))
+def test_listings_name_files_of_one_folder_or_are_refused(files):
+    found = survive("archives", lambda: checked_listing(files, "here"))
     for name, file in (found or {}).items():
         assert (Path("/folder") / name).resolve().is_relative_to("/folder") and ".." not in Path(name).parts
         assert file.size >= 0 and len(file.digest) in (40, 64)

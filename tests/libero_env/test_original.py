@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from libero_env.assets.arena import WORKSPACES, load_workspace
-from libero_env.assets.check import problems
 from libero_env.assets.original import OriginalPack, is_original
 from libero_env.assets.original_arena import TEXTURES
-from libero_env.assets.pack import BuiltinPack
+from libero_env.assets.pack import BuiltinPack, problems
 from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import decimate, nearest
 from libero_env.errors import LiberoError, UnknownNameError

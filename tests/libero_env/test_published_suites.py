@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from libero_env import BatchEnv, LiberoEnv
-from libero_env.assets.installed import installed_folder
 from libero_env.assets.original import LIBERO_PRO, OriginalPack
 from libero_env.assets.pack import select_pack
+from libero_env.assets.published import installed_folder
 from libero_env.errors import (
     BDDLError,
     InvalidInputError,

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from libero_env.assets.check import problems
-from libero_env.assets.pack import BuiltinPack
+from libero_env.assets.pack import BuiltinPack, problems
 from libero_env.assets.robot import robosuite_assets, robosuite_version
 from libero_env.cli import doctor
 from libero_env.errors import LiberoError, MissingPackageError

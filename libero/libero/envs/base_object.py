@@ -200,7 +200,7 @@ class MujocoXMLObject(BaseObject):
     """An object from an MJCF file, with the interface of robosuite's class of that name.
 
     Args:
-        fname: MJCF file, see `libero_env.assets.object_mjcf`; `custom_path` is another name for it.
+        fname: MJCF file, see `libero._adapters.envs.mjcf_models`; `custom_path` is another name for it.
         name: Name of the instance.
         joints: Joints, `[{"type": "free", "damping": "0.0005"}]`; None for an object that does not move.
         obj_type: Accepted without effect.

@@ -7,13 +7,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from libero._adapters.downloads import check_url, fetch, open_url, unpack
 from libero.libero import get_path_dict
 from libero.libero.benchmark import get_benchmark
-from libero_env.assets.archive import unpack
-from libero_env.assets.download import REPO as HF_ASSETS_REPO_ID  # noqa: F401 - name of the original
-from libero_env.assets.download import download as _download_assets
-from libero_env.assets.http import check_url, fetch, open_url
-from libero_env.assets.hub import DownloadError, check_names
+from libero_env.assets.downloads import REPO as HF_ASSETS_REPO_ID  # noqa: F401 - name of the original
+from libero_env.assets.downloads import DownloadError, check_names
+from libero_env.assets.downloads import download as _download_assets
 from libero_env.demos.download import REPO as HF_REPO_ID  # noqa: F401 - name of the original
 from libero_env.demos.download import download_demos
 from libero_env.errors import UnknownNameError
@@ -53,9 +52,9 @@ def url_is_alive(url: str) -> bool:
 
 
 def download_url(url: str, download_dir: Dir, check_overwrite: bool = True, is_zipfile: bool = True) -> Path:
-    """Download a file into a folder, see `libero_env.assets.http.fetch`, and return it.
+    """Download a file into a folder, see `libero._adapters.downloads.fetch`, and return it.
 
-    With `is_zipfile` the archive is unpacked, see `libero_env.assets.archive.unpack`, and removed, and the folder is
+    With `is_zipfile` the archive is unpacked, see `libero._adapters.downloads.unpack`, and removed, and the folder is
     returned. With `check_overwrite` files that exist are kept, also those that the archive has too.
     """
     folder, name = Path(download_dir), check_url(url)
@@ -91,7 +90,7 @@ def download_from_huggingface(
 
 
 def download_assets_from_huggingface(download_dir: Dir | None = None) -> str:
-    """Download and verify the original's models, see `libero_env.assets.download`, and return their folder."""
+    """Download and verify the original's models, see `libero_env.assets.downloads`, and return their folder."""
     return str(_download_assets(None if download_dir is None else Path(download_dir)))
 
 

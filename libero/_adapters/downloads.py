@@ -1,23 +1,31 @@
-"""Download over HTTP that resumes after an interruption, verifies the result, and never waits without a limit."""
+"""Downloads of plain files and archives from addresses, and the unpacking of archives.
+
+A download resumes after an interruption and never waits without a limit; nothing but http and https is followed. All
+names and sizes of an archive are checked before its first file is written.
+"""
 
 import errno
 import http.client
-import json
 import os
 import socket
+import stat
+import struct
 import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Mapping
+import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urljoin, urlsplit
 
 from tqdm import tqdm
 
-from libero_env.assets.hub import DownloadError, check_free_space
+from libero_env.assets.downloads import DownloadError, check_free_space, check_names
 from libero_env.parallel import progress_bar
+from libero_env.storage import atomic_path
 
 TRIES = 5  # consecutive attempts that receive next to nothing
 TIMEOUT = 60.0  # [s] without a byte
@@ -25,73 +33,33 @@ _ANSWER = 120.0  # [s] until all headers of an answer are there
 _BLOCK = 1 << 18  # [bytes] read at a time
 _PROGRESS = 1 << 16  # [bytes] that an attempt, and each interval, must receive
 _INTERVAL = 300.0  # [s]
-_MAX_LISTING = 32 << 20  # [bytes]
+_MAX_FILES = 20_000  # of an archive
+_MAX_RATIO = 100  # of all unpacked bytes to those of the archive; pictures pack to a tenth at best
+_SMALL = 64 << 20  # [bytes] unpacked, up to which any ratio is fine
+_HEADER = 30  # [bytes] before the name of each file of an archive
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
-def fetch(
-    url: str,
-    target: Path,
-    *,
-    size: int | None = None,
-    is_valid: Callable[[Path], bool] | None = None,
-    progress: bool | None = None,
-    pause: float = 1.0,
-) -> Path:
+def fetch(url: str, target: Path, *, pause: float = 1.0) -> Path:
     """Download a file; an incomplete one is kept beside it as `<name>.partial`, from which a later call resumes.
 
     Args:
         url: Address, http or https.
-        target: File to write; replaced when the download is complete and valid.
-        size: Expected number of bytes; None where it is not known.
-        is_valid: Decides whether the downloaded file is valid, such as by its digest.
-        progress: Whether to show a bar; None shows it where stderr is a terminal.
+        target: File to write; replaced when the download is complete.
         pause: Time before the first new attempt to connect, [s]; it doubles each time.
 
     Raises:
-        DownloadError: The address is not valid, the server cannot be reached, refuses or stalls, the disk is full, or
-            the file is not valid; then it is removed.
+        DownloadError: The address is not valid, the server cannot be reached, refuses or stalls, or the disk is full.
     """
     partial = target.with_name(f"{target.name}.partial")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with progress_bar(
-            total=size, unit="B", unit_scale=True, desc=target.name[:40], progress=progress
-        ) as bar:
-            _fetch_all(url, partial, size, bar, pause)
-        if is_valid is not None and not is_valid(partial):
-            partial.unlink()
-            raise DownloadError(
-                f"{url}: the downloaded file has the wrong checksum and was removed: the server or a "
-                "proxy changes it, or the disk is failing; try again, or another server"
-            )
+        with progress_bar(unit="B", unit_scale=True, desc=target.name[:40]) as bar:
+            _fetch_all(url, partial, bar, pause)
         partial.replace(target)
     except OSError as error:
         raise DownloadError(f"{error}; free some space, or give a folder that you can write to") from error
     return target
-
-
-def read_json(url: str) -> Any:
-    """Return the JSON that a server answers.
-
-    Raises:
-        DownloadError: The server cannot be reached, refuses or stalls, or the answer is too large or no JSON.
-    """
-    try:
-        with open_url(url) as response:
-            data, start = bytearray(), time.monotonic()
-            while block := response.read1(_BLOCK):
-                data += block
-                if len(data) > _MAX_LISTING or time.monotonic() - start > _INTERVAL:
-                    raise DownloadError(
-                        f"{url}: the answer is longer than {_MAX_LISTING >> 20} MiB, or takes too long"
-                    )
-        return json.loads(data)
-    except urllib.error.HTTPError as error:
-        error.close()
-        raise DownloadError(f"{url}: the server answers {error.code} {_plain(error.reason)}") from error
-    except (http.client.HTTPException, OSError, ValueError, RecursionError) as error:
-        reason = _plain(getattr(error, "reason", error))
-        raise DownloadError(f"{url}: {reason}; no network? HF_ENDPOINT names another server") from error
 
 
 def check_url(url: str) -> str:
@@ -137,8 +105,8 @@ def open_url(
         _Https(),
     ):
         opener.add_handler(handler)
-    found: http.client.HTTPResponse = opener.open(request, timeout=TIMEOUT)
-    return found
+    response: http.client.HTTPResponse = opener.open(request, timeout=TIMEOUT)
+    return response
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
@@ -169,13 +137,13 @@ class _LimitedAnswer(http.client.HTTPConnection):
         timer.daemon = True
         timer.start()
         try:
-            found = super().getresponse()
+            response = super().getresponse()
         finally:
             timer.cancel()
         if late.is_set():
-            found.close()
+            response.close()
             raise TimeoutError(f"no complete answer in {_ANSWER:.0f} s")
-        return found
+        return response
 
 
 class _LimitedSecureAnswer(_LimitedAnswer, http.client.HTTPSConnection):
@@ -200,15 +168,13 @@ def _shut(connection: socket.socket | None, late: threading.Event) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def _fetch_all(url: str, partial: Path, size: int | None, bar: tqdm, pause: float) -> None:
+def _fetch_all(url: str, partial: Path, bar: tqdm, pause: float) -> None:
     """Connect until the file is complete."""
-    if size is not None and _length(partial) > size:
-        partial.unlink()
     failures = 0
     while True:
         before = _length(partial)
         try:
-            if _fetch_rest(url, partial, size, bar):
+            if _fetch_rest(url, partial, bar):
                 return
             reason = "the connection was closed early"
         except urllib.error.HTTPError as error:
@@ -231,12 +197,9 @@ def _fetch_all(url: str, partial: Path, size: int | None, bar: tqdm, pause: floa
         time.sleep(pause * 2 ** max(failures - 1, 0))
 
 
-def _fetch_rest(url: str, partial: Path, size: int | None, bar: tqdm) -> bool:
+def _fetch_rest(url: str, partial: Path, bar: tqdm) -> bool:
     """Append the missing bytes until the connection ends; return whether the file is complete."""
     start = _length(partial)
-    if size is not None and start == size:
-        partial.touch()  # an empty file is complete from the beginning
-        return True
     try:
         response = open_url(url, {"Range": f"bytes={start}-"} if start else None)
     except urllib.error.HTTPError as error:
@@ -249,23 +212,21 @@ def _fetch_rest(url: str, partial: Path, size: int | None, bar: tqdm) -> bool:
         resumed = response.status == 206 and _range_start(response) in (start, None)
         start = start if resumed else 0  # a server without ranges starts at the beginning
         announced = response.headers.get("Content-Length", "")
-        total = size if size is not None else start + int(announced) if announced.isdecimal() else None
+        total = start + int(announced) if announced.isdecimal() else None
         if total is None and not getattr(response, "chunked", False):
             raise http.client.HTTPException("the server does not say how long the file is")
         check_free_space(partial.parent, max((total or 0) - start, 0))
         bar.total, bar.n = total, start
         with partial.open("ab" if start else "wb") as file:
-            _copy(response, file, None if total is None else total - start, bar)
+            _copy(response, file, bar)
     return total is None or _length(partial) == total
 
 
-def _copy(response: http.client.HTTPResponse, file: Any, wanted: int | None, bar: tqdm) -> None:
-    """Write what arrives; raise where it is more than announced, or comes too slowly to ever end."""
+def _copy(response: http.client.HTTPResponse, file: Any, bar: tqdm) -> None:
+    """Write what arrives; raise OSError where it comes too slowly to ever end."""
     arrived, mark, end = 0, 0, time.monotonic() + _INTERVAL
     while block := response.read1(_BLOCK):
         arrived += len(block)
-        if wanted is not None and arrived > wanted:
-            raise DownloadError("the server sends more than it announces: do not trust it")
         file.write(block)
         bar.update(len(block))
         if time.monotonic() > end:
@@ -287,3 +248,79 @@ def _plain(reason: object) -> str:
 
 def _length(path: Path) -> int:
     return os.path.getsize(path) if path.is_file() else 0
+
+
+def unpack(archive: Path, folder: Path, *, overwrite: bool = False) -> list[Path]:
+    """Unpack a zip archive into a folder.
+
+    Args:
+        archive: File to read.
+        folder: Folder to write to.
+        overwrite: Whether to replace files that exist; otherwise they are kept.
+
+    Returns:
+        The files that were kept.
+
+    Raises:
+        DownloadError: The archive is damaged, encrypted, or has links, names that lead out of the folder, one name
+            twice, or much more content than bytes; then nothing is written, or only complete files.
+    """
+    kept: list[Path] = []
+    try:
+        with zipfile.ZipFile(archive) as source:
+            entries = [entry for entry in source.infolist() if not entry.is_dir()]
+            _check(archive, source)
+            check_free_space(folder, sum(entry.file_size for entry in entries))
+            for entry in entries:
+                target = folder / entry.filename
+                if target.exists() and not overwrite:
+                    kept.append(target)
+                else:
+                    _write(source, entry, target)
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        struct.error,
+        NotImplementedError,
+        UnicodeError,
+    ) as error:
+        raise DownloadError(f"{archive}: the archive is damaged ({error})") from error
+    except OSError as error:
+        raise DownloadError(f"{archive}: it cannot be unpacked: {error}") from error
+    return kept
+
+
+def _write(source: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
+    with atomic_path(target) as temporary, source.open(entry) as packed, temporary.open("wb") as file:
+        while block := packed.read(_BLOCK):
+            file.write(block)
+
+
+def _check(archive: Path, source: zipfile.ZipFile) -> None:
+    """Check all entries of an archive by its directory."""
+    everything = source.infolist()
+    if len(everything) > _MAX_FILES:
+        raise DownloadError(f"{archive}: more than {_MAX_FILES} files: do not trust it")
+    for entry in everything:
+        kind = stat.S_IFMT(entry.external_attr >> 16)
+        if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+            raise DownloadError(f"{archive}: {entry.filename!r} is a link or a device: do not trust it")
+        if entry.flag_bits & 1:
+            raise DownloadError(f"{archive}: {entry.filename!r} is encrypted")
+        if entry.compress_type not in _METHODS:
+            raise DownloadError(
+                f"{archive}: {entry.filename!r} is packed in an unknown way; expected deflate"
+            )
+    check_names([entry.orig_filename.removesuffix("/") for entry in everything], str(archive))
+    unpacked, packed = sum(entry.file_size for entry in everything), archive.stat().st_size
+    if unpacked > max(_SMALL, _MAX_RATIO * packed):
+        raise DownloadError(
+            f"{archive}: {packed >> 10} KiB would unpack to {unpacked >> 20} MiB, more than {_MAX_RATIO} times as "
+            "much: do not trust it"
+        )
+    end = 0
+    for entry in sorted(everything, key=lambda entry: entry.header_offset):
+        if entry.header_offset < end:
+            raise DownloadError(f"{archive}: {entry.filename!r} overlaps another file: do not trust it")
+        end = entry.header_offset + _HEADER + len(entry.orig_filename) + entry.compress_size
